@@ -12,7 +12,7 @@ from anatomy.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Count, NotNegative, Processes, Seconds
+from lungaccess.cli.numbers import Count, CountOrNone, Processes, SamplesOrNone, Seconds
 from lungaccess.cli.options import OutputOptions, PatientOptions
 from lungaccess.cli.progress import progress
 
@@ -179,8 +179,8 @@ def score(
     submission: Path,
     folder: Path,
     *,
-    samples: NotNegative = 1000,
-    certify: NotNegative = 0,
+    samples: SamplesOrNone = 1000,
+    certify: CountOrNone = 0,
     only_answered: Annotated[bool, Parameter(negative="")] = False,
     out: Path | None = None,
     output: PatientOptions = PatientOptions(),
@@ -214,7 +214,7 @@ def score(
     with progress(f"scoring {handed_in.planner}") as shown:
         scores = list(
             score_submission(
-                handed_in, folder, cache=output.cache, samples=int(samples), certify_boxes=int(certify),
+                handed_in, folder, cache=output.cache, samples=samples, certify_boxes=certify,
                 only_answered=only_answered, progress=shown.step,
             )
         )  # fmt: skip

@@ -15,13 +15,14 @@ from lungaccess.problem.system import (
     load_system,
     needle_preset_names,
     preset_names,
+    preset_text,
     shipped_names,
     system_fingerprint,
     tube_preset_names,
 )
 
-PRESETS = Path(__file__).resolve().parents[3] / "lungaccess" / "presets"
-DEFAULT = (PRESETS / "lung-default.toml").read_text(encoding="utf-8")
+DOCS = Path(__file__).resolve().parents[3] / "docs"
+DEFAULT = preset_text("lung-default")
 
 
 def write(folder: Path, content: str) -> Path:
@@ -54,7 +55,7 @@ def test_preset_is_valid_sourced_and_survives_a_round_trip(name: str) -> None:
 
 @pytest.mark.parametrize("name", shipped_names())
 def test_sources_of_presets_are_in_the_bibliography(name: str) -> None:
-    bibliography = (PRESETS.parents[1] / "docs" / "reference" / "bibliography.md").read_text(encoding="utf-8")
+    bibliography = (DOCS / "reference" / "bibliography.md").read_text(encoding="utf-8")
     keys = {part.split("]")[0] for source in load_system(name).sources for part in source.split("[")[1:]}
     assert keys
     assert not {key for key in keys if f"[{key}]" not in bibliography}
@@ -148,14 +149,14 @@ def test_fingerprint_depends_on_every_number_and_nothing_else() -> None:
 
 
 def test_example_of_the_documentation_works(tmp_path: Path) -> None:
-    page = (PRESETS.parents[1] / "docs" / "how_to" / "devices.md").read_text(encoding="utf-8")
+    page = (DOCS / "how_to" / "devices.md").read_text(encoding="utf-8")
     example = page.split("```toml\n")[1].split("```")[0]
     system = load_system(write(tmp_path, example))
     assert system.needle.min_radius_of_curvature_mm == pytest.approx(100.0)
 
 
 def test_documentation_names_every_key() -> None:
-    page = (PRESETS.parents[1] / "docs" / "reference" / "devices.md").read_text(encoding="utf-8")
+    page = (DOCS / "reference" / "devices.md").read_text(encoding="utf-8")
 
     def keys(mapping: dict[str, object]) -> set[str]:
         nested = (keys(value) for value in mapping.values() if isinstance(value, dict))

@@ -26,6 +26,8 @@ MAY_SAY_NO = ("advise", "benchmark", "certify", "needle", "plan", "tubes")
 """Commands that end with 1 where a device does not get there, which depends on the patient."""
 SERVES = ("view",)
 """Commands that run until they are ended: their own tests start and end them."""
+SCRIPTS = ("examples/stranger/stranger.py",)
+"""Scripts of the project whose files later commands of a page name; those of the gallery have their own test."""
 INSTEAD = {"--budget": "2", "--samples": "500", "--spacing": "15", "--iterations": "20", "--count": "3"}
 """How long the reader wants to wait, and how exact the answer has to be: less than on the pages."""
 QUICK = ("docs/explanation/tubes.md", "docs/explanation/replanning.md", "docs/explanation/ompl.md")
@@ -97,10 +99,12 @@ def at_hand(words: list[str]) -> list[str]:
 
 def run_command(words: list[str]) -> None:
     """Run a command of ours; those of a shell are looked at in `test_docs`."""
+    if words[0] == "python" and words[1] in SCRIPTS:
+        subprocess.run([sys.executable, str(ROOT / words[1]), *words[2:]], check=True)
     if words[0] != "lungaccess" or words[1] in SERVES:
         return
     stated = at_hand(words[1:])
-    if stated[0] == "study" or stated[:3:2] == ["benchmark", "run"]:  # it starts processes
+    if stated[0] == "study" or stated[:3:2] == ["benchmark", "run"]:  # they start processes
         code = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         done = subprocess.run([sys.executable, "-c", code, *stated], env=os.environ | {"PYTHONPATH": path})

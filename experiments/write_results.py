@@ -44,6 +44,7 @@ OUR_OWN = (
     "slice_thickness",
     "growth",
     "breathing",
+    "phantom_likeness",
 )
 SETTINGS = ("full", "quick")
 OUR_TITLE = "Our own studies"

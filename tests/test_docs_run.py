@@ -27,7 +27,7 @@ MAY_SAY_NO = ("advise", "benchmark", "certify", "needle", "plan", "tubes")
 SERVES = ("view",)
 """Commands that run until they are ended: their own tests start and end them."""
 SCRIPTS = ("examples/stranger/stranger.py",)
-"""Scripts of the project whose files later commands of a page name; those of the gallery have their own test."""
+"""Scripts whose files later commands of a page name; those of the gallery have a test of their own."""
 INSTEAD = {"--budget": "2", "--samples": "500", "--spacing": "15", "--iterations": "20", "--count": "3"}
 """How long the reader wants to wait, and how exact the answer has to be: less than on the pages."""
 QUICK = ("docs/explanation/tubes.md", "docs/explanation/replanning.md", "docs/explanation/ompl.md")

@@ -12,11 +12,13 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
 from anatomy.records import frozen_value
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Array, Float
+from anatomy.typed import Array, Float, Mask
 
 GENERATIONS = (1, 2, 3, 4, 5, 6, 7, 8)
 DEPTHS_MM = ((2.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 30.0), (30.0, 60.0))
 """Shells by distance to the pleura; nearer than 2 mm a mask is half a voxel of chance."""
+FAR_MM = 60.0
+"""So far from the carina no vessel is on its way from the heart into the lung."""
 ENDS_MM = 2.0
 """The direction of a branch leaves out so much at its beginning, which lies in the parent."""
 QUANTILES = (0.25, 0.5, 0.75)
@@ -35,8 +37,9 @@ class Likeness:
     length_mm, diameter_mm, angle_deg : mapping of int to tuple of 3 float
         By generation, quartiles and median of the branches that end in a fork (length) or of all (others):
         arc length, inner diameter, and angle to the parent branch.
-    vessel_share : tuple of float
-        Share of the lung's volume that vessels take up, by the shells of `DEPTHS_MM`.
+    vessel_share, far_vessel_share : tuple of float
+        Share of the lung's volume that vessels take up, by the shells of `DEPTHS_MM`: in all of the lung, and
+        more than `FAR_MM` from the carina.
     clearance_mm : tuple of 3 float
         Quartiles of the distance of free tissue, 5 to 25 mm from the pleura, from vessels and airways.
     """
@@ -49,6 +52,7 @@ class Likeness:
     diameter_mm: dict[int, tuple[float, ...]]
     angle_deg: dict[int, tuple[float, ...]]
     vessel_share: tuple[float, ...]
+    far_vessel_share: tuple[float, ...]
     clearance_mm: tuple[float, ...]
 
 
@@ -60,6 +64,7 @@ def likeness_of(lung: Lung) -> Likeness:
     inside = (labels & OUTSIDE) == 0
     voxel_mm3 = float(np.prod(lung.grid.spacing_mm))
     shells = [inside & (depth >= low) & (depth < high) for low, high in DEPTHS_MM]
+    far = _far_from_carina(lung)
     free = inside & ((labels & (AIRWAY | VESSEL | FISSURE)) == 0) & (depth >= 5.0) & (depth < 25.0)
     nearest = np.minimum(_corner_distance(lung, "vessel"), _corner_distance(lung, "airway"))
     return Likeness(
@@ -71,12 +76,22 @@ def likeness_of(lung: Lung) -> Likeness:
         diameter_mm=diameters,
         angle_deg=angles,
         vessel_share=tuple(_share(labels, VESSEL, shell) for shell in shells),
+        far_vessel_share=tuple(_share(labels, VESSEL, shell & far) for shell in shells),
         clearance_mm=_quartiles(nearest[free]),
     )
 
 
 def _share(labels: Array, bit: int, where: Array) -> float:
     return float(((labels[where] & bit) != 0).mean()) if where.any() else 0.0
+
+
+def _far_from_carina(lung: Lung) -> Mask:
+    """Return the voxels more than `FAR_MM` from the carina; the grid may lie aslant."""
+    steps = np.asarray(lung.grid.lps_from_ijk)[:3, :3]
+    away = lung.grid.lps(np.zeros(3)) - lung.tree.carina_lps
+    index = np.ogrid[tuple(slice(n) for n in lung.grid.shape)]
+    squared = sum((away[axis] + sum(steps[axis, d] * index[d] for d in range(3))) ** 2 for axis in range(3))
+    return np.asarray(squared > FAR_MM**2)
 
 
 def _quartiles(values: Array) -> tuple[float, ...]:

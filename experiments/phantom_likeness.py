@@ -66,7 +66,7 @@ class Measured:
                     found[f"generation {generation}: {words}"] = quartiles[1]
         for where, shares in (
             ("", like.vessel_share),
-            (f", {FAR_MM:g} mm from carina", like.far_vessel_share),
+            (f", more than {FAR_MM:g} mm from the carina", like.far_vessel_share),
         ):
             for (low, high), share in zip(DEPTHS_MM, shares, strict=True):
                 found[f"vessels {low:g} to {high:g} mm below the pleura{where}, %"] = 100.0 * share

@@ -65,6 +65,11 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
         "Patient1: targets reached in all phases, rigid plan",
         "Patient1: targets reached in all phases, window plan",
     ),
+    "phantom_likeness": (
+        "generation 1: length", "generation 4: inner diameter",
+        "vessels 2 to 5 mm below the pleura, more than 60 mm from the carina",
+        "peripheral targets within reach of lung-default",
+    ),
 }  # fmt: skip
 
 MEASURED_ON: Mapping[str, str] = {

@@ -117,13 +117,14 @@ def headlines(found: dict[str, Found], tables: str, docs: str) -> str:
 def _headlines(name: str, found: dict[str, Found], docs: str) -> list[list[str]]:
     """Return the cells of a study's headline rows, or one that says why there is none."""
     made = found.get(name, {})
+    page = MEASURED_ON.get(name)
+    elsewhere = f"measured once: [page]({docs}{page.removeprefix('docs')})" if page else ""
     if not made:
-        page = MEASURED_ON.get(name)
-        where = f"; measured once: [page]({docs}{page.removeprefix('docs')})" if page else ""
-        return [[f"**no result is kept**{where}", "", "", "", "none"]]
+        return [["; ".join(filter(None, ("**no result is kept**", elsewhere))), "", "", "", "none"]]
     shown = made.get("full") or made["quick"]
     state = shown.get("progress") or ""
     state = f"{shown['setting']}, **unfinished: {state}**" if state else shown["setting"]
+    state = f"{state}; more was {elsewhere}" if elsewhere and "full" not in made else state
     by_quantity = {row.quantity: row for row in shown["rows"]}
     rows = [by_quantity[each] for each in HEADLINES.get(name, ()) if each in by_quantity]
     rows = rows or shown["rows"][:1]

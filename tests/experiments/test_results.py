@@ -18,7 +18,7 @@ from anatomy.errors import FileError
 from anatomy.lung import Lung
 from experiments import pan2025_tour, run_all, write_results
 from experiments.support import anatomies, results
-from experiments.support.headlines import HEADLINES
+from experiments.support.headlines import HEADLINES, MEASURED_ON
 from experiments.support.results import PNG_BYTES, Result, Row, cells, number, write_result
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -156,6 +156,17 @@ def test_results_md_has_every_study_and_few_rows(tmp_path: Path) -> None:
     for name in run_all.STUDIES:
         assert f"](results/tables.md#{name}) |" in text
     assert text.count("**no result is kept**") == len(run_all.STUDIES) - 2
+
+
+def test_results_md_names_the_page_of_a_study_whose_full_result_is_not_kept(tmp_path: Path) -> None:
+    name, page = next(iter(MEASURED_ON.items()))
+    write_result(made(name, "quick"), tmp_path)
+    write_results.write_page(tmp_path, tmp_path / "RESULTS.md")
+    where = f"more was measured once: [page]({page})"
+    assert f"| quick; {where} |" in (tmp_path / "RESULTS.md").read_text()
+    write_result(made(name, "full"), tmp_path)
+    write_results.write_page(tmp_path, tmp_path / "RESULTS.md")
+    assert where not in (tmp_path / "RESULTS.md").read_text().split(f"#{name}")[1].splitlines()[0]
 
 
 def test_each_headline_is_a_row_of_the_stored_results() -> None:

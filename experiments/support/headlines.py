@@ -77,4 +77,4 @@ MEASURED_ON: Mapping[str, str] = {
     "tube_designs": "docs/measurements/coverage.md",
     "decided_targets": "docs/measurements/proofs.md",
 }
-"""Pages that state what a study measured of which no file of results, or none of the full setting, is kept."""
+"""Pages that state what a study measured of which no result, or none of the full setting, is kept."""

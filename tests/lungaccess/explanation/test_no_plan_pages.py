@@ -109,8 +109,7 @@ class TestBrowser:
         window.run("window.lungaccessReport.set(arguments[0])", [mm + 7.0 for mm in target])
         assert window.state()["slices"]["place_lps"] != pytest.approx(target)
         window.run(
-            "const s = document.getElementById('place'); s.value = '0';"
-            "s.dispatchEvent(new Event('change'))"
+            "const s = document.getElementById('place'); s.value = '0';s.dispatchEvent(new Event('change'))"
         )
         window.frame()
         state = window.state()

@@ -15,6 +15,8 @@ from lungaccess.explorer.messages import Frame, error_message, frame
 from lungaccess.explorer.questions import Question
 from lungaccess.problem import System
 
+GONE = (EOFError, BrokenPipeError, ConnectionResetError)
+"""What a connection raises when the server is gone."""
 Key = tuple[str, str]
 """A page, and what it asked: a later question with the same key supersedes an earlier one."""
 
@@ -173,7 +175,7 @@ class Worker:
                 self._take_in(wait=not self._running)
                 for key in list(self._running):
                     self._advance(key)
-        except (EOFError, BrokenPipeError, ConnectionResetError):
+        except GONE:
             return
 
     def _take_in(self, *, wait: bool) -> None:
@@ -205,10 +207,14 @@ class Worker:
         self._now.append(key)
         try:
             part = next(iterator)
+            if part is not None and self._is_wanted(asked):
+                self._send(asked, part)
         except StopIteration:
             self._finish(asked, Part({"answer": "end"}))
         except Superseded:
             pass
+        except GONE:
+            raise
         except LungaccessError as error:
             self._finish(asked, Part(dict(error_message(asked.question.id, error))))
         except MemoryError:
@@ -218,9 +224,6 @@ class Worker:
             self._finish(
                 asked, _failed(asked, "This question made the program fail; its terminal says where")
             )
-        else:
-            if part is not None and self._is_wanted(asked):
-                self._send(asked, part)
         finally:
             self._now.remove(key)
 

@@ -35,7 +35,7 @@ export function showCompared(scene, compared, most, distance) {
   for (let n = 1; n <= most; n++) {
     const found = compared.find(({ number }) => number === n);
     put(scene, `${COMPARED}${n}`, found && ((solids) => {
-      const end = found.motion.at(1), radius = thickened(found.motion.plan.radius_mm, distance), { colour, bands } = planStyle(n);
+      const end = found.motion.end, radius = thickened(found.motion.plan.radius_mm, distance), { colour, bands } = planStyle(n);
       const show = (points, mm) => {
         const line = banded(points, rgb(colour), WHITE, bands);
         solids.tube(line.points, mm, line.colours);
@@ -63,7 +63,7 @@ export function deviceLines(motion, state) {
 
 export function comparedLines(compared) {
   return compared.flatMap(({ motion, number }) => {
-    const end = motion.at(1), { radius_mm: radius } = motion.plan, { colour } = planStyle(number);
+    const end = motion.end, { radius_mm: radius } = motion.plan, { colour } = planStyle(number);
     return [
       { points: [...end.outer, ...end.middle, ...end.inner], radius: radius.inner, colour },
       { points: end.needle, radius: radius.needle, colour },

@@ -1,43 +1,37 @@
 // The page of the explorer: what is asked, what is shown, and how both follow from the address.
-import { AnatomyPage, byId, openPage } from "../report/anatomy_page.js";
+import { byId, openPage } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
+import { DevicePage } from "../report/device_page.js";
 import { Motion } from "../report/motion.js";
 import { STANDARD } from "../report/slices.js";
-import { ballAround, sideOf } from "../report/orbit.js";
+import { Player } from "../report/player.js";
 import { oncePerFrame } from "../report/structures.js";
-import { alongLine } from "../report/surfaces.js";
-import { minus, mix, norm, rgb, unit } from "../report/vectors.js";
+import { minus, norm, rgb } from "../report/vectors.js";
 import { VoxelImage } from "../report/voxel_image.js";
 import { placedVolume } from "../report/voxels.js";
+import { Asker } from "./asker.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
 import { CtSource } from "./ct_source.js";
 import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
-import { Exits } from "./exits.js";
 import { connectHelp, connectKeys } from "./keys.js";
 import { PlanPanel } from "./plan_panel.js";
 import { connectPointer } from "./pointer.js";
-import { ReachLayer } from "./reach_layer.js";
-import { MOST_COMPARED, planKey, planQuestion, State, systemKey, whatIf } from "./state.js";
-import { Tips } from "./tips.js";
+import { Search } from "./search.js";
+import { MOST_COMPARED, planKey, State } from "./state.js";
 import { WhatIfPanel } from "./what_if.js";
 import { errorWords, fillRows, lpsText, made, mm, placeWords } from "./widgets.js";
 
-const PLAY_S = 12, MOST_STEP_S = 0.25;
 const KEPT_PLANS = 30, REST_MS = 250;
-// Answers that come soon, and are shown before a better picture is drawn.
-const SOON = ["exits", "plan", "place", "appraise"];
-const NEAR_NODULE_MM = 25, SCOPE_POINTS = 16, AROUND_PLAN_MM = 12;
 
-class ExplorerPage extends AnatomyPage {
+class ExplorerPage extends DevicePage {
   constructor() {
     super({ structures: [], breath: null });
+    this.player = new Player(this);
     this.plans = new Map();
-    this.asking = {};
-    this.awaited = 0;
-    this.times = {};
+    this.search = new Search(this);
     this.exits = this.tips = this.reach = this.motion = null;
-    this.targetLps = null;
+    this.targetLps = this.failure = null;
     this.stale = { scene: true, slices: true };
     const later = oncePerFrame((atOnce) => (this.stale.scene ? this.show(atOnce ? "rest" : "moving") : this.draw()));
     const mark = (changes) => Object.assign(this.stale, changes);
@@ -50,10 +44,11 @@ class ExplorerPage extends AnatomyPage {
 
   async open() {
     this.connection = await Connection.open(() => this.say("The explorer has ended: start `lungaccess view` again."));
+    this.asker = new Asker(this.connection, (words) => this.say(words));
     this.say("Reading the patient…");
-    await this.asked("patient", {}, (facts) => this.takePatient(facts));
+    await this.asker.asked("patient", {}, (facts) => this.takePatient(facts));
     this.say("Loading the anatomy…");
-    await this.asked("scene", {}, (part) => this.takeScene(part));
+    await this.asker.asked("scene", {}, (part) => this.takeScene(part));
     await this.scenePart;
     this.listStructures();
     this.connectControls();
@@ -69,50 +64,12 @@ class ExplorerPage extends AnatomyPage {
     super.show(quality);
     if (!this.scene || !this.scene.slow || this.tools.recording) return;
     clearTimeout(this.better);
-    const later = () => (this.awaited ? (this.better = setTimeout(later, REST_MS)) : this.show("rest"));
+    const later = () => (this.asker.awaited ? (this.better = setTimeout(later, REST_MS)) : this.show("rest"));
     if (quality === "moving") this.better = setTimeout(later, REST_MS);
   }
 
   say(words) {
     byId("status").textContent = words;
-  }
-
-  // Ask, and show an error where that is the answer; `done` is the last message.
-  async asked(ask, values, part) {
-    const last = await this.connection.ask(ask, values, part).done;
-    if (last.answer === "error") this.say(errorWords(last.error));
-    return last;
-  }
-
-  // Ask so that a later question with the same name takes the place of this one.
-  async latest(name, values, part) {
-    this.forget(name);
-    const number = this.asking[name], isLatest = () => this.asking[name] === number;
-    const counts = SOON.includes(name) ? 1 : 0;
-    this.awaited += counts;
-    const last = await this.connection.ask(name, values, (message) => {
-      if (!isLatest()) return null;
-      return message.answer === "progress" ? this.showProgress(message) : part(message);
-    }).done;
-    this.awaited -= counts;
-    if (!isLatest()) return { answer: "superseded" };
-    this.showProgress(null);
-    return last;
-  }
-
-  // Take no more of what is answered to the latest question of a name.
-  forget(name) {
-    this.asking[name] = (this.asking[name] || 0) + 1;
-  }
-
-  showProgress(message) {
-    const bar = byId("progress");
-    bar.hidden = message === null;
-    if (!message) return;
-    if (message.share === null) bar.removeAttribute("value");
-    else bar.value = message.share;
-    const share = message.share === null ? "" : `: ${Math.round(100 * message.share)} %`;
-    this.say(`${message.what[0].toUpperCase()}${message.what.slice(1)}${share}`);
   }
 
   takePatient(facts) {
@@ -170,15 +127,18 @@ class ExplorerPage extends AnatomyPage {
     byId("tip-back").addEventListener("click", () => this.moveTip(-1));
     byId("tip-forward").addEventListener("click", () => this.moveTip(1));
     byId("free").addEventListener("click", () => this.state.set({ exit: null, tip: null }));
-    byId("position").addEventListener("input", () => {
-      this.stop();
-      this.redraw();
-    });
-    byId("play").addEventListener("click", () => (this.playing ? this.stop() : this.play()));
     connectHelp();
     connectKeys(this);
     this.planPanel.connect();
     this.whatIfPanel.connect();
+  }
+
+  get end() {
+    return this.motion && this.motion.end;
+  }
+
+  get target() {
+    return this.targetLps;
   }
 
   // Where the cross is.
@@ -194,7 +154,7 @@ class ExplorerPage extends AnatomyPage {
   }
 
   describe() {
-    this.latest("place", { point: this.place }, (found) => {
+    this.asker.latest("place", { point: this.place }, (found) => {
       byId("place-table").hidden = false;
       const lobe = found.lobe ? `, ${found.lobe}` : "";
       byId("place-words").textContent = `${found.tissue}${lobe} at LPS ${placeWords(found.lps_mm)} mm`;
@@ -207,7 +167,7 @@ class ExplorerPage extends AnatomyPage {
   }
 
   chooseTarget(text) {
-    this.times.click = performance.now();
+    this.search.click();
     this.state.set({ target: text, exit: null, tip: null });
   }
 
@@ -230,73 +190,29 @@ class ExplorerPage extends AnatomyPage {
     byId("nodule").value = this.facts.targets.some(({ text }) => text === asked.target) ? asked.target : "";
     byId("target-text").value = asked.target;
     byId("target-error").hidden = true;
-    if (asked.target) this.seek(this.prepare());
-    else {
-      this.prepare();
-      this.clear();
-    }
+    this.search.follow();
+    if (!asked.target) this.clear();
     this.compared.follow();
   }
 
   clear() {
-    this.seeking = null;
-    this.exits = this.motion = this.targetLps = this.plan = null;
+    this.exits = this.motion = this.targetLps = this.plan = this.failure = null;
     this.planPanel.clear("Choose a target: click into a slice, or pick a nodule.");
     this.showExits();
     this.showPlan();
     this.fitImage(this.place);
   }
 
-  // Prepare the system, then show what it reaches; resolves when its atlas is known, with whether it is.
-  prepare() {
-    const key = systemKey(this.state.asked);
-    if (this.systemKey !== key) {
-      this.systemKey = key;
-      this.preparing = this.prepareAnew();
-    }
-    return this.preparing;
-  }
-
-  async prepareAnew() {
-    // What was painted holds for the system before.
-    if (this.reach) this.reach = this.reach.outdated();
-    this.showReach();
-    const began = performance.now();
-    const last = await this.latest("prepare", { what_if: whatIf(this.state.asked) }, (found) => {
-      this.tips = new Tips(found);
-      this.prepared = found;
-      this.whatIfPanel.prepared(found);
-      this.showExits();
-    });
-    this.whatIfPanel.fail(last.answer === "error" ? errorWords(last.error) : "");
-    if (last.answer === "error") this.systemKey = null;
-    if (last.answer !== "end") return last;
-    this.latest("ready", { what_if: whatIf(this.state.asked) }, () => null);
-    this.seekReach(began);
-    return last;
-  }
-
-  async seekReach(began) {
-    let layer = null;
-    const last = await this.latest("reach", { what_if: whatIf(this.state.asked), around: this.targetLps || this.place }, (part) => {
-      if (part.answer === "reach grid") {
-        layer = new ReachLayer(part, Object.fromEntries(Object.entries(this.facts.reach_colours).map(([name, colour]) => [name, rgb(colour)])), this.reach);
-        return;
-      }
-      layer.take(part);
-      if (this.reach !== layer) this.times.reach = performance.now() - began;
-      this.reach = layer;
-      this.showReach();
-    });
-    if (last.answer !== "error") return;
-    this.reach = null;
-    this.showReach(errorWords(last.error));
-  }
-
   // Whether the system has a needle: without one the tubes themselves reach the target.
   get hasNeedle() {
     const { system } = this.whatIfPanel;
     return !system || system.needle_length_mm !== null;
+  }
+
+  // Show a layer of the reach, or words in its place.
+  takeReach(layer, words = null) {
+    this.reach = layer;
+    this.showReach(words);
   }
 
   showReach(words = null) {
@@ -310,68 +226,8 @@ class ExplorerPage extends AnatomyPage {
     this.redrawSlices();
   }
 
-  // Ask for exits and plan once the system is prepared; what is known already is shown at once.
-  async seek(preparing) {
-    const { asked } = this.state, question = planQuestion(asked), key = planKey(asked), known = this.plans.get(key);
-    const click = this.times.click || performance.now();
-    this.times.click = null;
-    this.times.exits = this.times.plan = null;
-    this.exits = null;
-    // What still comes of the questions before is not taken.
-    for (const name of ["exits", "plan"]) this.forget(name);
-    if (known) this.takePlan(known, key);
-    else {
-      this.planPanel.searching();
-      this.say("Planning…");
-    }
-    const isNow = this.seeking = {}, { answer, error } = await preparing;
-    if (isNow !== this.seeking || answer === "superseded") return;
-    if (error) {
-      this.planFailed(error);
-      return;
-    }
-    this.seekExits(question, asked, click);
-    if (!known || !known.final) this.seekPlan(question, key, click);
-  }
-
-  seekExits({ target, what_if }, { tip, exit }, click) {
-    if (!this.hasNeedle) {
-      this.showExits("This system has no needle: its tubes go to the target themselves, and no exit is to be chosen. The reach shows what they can do.");
-      return;
-    }
-    const more = tip !== null && exit === null ? { scope_tip: tip } : {};
-    this.latest("exits", { target, what_if, ...more }, (found) => {
-      this.exits = new Exits(found);
-      this.takeTarget(found.target_lps);
-      this.showExits();
-      if (this.times.exits === null) {
-        this.redrawFast();
-        this.times.exits = performance.now() - click;
-      }
-    }).then((last) => this.exitsEnded(last));
-  }
-
-  seekPlan(question, key, click) {
-    this.latest("plan", question, async (found) => {
-      if (found.answer === "no_plan") this.takeNoPlan(found);
-      else {
-        await this.takePlan(found, key);
-        if (this.times.plan === null) {
-          this.redrawFast();
-          this.times.plan = performance.now() - click;
-        }
-      }
-    }).then((last) => last.answer === "error" && this.planFailed(last.error));
-  }
-
-  exitsEnded(last) {
-    if (last.answer !== "error") return;
-    byId("exits-words").textContent = errorWords(last.error);
-    this.exits = null;
-    this.showExits(errorWords(last.error));
-  }
-
   planFailed(error) {
+    this.failure = error.kind;
     this.motion = this.plan = null;
     byId("target-error").hidden = error.kind !== "TargetError" && error.kind !== "FrameError";
     byId("target-error").textContent = errorWords(error);
@@ -390,7 +246,7 @@ class ExplorerPage extends AnatomyPage {
 
   // Fetch fine voxels around a point.
   fitImage(around) {
-    this.latest("image", { around }, async ({ image }) => {
+    this.asker.latest("image", { around }, async ({ image }) => {
       const [labels, ct] = await Promise.all([
         placedVolume(image.labels[0]), image.ct ? placedVolume(image.ct[0], image.hounsfield) : null,
       ]);
@@ -402,7 +258,7 @@ class ExplorerPage extends AnatomyPage {
 
   async takePlan(found, key) {
     const known = this.plans.get(key);
-    const plan = { ...(known || {}), ...found };
+    const plan = { ...(known || {}), ...found, key };
     if (found.packed) plan.motion = await Motion.of({ ...found.packed, scope_tip_lps: found.scope_tip_lps });
     this.plans.delete(key);
     this.plans.set(key, plan);
@@ -422,7 +278,7 @@ class ExplorerPage extends AnatomyPage {
   }
 
   appraise(plan) {
-    return this.latest("appraise", { plan: plan.digest }, (found) => {
+    return this.asker.latest("appraise", { plan: plan.digest }, (found) => {
       plan.appraisal = found;
       if (this.plan === plan) this.planPanel.appraised(plan);
       this.compared.list();
@@ -441,8 +297,7 @@ class ExplorerPage extends AnatomyPage {
     byId("player").hidden = !this.motion;
     this.drawn = null;
     if (this.scene && !this.targetLps) showTarget(this.scene, null);
-    if (this.scene) this.scene.setFocus(this.motion ? this.devices : null);
-    if (this.motion && this.orbit) this.fitToPlan();
+    if (this.orbit) this.fitToPlan();
     this.redraw();
   }
 
@@ -466,103 +321,23 @@ class ExplorerPage extends AnatomyPage {
     this.redraw();
   }
 
-  // The line of tubes and needle of the plan at their end.
-  get devices() {
-    const end = this.motion.at(1);
-    return [...end.outer, ...end.middle, ...end.inner, ...end.needle];
-  }
-
-  // Name the plan as what can be fitted into the 3-D view: its devices beyond the scope, and the end of the scope.
-  fitToPlan() {
-    const points = [...this.motion.at(1).scope.slice(-SCOPE_POINTS), ...this.devices, this.motion.plan.target_lps];
-    const { centre, radius } = ballAround(points);
-    this.orbit.setHome("plan", centre, radius + AROUND_PLAN_MM);
-  }
-
-  // Look at the plan from the side from which it is seen long, or else at the target.
-  lookAtPlan() {
-    if (!this.orbit) return;
-    if (!this.motion) {
-      this.orbit.setHome("plan", this.targetLps || this.place, NEAR_NODULE_MM);
-      this.orbit.fit("plan");
-      return;
-    }
-    this.orbit.home = this.orbit.homes.plan;
-    this.orbit.look(sideOf(this.devices));
-  }
-
-  cutThrough() {
-    if (!this.motion) return this.targetLps ? { point: this.targetLps, name: "the target" } : null;
-    const { needle, inner } = this.motion.at(1), [line, name] = needle.length > 1 ? [needle, "the needle"] : [inner, "the tube"];
-    const [first, last] = [line[0], line[line.length - 1]];
-    return line.length > 1 ? { point: mix(first, last, 0.5), axis: unit(minus(last, first)), name } : null;
-  }
-
   nameOf(hit) {
-    const names = { scope: "Bronchoscope", outer: "Outer tube", middle: "Middle tube", inner: "Inner tube", needle: "Needle", target: "Target",
-      exits: `Exit ${hit.index + 1}`, tip: "Chosen place of the scope tip", preview: "Let go to choose", reach: "Voxel of the reach", measure: "Measured line" };
+    const names = { exits: `Exit ${hit.index + 1}`, tip: "Chosen place of the scope tip", preview: "Let go to choose", reach: "Voxel of the reach" };
     if (hit.key.startsWith(COMPARED)) return `Compared plan ${hit.key.slice(COMPARED.length)}`;
     return names[hit.key] || super.nameOf(hit);
-  }
-
-  distancesOf(point) {
-    const needle = this.motion ? this.motion.at(1).needle : [];
-    const axis = needle.length > 1 ? [`${mm(alongLine(needle, point).awayMm)} to the needle's axis`] : [];
-    return [...axis, ...(this.targetLps ? [`${mm(norm(minus(point, this.targetLps)))} to the target`] : [])];
-  }
-
-  alongMm(a, b) {
-    return this.motion ? Math.abs(alongLine(this.devices, a).alongMm - alongLine(this.devices, b).alongMm) : null;
   }
 
   // The numbers of compared plans, each at its needle.
   labels() {
     return this.compared.shown.map(({ motion, number }) => {
-      const { needle } = motion.at(1);
+      const { needle } = motion.end;
       return { text: String(number), point: needle[Math.floor(needle.length / 2)] || motion.plan.target_lps, colour: planStyle(number).colour };
     });
   }
 
-  films() {
-    return [{ key: "deployment", name: "the deployment" }];
-  }
-
-  filmAt(_kind, share) {
-    byId("position").value = Math.round(1000 * share);
-  }
-
-  get position() {
-    return Number(byId("position").value) / 1000;
-  }
-
-  play() {
-    let position = this.position >= 1 ? 0 : this.position, last = performance.now();
-    const step = (now) => {
-      if (!this.playing) return;
-      position = Math.min(position + Math.min(Math.max(now - last, 0) / 1000, MOST_STEP_S) / PLAY_S, 1);
-      last = now;
-      byId("position").value = Math.round(1000 * position);
-      this.show("moving");
-      if (position >= 1) this.stop();
-      else this.playing = requestAnimationFrame(step);
-    };
-    this.playing = requestAnimationFrame(step);
-    byId("play").textContent = "Pause";
-  }
-
-  stop() {
-    if (this.playing) cancelAnimationFrame(this.playing);
-    this.playing = null;
-    byId("play").textContent = "Play";
-  }
-
   draw() {
-    const state = this.motion ? this.motion.at(this.position) : null;
-    if (state) {
-      const words = this.motion.words(state);
-      byId("position-words").textContent = words;
-      byId("position").setAttribute("aria-valuetext", words);
-    }
+    const state = this.motion ? this.motion.at(this.player.position) : null;
+    if (state) this.player.say(this.motion.words(state));
     const { scene, slices } = this.stale;
     this.stale = { scene: false, slices: false };
     if (scene && this.scene && this.orbit && this.views) {
@@ -586,7 +361,7 @@ class ExplorerPage extends AnatomyPage {
 
   // The solid bodies are made again only where they changed.
   drawDevices(state) {
-    const key = JSON.stringify([state && this.plan.digest, this.position, Math.round(8 * Math.log(this.orbit.distance)), this.compared.key]);
+    const key = JSON.stringify([state && this.plan.digest, this.player.position, Math.round(8 * Math.log(this.orbit.distance)), this.compared.key]);
     if (this.drawn === key) return;
     this.drawn = key;
     showDevices(this.scene, this.motion, state, this.orbit.distance);
@@ -595,19 +370,21 @@ class ExplorerPage extends AnatomyPage {
 
   drawSlices(isCoarse = this.hurriesSlices()) {
     this.image.overlay = byId("reach-slices").checked && this.reach ? this.reach.painter() : null;
-    const of = this.motion ? deviceLines(this.motion, this.motion.at(this.position)) : [];
+    const of = this.motion ? deviceLines(this.motion, this.motion.at(this.player.position)) : [];
     this.views.draw(STANDARD, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps }, isCoarse);
   }
 
   // What a test may read.
   report() {
-    const state = this.motion ? this.motion.at(this.position) : null;
+    const state = this.motion ? this.motion.at(this.player.position) : null;
+    // While another plan is searched, the one before is still shown.
+    const plan = this.plan && this.plan.key === planKey(this.state.asked) ? this.plan : null;
     return {
-      ...super.report(), asked: { ...this.state.asked }, place_lps: this.place, target_lps: this.targetLps,
+      ...super.report(), asked: { ...this.state.asked }, place_lps: this.place, target_lps: this.targetLps, failure: this.failure,
       exits: this.exits ? { count: this.exits.count, complete: this.exits.answer.complete, entries: [...this.exits.entries], tips: [...this.exits.tips] } : null,
-      plan: this.plan ? { digest: this.plan.digest, final: this.plan.final, cost: this.plan.cost, command: this.plan.command, curve: this.plan.curve,
-        appraised: Boolean(this.plan.appraisal), scope_tip_lps: this.plan.scope_tip_lps, exit_lps: this.plan.exit_lps, system: this.plan.system } : null,
-      tip_lps: state ? state.tip : null, compared: this.compared.report(), times_ms: { ...this.times },
+      plan: plan ? { digest: plan.digest, final: plan.final, cost: plan.cost, command: plan.command, curve: plan.curve,
+        appraised: Boolean(plan.appraisal), scope_tip_lps: plan.scope_tip_lps, exit_lps: plan.exit_lps, system: plan.system } : null,
+      tip_lps: state ? state.tip : null, compared: this.compared.report(), times_ms: { ...this.search.times },
       reach: this.reach ? { share: this.reach.share, system: this.reach.grid.system } : null,
       finer: this.slices ? Object.fromEntries(Object.entries(this.slices).map(([name, slice]) => [name, slice.isFine])) : {},
       place: this.placeFound || null, points: this.scene ? Object.fromEntries([...this.scene.points].map(([key, p]) => [key, p.count])) : {},

@@ -23,10 +23,9 @@ export class PlanPanel {
       if (what) this.export(what);
     });
     byId("keep").addEventListener("click", () => this.page.compared.keep());
-    byId("copy").addEventListener("click", async () => {
-      await navigator.clipboard.writeText(byId("command").textContent);
-      this.page.say("The command is copied.");
-    });
+    byId("copy").addEventListener("click", () => navigator.clipboard.writeText(byId("command").textContent).then(
+      () => this.page.say("The command is copied."),
+      () => this.page.say("This browser does not let the page copy the command. Select it, and copy it by the browser's own menu.")));
     byId("explain").addEventListener("click", () => this.explain());
   }
 
@@ -109,7 +108,7 @@ export class PlanPanel {
   async explain() {
     const { page } = this, { asked } = page.state, key = planKey(asked);
     byId("explain").hidden = true;
-    const last = await page.latest("explain", { target: asked.target, what_if: whatIf(asked), seed: asked.seed }, ({ headline, sections }) => {
+    const last = await page.asker.latest("explain", { target: asked.target, what_if: whatIf(asked), seed: asked.seed }, ({ headline, sections }) => {
       if (key !== planKey(page.state.asked)) return;
       byId("explanation").replaceChildren(made("p", {}, headline), ...sections.map(({ title, headings, rows }) => {
         const head = made("thead", {}, made("tr", {}, ...headings.map((text) => made("th", { scope: "col" }, text))));
@@ -127,9 +126,9 @@ export class PlanPanel {
     let address = null;
     const last = await this.page.connection.ask("export", { plan: plan.digest, what, slot: what }, (message) => {
       if (message.answer === "link") address = message.address;
-      else this.page.showProgress(message.answer === "progress" ? message : null);
+      else this.page.asker.showProgress(message.answer === "progress" ? message : null);
     }).done;
-    this.page.showProgress(null);
+    this.page.asker.showProgress(null);
     if (last.answer !== "end" || !address) {
       this.page.say(last.error ? errorWords(last.error) : `${what} was not made.`);
       return;

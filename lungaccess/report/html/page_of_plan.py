@@ -36,7 +36,10 @@ if TYPE_CHECKING:
     from lungaccess.risk import ErrorModel
     from stages.needle import StartRegion
 
-MODULES = ("motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "plan.js")
+MODULES = (
+    "motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "player.js", "device_page.js",
+    "plan.js",
+)  # fmt: skip
 NO_REGION = "No safe start region"
 THICKER = "; seen from afar, devices are drawn thicker than they are"
 FOLLOW = '<label><input type="checkbox" id="follow" checked> follow the foremost tip</label>'

@@ -78,15 +78,27 @@ export class Layers {
     gl.clearBufferfv(gl.DEPTH, 0, [1]);
   }
 
+  // Wait until all is drawn, and return pixels of the framebuffer that is bound, four bytes each.  They come through a
+  // buffer: of pixels that are read directly, drivers write to the console that one has to wait for them.
+  pixels(x, y, width, height) {
+    const gl = this.gl, bytes = new Uint8Array(4 * width * height);
+    this.buffer ??= gl.createBuffer();
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, this.buffer);
+    gl.bufferData(gl.PIXEL_PACK_BUFFER, bytes.length, gl.STREAM_READ);
+    gl.readPixels(x, y, width, height, gl.RGBA, gl.UNSIGNED_BYTE, 0);
+    gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, bytes);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    return bytes;
+  }
+
   // Return what is stored at a place of a framebuffer, in pixels from its lower left: the number of a body, and the depth
   // as it is stored, 65535 for nothing; between the four pixels around where these differ by no more than `most`.
   read(framebuffer, x, y, most) {
     const gl = this.gl;
     const column = Math.min(Math.max(Math.floor(x - 0.5), 0), Math.max(this.width - 2, 0));
     const row = Math.min(Math.max(Math.floor(y - 0.5), 0), Math.max(this.height - 2, 0));
-    const bytes = new Uint8Array(16);
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    gl.readPixels(column, row, 2, 2, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
+    const bytes = this.pixels(column, row, 2, 2);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     const deep = [0, 1, 2, 3].map((n) => 256 * bytes[4 * n + 1] + bytes[4 * n + 2]);
     const nearest = (Math.floor(x) > column ? 1 : 0) + (Math.floor(y) > row ? 2 : 0);

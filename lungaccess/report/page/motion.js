@@ -37,6 +37,11 @@ export class Motion {
     return motion;
   }
 
+  // Everything at the end of the slider.
+  get end() {
+    return (this.ended ??= this.at(1));
+  }
+
   get hasNeedle() {
     return this.ends.needle > 0;
   }

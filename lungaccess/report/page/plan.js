@@ -1,13 +1,14 @@
 // The page of a plan.
-import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
+import { byId, openPage } from "./anatomy_page.js";
 import { Breath } from "./breath.js";
 import { bifurcationsAhead, Bronchoscopy, pausesOf } from "./bronchoscopy.js";
 import { lineChart } from "./charts.js";
 import { DEVICE_COLOURS, planStyle } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
+import { DevicePage } from "./device_page.js";
 import { Motion, STAGES } from "./motion.js";
 import { bendOf, planeAcross, planeAlong, STANDARD } from "./slices.js";
-import { ballAround, sideOf } from "./orbit.js";
+import { paced, Player } from "./player.js";
 import { banded, Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
 import { alongLine } from "./surfaces.js";
@@ -23,30 +24,23 @@ const DEVICES = [
   { key: "target", name: "Target", colour: TARGET, shown: true },
   { key: "aim", name: "Aim of the devices, beside the moving target", colour: AIM, shown: true },
 ];
-const SOLID_NAMES = {
-  scope: "Bronchoscope", outer: "Outer tube", middle: "Middle tube", inner: "Inner tube", needle: "Needle", target: "Target",
-  aim: "Aim of the devices", measure: "Measured line",
-};
 const WHITE = [1, 1, 1];
-// Of the scope so many points before its tip are in the view of the plan, and so much around all of it.
-const SCOPE_POINTS = 16, AROUND_PLAN_MM = 12;
 const CHART = {
   airway: ["airway wall", "#3A9BD5", ""], vessel: ["vessel", "#D81B60", "9 4"],
   pleura: ["pleura", "#B8860B", "3 4"], fissure: ["fissure", "#785EF0", "12 4 3 4"],
 };
 const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
-const PLAY_S = 14, BREATH_S = 5, MOST_STEP_S = 0.25;
+const BREATH_S = 5;
 const LEAST_WIDTH = 0.0016;
 const MOST_ACROSS_MM = 60;
 const TARGET_MM = 1.6, AIM_MM = 1.1;
 
-class PlanPage extends AnatomyPage {
+class PlanPage extends DevicePage {
   constructor(data) {
     super(data);
-    this.slider = byId("position");
+    this.player = new Player(this, () => (byId("pause").checked ? pausesOf(this.motion) : []));
     this.shown = Object.fromEntries(DEVICES.map(({ key, shown }) => [key, shown]));
     this.cursors = [];
-    this.playing = null;
     this.breathing = null;
     this.phase = 0;
     this.exhaling = false;
@@ -64,6 +58,7 @@ class PlanPage extends AnatomyPage {
     this.connectControls();
     if (await this.openScene(distanceOfAll)) {
       this.addTarget();
+      this.fitToPlan();
       this.lookAtPlan();
     }
     this.image = await VoxelImage.of(this.data);
@@ -80,48 +75,20 @@ class PlanPage extends AnatomyPage {
     return this.motions[this.followed];
   }
 
+  // In the phase of the breath.
+  get end() {
+    return this.stateOf(this.followed, 1);
+  }
+
   addTarget() {
     const target = this.data.plans[0].target_lps;
     byId("view-target").addEventListener("click", () => this.orbit.approach(target, 170));
     this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));
   }
 
-  // Look at the devices beyond the scope and at the end of the scope, from the side from which they are seen long.
-  lookAtPlan() {
-    const end = this.motion.at(1), devices = [...end.outer, ...end.middle, ...end.inner, ...end.needle];
-    const { centre, radius } = ballAround([...end.scope.slice(-SCOPE_POINTS), ...devices, this.motion.plan.target_lps]);
-    this.orbit.setHome("plan", centre, radius + AROUND_PLAN_MM);
-    this.scene.setFocus(devices);
-    this.orbit.home = this.orbit.homes.plan;
-    this.orbit.look(sideOf(devices));
-  }
-
-  // The line of tubes and needle at their end, in the phase of the breath.
-  get devices() {
-    const end = this.stateOf(this.followed, 1);
-    return [...end.outer, ...end.middle, ...end.inner, ...end.needle];
-  }
-
-  cutThrough() {
-    const { needle, inner } = this.stateOf(this.followed, 1), [line, name] = needle.length > 1 ? [needle, "the needle"] : [inner, "the tube"];
-    const [first, last] = [line[0], line[line.length - 1]];
-    return line.length > 1 ? { point: mix(first, last, 0.5), axis: unit(minus(last, first)), name } : null;
-  }
-
   nameOf(hit) {
     const [, number] = hit.key.split("plan ");
-    return number ? this.data.plans[Number(number)].name : SOLID_NAMES[hit.key] || super.nameOf(hit);
-  }
-
-  distancesOf(point) {
-    const { needle } = this.stateOf(this.followed, 1);
-    const axis = needle.length > 1 ? [`${alongLine(needle, point).awayMm.toFixed(1)} mm to the needle's axis`] : [];
-    return [...axis, `${norm(minus(point, this.target)).toFixed(1)} mm to the target`];
-  }
-
-  alongMm(a, b) {
-    const { devices } = this;
-    return Math.abs(alongLine(devices, a).alongMm - alongLine(devices, b).alongMm);
+    return number ? this.data.plans[Number(number)].name : super.nameOf(hit);
   }
 
   // The numbers of the plans where several are shown, each at another place of its devices.
@@ -133,14 +100,6 @@ class PlanPage extends AnatomyPage {
       const at = Math.round((line.length - 1) * (0.25 + (0.6 * k) / shown.length));
       return { text: String(n), point: line[at], colour: planStyle(n).colour };
     });
-  }
-
-  films() {
-    return [{ key: "deployment", name: "the deployment" }];
-  }
-
-  filmAt(_kind, share) {
-    this.slider.value = Math.round(1000 * share);
   }
 
   listSwitches() {
@@ -172,14 +131,9 @@ class PlanPage extends AnatomyPage {
   }
 
   connectControls() {
-    this.slider.addEventListener("input", () => {
-      this.stop();
-      this.redraw();
-    });
-    byId("play").addEventListener("click", () => (this.playing === null ? this.play() : this.stop()));
     for (const button of document.querySelectorAll("button[data-stage]")) {
       button.addEventListener("click", () => {
-        this.stop();
+        this.player.stop();
         this.moveTo(this.motion.starts[Number(button.dataset.stage)]);
       });
     }
@@ -201,8 +155,8 @@ class PlanPage extends AnatomyPage {
 
   // Go to where the scope stands before the next bifurcation, or the one before.
   goToBifurcation(way) {
-    this.stop();
-    const now = Number(this.slider.value), ticks = pausesOf(this.motion);
+    this.player.stop();
+    const now = 1000 * this.player.position, ticks = pausesOf(this.motion);
     const found = way > 0 ? ticks.find((tick) => tick > now) : ticks.filter((tick) => tick < now).pop();
     if (found !== undefined) this.moveTo(found / 1000);
   }
@@ -243,41 +197,15 @@ class PlanPage extends AnatomyPage {
   }
 
   moveTo(position) {
-    this.slider.value = Math.round(1000 * position);
+    this.player.position = position;
     this.redraw();
-  }
-
-  play() {
-    let position = Number(this.slider.value) >= 1000 ? 0 : Number(this.slider.value) / 1000;
-    const first = position, ticks = pausesOf(this.motion);
-    const step = paced((seconds) => {
-      if (this.playing === null) return;
-      const before = position;
-      position = Math.min(position + seconds / PLAY_S, 1);
-      const pause = byId("pause").checked && ticks.find((tick) => tick > 1000 * Math.max(before, first) + 1e-6 && tick <= 1000 * position);
-      if (pause) position = pause / 1000;
-      this.slider.value = 1000 * position;
-      this.show("moving");
-      if (position >= 1 || pause) this.stop();
-      else this.playing = requestAnimationFrame(step);
-    });
-    byId("play").textContent = "Pause";
-    this.playing = requestAnimationFrame(step);
-  }
-
-  stop() {
-    if (this.playing !== null) cancelAnimationFrame(this.playing);
-    this.playing = null;
-    byId("play").textContent = "Play";
   }
 
   draw() {
     if (this.breath) this.drawBreath();
-    const state = this.stateOf(this.followed, Number(this.slider.value) / 1000);
+    const state = this.stateOf(this.followed, this.player.position);
     this.state = state;
-    const words = this.motion.words(state);
-    this.slider.setAttribute("aria-valuetext", words);
-    byId("position-words").textContent = words;
+    this.player.say(this.motion.words(state));
     for (const button of document.querySelectorAll("button[data-stage]")) {
       button.setAttribute("aria-pressed", String(Number(button.dataset.stage) === state.stage));
     }
@@ -493,17 +421,6 @@ class PlanPage extends AnatomyPage {
       view: this.orbit ? { yaw: this.orbit.yaw, pitch: this.orbit.pitch, distance: this.orbit.distance, edges: this.orbit.edges() } : null,
     };
   }
-}
-
-// Return a step of an animation that is told the seconds since the one before: on a slow machine it is slower,
-// and does not jump.
-function paced(step) {
-  let last = performance.now();
-  return (now) => {
-    const seconds = Math.min(Math.max(now - last, 0) / 1000, MOST_STEP_S);
-    last = now;
-    step(seconds);
-  };
 }
 
 // Return a plan's style as the background of a swatch.

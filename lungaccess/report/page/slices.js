@@ -50,7 +50,8 @@ export class Slice {
   constructor(canvas, image) {
     this.canvas = canvas;
     this.image = image;
-    this.pen = canvas.getContext("2d");
+    // Its pixels are painted here, and some are read back: they stay with the processor.
+    this.pen = canvas.getContext("2d", { willReadFrequently: true });
   }
 
   // Draw the plane { right, up } through a centre, so many mm wide, and again when a finer source has its values.
@@ -115,17 +116,24 @@ export class Slice {
     if (!isSame || (painted.isCoarse && !this.isCoarse)) {
       this.paint(values);
       this.painted = { look, isCoarse: this.isCoarse };
-    }
-    this.pen.putImageData(this.pixels, 0, 0);
+    } else this.pen.putImageData(this.ground, 0, 0);
     for (const line of marks.lines || []) this.line(line);
     if (marks.target) this.target(marks.target);
     if (marks.cross) this.cross(marks.cross);
+  }
+
+  // Paint what is behind the marks, and keep it: the plane, the patient's sides at its edges, and a bar of known length.
+  paint(values) {
+    const { pen, canvas: { width, height } } = this;
+    this.paintPixels(values);
+    pen.putImageData(this.pixels, 0, 0);
     this.letters();
-    this.bar(this.canvas.width / this.plane.scale);
+    this.bar(width / this.plane.scale);
+    this.ground = pen.getImageData(0, 0, width, height);
   }
 
   // Paint the pixels of the plane.
-  paint(values) {
+  paintPixels(values) {
     const { width, height } = this.canvas, step = 1 / this.plane.scale, many = this.isCoarse ? COARSE_PIXELS : 1;
     if (!this.pixels || this.pixels.width !== width || this.pixels.height !== height) this.pixels = this.pen.createImageData(width, height);
     const { data } = this.pixels, words = new Uint32Array(data.buffer);
@@ -194,17 +202,17 @@ export class Slice {
   line({ points, radius, colour }) {
     const pen = this.pen;
     const places = points.map((place) => this.project(place));
-    pen.lineCap = "round";
+    pen.lineCap = pen.lineJoin = "round";
     pen.strokeStyle = colour;
     for (const near of [false, true]) {
       pen.globalAlpha = near ? 1 : FAINT;
       pen.lineWidth = near ? Math.max(2 * radius * this.plane.scale, 2.5) : 2;
       pen.beginPath();
-      for (let n = 1; n < places.length; n++) {
-        const [a, b] = [places[n - 1], places[n]];
-        if ((Math.min(a[2], b[2]) <= NEAR_MM) !== near) continue;
-        pen.moveTo(a[0], a[1]);
-        pen.lineTo(b[0], b[1]);
+      for (let n = 1, goesOn = false; n < places.length; n++) {
+        const [a, b] = [places[n - 1], places[n]], isShown = (Math.min(a[2], b[2]) <= NEAR_MM) === near;
+        if (isShown && !goesOn) pen.moveTo(a[0], a[1]);
+        if (isShown) pen.lineTo(b[0], b[1]);
+        goesOn = isShown;
       }
       pen.stroke();
     }

@@ -104,6 +104,17 @@ class TestBrowser:
             next(key for key in before if key.startswith("start "))
         ]
 
+    def test_the_list_of_places_brings_the_slices_back_to_the_target(self, window: browser.Browser) -> None:
+        target = window.state()["place_lps"]
+        window.run("window.lungaccessReport.set(arguments[0])", [mm + 7.0 for mm in target])
+        assert window.state()["slices"]["place_lps"] != pytest.approx(target)
+        window.run(
+            "const s = document.getElementById('place'); s.value = '0';s.dispatchEvent(new Event('change'))"
+        )
+        window.frame()
+        state = window.state()
+        assert state["place_lps"] == pytest.approx(target) == state["slices"]["place_lps"]
+
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_the_command_leaves_what_it_learned_and_exits_1(

@@ -25,15 +25,22 @@ from lungaccess.explorer import PatientSource
 from tests.lungaccess.explorer.windows import PLANNED, Page, Served
 
 ITERATIONS = 50
-WINDOW = 480, 400
+WINDOW = 700, 620
 """Small: where the processor draws, pictures take most of the time."""
 SLICES = ("slice-axial", "slice-coronal", "slice-sagittal")
-SHOWN = (
-    "!document.getElementById('target-error').hidden || !document.getElementById('no-plan').hidden"
-    " || (s.exits && s.exits.complete && (s.plan || !s.exits.count))"
-)
-"""A click is answered: with a plan, with no exit, with the reasons for no plan, or as no target."""
-DECIDED = f"({PLANNED}) || !document.getElementById('no-plan').hidden"
+CLICKED_PX = 20.0, 180.0
+"""Clicks into slices are so far from their upper left."""
+NO_PLAN = "!document.getElementById('no-plan').hidden"
+SHOWN = f"(s.failure || {NO_PLAN} || (s.exits && s.exits.complete && (s.plan || !s.exits.count)))"
+"""A click is answered: with a plan, with no exit, with the reasons for no plan, or with why not."""
+DECIDED = f"(s.failure || ({PLANNED}) || {NO_PLAN})"
+NO_TARGET = "TargetError"
+"""What is said of a point that cannot be a target, such as one in a vessel."""
+EXPORTED = """const page = window.lungaccessExplorer; let address = null;
+page.connection.ask('export', { plan: '%s', what: 'plan.json', slot: 'session' }, (each) => {
+  if (each.answer === 'link') address = each.address;
+}).done.then(() => fetch(address)).then((file) => file.text()).then(done, (error) => done(String(error)))"""
+"""The plan with a digest, as the page exports it."""
 RUN = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
 GROWTH = 1.15
 """Memory at the end may be so much more than after a fifth of the clicks: caches of the kernels fill late."""
@@ -74,19 +81,20 @@ def click_through(
     window.run("window.lungaccessExplorer.state.set({ iterations: arguments[0] })", ITERATIONS)
     part = max(len(points) // parts, 1)
     for n, point in enumerate(points, start=1):
-        text = "lps:" + ",".join(f"{value:.1f}" for value in point)
         if n % 2 == 0:
-            x, y = rng.uniform(20.0, 180.0, 2).tolist()
-            before = window.state()["asked"]["target"]
-            window.press_at(SLICES[n // 2 % 3], x, y)
-            window.wait(f"s.asked.target !== {json.dumps(before)} && ({SHOWN})")
+            before = json.dumps(window.state()["asked"]["target"])
+            window.press_at(SLICES[n // 2 % 3], *rng.uniform(*CLICKED_PX, 2).tolist())
+            state = window.wait(f"s.asked.target !== {before} && {SHOWN}")
         else:
+            text = "lps:" + ",".join(f"{value:.1f}" for value in point)
             window.run("document.getElementById('target-text').value = arguments[0]", text)
             window.run("document.getElementById('target-form').requestSubmit()")
-            state = window.wait(f"s.asked.target === {json.dumps(text)} && ({SHOWN})")
+            state = window.wait(f"s.asked.target === {json.dumps(text)} && {SHOWN}")
             if state["plan"] and made.plans // compare >= made.compared:
-                compare_with_command(window, served, made)
+                compare_with_command(window, made)
             made.plans += state["plan"] is not None
+        if state["failure"] not in (None, NO_TARGET):
+            made.messages.append(f"{state['failure']}: {window.text('headline-text')}")
         if n % part == 0:
             take_memory(window, served, made)
             made.messages += window.messages()
@@ -96,13 +104,13 @@ def click_through(
     return made
 
 
-def compare_with_command(window: Page, served: Served, made: Session) -> None:
-    """Run the command that the page states, and compare its plan with the one that is shown."""
+def compare_with_command(window: Page, made: Session) -> None:
+    """Run the command that the page states, and compare its plan with the one that the page exports."""
     state = window.wait(DECIDED)
     if not state["plan"]:
         return
     digest, command = state["plan"]["digest"], state["plan"]["command"]
-    (text,) = {page.plans[digest].text for page in served.explorer._pages.values() if digest in page.plans}
+    text = str(window.run_async(EXPORTED % digest))
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-c", RUN, *shlex.split(command)[1:], "--no-pictures"]
         done = subprocess.run(words, cwd=folder, env=os.environ, capture_output=True, check=False)

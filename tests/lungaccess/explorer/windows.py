@@ -11,6 +11,12 @@ from lungaccess.explorer import Address, Explorer, PatientSource
 from tests.lungaccess.report import browser
 
 PLANNED = "s.plan && s.plan.final && s.plan.appraised"
+AT = """const [name, x, y] = arguments, canvas = document.getElementById(name);
+const place = () => { const box = canvas.getBoundingClientRect(); return [box.left + x, box.top + y]; };
+const isSeen = () => document.elementFromPoint(...place()) === canvas;
+if (!isSeen()) window.scrollBy({ top: place()[1] - innerHeight / 2, behavior: 'instant' });
+return isSeen() ? place() : null"""
+"""Where a place of a canvas is in the window, scrolled if need be; null if it cannot be seen."""
 
 
 class Served:
@@ -36,12 +42,28 @@ class Page(browser.Browser):
     """The explorer in a window."""
 
     def wait(self, condition: str) -> dict[str, Any]:
-        """Wait until a condition of the state `s` holds, and return the state."""
-        self.run_async(
-            "const look = () => { const s = window.lungaccessReport.state();"
-            f"if ({condition}) done(null); else setTimeout(look, 30); }}; look()"
-        )
+        """Wait until a condition of the state `s` holds, and return the state.
+
+        Raises
+        ------
+        AssertionError
+            If the condition fails, or does not hold within the time of a script; it says what is shown.
+        """
+        try:
+            problem = self.run_async(
+                "const look = () => { try { const s = window.lungaccessReport.state();"
+                f"if ({condition}) done(''); else setTimeout(look, 30); }}"
+                " catch (error) { done(error.stack); } }; look()"
+            )
+        except RuntimeError as error:
+            raise AssertionError(f"not within its time: {condition}\n{self.shown()}") from error
+        assert not problem, problem
         return self.state()
+
+    def shown(self) -> str:
+        """Return what the page says, for the message of a failure."""
+        words = {name: self.text(name) for name in ("status", "headline-text", "exits-words", "target-error")}
+        return json.dumps({"words": words, "console": self.messages(), "state": self.state()}, indent=1)
 
     def choose(self, element: str, value: str) -> None:
         """Put a value into a control."""
@@ -59,12 +81,9 @@ class Page(browser.Browser):
 
     def pointer(self, kind: str, canvas: str, x: float, y: float) -> None:
         """Move, press or release the mouse at a place of a canvas, in pixels from its upper left."""
-        left, top = self.run(
-            "const c = document.getElementById(arguments[0]); c.scrollIntoView({ block: 'center' });"
-            "const box = c.getBoundingClientRect(); return [box.left, box.top]",
-            canvas,
-        )
-        event = {"type": kind, "x": left + x, "y": top + y, "button": "left", "clickCount": 1}
+        at = self.run(AT, canvas, x, y)
+        assert at is not None, f"{x}, {y} of {canvas} cannot be seen"
+        event = {"type": kind, "x": at[0], "y": at[1], "button": "left", "clickCount": 1}
         if kind == "mouseMoved":
             event |= {"buttons": 1}
         self.command("Input.dispatchMouseEvent", event)

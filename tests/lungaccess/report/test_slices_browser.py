@@ -41,6 +41,19 @@ const pen = copy.getContext('2d', { willReadFrequently: true });
 pen.drawImage(c, 0, 0);
 const d = pen.getImageData(0, 0, c.width, c.height).data;
 return Array.from({ length: d.length / 4 }, (_, n) => d[4 * n])"""
+RING = """const c = document.getElementById('inside'), copy = document.createElement('canvas');
+[copy.width, copy.height] = [c.width, c.height];
+const pen = copy.getContext('2d', { willReadFrequently: true });
+pen.drawImage(c, 0, 0);
+let found = 0;
+for (let n = 0; n < 36; n++) {
+  const angle = (n * Math.PI) / 18, [x, y] = arguments;
+  const at = [x + 13 * Math.cos(angle), y + 13 * Math.sin(angle)];
+  const [r, g, b] = pen.getImageData(...at.map(Math.floor), 1, 1).data;
+  found += Math.hypot(r - 125, g - 240, b - 181) < 60 ? 1 : 0;
+}
+return found / 36"""
+"""The share of a circle around a place of the bronchoscopy that has the colour of the opening to be taken."""
 DEVICES = ("scope", "tubes", "needle", "target")
 SIDE = 360
 GRID_PAGE = """<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,"><script type="module">
@@ -228,6 +241,15 @@ def test_the_plane_along_the_needle_holds_it_and_turns_about_it(fresh: browser.B
     fresh.run(CHOOSE, "along", "needle")
 
 
+def test_a_click_into_the_plane_along_the_needle_stays_in_it(fresh: browser.Browser) -> None:
+    before, plane = cross(fresh), fresh.state()["along"]
+    click(fresh, "slice-along", 215.0, 140.0)
+    moved = cross(fresh) - np.array(plane["through"])
+    assert np.linalg.norm(cross(fresh) - before) > 5.0
+    assert moved @ np.cross(plane["right"], plane["up"]) == pytest.approx(0.0, abs=1e-6)
+    assert moved @ np.array(plane["right"]) > 0.0 and moved @ np.array(plane["up"]) > 0.0
+
+
 def test_opacity_of_a_structure(fresh: browser.Browser) -> None:
     before = fresh.run("return document.getElementById('slice-axial').toDataURL()")
     change = """const s = document.querySelector("input[data-structure='vessel']");
@@ -339,6 +361,59 @@ def test_playing_pauses_before_every_bifurcation(fresh: browser.Browser, data: d
     assert round(1000 * fresh.state()["position"]) == next(tick for tick in pauses if tick > 0)
     fresh.run("document.getElementById('fork-before').click()")
     assert fresh.messages() == []
+
+
+@pytest.mark.slow
+def test_without_the_pause_box_playing_goes_on(fresh: browser.Browser) -> None:
+    """From just before the place of a pause, which is passed only without the box."""
+    first = next(tick for tick in fresh.state()["pauses"] if tick > 0)
+    stopped = {}
+    for pausing in (False, True):
+        fresh.run(CHOOSE, "pause", pausing)
+        fresh.run("window.lungaccessReport.set(arguments[0])", (first - 1) / 1000)
+        fresh.run("document.getElementById('play').click()")
+        for _ in range(200):
+            fresh.frame()
+            at = 1000 * fresh.state()["position"]
+            playing = fresh.run("return document.getElementById('play').textContent") == "Pause"
+            if at > first or not playing:
+                break
+        stopped[pausing] = at, playing
+        if playing:
+            fresh.run("document.getElementById('play').click()")
+    assert stopped[False][0] > first and stopped[False][1]
+    assert stopped[True] == (pytest.approx(first), False)
+
+
+@pytest.mark.slow
+def test_openings_are_named_where_they_are(fresh: browser.Browser, data: dict[str, Any]) -> None:
+    """Their places in the picture are computed again from the camera; a ring is around the one to take."""
+    plan = data["plans"][0]
+    radius, half, tangent = plan["radius_mm"], 220.0, np.tan(np.radians(48.0))
+    aside = min(max(0.7 * radius["scope"], radius["outer"] + 0.35), 0.9 * radius["scope"])
+    ringed = 0
+    for tick in fresh.state()["pauses"]:
+        fresh.run("window.lungaccessReport.set(arguments[0])", tick / 1000)
+        state = fresh.state()
+        eye, forward, up = (np.array(state["camera"][name]) for name in ("eye", "forward", "up"))
+        eye = eye + aside * up
+        wanted = []
+        for each in plan["scope"]["bifurcations"]:
+            for opening in each["openings"] if each["number"] in state["prompts"] else ():
+                away = np.array(opening["place_lps"]) - eye
+                depth = away @ forward
+                place = np.array([away @ np.cross(forward, up), away @ up]) / (depth * tangent)
+                if depth <= 0 or np.linalg.norm(away) > 45.0 or np.linalg.norm(place) > 0.92:
+                    continue
+                wanted.append(opening["branch"])
+                if opening["taken"]:
+                    ringed += 1
+                    at = half * (1.0 + place[0]), half * (1.0 - place[1])
+                    assert fresh.run(RING, *at) > 0.6
+        assert state["named"] == wanted
+    assert ringed > 0
+    fresh.run("window.lungaccessReport.set(1)")
+    assert fresh.state()["named"] == []
 
 
 def test_the_cross_section_shows_what_is_free(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from anatomy.kernels.arcs import pose_on_arc
@@ -72,6 +72,8 @@ class TestGoalBall:
     def test_paths_end_where_they_first_are_in_the_ball(
         self, goal: tuple[float, float, float], tolerance: float
     ) -> None:
+        # A goal that lies at the start but for rounding needs no path, or a whole circle.
+        assume(math.hypot(*goal) > 1e-6)
         limits = self.limits(tolerance, 180.0)
         start = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
         bound = goal_ball.least_length(math.hypot(goal[0], goal[1]), goal[2], limits, 1.0, math.pi)

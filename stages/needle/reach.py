@@ -9,17 +9,16 @@ from anatomy.errors import SettingsError
 from anatomy.records import frozen_record
 from anatomy.typed import Float, Int, UInt8, UInt64
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import reach as kernel
-from stages.needle.kernels import tree
+from stages.needle.kernels import reach_arcs, reach_search, tree
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.search.base import RANDOM_SHARE
 
 DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
-    kernel.DIRECT,
-    kernel.SEARCHED,
-    kernel.UNREACHED,
-    kernel.NO_CLEARANCE,
+    reach_arcs.DIRECT,
+    reach_arcs.SEARCHED,
+    reach_arcs.UNREACHED,
+    reach_arcs.NO_CLEARANCE,
 )
 
 
@@ -121,7 +120,7 @@ class ReachScan:
         kinds, found = np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 2))
         environment, entries = self.environment, np.full(len(places), -1, dtype=np.int64)
         before = np.arange(len(places))[:, None] - 1 if near is None else near
-        kernel.reach_by_arcs(
+        reach_arcs.reach_by_arcs(
             environment.obstacles, environment.limits, self._starts, self._branches, self._order, self._mixed,
             places, *_cubes(places), np.array(before, dtype=np.int64, order="C"), self._arcs,
             np.zeros(len(self._starts)), kinds, found, entries,
@@ -130,8 +129,8 @@ class ReachScan:
             self._search(places, seeds, kinds, found, entries)
         return Reached(
             kinds=kinds.astype(np.uint8),
-            cost=found[:, kernel.COST],
-            clearance_mm=found[:, kernel.CLEARANCE],
+            cost=found[:, reach_arcs.COST],
+            clearance_mm=found[:, reach_arcs.CLEARANCE],
             entries=entries,
         )
 
@@ -141,7 +140,7 @@ class ReachScan:
         """Search paths to the points not reached; return the tree to the last one, and its row there."""
         rows = RRT_ITERATIONS * tree.ROWS_PER_STEP
         nodes, parents = np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64)
-        last = kernel.reach_by_search(
+        last = reach_search.reach_by_search(
             self.environment.obstacles, self.environment.limits, self._objective, self._starts,
             self._branches, self._order, places, self.trees, RRT_ITERATIONS, RANDOM_SHARE,
             np.array(seeds, dtype=np.uint64), nodes, parents, np.zeros(self.trees, dtype=np.int64), kinds,

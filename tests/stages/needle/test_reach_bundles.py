@@ -7,13 +7,13 @@ import math
 import numpy as np
 
 from anatomy.poses import pose
-from stages.needle.kernels import reach as kernel
+from stages.needle.kernels import reach_bundles as kernel
 from stages.needle.path import CURVATURE, ROLL, direct_path
 
 
 def test_arcs_to_the_points_of_a_ball_are_never_farther_apart_than_stated() -> None:
     rng = np.random.default_rng(5)
-    inverted, apart = kernel._inverted_aside.py_func, kernel._greatest_spread.py_func
+    inverted, apart = kernel.inverted_aside.py_func, kernel._greatest_spread.py_func
     spread, at_chord = kernel._spread.py_func, kernel._point_at_chord.py_func
     tightest, looked = 0.0, 0
     for _ in range(20_000):
@@ -49,7 +49,7 @@ def test_the_place_at_a_chord_lies_on_the_arc() -> None:
         lps_from_start = pose(rng.uniform(-50.0, 50.0, 3), _unit(rng))
         start = (*lps_from_start[:3, 3], *lps_from_start[:3, 2])
         q = lps_from_start[:3, 3] + rng.uniform(-60.0, 60.0, 3)
-        chord2, aside = kernel._inverted_aside.py_func(start, q)
+        chord2, aside = kernel.inverted_aside.py_func(start, q)
         c = rng.uniform(0.0, 1.0) * math.sqrt(chord2)
         place = np.array(kernel._point_at_chord.py_func(start, aside, c))
         assert abs(np.linalg.norm(place - lps_from_start[:3, 3]) - c) < 1e-9

@@ -1,4 +1,4 @@
-"""Many points and many start poses: which points the needle reaches, and how well.
+"""Many points and many start poses: which points single arcs reach, and how well.
 
 `starts` is `(E, 6)`: point and unit tangent of each start pose, LPS mm, neighbours in the list being alike;
 `branches` (E,) the branch that each has pierced.  `order` (E,) is a permutation of them, and `mixed` `(6, E)`
@@ -14,15 +14,12 @@ import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc
 from anatomy.kernels.compiling import inner_kernel
-from anatomy.kernels.field import UNITS_PER_MM, distance_bound, exact_distance, interpolate_squared
+from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY
-from stages.needle.kernels.connections import seen_from, single_arc_exceeds
+from stages.needle.kernels.connections import single_arc_exceeds
 from stages.needle.kernels.cost import inverse_clearance_on_arc
-from stages.needle.kernels.goal_ball import workspace_length
-from stages.needle.kernels.limits import TINY
 from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.kernels.rrt import grow_rrt
-from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
+from stages.needle.kernels.reach_bundles import blocked_at, inverted_aside, is_blocked_bundle
 
 DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = range(1, 5)
 
@@ -38,19 +35,9 @@ JUMP_GROWTH = 4
 ROUNDS = 20
 BLOCK = 512
 
-LOOK_SPACING_MM = 3.0
-"""Before their proof, arcs are looked at in places at most so far apart."""
-BUNDLE_SHARE = 0.7
-"""Arcs of a bundle are looked at together up to where they are about this share of the clearance apart."""
-STEEPEST_SINE = 0.9
-"""Lean of a chord beyond which arcs of a bundle are not looked at together."""
-
-# A typed number: a kernel is compiled once more for every literal that it is called with.
-_NOBODY = np.int64(-1)
-
 
 @inner_kernel
-def _least_clearance(obstacles, limits, pose, bend, length, s0, least):
+def least_clearance(obstacles, limits, pose, bend, length, s0, least):
     """Return a clearance that an arc is never below beyond the exempt length, at most `least`."""
     begin = min(max(limits.exempt_mm - s0, 0.0), length)
     count = max(int(math.ceil((length - begin) / CLEARANCE_STEP_MM)), 1)
@@ -63,125 +50,14 @@ def _least_clearance(obstacles, limits, pose, bend, length, s0, least):
 
 
 @inner_kernel
-def _is_blocked(obstacles, required, x, y, z):
-    """Tell whether a point is nearer than `required` to an obstacle; exact distances only where in doubt."""
-    total, spread = interpolate_squared(obstacles.clearance, obstacles.geometry, x, y, z)
-    if total - spread >= required * required:
-        return False
-    # See `anatomy.kernels.field`: the true distance is at most this.
-    if math.sqrt(total) + math.sqrt(spread) + 1.0 / UNITS_PER_MM < required:
-        return True
-    distance, _label = exact_distance(
-        obstacles.labels, obstacles.geometry, x, y, z, obstacles.bits, _NOBODY, required
-    )
-    return distance < required
-
-
-@inner_kernel
-def _point_at_chord(start, aside, c):
-    """Return the point of an arc that is `c` away from its start, for `aside` see `_inverted_aside`."""
-    wx, wy, wz = c * aside[0], c * aside[1], c * aside[2]
-    ahead = math.sqrt(max(1.0 - wx * wx - wy * wy - wz * wz, 0.0))
-    return (
-        start[0] + c * (ahead * start[3] + wx),
-        start[1] + c * (ahead * start[4] + wy),
-        start[2] + c * (ahead * start[5] + wz),
-    )
-
-
-@inner_kernel
-def _inverted_aside(start, q):
-    """Return the squared distance of a point and what tells the arc to it: half its curvature, sideways.
-
-    Inversion about the start, `d -> d / |d|^2`, takes the circles that touch the start to straight lines
-    along its tangent.  A line keeps its part across the tangent, which is returned (1/mm).
-    """
-    dx, dy, dz = q[0] - start[0], q[1] - start[1], q[2] - start[2]
-    chord2 = dx * dx + dy * dy + dz * dz
-    h = dx * start[3] + dy * start[4] + dz * start[5]
-    share = 1.0 / max(chord2, TINY)
-    return (chord2, (share * (dx - h * start[3]), share * (dy - h * start[4]), share * (dz - h * start[5])))
-
-
-@inner_kernel
-def _greatest_spread(aside, spread, c):
-    """Return how far arcs from one start may be apart where they are `c` away from it; inf if not bounded.
-
-    `aside` is that of one of the arcs, and that of the others differs from it by at most `spread`.
-    """
-    sine = c * (math.sqrt(aside[0] ** 2 + aside[1] ** 2 + aside[2] ** 2) + spread)
-    return c * c * spread / math.sqrt(1.0 - sine * sine) if sine < STEEPEST_SINE else math.inf
-
-
-@inner_kernel
-def _is_blocked_at(obstacles, limits, start, aside, spread, c):
-    """Tell whether all arcs of a bundle are blocked at the distance `c` from their start."""
-    required = limits.required_mm
-    if spread > 0.0:
-        required -= _greatest_spread(aside, spread, c)
-    if required <= 0.0:
-        return False
-    x, y, z = _point_at_chord(start, aside, c)
-    return _is_blocked(obstacles, required, x, y, z)
-
-
-@inner_kernel
-def _spread(chord, radius):
-    """Return how much `_inverted_aside` may differ for points within `radius` of one that is `chord` away.
-
-    Inversion divides distances by the product of the distances from the start.
-    """
-    return radius / (chord * (chord - radius)) if chord > radius else math.inf
-
-
-@inner_kernel
-def _blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
-    """Look for an obstacle at a few places of a bundle of arcs, first where one was met the last time.
-
-    A place is its distance from the start, as is `hint`.  Looked at are places from `begin` to `end`; no arc
-    is exempt there, since none is shorter than its chord.
-
-    Returns
-    -------
-    float
-        The place, -1 if none was met.
-    """
-    if hint >= begin and hint < end and _is_blocked_at(obstacles, limits, start, aside, spread, hint):
-        return hint
-    count = 1
-    while (end - begin) / count > LOOK_SPACING_MM:
-        for m in range(count):
-            c = begin + (end - begin) * (m + 0.5) / count
-            if _is_blocked_at(obstacles, limits, start, aside, spread, c):
-                return c
-        count *= 2
-    return -1.0
-
-
-@inner_kernel
-def _is_blocked_bundle(obstacles, limits, start, q, radius, hints, entry):
-    """Tell whether all arcs to the points within `radius` of `q` are blocked, as far as they are close."""
-    chord2, aside = _inverted_aside(start, q)
-    chord = math.sqrt(chord2)
-    spread = _spread(chord, radius)
-    if spread == math.inf:
-        return False
-    end = min(math.sqrt(BUNDLE_SHARE * limits.required_mm / max(spread, TINY)), chord - radius)
-    c = _blocked_at(obstacles, limits, start, aside, spread, limits.exempt_mm, end, hints[entry])
-    if c >= 0.0:
-        hints[entry] = c
-    return c >= 0.0
-
-
-@inner_kernel
 def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
     """Return the estimated cost of the direct arc.
 
     It is inf if the arc breaks a limit, is not proved clear, or costs no less than `below`.
     """
-    chord2, aside = _inverted_aside(start, q)
+    chord2, aside = inverted_aside(start, q)
     chord = math.sqrt(chord2)
-    c = _blocked_at(obstacles, limits, start, aside, 0.0, limits.exempt_mm, chord, hints[entry])
+    c = blocked_at(obstacles, limits, start, aside, 0.0, limits.exempt_mm, chord, hints[entry])
     if c >= 0.0:
         hints[entry] = c
         return math.inf
@@ -249,7 +125,7 @@ def _extend(obstacles, limits, starts, order, mixed, q, radius, marks, hints, ch
             if not marks[m - scanned]:
                 continue
             entry = order[m]
-            if radius > 0.0 and _is_blocked_bundle(obstacles, limits, starts[entry], q, radius, hints, entry):
+            if radius > 0.0 and is_blocked_bundle(obstacles, limits, starts[entry], q, radius, hints, entry):
                 continue
             chosen[count] = entry
             for c in range(6):
@@ -398,7 +274,7 @@ def reach_by_arcs(
             length, bend, _turn = arc_to_point(pose, q)
             kinds[n] = DIRECT
             found[n, COST] = best
-            found[n, CLEARANCE] = _least_clearance(obstacles, limits, pose, bend, length, 0.0, math.inf)
+            found[n, CLEARANCE] = least_clearance(obstacles, limits, pose, bend, length, 0.0, math.inf)
 
 
 @inner_kernel
@@ -417,98 +293,3 @@ def _ball_around(points, members):
             gap2 += (points[n, c] - centre[c]) ** 2
         radius2 = max(radius2, gap2)
     return (centre[0], centre[1], centre[2]), math.sqrt(radius2) * (1.0 + 1e-9)
-
-
-@inner_kernel
-def _grow(obstacles, limits, objective, start, branch, q, nodes, parents, iterations, share, state):
-    """Grow a tree from one start pose; return the row at the point, 0 if it was not reached."""
-    for c in range(nodes.shape[1]):
-        nodes[0, c] = start[c] if c < 6 else 0.0
-    count, _used, solved = grow_rrt(
-        obstacles, limits, objective, branch, q, nodes, parents, 1, iterations, share, state, math.inf
-    )
-    return count - 1 if solved else 0
-
-
-@inner_kernel
-def _record_path(obstacles, limits, nodes, parents, last, row):
-    """Fill `row` with cost and least clearance of the path to the node `last`."""
-    least = math.inf
-    node = last
-    while node != 0:
-        parent = parents[node]
-        arc = nodes[node]
-        bend = (arc[BEND], arc[BEND + 1], arc[BEND + 2], arc[BEND + 3])
-        pose = pose_of(nodes[parent])
-        if nodes[node, PATH_LENGTH] > limits.exempt_mm or node == last:
-            begun = nodes[parent, PATH_LENGTH]
-            least = _least_clearance(obstacles, limits, pose, bend, arc[ARC_LENGTH], begun, least)
-        node = parent
-    row[COST] = nodes[last, PATH_COST]
-    row[CLEARANCE] = least
-
-
-@numba.njit(cache=True, nogil=True)
-def reach_by_search(
-    obstacles, limits, objective, starts, branches, order, points, trees, iterations, share, seeds,
-    nodes, parents, picked, kinds, found, entries,
-):  # fmt: skip
-    """Search paths of several arcs to the points that no single arc reaches.
-
-    From every start pose with the point in its workspace, the shortest path is tried; if none is clear, an
-    RRT from the first `trees` of them in the mixed order.
-
-    Parameters
-    ----------
-    obstacles, limits, objective, starts, branches, order, points
-        See `reach_by_arcs` and `cost`.
-    trees, iterations, share : int, int, float
-        Trees for each point, and iterations and share of random arcs of each.
-    seeds : (N,) uint64
-        Seed of each point, so that points may be searched in any order.
-    nodes, parents, picked : arrays
-        Scratch: a tree, and `trees` int64.
-    kinds, found, entries : arrays
-        As `reach_by_arcs` left them; points found become SEARCHED.
-
-    Returns
-    -------
-    int
-        The row of `nodes` at the last point that was searched, 0 if it was not found.
-    """
-    state = seeds[:1].copy()
-    last = 0
-    for n in range(points.shape[0]):
-        if kinds[n] != UNREACHED:
-            continue
-        q = (points[n, 0], points[n, 1], points[n, 2])
-        state[0] = seeds[n]
-        last = 0
-        count = 0
-        entry = -1
-        for entry in order:
-            start = starts[entry]
-            rho, h = seen_from((start[0], start[1], start[2], start[3], start[4], start[5]), q)
-            if workspace_length(rho, h, limits) == math.inf:
-                continue
-            last = _grow(
-                obstacles, limits, objective, start, branches[entry], q, nodes, parents, 0, share, state
-            )
-            if last > 0:
-                break
-            if count < trees:
-                picked[count] = entry
-                count += 1
-        turn = 0
-        while last == 0 and turn < count:
-            entry = picked[turn]
-            last = _grow(
-                obstacles, limits, objective, starts[entry], branches[entry], q, nodes, parents, iterations,
-                share, state,
-            )  # fmt: skip
-            turn += 1
-        if last > 0:
-            kinds[n] = SEARCHED
-            entries[n] = entry
-            _record_path(obstacles, limits, nodes, parents, last, found[n])
-    return last

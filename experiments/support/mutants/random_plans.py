@@ -19,10 +19,11 @@ from experiments.support.mutants.draws import Rng
 from lungaccess.coupled import DirectArcs, alternatives
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.plans.assemble import assemble
+from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, nodule_target, point_target
-from lungaccess.problem.task import Task
+from lungaccess.problem.task import Task, objective_of
 from stages.needle import TERMS, ArcPath
 
 TWISTED = "curved-outer"
@@ -117,7 +118,14 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
     )
     if kind > 0.75 and system.needle is not None:
         yield from bent_plans(
-            Task(lung=lung, system=system, target=target, objective=objective, method="bent", seed=seed),
+            Task(
+                lung=lung,
+                system=system,
+                target=target,
+                objective=objective_of(lung, objective),
+                method="bent",
+                seed=seed,
+            ),
             atlas,
             rng,
         )
@@ -164,11 +172,16 @@ def bent_plans(task: Task, atlas: Atlas, rng: Rng) -> Iterator[Plan]:
             path.length_mm > device.max_length_mm
             or path.accumulated_turn_rad > np.deg2rad(device.max_accumulated_turn_deg)
             or path.max_angle_from_start_rad() > np.deg2rad(device.max_angle_from_start_deg)
-            or not arcs_to_target.evaluator.proves(candidate.deployment, path)
         ):
             continue
         end = Target(lps_mm=path.frames()[-1][:3, 3], origin="point")
-        here = replace(task, target=end)
+        # A path has to end at the target of its task, so each is proved in a task of its own.
+        try:
+            here = replace(task, target=end)
+        except TargetError:
+            continue
+        if not CandidateEvaluator(here).proves(candidate.deployment, path):
+            continue
         yield assemble(here, replace(candidate, path=path), iteration=0, timing={})
         made += 1
         if made == AT_A_TIME:

@@ -22,7 +22,7 @@ from experiments.support.mutants.mutant import Case
 from lungaccess.checking import Checker, check
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task
+from lungaccess.problem.task import Task, objective_of
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 PLANS_A_SYSTEM = 5
@@ -81,7 +81,9 @@ def drawn_plans(lung: Lung, system: la.System, atlas: Any, rng: Any, way: Any) -
 
 def bent_plans(lung: Lung, system: la.System, target: Target, atlas: Any, rng: Any) -> Iterator[Plan]:
     """Yield plans of several arcs from deployments near a target."""
-    task = Task(lung=lung, system=system, target=target, objective="length", method="bent", seed=0)
+    task = Task(
+        lung=lung, system=system, target=target, objective=objective_of(lung, "length"), method="bent", seed=0
+    )
     yield from random_plans.bent_plans(task, atlas, rng)
 
 

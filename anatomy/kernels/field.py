@@ -42,6 +42,8 @@ EXACT_REACH_MM = 0.5
 """How far beyond the required clearance such a proof searches voxels: its longest step near obstacles."""
 ROUNDING = 1e-9
 """Searches go farther than what they may find by this share."""
+TRANSFORM_ROUNDING = 1e-4
+"""Share by which distance transforms are made smaller before they are rounded down; they have less."""
 
 
 @numba.njit(cache=True, inline="always", _nrt=False)
@@ -91,6 +93,43 @@ def distance_estimate(field, geometry, x, y, z):
     """Return a smooth estimate of the distance in mm, off by less than a voxel diagonal; no bound."""
     total, spread = interpolate_squared(field, geometry, x, y, z)
     return math.sqrt(max(total - 0.5 * spread, 0.0))
+
+
+@numba.njit(cache=True, _nrt=False)
+def most_distance(field, geometry, x, y, z):
+    """Return a distance in mm that the true distance never exceeds; inf off the grid and next to its border.
+
+    Let X be the corner nearest to the point p, and o the obstacle point nearest to X.  No obstacle point
+    is nearer to another corner than that corner's distance, which bounds how far o lies beyond X.
+    """
+    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
+    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
+    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
+    u -= 0.5 - geometry[0, 5]
+    v -= 0.5 - geometry[1, 5]
+    w -= 0.5 - geometry[2, 5]
+    ni, nj, nk = field.shape
+    if not (1.0 <= u < ni - 2 and 1.0 <= v < nj - 2 and 1.0 <= w < nk - 2):
+        return math.inf
+    i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
+    here = (float(field[i, j, k]) * (1.0 + TRANSFORM_ROUNDING) + 2.0) / UNITS_PER_MM
+    square = here * here
+    total = beside = 0.0
+    for axis in range(3):
+        if axis == 0:
+            off = u - i
+            other = field[i - 1 if off > 0.0 else i + 1, j, k]
+        elif axis == 1:
+            off = v - j
+            other = field[i, j - 1 if off > 0.0 else j + 1, k]
+        else:
+            off = w - k
+            other = field[i, j, k - 1 if off > 0.0 else k + 1]
+        share, size2 = abs(off), geometry[axis, 4]
+        there = float(other) / UNITS_PER_MM
+        total += share * (square - there * there + size2)
+        beside += share * share * size2
+    return min(math.sqrt(max(square + total + beside, 0.0)), here + math.sqrt(beside))
 
 
 @numba.njit(cache=True, _nrt=False)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
@@ -34,8 +36,10 @@ BOXES_A_STEP = 250
 """Boxes that are divided in one step of a search, which takes some ten milliseconds."""
 BOXES_A_TIP = 2
 """A scope tip is begun with instead of dividing so many boxes."""
-TRIED_A_STEP = 4
-"""Deployments that are tried in one step, in the middle of boxes: less than a millisecond."""
+TRIED_A_QUEUE = 2
+"""Deployments that are tried in one step, in the middle of the lowest boxes: less than a millisecond."""
+QUEUES = 2
+"""Queues of boxes, each in a thread of its own: of every second scope tip.  More would be other plans."""
 INSERTION_SPACING_MM = 0.01
 """Spacing of the insertions that are tried for the greatest one."""
 
@@ -74,31 +78,33 @@ class CostBound:
             )
         self._most_boxes = most_boxes
         self._task = task
-        self._environment: BoundEnvironment | None = None
         self._tubes = tube_constants(system.tubes, system.margins)
-        self._longest = float(self._tubes[MAX_EXTENSION])
-        self._insertions = np.zeros(0)
         self._tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
-        self._rates = np.zeros((len(self._tips), 2))
-        x, y, z = task.target.lps_mm.tolist()
-        self._target = (x, y, z)
-        self._state: tuple[np.ndarray, ...] | None = None
-        self._begun = 0
-        self._left_out = math.inf
+        self.queues: list[BoxQueue] = []
+        """Once it has begun."""
+        self._workers = ThreadPoolExecutor(QUEUES)
+        self._running: list[Future[None]] = []
+        self._value, self._left_out = 0.0, math.inf
+        self._lowest: list[tuple[int, float, float, float]] = []
         self.settled = False
         """Whether it rises no more."""
 
     @property
     def value(self) -> float:
         """The bound: 0 before it has begun."""
-        if self._state is None or self._begun < len(self._tips):
-            return 0.0
-        boxes, heap, _unused, numbers = self._state
-        lowest = float(boxes[heap[0], BOUND]) if numbers[WAITING] else math.inf
-        return min(lowest, self._left_out)
+        self.finish()
+        return self._value
 
-    def improve(self, cost: float, boxes: int) -> float:
-        """Divide so many boxes, and return the bound.
+    @property
+    def lowest(self) -> list[tuple[int, float, float, float]]:
+        """Scope tip, rotation (rad) and insertions (mm) in the middle of some of the lowest boxes.
+
+        Those when the boxes were last divided to the end, while others may be divided now.
+        """
+        return self._lowest
+
+    def start(self, cost: float, boxes: int) -> None:
+        """Begin to divide so many boxes in other threads; `finish` waits for them.
 
         Parameters
         ----------
@@ -106,59 +112,110 @@ class CostBound:
             That of a plan: deployments that cost as much need not be told apart.  The first calls only begin
             with the boxes of some scope tips each.
         """
+        self.finish()
         if self.settled:
-            return self.value
+            return
         self._left_out = min(self._left_out, cost)
-        if self._begun < len(self._tips):
-            self._begin(cost, max(boxes // BOXES_A_TIP, 1))
-            return self.value
-        outcome, _divided = divide(
-            self._environment, self._tubes, self._insertions, self._tips, self._rates, self._target,
-            boxes, cost, self._state,
-        )  # fmt: skip
-        self.settled = outcome != ENDED
+        if not self.queues:
+            environment = _environment(self._task, self._tips[:, 0], cost)
+            insertions = np.zeros(int(self._tubes[MAX_EXTENSION] / INSERTION_STEP_MM) + 1)
+            greatest_insertions(self._tubes, self._tubes[MAX_EXTENSION], INSERTION_SPACING_MM, insertions)
+            x, y, z = self._task.target.lps_mm.tolist()
+            for n in range(QUEUES):
+                tips = np.ascontiguousarray(self._tips[n::QUEUES])
+                about = (environment, self._tubes, insertions, tips, np.zeros((len(tips), 2)), (x, y, z))
+                self.queues.append(BoxQueue(about, self._most_boxes // QUEUES))
+        self._running = [self._workers.submit(each.go_on, cost, boxes // QUEUES) for each in self.queues]
+
+    def finish(self) -> None:
+        """Wait until the boxes are divided that `start` has begun with."""
+        if not self._running:
+            return
+        for each in self._running:
+            each.result()
+        self._running = []
+        if any(not each.begun for each in self.queues):
+            return
+        least = min(self.queues, key=lambda each: each.value)
+        self._value, self.settled = min(least.value, self._left_out), least.settled
+        self._lowest = [
+            (tip * QUEUES + n, rotation, outer, inner)
+            for n, each in enumerate(self.queues)
+            for tip, rotation, outer, inner in each.lowest(TRIED_A_QUEUE)
+        ]
+
+    def improve(self, cost: float, boxes: int) -> float:
+        """Divide so many boxes as `start` does, and return the bound."""
+        self.start(cost, boxes)
         return self.value
+
+
+class BoxQueue:
+    """The boxes of some scope tips, the lowest first.
+
+    Parameters
+    ----------
+    about : tuple
+        What `begin_queue` and `divide` take first: environment, tubes, insertions, tips, rates and target.
+    most_boxes : int
+    """
+
+    def __init__(self, about: tuple[Any, ...], most_boxes: int) -> None:
+        self.about = about
+        self._longest, self._tips = float(about[2].max()), len(about[3])
+        places, numbers = np.zeros(most_boxes, dtype=np.int64), np.zeros(2, dtype=np.int64)
+        self._state = (np.zeros((most_boxes, BOX_COLUMNS)), places, np.zeros_like(places), numbers)
+        self._next_tip = 0
+        self._room = True
+        self.settled = False
+        """Whether its bound rises no more."""
+
+    @property
+    def begun(self) -> bool:
+        """Whether boxes of all scope tips wait."""
+        return self.settled or self._next_tip == self._tips
+
+    @property
+    def value(self) -> float:
+        """The least bound of the boxes that wait; inf if none does."""
+        boxes, heap, _unused, numbers = self._state
+        if not self._room:
+            return 0.0
+        return float(boxes[heap[0], BOUND]) if numbers[WAITING] else math.inf
+
+    def go_on(self, cost: float, boxes: int) -> None:
+        """Divide so many boxes, or let those of some scope tips wait."""
+        if self.settled:
+            return
+        if self.begun:
+            outcome, _divided = divide(*self.about, boxes, cost, self._state)
+            self.settled = outcome != ENDED
+            return
+        first = self._next_tip
+        self._next_tip = min(first + max(boxes // BOXES_A_TIP, 1), self._tips)
+        self._room = begin_queue(*self.about, self._longest, cost, first, self._next_tip, self._state)
+        self.settled = not self._room
 
     def lowest(self, count: int) -> list[tuple[int, float, float, float]]:
         """Return scope tip, rotation (rad) and insertions (mm) in the middle of some of the lowest boxes."""
-        if self._state is None:
-            return []
         boxes, heap, _unused, numbers = self._state
         rows = boxes[heap[: min(count, int(numbers[WAITING]))]]
         inner = rows[:, INNER]
         columns = rows[:, TIP], rows[:, ROTATION], np.clip(rows[:, OUTER], 0.0, inner), inner
         return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
 
-    def _begin(self, cost: float, tips: int) -> None:
-        if self._state is None:
-            self._environment = _environment(self._task, self._tips[:, 0], cost)
-            self._insertions = np.zeros(int(self._longest / INSERTION_STEP_MM) + 1)
-            greatest_insertions(self._tubes, self._longest, INSERTION_SPACING_MM, self._insertions)
-            most = self._most_boxes
-            places = np.zeros(most, dtype=np.int64)
-            numbers = np.zeros(2, dtype=np.int64)
-            self._state = (np.zeros((most, BOX_COLUMNS)), places, np.zeros_like(places), numbers)
-        first, last = self._begun, min(self._begun + tips, len(self._tips))
-        room = begin_queue(
-            self._environment, self._tubes, self._insertions, self._tips, self._rates, self._target,
-            float(self._insertions.max()), cost, first, last, self._state,
-        )  # fmt: skip
-        self._begun = last
-        if not room:
-            self._left_out, self.settled = 0.0, True
-
 
 def guided(search: AtlasSearch, steps: Iterator[Step], bound: CostBound) -> Iterator[Step]:
     """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
 
     Each of those becomes the search's best candidate, which it then improves.  Who takes the steps improves
-    the bound.
+    the bound, which may go on while the search takes its next step.
     """
     for step in steps:
         yield step
         if bound.settled or search.incumbent.step is None:
             continue
-        for tip, rotation, outer, inner in bound.lowest(TRIED_A_STEP):
+        for tip, rotation, outer, inner in bound.lowest:
             candidate = search.evaluator.direct(search.atlas.motions.tip(tip), rotation, outer, inner)
             found = evaluated_step(search.evaluator, "lower bound", candidate, step.iteration)
             if found.cost < search.incumbent.cost:
@@ -188,8 +245,14 @@ class GapGoal:
         self.bound, self._gap = bound, gap
 
     def is_met(self, cost: float) -> bool:
-        """Improve the bound, and tell whether a plan of this cost is so near to the best possible."""
-        return cost <= (1.0 + self._gap) * self.bound.improve(cost, BOXES_A_STEP)
+        """Tell whether a plan of this cost is so near to the best possible.
+
+        If it is not, the bound is improved in other threads until the next call.
+        """
+        met = cost <= (1.0 + self._gap) * self.bound.value
+        if not met:
+            self.bound.start(cost, BOXES_A_STEP)
+        return met
 
 
 def _environment(task: Task, tips: Float, limit: float) -> BoundEnvironment:

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.typed import Float, UInt16
-from lungaccess.coupled.kernels.cost_to_go import LEVELS, MOST_UNITS, N_NUMBERS, CostToGo, fill_cost_to_go
+from lungaccess.coupled.kernels.cost_to_go import (
+    LEVELS,
+    MOST_UNITS,
+    N_NUMBERS,
+    CostToGo,
+    end_shell,
+    fill_shell,
+)
 from stages.needle.kernels import Limits
 
 SHELL_MM = 1.5
 """From shell to shell."""
 HALF_WIDTH = 0.8
 """Of the window in the plane of directions: up to 77 degrees from the middle."""
+THREADS = 2
+"""Threads that fill a shell; their number changes nothing."""
 SPREAD = 1.1
 """Cells are by this wider than the directions of paths change from a shell to the next near the target."""
 
@@ -47,7 +59,7 @@ def cost_to_go(
     """
     kappa = limits.kappa
     cell = 0.25 * kappa * SHELL_MM * SPREAD
-    count = 2 * int(HALF_WIDTH / cell) + 1
+    cells = 2 * int(HALF_WIDTH / cell) + 1
     shells = int(min(limits.max_length_mm, 1.9 / kappa) / SHELL_MM)
     away = places - np.asarray(target_lps)
     axis = (away / np.maximum((away**2).sum(axis=1, keepdims=True), 1.0) ** 1.5).sum(axis=0)
@@ -55,7 +67,7 @@ def cost_to_go(
     across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     across /= np.linalg.norm(across)
     levels = []
-    side = count
+    side = cells
     for _ in range(LEVELS):
         levels.append(np.zeros((shells + 1, side, side), dtype=np.uint16))
         side = (side + 1) // 2
@@ -69,5 +81,20 @@ def cost_to_go(
         levels=tuple(levels),
     )
     if math.isfinite(limit) and limit > 0.0:
-        fill_cost_to_go(field, geometry, *weights, limits.goal_tolerance_mm, limit, togo)
+        _fill(togo, partial(fill_shell, field, geometry, weights, limits.goal_tolerance_mm, limit, togo))
     return togo
+
+
+def _fill(togo: CostToGo, fill_rows: Callable[..., bool]) -> None:
+    """Fill the shells from the target outwards, until no path costs less than the limit."""
+    levels = togo.levels[0]
+    # The cost from half a shell beyond the last one, and the same for the one that is being filled.
+    behind, beyond = np.zeros(levels.shape[1:]), np.zeros(levels.shape[1:])
+    with ThreadPoolExecutor(THREADS) as workers:
+        for k in range(len(levels)):
+            fill = partial(fill_rows, k, behind, beyond)
+            some = list(workers.map(fill, range(THREADS), [THREADS] * THREADS))
+            end_shell(togo, k)
+            if not any(some):
+                return
+            behind, beyond = beyond, behind

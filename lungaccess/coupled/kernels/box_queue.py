@@ -83,7 +83,8 @@ def _pop(boxes, heap, numbers):
 def _halve(parent, child, sides):
     """Halve a box on the side that costs most.
 
-    Returns 2; 1 if its paths are to be told apart halfway from now on; 0 if it is too small.
+    Returns 2; 1 if its paths are to be told apart halfway from now on; 0 if it is too small.  And whether the
+    halves hold the same tubes.
     """
     if parent[LAST] - parent[FIRST] < 2.0:
         parent[LOSS] = 0.0
@@ -92,13 +93,13 @@ def _halve(parent, child, sides):
         if parent[LOSS + m] > parent[LOSS + side]:
             side = m
     if parent[LOSS + side] < SMALL_MM:
-        return 0
+        return 0, True
     if side == 4 and parent[HALF_ACROSS] < 0.0:
-        return 1
+        return 1, True
     child[:] = parent
     if side == 0:
         parent[LAST] = child[FIRST] = math.floor(0.5 * (parent[FIRST] + parent[LAST]))
-        return 2
+        return 2, False
     if side == 1:
         middle, half = ROTATION, HALF_ROTATION
     elif side == 2:
@@ -113,7 +114,7 @@ def _halve(parent, child, sides):
     child[half] = parent[half]
     parent[middle] -= parent[half]
     child[middle] += parent[half]
-    return 2
+    return 2, side >= TIP_SIDES
 
 
 @numba.njit(cache=True, nogil=True)
@@ -156,13 +157,13 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
         stacked = 1
         while stacked > 0:
             box = stack[stacked - 1]
-            box[BOUND] = bound_box(environment, tubes, insertions, tips, rates, target, limit, box)
+            box[BOUND] = bound_box(environment, tubes, insertions, tips, rates, target, limit, box, False)
             if box[BOUND] >= limit:
                 stacked -= 1
                 continue
             halves = 0
             if box[AWAY] > BEGUN_MM and stacked < MOST_STACKED:
-                halves = _halve(box, stack[stacked], TIP_SIDES)
+                halves, _same = _halve(box, stack[stacked], TIP_SIDES)
             if halves == 2:
                 stacked += 1
                 continue
@@ -205,7 +206,7 @@ def divide(environment, tubes, insertions, tips, rates, target, most, limit, sta
         row = _pop(boxes, heap, numbers)
         floor = boxes[row, BOUND]
         other = unused[numbers[UNUSED] - 1]
-        halves = _halve(boxes[row], boxes[other], SIDES)
+        halves, same_tubes = _halve(boxes[row], boxes[other], SIDES)
         if halves == 0:
             _push(boxes, heap, numbers, row)
             return WHOLE, done
@@ -215,8 +216,9 @@ def divide(environment, tubes, insertions, tips, rates, target, most, limit, sta
             numbers[UNUSED] -= 1
         for part in range(halves):
             at = row if part == 0 else other
-            bound = bound_box(environment, tubes, insertions, tips, rates, target, limit, boxes[at])
-            boxes[at, BOUND] = max(bound, floor)
+            box = boxes[at]
+            bound = bound_box(environment, tubes, insertions, tips, rates, target, limit, box, same_tubes)
+            box[BOUND] = max(bound, floor)
             if boxes[at, BOUND] < limit:
                 _push(boxes, heap, numbers, at)
             else:

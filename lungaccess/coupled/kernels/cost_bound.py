@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from lungaccess.coupled.kernels.cost_to_go import LARGEST_SINE, CostToGo, angle_at, cost_from, most_distance
+from anatomy.kernels.field import most_distance
+from lungaccess.coupled.kernels.cost_to_go import LARGEST_SINE, CostToGo, angle_at, cost_from
 from lungaccess.coupled.kernels.deployment_box import (
     ACROSS,
     AWAY,
@@ -216,7 +217,7 @@ def _across(direction):
 
 
 @inner_kernel
-def bound_box(environment, tubes, insertions, tips, rates, target, limit, box):
+def bound_box(environment, tubes, insertions, tips, rates, target, limit, box, same_tubes):
     """Bound the cost of every path from the deployments of a box from below; inf if there is none.
 
     Tubes are not looked at where the bound is `limit` or more without.
@@ -235,6 +236,9 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box):
     limit : float
     box : (BOX_COLUMNS,) float64
         AWAY, WIDE and LOSS are filled.
+    same_tubes : bool
+        Whether a box with the same tubes was looked at before, whose bound counts as well: then this is that
+        of the paths alone.
     """
     kappa = environment.kappa
     outer, half_outer, inner, half_inner = box[OUTER], box[HALF_OUTER], box[INNER], box[HALF_INNER]
@@ -271,7 +275,9 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box):
     least = max(least_distance(tubes, kappa, pose, box, tip, tangent, target, off), far - away - off)
     if least == math.inf or least > environment.max_length_mm:
         return math.inf
-    ahead_cost = along_tangent(environment, tip, tangent, swing, away, far - away - off, limit)
+    ahead_cost = 0.0
+    if not same_tubes:
+        ahead_cost = along_tangent(environment, tip, tangent, swing, away, far - away - off, limit)
     if ahead_cost >= limit:
         return math.inf
     x, z = planar_point(tubes, outer, inner, inner)
@@ -289,7 +295,7 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box):
             bound = max(bound, as_far_as(environment, target, tip, off, away, least))
         else:
             bound = max(bound, _by_halfway(environment, target, tip, tangent, swing, off, away, least, box))
-    if bound >= limit or away >= FOLLOWED_MM:
+    if same_tubes or bound >= limit or away >= FOLLOWED_MM:
         return bound
     return math.inf if tubes_blocked(environment.surroundings, tubes, pose, box, sweep) else bound
 

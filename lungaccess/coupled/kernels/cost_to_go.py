@@ -14,11 +14,9 @@ import numba
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from anatomy.kernels.field import UNITS_PER_MM
+from anatomy.kernels.field import most_distance
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
 
-ROUNDING = 1e-4
-"""Share by which distance transforms are made smaller before they are rounded down; they have less."""
 LARGEST_SINE = 0.99
 """Of half the turn of an arc over a line; of paths over longer ones nothing but their length is known."""
 SPARE = 1e-6
@@ -64,43 +62,6 @@ def angle_at(kappa, length):
 
 
 @inner_kernel
-def most_distance(field, geometry, x, y, z):
-    """Return a distance in mm that the true distance never exceeds; inf off the grid and next to its border.
-
-    Let X be the corner nearest to the point p, and o the obstacle point nearest to X.  No obstacle point
-    is nearer to another corner than that corner's distance, which bounds how far o lies beyond X.
-    """
-    u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
-    v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
-    w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
-    u -= 0.5 - geometry[0, 5]
-    v -= 0.5 - geometry[1, 5]
-    w -= 0.5 - geometry[2, 5]
-    ni, nj, nk = field.shape
-    if not (1.0 <= u < ni - 2 and 1.0 <= v < nj - 2 and 1.0 <= w < nk - 2):
-        return math.inf
-    i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
-    here = (float(field[i, j, k]) * (1.0 + ROUNDING) + 2.0) / UNITS_PER_MM
-    square = here * here
-    total = beside = 0.0
-    for axis in range(3):
-        if axis == 0:
-            off = u - i
-            other = field[i - 1 if off > 0.0 else i + 1, j, k]
-        elif axis == 1:
-            off = v - j
-            other = field[i, j - 1 if off > 0.0 else j + 1, k]
-        else:
-            off = w - k
-            other = field[i, j, k - 1 if off > 0.0 else k + 1]
-        share, size2 = abs(off), geometry[axis, 4]
-        there = float(other) / UNITS_PER_MM
-        total += share * (square - there * there + size2)
-        beside += share * share * size2
-    return min(math.sqrt(max(square + total + beside, 0.0)), here + math.sqrt(beside))
-
-
-@inner_kernel
 def _in_plane(angle, size):
     """Return how far apart points of the plane are at most, of directions an angle (rad) apart.
 
@@ -126,77 +87,89 @@ def _reduce(levels, shell):
 
 
 @numba.njit(cache=True, nogil=True)
-def fill_cost_to_go(field, geometry, per_clearance, per_mm, off, limit, togo):
-    """Fill a `CostToGo` from the target outwards, until no path costs less than `limit`.
+def fill_shell(field, geometry, weights, off, limit, togo, k, behind, beyond, part, parts):
+    """Fill each `parts`-th row of cells of a shell of a `CostToGo`, when the shells before it are filled.
 
     Parameters
     ----------
     field, geometry
         Corner field of the distance to all obstacles.
-    per_clearance, per_mm : float
-        The objective.
+    weights : tuple of 2 float
+        Of the integral of 1 / clearance, and of the length in mm.
     off : float
         How far from the target a path may end, mm.
     limit : float
+        Costs above are not told apart.
     togo : CostToGo
-        Its levels are 0 at first; of its numbers the last is filled.
+    k : int
+        The shell.
+    behind, beyond : (N, N) float64
+        The cost from half a shell beyond the last one, and the same for this one, whose rows are filled.
+    part, parts : int
+        Rows part, part + parts, ...
+
+    Returns
+    -------
+    bool
+        Whether paths from some cell cost less than `limit`.
     """
     frame, numbers, levels = togo
     cell, shell, kappa, unit = numbers[CELL], numbers[SHELL], numbers[KAPPA], numbers[UNIT]
+    per_clearance, per_mm = weights
     values = levels[0]
     count = values.shape[1]
     half = 0.5 * (count - 1)
-    # The cost from half a shell beyond the last one, and the same for the one that is being filled.
-    behind, beyond = np.zeros((count, count)), np.zeros((count, count))
-    for k in range(values.shape[0]):
-        radius = k * shell
-        drift = angle_at(kappa, radius) - angle_at(kappa, max(radius - shell, 0.0)) + SPARE
-        stretch = 1.0 / math.sqrt(1.0 - (0.5 * kappa * (radius + 0.5 * shell)) ** 2)
-        border = radius * numbers[LEAST_RATE]
-        some = False
-        for i in range(count):
-            u = (i - half) * cell
-            for j in range(count):
-                if i == 0 or j == 0 or i == count - 1 or j == count - 1:
-                    values[k, i, j] = min(int(border / unit), BEYOND - 1)
-                    beyond[i, j] = border
-                    continue
-                v = (j - half) * cell
-                size2 = u * u + v * v
-                size = math.sqrt(size2)
-                reach = int(math.ceil(_in_plane(drift, size + HALF_DIAGONAL * cell) / cell)) if k > 0 else 0
-                cost = math.inf
-                for m in range(max(i - reach, 0), min(i + reach, count - 1) + 1):
-                    for n in range(max(j - reach, 0), min(j + reach, count - 1) + 1):
-                        cost = min(cost, behind[m, n])
-                values[k, i, j] = BEYOND
-                beyond[i, j] = math.inf
-                if cost >= limit:
-                    continue
-                a, b, c = 2.0 * u / (1.0 + size2), 2.0 * v / (1.0 + size2), (1.0 - size2) / (1.0 + size2)
-                x = frame[3, 0] + radius * (a * frame[0, 0] + b * frame[1, 0] + c * frame[2, 0])
-                y = frame[3, 1] + radius * (a * frame[0, 1] + b * frame[1, 1] + c * frame[2, 1])
-                z = frame[3, 2] + radius * (a * frame[0, 2] + b * frame[1, 2] + c * frame[2, 2])
-                inner = max(size - HALF_DIAGONAL * cell, 0.0)
-                around = radius * 2.0 * HALF_DIAGONAL * cell / (1.0 + inner * inner)
-                clear = most_distance(field, geometry, x, y, z) + around + off
-                if clear < numbers[REQUIRED]:
-                    continue
-                clear = max(clear, CLEARANCE_FLOOR_MM)
-                beside = per_clearance * math.log(1.0 + 0.5 * stretch * shell / clear) / stretch
-                beside += 0.5 * shell * per_mm
-                if k > 0:
-                    cost += beside
-                if cost >= limit:
-                    continue
-                some = True
-                values[k, i, j] = int(cost / unit)
-                beyond[i, j] = cost + beside
-        behind, beyond = beyond, behind
-        _reduce(levels, k)
-        numbers[LAST_SHELL] = k
-        if not some:
-            return
+    radius = k * shell
+    drift = angle_at(kappa, radius) - angle_at(kappa, max(radius - shell, 0.0)) + SPARE
+    stretch = 1.0 / math.sqrt(1.0 - (0.5 * kappa * (radius + 0.5 * shell)) ** 2)
+    border = radius * numbers[LEAST_RATE]
+    some = False
+    for i in range(part, count, parts):
+        u = (i - half) * cell
+        for j in range(count):
+            if i == 0 or j == 0 or i == count - 1 or j == count - 1:
+                values[k, i, j] = min(int(border / unit), BEYOND - 1)
+                beyond[i, j] = border
+                continue
+            v = (j - half) * cell
+            size2 = u * u + v * v
+            size = math.sqrt(size2)
+            reach = int(math.ceil(_in_plane(drift, size + HALF_DIAGONAL * cell) / cell)) if k > 0 else 0
+            cost = math.inf
+            for m in range(max(i - reach, 0), min(i + reach, count - 1) + 1):
+                for n in range(max(j - reach, 0), min(j + reach, count - 1) + 1):
+                    cost = min(cost, behind[m, n])
+            values[k, i, j] = BEYOND
+            beyond[i, j] = math.inf
+            if cost >= limit:
+                continue
+            a, b, c = 2.0 * u / (1.0 + size2), 2.0 * v / (1.0 + size2), (1.0 - size2) / (1.0 + size2)
+            x = frame[3, 0] + radius * (a * frame[0, 0] + b * frame[1, 0] + c * frame[2, 0])
+            y = frame[3, 1] + radius * (a * frame[0, 1] + b * frame[1, 1] + c * frame[2, 1])
+            z = frame[3, 2] + radius * (a * frame[0, 2] + b * frame[1, 2] + c * frame[2, 2])
+            inner = max(size - HALF_DIAGONAL * cell, 0.0)
+            around = radius * 2.0 * HALF_DIAGONAL * cell / (1.0 + inner * inner)
+            clear = most_distance(field, geometry, x, y, z) + around + off
+            if clear < numbers[REQUIRED]:
+                continue
+            clear = max(clear, CLEARANCE_FLOOR_MM)
+            beside = per_clearance * math.log(1.0 + 0.5 * stretch * shell / clear) / stretch
+            beside += 0.5 * shell * per_mm
+            if k > 0:
+                cost += beside
+            if cost >= limit:
+                continue
+            some = True
+            values[k, i, j] = int(cost / unit)
+            beyond[i, j] = cost + beside
+    return some
+
+
+@numba.njit(cache=True, nogil=True)
+def end_shell(togo, k):
+    """Fill the higher levels of a shell whose cells are filled; from now on it counts."""
+    _reduce(togo.levels, k)
+    togo.numbers[LAST_SHELL] = k
 
 
 @inner_kernel

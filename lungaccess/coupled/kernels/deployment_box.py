@@ -14,19 +14,23 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
-from anatomy.kernels.field import distance_bound, exact_distance
+from anatomy.kernels.field import distance_bound, exact_distance, most_distance
 from anatomy.kernels.labels import BRANCH_SHIFT, LUMEN
 from stages.tube.kernels import (
     CORNER_MM,
     CURVED_LENGTH,
+    FINE_STEP_MM,
     INNER_CURVATURE,
     INNER_RADIUS,
+    LOOK_MM,
     MARGIN,
     OUTER_RADIUS,
     OVERLAP_CURVATURE,
     SWEEP_SAMPLES,
+    UNNOTICED_MM,
     off_track,
     planar_point,
+    refused_exits,
 )
 
 BOUND, TIP, FIRST, LAST, ROTATION, OUTER, INNER, ACROSS, UP = range(9)
@@ -45,6 +49,8 @@ LOOSE_SWEEP_MM = 0.3
 """The samples of the sweep are looked at where they are known so well."""
 SWEEPS_EVERY = 4
 """Of the samples of the sweep, one of so many is looked at."""
+LOOK_AHEAD_MM = 0.5
+"""Hazards that are farther from a tube than they must be are searched for within this."""
 LEAST_STEP_MM = 0.1
 """The same where they leave their airway."""
 WIDEST_LOOK_MM = 2.5
@@ -212,6 +218,8 @@ def tubes_blocked(surroundings, tubes, pose, box, sweep):
 
     A tube leaves its airway behind the last sample at which all tubes are in the lumen, and before the first
     at which all are out of every lumen.  Where they all leave one branch, other branches count as obstacles.
+    A hazard also refuses tubes that leave beyond it and touch the wall from there on: see
+    `docs/explanation/cost_bound.md`.
 
     Parameters
     ----------
@@ -222,36 +230,50 @@ def tubes_blocked(surroundings, tubes, pose, box, sweep):
     sweep : float
         No tube of the box sweeps sideways by less, mm.
     """
+    first_outer, longer = box[OUTER] - box[HALF_OUTER], 2.0 * box[HALF_INNER]
     shortest = max(box[INNER] - box[HALF_INNER], 0.0)
     hazards, bits = surroundings.hazard_bits, surroundings.bits
-    left, meets, branches = False, True, (NONE, NONE)
-    refused = other_refused = False
-    s = back = 0.0
+    beside = tubes[MARGIN] + sweep - SPARE
+    left, branches = False, (NONE, NONE)
+    refused = other_refused = touching = False
+    refuted = 0.0  # Tubes that leave before this arc length are refused.
+    s = back = looked = 0.0
     while True:
         point, away = point_of(tubes, pose, box, s)
         x, y, z = point
         deep = distance_bound(surroundings.depth, surroundings.depth_geometry, x, y, z)
-        radius = tubes[OUTER_RADIUS] if s <= box[OUTER] - box[HALF_OUTER] else tubes[INNER_RADIUS]
-        required = radius + tubes[MARGIN] + sweep - SPARE
+        radius = tubes[OUTER_RADIUS] if s <= first_outer else tubes[INNER_RADIUS]
+        reach = radius + beside - away
         if not left:
             step = max(min(TUBE_STEP_MM, 2.0 * away), LEAST_STEP_MM, away)
             if deep > away + back:
-                meets, branches = True, (NONE, NONE)
+                branches = (NONE, NONE)
                 step = max(step, 0.5 * (deep - away))
             else:
                 around = away + back
                 branches = _branches_of_lumen(surroundings, point, around + 2.0 * CORNER_MM, branches)
-                meets = meets and _within(surroundings, point, hazards, -1, required - around)
-                left = not _within(surroundings, point, LUMEN, -1, away + CORNER_MM + SPARE)
-                if left and meets:
-                    return True
-                if left and branches[0] != SEVERAL:
-                    refused = _must_not_leave(surroundings, branches[0])
-                    other_refused = _must_not_leave(surroundings, branches[1])
-        if left:
-            if deep > away + SPARE:
+            deepest = most_distance(surroundings.depth, surroundings.depth_geometry, x, y, z) + away
+            touching = touching and deepest + back < radius
+            if deep < away + radius and s >= looked and reach > 0.0:
+                near, _label = exact_distance(
+                    surroundings.labels, surroundings.geometry, x, y, z, hazards, -1, reach + LOOK_AHEAD_MM
+                )
+                lack = reach - near
+                looked = s + abs(lack)  # Before, the same holds by and large.
+                if lack > 0.0:
+                    refuted = max(refuted, refused_exits(tubes, s, lack, first_outer))
+                    touching = touching or deepest + FINE_STEP_MM < radius
+            if touching or refuted >= s:
+                branches = (NONE, NONE)
+            left = deep <= 0.0 and not _within(surroundings, point, LUMEN, -1, away + UNNOTICED_MM)
+            if left and (touching or refuted >= s):
                 return True
-            reach = required - away
+            if left and branches[0] != SEVERAL:
+                refused = _must_not_leave(surroundings, branches[0])
+                other_refused = _must_not_leave(surroundings, branches[1])
+        if left:
+            if deep > away + LOOK_MM:
+                return True
             if branches[0] == SEVERAL:
                 refused = other_refused = _within(surroundings, point, hazards, -1, reach)
             else:
@@ -260,8 +282,10 @@ def tubes_blocked(surroundings, tubes, pose, box, sweep):
             if refused and other_refused:
                 return True
             clear = distance_bound(surroundings.clearance, surroundings.geometry, x, y, z)
-            step = max(TUBE_STEP_MM, away, clear - required - away)
+            step = max(TUBE_STEP_MM, away, clear - radius - beside - away)
         if s >= shortest:
-            return deep > away + 2.0 * box[HALF_INNER] + SPARE
+            if not left and (refuted >= s + longer or (touching and deepest + longer < tubes[INNER_RADIUS])):
+                return True
+            return deep > away + longer + SPARE
         back = min(step, shortest - s)
         s = min(s + step, shortest)

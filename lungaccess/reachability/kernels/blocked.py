@@ -14,18 +14,20 @@ from anatomy.kernels.labels import LUMEN
 from lungaccess.reachability.kernels.deployment_boxes import HALF, INNER, OUTER, SPARE_MM, heading, sample_of
 from stages.needle.infeasibility.kernels import BackwardReach, never_along
 from stages.tube.kernels import (
+    CORNER_MM,
     CURVED_LENGTH,
     INNER_CURVATURE,
     INNER_RADIUS,
+    LOOK_MM,
     MARGIN,
     OUTER_RADIUS,
     OVERLAP_CURVATURE,
+    UNNOTICED_MM,
     lateral_sweep,
+    refused_exits,
     sweep_slope,
 )
 
-UNNOTICED_MM = 0.05
-"""A tube that is farther than this from all lumen has left it noticeably; see `deployment.march`."""
 LOOK_STEP_MM, FARTHEST_LOOK_MM = 5.0, 40.0
 """The path of the needle is looked at in such steps, as long as it is known so well."""
 LOOSE_SWEEP_MM = 0.3
@@ -193,7 +195,8 @@ def tubes_blocked(environment, tubes, family, box):
     """Tell whether all tubes of a box leave no airway, or one that they must not leave, or meet a hazard.
 
     A tube leaves between the last sample that is in the lumen for all of the box and the first that is
-    outside for all; there and beyond it keeps clear of hazards, and out of every lumen.
+    outside for all; there and beyond it keeps clear of hazards, and out of every lumen.  A hazard also
+    refuses tubes that leave a little farther on, as they touch the wall there.
     """
     outer, inner = box[OUTER], box[INNER]
     half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]
@@ -203,18 +206,19 @@ def tubes_blocked(environment, tubes, family, box):
     if loose < LOOSE_SWEEP_MM and inner > tubes[CURVED_LENGTH]:
         sweep = max(lateral_sweep(tubes, min(outer, inner), inner) - loose, 0.0)
     shortest, longest = max(inner - half_inner, 0.0), inner + half_inner
-    may_leave = meets = out = False
-    s = 0.0
+    beside, first_outer = tubes[MARGIN] + sweep, outer - half_outer
+    may_leave = out = False
+    refuted = s = 0.0  # Tubes that leave before the first of these arc lengths are refused.
     while True:
         point, away = sample_of(tubes, family, s)
         step = min(max(away, LEAST_STEP_MM), GREATEST_STEP_MM)
-        radius = tubes[OUTER_RADIUS] if s <= outer - half_outer else tubes[INNER_RADIUS]
-        lacking = _lacking(environment, point, away, radius + tubes[MARGIN] + sweep)
+        radius = tubes[OUTER_RADIUS] if s <= first_outer else tubes[INNER_RADIUS]
+        lacking = _lacking(environment, point, away, radius + beside)
         deep = (
             distance_bound(environment.depth, environment.depth_geometry, point[0], point[1], point[2]) - away
         )
         if out:
-            if s <= shortest and (deep > 0.0 or lacking > SPARE_MM):
+            if s <= shortest and (deep > LOOK_MM or lacking > SPARE_MM):
                 return True
             to_lumen = distance_bound(environment.lumen, environment.geometry, point[0], point[1], point[2])
             step = max(step, min(-lacking, to_lumen))
@@ -222,17 +226,18 @@ def tubes_blocked(environment, tubes, family, box):
             to_allowed = distance_bound(
                 environment.may_be_left, environment.geometry, point[0], point[1], point[2]
             )
-            may_here = to_allowed <= away + step + UNNOTICED_MM
-            meets_here = lacking > step
-            if deep > 0.0 and s <= shortest:
-                may_leave, meets = may_here, meets_here
+            if s <= shortest and lacking > SPARE_MM:
+                refuted = max(refuted, refused_exits(tubes, s, lacking, first_outer))
+            may_here = to_allowed <= away + step + CORNER_MM and refuted < s + step
+            if (deep > 0.0 and s <= shortest) or refuted >= s:
+                may_leave = may_here
             else:
-                may_leave, meets = may_leave or may_here, meets and meets_here
+                may_leave = may_leave or may_here
             out = _is_out(environment, point, away)
-            if out and (not may_leave or meets or (lacking > SPARE_MM and s <= shortest)):
+            if out and (not may_leave or refuted >= s or (lacking > SPARE_MM and s <= shortest)):
                 return True
             if deep > step:
                 step = deep
         if s >= longest:
-            return not may_leave
+            return not may_leave or (not out and refuted >= longest)
         s = min(s + step, longest)

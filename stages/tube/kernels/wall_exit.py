@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numba
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float, Labels, UInt16
-from stages.tube.kernels.planar import MAX_WALL_RUN, MIN_WALL_ANGLE
+from stages.tube.kernels.planar import INNER_RADIUS, MAX_WALL_RUN, MIN_WALL_ANGLE, OUTER_RADIUS
 
 # trace
 PHASE, LEFT_AT, BRANCH, WALL_ANGLE, HAZARD, WALL_RUN, REFUSAL, N_TRACE = range(8)
@@ -31,8 +32,9 @@ FREE = -1
 FINE_STEP_MM = 0.05
 """Least step in the lumen, where the axis may cut corners of voxels: a tenth of a voxel."""
 CORNER_MM = 0.05
-"""An axis that is back in a lumen after no more than this has cut the corner of a voxel and not left: it is
-never farther than half of this from the lumen."""
+"""An axis that is back in a lumen after no more than this has cut the corner of a voxel and not left."""
+UNNOTICED_MM = 0.026
+"""An axis that is farther than this from all lumen has left it: it is out for longer than CORNER_MM."""
 LOOK_MM = 0.02
 """Spacing of the points that are looked up for lumen while the axis leaves: well below CORNER_MM."""
 RUN_STEP_MM = 0.02
@@ -197,6 +199,19 @@ def _lumen_step(environment, trace, x, y, z, radius, required):
         trace[HAZARD] = _reason(label)
         return max(0.5 * depth, FINE_STEP_MM)
     return max(min(0.5 * depth, distance - required), FINE_STEP_MM)
+
+
+@inner_kernel
+def refused_exits(tubes, s, lack, first_outer):
+    """Return up to which arc length a hazard refuses all exits that is `lack` mm too near to the tube at `s`.
+
+    On its last stretch before an exit, as long as its radius, a tube touches the wall; see
+    docs/explanation/proofs.md.  The outer tube, which is wider, ends at `first_outer` or farther.
+    """
+    end = s + lack
+    if s <= first_outer:
+        end = max(min(end, first_outer), end - tubes[OUTER_RADIUS] + tubes[INNER_RADIUS])
+    return end + max(tubes[INNER_RADIUS] - FINE_STEP_MM, 0.0)
 
 
 @numba.njit(cache=True)

@@ -14,11 +14,12 @@ import lungaccess as la
 from anatomy.errors import SettingsError, TargetError
 from anatomy.fields import distance_field
 from anatomy.grid import Grid
+from anatomy.kernels.field import most_distance
 from anatomy.lung import Lung
-from lungaccess.coupled.cost_bound import CostBound, GapGoal
+from lungaccess.coupled.cost_bound import QUEUES, CostBound, GapGoal
 from lungaccess.coupled.cost_to_go import cost_to_go
 from lungaccess.coupled.kernels.cost_bound import BoundEnvironment, between, bound_box
-from lungaccess.coupled.kernels.cost_to_go import cost_from, most_distance
+from lungaccess.coupled.kernels.cost_to_go import cost_from
 from lungaccess.coupled.kernels.deployment_box import (
     BOX_COLUMNS,
     HALF_ACROSS,
@@ -321,7 +322,7 @@ def test_no_deployment_costs_less_than_the_bound(small_lung: Lung, target: Targe
 @numba.njit
 def _box_bound(environment: Any, tubes: Any, insertions: Any, tips: Any, target: Any, box: Any) -> float:
     rates = np.zeros((len(tips), 2))
-    return float(bound_box(environment, tubes, insertions, tips, rates, target, math.inf, box))
+    return float(bound_box(environment, tubes, insertions, tips, rates, target, math.inf, box, False))
 
 
 def _attacked(
@@ -365,13 +366,13 @@ def _attacked(
             place, cost = found
             widths = np.array([0.4, 3.0, 3.0]) * 10.0 ** rng.uniform(-3.0, 0.0, 3)
             box = np.zeros(BOX_COLUMNS)
-            box[TIP] = entries.site[entry]
+            queue, box[TIP] = bound.queues[entries.site[entry] % QUEUES], entries.site[entry] // QUEUES
             box[[ROTATION, OUTER, INNER]] = place + rng.uniform(-1.0, 1.0, 3) * widths
             box[[HALF_ROTATION, HALF_OUTER, HALF_INNER]] = widths
             box[[HALF_ACROSS, HALF_UP]] = -1.0
-            state = bound._environment, bound._tubes, bound._insertions, bound._tips
+            environment, tubes, insertions, tips, _rates, goal = queue.about
             looked_at += 1
-            highest = max(highest, _box_bound(*state, tuple(end.tolist()), box) / cost)
+            highest = max(highest, _box_bound(environment, tubes, insertions, tips, goal, box) / cost)
     return looked_at, highest
 
 

@@ -93,7 +93,7 @@ def proof(small_lung: Lung, system: System) -> UnreachableProof:
 @pytest.fixture(scope="module")
 def plans(small_lung: Lung, system: System) -> list[la.Plan]:
     """Plans to points of the lung."""
-    atlas = la.build_atlas(small_lung, system)
+    atlas = la.build_atlas(small_lung, system, rotations=12, stop_spacing_mm=4.0)
     rng = np.random.default_rng(0)
     inside = np.argwhere(small_lung.labels == 0)
     found = []

@@ -91,7 +91,7 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     box = _box(inside | lungs.central_airway, ct.grid.spacing_mm)
     hu = _hounsfield(ct.array[box])
     lung = np.ascontiguousarray(inside[box].T)
-    spacing_mm = ct.grid.spacing_mm[::-1]
+    spacing_mm = np.ascontiguousarray(ct.grid.spacing_mm[::-1])
     smooth = _smoothed(hu, spacing_mm)
     upright = 2 - int(np.argmax(np.abs(ct.grid.lps_from_ijk[2, :3] / ct.grid.spacing_mm)))
     depth = local_minima_map(hu, spacing_mm, upright)

@@ -38,6 +38,8 @@ class Equilibrium:
         self.mechanics = mechanics
         self.tip_angles_rad = read_only(tip_angles_rad.copy())
         self.beta_mm = read_only(beta_mm.copy())
+        # As the kernels of the search have it: for a read-only array they would be compiled once more.
+        self._beta_mm = beta_mm.copy()
         self._cutting, n_steps = mechanics.cut(beta_mm)
         self._nodes, self._steps = torsion_scratch(n_steps, n, 2 * n)
         owners = np.concatenate([-1 - np.arange(n), np.arange(n)])
@@ -66,7 +68,7 @@ class Equilibrium:
     @cached_property
     def least_determinant(self) -> float:
         """Least of the determinants along the tubes; -inf where two directions lose stability at once."""
-        return float(equilibrium.least_determinant(self._relative_nodes(), self.beta_mm))
+        return float(equilibrium.least_determinant(self._relative_nodes(), self._beta_mm))
 
     @property
     def stable(self) -> bool:
@@ -114,7 +116,7 @@ class Equilibrium:
         for m, x in enumerate(s):
             dpsi, drate = self._derivatives_at(float(x))
             found[m] = equilibrium.determinant_at(
-                dpsi[None], drate[None], 0, self.beta_mm, min(float(x), 0.0), matrix, right
+                dpsi[None], drate[None], 0, self._beta_mm, min(float(x), 0.0), matrix, right
             )
         return found
 

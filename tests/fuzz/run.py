@@ -1,8 +1,10 @@
-"""Damage the file of one target again and again, and read it: `python -m tests.fuzz.run TARGET SEED COUNT`.
+"""Damage the files of targets again and again, and read them.
 
-Each input has at most 20 s of processor time, and all together 4 GiB.  The last line of the output is JSON:
-how many inputs were refused, and what went wrong.  A crash ends the process; the file that the last argument
-names then holds the input.
+    python -m tests.fuzz.run SEED COUNT KEEP TARGET...
+
+Each input has at most 20 s of processor time, and all together 4 GiB.  A line of JSON for each target says
+how many of COUNT inputs were refused, and what went wrong.  A crash ends the process; the file KEEP then
+holds the input.
 """
 
 from __future__ import annotations
@@ -81,5 +83,7 @@ def _too_long(signum: int, frame: object) -> None:
 
 
 if __name__ == "__main__":
-    stated_name, stated_seed, stated_count, stated_keep = sys.argv[1:]
-    print(json.dumps(main(stated_name, int(stated_seed), int(stated_count), Path(stated_keep))))
+    stated_seed, stated_count, stated_keep, *names = sys.argv[1:]
+    for stated in names:
+        said = main(stated, int(stated_seed), int(stated_count), Path(stated_keep))
+        print(json.dumps({"target": stated, **said}), flush=True)

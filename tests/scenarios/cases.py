@@ -83,6 +83,8 @@ PLANNERS = {
 }
 ALL_PLANNERS_DEVICE = "flexure-needle"
 """The device for which all planners are run; for others, only the first."""
+DEFAULT_DEVICES = (ALL_PLANNERS_DEVICE, "lung-default")
+"""Those of the default tests."""
 CASES = tuple(
     Case(anatomy=anatomy, device=device, planner=planner)
     for anatomy in ANATOMIES

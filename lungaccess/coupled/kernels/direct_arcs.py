@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel
@@ -16,6 +17,9 @@ from stages.needle.kernels import CLEARANCE_FLOOR_MM, blocker_on_arc, cost_of_ar
 
 PRUNED_BY_BOUND = -2
 """The label of an arc that was not tested for obstacles, because its cost or its lower bound is too high."""
+
+# Typed: a kernel is compiled once more for every literal that it is called with.
+_FIRST = np.bool_(True)
 
 
 @inner_kernel
@@ -95,7 +99,7 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
         if _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length) > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        costs[n] = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, True)
+        costs[n] = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, _FIRST)
         if costs[n] > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue

@@ -35,6 +35,9 @@ JUMP_GROWTH = 4
 ROUNDS = 20
 BLOCK = 512
 
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+
 
 @inner_kernel
 def least_clearance(obstacles, limits, pose, bend, length, s0, least):
@@ -184,7 +187,7 @@ def _has_clearance(obstacles, limits, q, bits):
     """Tell whether the needle's tip keeps the required clearance at a point."""
     required = limits.required_mm
     distance, _label = exact_distance(
-        obstacles.labels, obstacles.geometry, q[0], q[1], q[2], bits, -1, required + 0.1
+        obstacles.labels, obstacles.geometry, q[0], q[1], q[2], bits, _NOBODY, required + 0.1
     )
     return distance >= required
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 from anatomy.kernels.arcs import any_normal, arc_to_point
 from anatomy.kernels.compiling import inner_kernel
@@ -24,6 +25,9 @@ from stages.needle.kernels.tree import (
 
 SAMPLE_TRIES = 50
 """So many points are drawn in search of one in the workspace; then the iteration draws none."""
+
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_ROOT = np.int64(0)
 
 
 @inner_kernel
@@ -103,7 +107,7 @@ def goal_from_root(obstacles, limits, objective, branch, goal, nodes, parents, c
         return count, True, False
     if count > 1:
         return count, False, False
-    count = add_goal(obstacles, limits, objective, branch, nodes, parents, count, 0, goal, best, state)
+    count = add_goal(obstacles, limits, objective, branch, nodes, parents, count, _ROOT, goal, best, state)
     return count, count > 1, count > 1
 
 

@@ -22,6 +22,9 @@ NO_PATH, DIRECT, VIA, SEARCHED, START_BLOCKED, OUT_OF_REACH = 0, 1, 2, 3, 4, 5
 ROWS = ROWS_PER_STEP + 2
 """Rows that a tree needs before its first step."""
 
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_ROOT, _ONE, _TWO = np.int64(0), np.int64(1), np.int64(2)
+
 
 @numba.njit(cache=True, nogil=True)
 def try_starts(
@@ -78,7 +81,7 @@ def try_starts(
                 goal,
                 nodes,
                 parents,
-                1,
+                _ONE,
                 iterations,
                 share,
                 state,
@@ -106,7 +109,8 @@ def _by_arc(obstacles, limits, branch, pose, goal):
 @inner_kernel
 def _by_vias(obstacles, limits, objective, branch, vias, goal, nodes, parents, state):
     """Try the shortest path, then paths through one via point each; True if one is clear."""
-    if add_goal(obstacles, limits, objective, branch, nodes, parents, 1, 0, goal, math.inf, state) > 1:
+    rows = add_goal(obstacles, limits, objective, branch, nodes, parents, _ONE, _ROOT, goal, math.inf, state)
+    if rows > 1:
         return True
     pose = pose_of(nodes[0])
     for v in range(vias.shape[0]):
@@ -115,9 +119,12 @@ def _by_vias(obstacles, limits, objective, branch, vias, goal, nodes, parents, s
         if not MIN_ARC_MM < length < math.inf or bend[0] > limits.kappa:
             continue
         if not add_arc(
-            obstacles, limits, objective, branch, nodes, parents, 1, 0, bend, length, goal, math.inf
+            obstacles, limits, objective, branch, nodes, parents, _ONE, _ROOT, bend, length, goal, math.inf
         ):
             continue
-        if add_goal(obstacles, limits, objective, branch, nodes, parents, 2, 1, goal, math.inf, state) > 2:
+        rows = add_goal(
+            obstacles, limits, objective, branch, nodes, parents, _TWO, _ONE, goal, math.inf, state
+        )
+        if rows > 2:
             return True
     return False

@@ -11,12 +11,16 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 from anatomy.kernels.arcs import any_normal, point_on_arc
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.cost import map_costs_on_arc
 from stages.needle.kernels.limits import TINY
 from stages.needle.kernels.proof import blocker_on_arc
+
+# Typed: a kernel is compiled once more for every literal that it is called with.
+_FIRST = np.bool_(True)
 
 
 @numba.njit(cache=True)
@@ -99,7 +103,7 @@ def _arc_from(state, c, s, curvature):
 def is_forbidden(costs, geometry, state, roll, curvature, length):
     """Tell whether an arc from a state meets a voxel of infinite cost, or leaves the grid."""
     pose, bend = _arc_from(state, math.cos(roll), math.sin(roll), curvature)
-    return map_costs_on_arc(costs, geometry, pose, bend, length, True)[0] == math.inf
+    return map_costs_on_arc(costs, geometry, pose, bend, length, _FIRST)[0] == math.inf
 
 
 @numba.njit(cache=True)

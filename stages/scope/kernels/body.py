@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numba
+import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
@@ -27,6 +28,10 @@ MOST_TWIST_RAD = math.pi
 """A scope is twisted by at most half a turn each way: more than that a hand and its cables do not follow."""
 BLOCKED = -1.0
 """The room of what is not proved to be free."""
+
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+_OUTSIDE = np.int64(OUTSIDE)
 
 
 class Walls(NamedTuple):
@@ -91,7 +96,7 @@ def room_at(walls, radius, x, y, z):
     if bound + math.sqrt(g[0, 4] + g[1, 4] + g[2, 4]) + 0.01 < radius:
         return BLOCKED
     cap = radius + EXACT_REACH_MM
-    return exact_distance(walls.solid, walls.geometry, x, y, z, OUTSIDE, -1, cap)[0] - radius
+    return exact_distance(walls.solid, walls.geometry, x, y, z, _OUTSIDE, _NOBODY, cap)[0] - radius
 
 
 @inner_kernel

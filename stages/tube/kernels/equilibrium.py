@@ -33,6 +33,7 @@ ROUND = 12
 """Angles tried all round for each tube but the last."""
 # With a type of its own it is no literal, for each of which a function would be compiled anew.
 _PLATE = np.float64(0.0)
+_FIRST_NODE = np.int64(0)
 SHARES = 8
 """Places at which the determinant is looked at between two rear ends, for four tubes or more."""
 
@@ -107,28 +108,28 @@ def _least_behind(dpsi, drate, beta, matrix, right):
     of them, a parabola for three, of which the vertex is looked at.
     """
     n = beta.shape[0]
-    least = determinant_at(dpsi, drate, 0, beta, 0.0, matrix, right)
+    least = determinant_at(dpsi, drate, _FIRST_NODE, beta, 0.0, matrix, right)
     for i in range(n):
         near = 0.0
         for j in range(n):
             if beta[i] < beta[j] < near:
                 near = beta[j]
         far = beta[i]
-        ends = determinant_at(dpsi, drate, 0, beta, far, matrix, right)
+        ends = determinant_at(dpsi, drate, _FIRST_NODE, beta, far, matrix, right)
         least = min(least, ends)
         if n == 3:
-            a = determinant_at(dpsi, drate, 0, beta, near, matrix, right)
-            b = determinant_at(dpsi, drate, 0, beta, 0.5 * (near + far), matrix, right)
+            a = determinant_at(dpsi, drate, _FIRST_NODE, beta, near, matrix, right)
+            b = determinant_at(dpsi, drate, _FIRST_NODE, beta, 0.5 * (near + far), matrix, right)
             bow = a - 2.0 * b + ends
             if bow > 0.0:
                 vertex = 0.25 * (3.0 * a - 4.0 * b + ends) / bow
                 if 0.0 < vertex < 1.0:
                     s = near + vertex * (far - near)
-                    least = min(least, determinant_at(dpsi, drate, 0, beta, s, matrix, right))
+                    least = min(least, determinant_at(dpsi, drate, _FIRST_NODE, beta, s, matrix, right))
         elif n > 3:
             for m in range(1, SHARES):
                 s = near + (far - near) * m / SHARES
-                least = min(least, determinant_at(dpsi, drate, 0, beta, s, matrix, right))
+                least = min(least, determinant_at(dpsi, drate, _FIRST_NODE, beta, s, matrix, right))
     return least
 
 
@@ -314,9 +315,8 @@ def scratch_for(n_steps, n, columns):
     """Return `nodes` and `steps` as `torsion.twist` fills them."""
     angles = np.zeros((2, n_steps + 1, n))
     derivatives = np.zeros((2, n_steps + 1, columns, n))
-    lengths = np.zeros((n_steps, columns + 1))
     nodes = (np.zeros(n_steps + 1), angles[0], angles[1], derivatives[0], derivatives[1])
-    return nodes, (lengths[:, 0], lengths[:, 1:], np.zeros(n_steps, np.int64))
+    return nodes, (np.zeros(n_steps), np.zeros((n_steps, columns)), np.zeros(n_steps, np.int64))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -151,6 +151,15 @@ def _coast(nodes, at, h, dh):
             drate[at - 1, c, i] = drate[at, c, i]
 
 
+@inner_kernel
+def _any_stretch(owners):
+    """Tell whether a column is of a length: a flag that began as False would compile a step once more."""
+    for owner in owners:
+        if owner >= 0:
+            return True
+    return False
+
+
 @numba.njit(cache=True)
 def twist(design, cutting, tip_angles, owners, nodes, steps):
     """Integrate torsion from the tip to the front plate.
@@ -179,7 +188,6 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
     at = lengths.shape[0]
     work = np.zeros((SCRATCH_ROWS, columns + 1, n))
     pairs = np.zeros((n * (n - 1) // 2, PAIR_COLUMNS))
-    stretches = False
     s[at] = pieces[count - 1, FAR] if count > 0 else 0.0
     for i in range(n):
         psi[at, i] = tip_angles[i]
@@ -187,8 +195,7 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
         for c in range(columns):
             dpsi[at, c, i] = 1.0 if owners[c] == -1 - i else 0.0
             drate[at, c, i] = 0.0
-    for c in range(columns):
-        stretches = stretches or owners[c] >= 0
+    stretches = _any_stretch(owners)
     for k in range(count - 1, -1, -1):
         number = int(pieces[k, STEPS])
         bent = _pair_up(design[0], pieces, moments, directions, k, pairs)

@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numba
+import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel
@@ -49,6 +50,10 @@ NORMAL_RADIUS_MM = 2.5
 """The wall's normal is that of the lumen within this radius: larger than voxels, smaller than branches."""
 BISECTIONS = 12
 """Halvings of a step to find where the axis leaves the lumen: to less than 0.001 mm."""
+
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+_LUMEN = np.int64(LUMEN)
 
 
 class TubeEnvironment(NamedTuple):
@@ -174,7 +179,7 @@ def _tissue_gap(environment, trace, x, y, z, required):
     distance, label = exact_distance(labels, geometry, x, y, z, bits, branch, reach)
     gap = distance - required
     if trace[PHASE] == IN_TISSUE:
-        lumen, _label = exact_distance(labels, geometry, x, y, z, LUMEN, -1, reach)
+        lumen, _label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
         if lumen - OUT_OF_LUMEN_MM < gap:
             return lumen - OUT_OF_LUMEN_MM, LUMEN
     return gap, label

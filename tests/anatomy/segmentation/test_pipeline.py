@@ -71,7 +71,11 @@ def _in_box(patient: Phantom, made: Segmentation, array: np.ndarray) -> np.ndarr
 
 
 def _again(patient: Phantom, made: Segmentation, folder: Path) -> Segmentation:
-    return segment(_request(patient, folder, nodule_mask=made.folder.parent / "given-nodule.nii.gz"))
+    return segment(_same_request(patient, made, folder))
+
+
+def _same_request(patient: Phantom, made: Segmentation, folder: Path) -> SegmentationRequest:
+    return _request(patient, folder, nodule_mask=made.folder.parent / "given-nodule.nii.gz")
 
 
 def _voxels(folder: Path) -> dict[str, str]:
@@ -224,12 +228,8 @@ class _Killed(BaseException):
     """Stands for kill -9: nothing catches it."""
 
 
-@pytest.mark.parametrize(
-    "moment", [9, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 3, 6, 14, 20))]
-)
-def test_a_killed_run_leaves_no_patient_and_is_made_good(
-    patient: Phantom, made: Segmentation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
-) -> None:
+def killed(request: SegmentationRequest, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
+    """Segment, and end without a word where the file of that number takes its place."""
     replace, calls = os.replace, []
 
     def killing(source: Any, target: Any) -> None:
@@ -238,11 +238,14 @@ def test_a_killed_run_leaves_no_patient_and_is_made_good(
             raise _Killed
         replace(source, target)
 
-    folder = tmp_path / "patient"
     with monkeypatch.context() as patched, pytest.raises(_Killed):
         patched.setattr(os, "replace", killing)
-        _again(patient, made, folder)
-    (folder / ".0123456789ab-cost.nii.gz").write_bytes(b"half")
+        segment(request)
+    (request.out / ".0123456789ab-cost.nii.gz").write_bytes(b"half")
+
+
+def require_made_good(patient: Phantom, made: Segmentation, folder: Path) -> None:
+    """Segment again into a folder where a run was killed; it then holds what a run to the end makes."""
     assert not (folder / "patient.toml").exists()
     again = _again(patient, made, folder)
     assert again.corrected == ()
@@ -250,11 +253,30 @@ def test_a_killed_run_leaves_no_patient_and_is_made_good(
     assert not list(folder.glob(".*-*"))
 
 
+@pytest.mark.parametrize("moment", [2, 3])
+def test_a_run_that_is_killed_in_its_last_steps_leaves_no_patient_and_is_made_good(
+    patient: Phantom, made: Segmentation, copy: Path, monkeypatch: pytest.MonkeyPatch, moment: int
+) -> None:
+    """The first file to take its place is the description, which is set aside."""
+    (copy / "lobes.nii.gz").unlink()
+    killed(_same_request(patient, made, copy), monkeypatch, moment)
+    require_made_good(patient, made, copy)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", [1, 2, 3, 6, 9, 14, 20])
+def test_a_killed_run_leaves_no_patient_and_is_made_good(
+    patient: Phantom, made: Segmentation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
+) -> None:
+    killed(_same_request(patient, made, tmp_path / "patient"), monkeypatch, moment)
+    require_made_good(patient, made, tmp_path / "patient")
+
+
 def test_an_edited_description_is_kept(patient: Phantom, made: Segmentation, copy: Path) -> None:
     description = copy / "patient.toml"
     edited = description.read_text().replace('name = "P"', 'name = "Patient A"')
     description.write_text(edited)
-    write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=_cut_airway(made)))
+    write_volume(copy / "lobes.nii.gz", Volume(grid=made.grid, array=made.parts.lobes * made.parts.left))
     again = _again(patient, made, copy)
     assert again.kept_description
     assert description.read_text() == edited
@@ -312,6 +334,7 @@ def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentat
         segment(_request(patient, tmp_path / "out", totalsegmentator=tmp_path))
 
 
+@pytest.mark.slow
 def test_thick_slices_are_marked(patient: Phantom, tmp_path: Path) -> None:
     step = 4
     matrix = patient.ct.grid.lps_from_ijk.copy()

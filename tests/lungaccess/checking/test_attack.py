@@ -25,8 +25,8 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
-PLANS_A_SYSTEM = 5
-MUTANTS_OF_A_KIND = 4
+PLANS_A_SYSTEM = 3
+MUTANTS_OF_A_KIND = 2
 WITHOUT_EXPLANATION = (
     "lungaccess.coupled.explanation.explain",
     lambda *_, **__: la.NoPlan("No plan", reasons={}),
@@ -123,7 +123,7 @@ def test_every_kind_of_mutant_is_refused(kind: str, cases: list[tuple[Any, Any, 
     raise AssertionError(f"{kind} made {refused} mutants")
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32), number=st.integers(0, 2 * PLANS_A_SYSTEM - 1))
 def test_random_mutants_are_refused(
     seed: int, number: int, cases: list[tuple[Any, Any, Case]], checks: Any
@@ -139,23 +139,23 @@ def test_a_checker_that_has_seen_other_plans_says_the_same(
     """What is kept from one plan to the next changes nothing."""
     checker = Checker(small_lung)
     for _ in range(2):
-        for _system, _target, case in cases[::6]:
+        for _system, _target, case in cases[:: PLANS_A_SYSTEM + 1]:
             assert checker.check(case.plan).findings == check(case.plan, small_lung).findings
 
 
 def test_a_run_that_was_interrupted_goes_on(
     small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(random_plans, "PLANS_A_BATCH", 2)
+    monkeypatch.setattr(random_plans, "PLANS_A_BATCH", 1)
     monkeypatch.setattr(*WITHOUT_EXPLANATION)
     monkeypatch.setattr(random_plans, "random_system", lambda _rng: la.load_system("ultrathin"))
     files = [tmp_path / name for name in ("at-once.jsonl", "in-parts.jsonl")]
-    for file, parts in zip(files, [(4,), (2, 4)], strict=True):
+    for file, parts in zip(files, [(2,), (1, 2)], strict=True):
         for plans in parts:
             check_attack.run("small", small_lung, plans, 2, 0, file, tmp_path)
     records = [[_lasting(each) for each in check_attack.read(file)] for file in files]
     assert records[0] == records[1]
-    assert sum("accepted" in each for each in records[0]) == 4
+    assert sum("accepted" in each for each in records[0]) == 2
     assert "all" in check_attack.table(check_attack.read(files[0]))
 
 

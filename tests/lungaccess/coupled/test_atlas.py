@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,13 @@ from stages.tube import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, inser
 from stages.tube.shape import centreline
 from tests.lungaccess.coupled.planning import SYSTEM
 from tests.stages.scenes import brute_clearance
+
+COARSE: dict[str, Any] = {"rotations": 9, "stop_spacing_mm": 4.0, "site_spacing_mm": 3.0}
+
+
+@pytest.fixture(scope="module")
+def coarse(small_lung: Lung) -> la.Atlas:
+    return la.build_atlas(small_lung, SYSTEM, **COARSE)
 
 
 def test_counts_add_up(atlas: la.Atlas) -> None:
@@ -100,23 +108,22 @@ def test_no_tube_leaves_trachea_or_main_bronchi(atlas: la.Atlas, small_lung: Lun
     assert atlas.deployments.refused[REASONS[kernels.LEAVES_MEDIASTINAL]] > 0
 
 
-def test_the_same_atlas_twice(atlas: la.Atlas, small_lung: Lung) -> None:
-    again = la.build_atlas(small_lung, SYSTEM)
-    assert np.array_equal(again.deployments.positions, atlas.deployments.positions)
-    assert again.deployments.refused == atlas.deployments.refused
+def test_the_same_atlas_twice(coarse: la.Atlas, small_lung: Lung) -> None:
+    again = la.build_atlas(small_lung, SYSTEM, **COARSE)
+    assert np.array_equal(again.deployments.positions, coarse.deployments.positions)
+    assert again.deployments.refused == coarse.deployments.refused
 
 
-def test_fissures(atlas: la.Atlas, small_lung: Lung) -> None:
-    assert small_lung.has_fissures and atlas.with_fissures
-    allowed = la.build_atlas(small_lung, replace(SYSTEM, fissures_allowed=True))
+def test_fissures(coarse: la.Atlas, small_lung: Lung) -> None:
+    assert small_lung.has_fissures and coarse.with_fissures
+    allowed = la.build_atlas(small_lung, replace(SYSTEM, fissures_allowed=True), **COARSE)
     assert not allowed.with_fissures
-    assert allowed.deployments.count > atlas.deployments.count
+    assert allowed.deployments.count > coarse.deployments.count
     fields = {name: field for name, field in small_lung.fields.items() if "fissure" not in name}
-    assert not la.build_atlas(replace(small_lung, fields=fields), SYSTEM, rotations=2).with_fissures
+    assert not la.build_atlas(replace(small_lung, fields=fields), SYSTEM, **COARSE).with_fissures
 
 
-def test_finer_is_more(atlas: la.Atlas, small_lung: Lung) -> None:
-    coarse = la.build_atlas(small_lung, SYSTEM, rotations=9, stop_spacing_mm=4.0, site_spacing_mm=3.0)
+def test_finer_is_more(atlas: la.Atlas, coarse: la.Atlas) -> None:
     assert 0 < coarse.deployments.count < 0.2 * atlas.deployments.count
     assert coarse.motions.count < 0.7 * atlas.motions.count
 
@@ -137,7 +144,7 @@ def test_a_scope_too_thick(small_lung: Lung) -> None:
 
 def test_progress(small_lung: Lung) -> None:
     told: list[float] = []
-    la.build_atlas(small_lung, SYSTEM, rotations=1, progress=told.append)
+    la.build_atlas(small_lung, SYSTEM, **COARSE, progress=told.append)
     assert told and all(0.0 < share <= 1.0 for share in told)
 
 

@@ -31,6 +31,8 @@ THICK = replace(
     margins=replace(SYSTEM.margins, segmentation_margin_mm=0.8),
 )
 
+COARSE: dict[str, Any] = {"rotations": 12, "stop_spacing_mm": 4.0}
+
 
 @pytest.fixture(scope="module")
 def atlas_of(small_lung: Lung) -> Callable[[System], la.Atlas]:
@@ -40,7 +42,7 @@ def atlas_of(small_lung: Lung) -> Callable[[System], la.Atlas]:
     def atlas(system: System) -> la.Atlas:
         key = repr(system)
         if key not in made:
-            made[key] = la.build_atlas(small_lung, system)
+            made[key] = la.build_atlas(small_lung, system, **COARSE)
         return made[key]
 
     return atlas
@@ -132,7 +134,7 @@ class TestNeedle:
         labels = small_lung.labels.copy(order="F")
         labels[(distance > 3.0) & (distance < 5.5)] = VESSEL
         walled = lung_of(labels, small_lung.grid, small_lung.tree)
-        error = explained(walled, SYSTEM, target)
+        error = explained(walled, SYSTEM, target, atlas=la.build_atlas(walled, SYSTEM, **COARSE))
         assert "is blocked, mostly by a vessel" in str(error)
         stopped = {k: v for k, v in error.reasons.items() if k.startswith("needle: arcs stopped by")}
         assert set(stopped) <= {
@@ -210,7 +212,7 @@ class TestAdvice:
     def test_a_thinner_scope(self, small_lung: Lung) -> None:
         """The named diameter gives a plan, whose motion a scope a tenth thicker cannot follow."""
         thick = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=4.5))
-        atlas = la.build_atlas(small_lung, thick)
+        atlas = la.build_atlas(small_lung, thick, **COARSE)
         for target in random_targets(small_lung, 40, 1):
             try:
                 list(la.plan(small_lung, thick, target, atlas=atlas, iterations=0))

@@ -25,7 +25,7 @@ MORE = replace(SYSTEM, name="more invasive", needle=replace(SYSTEM.needle, diame
 @pytest.fixture(scope="module")
 def atlas_of(small_lung: Lung) -> Callable[[System], la.Atlas]:
     """The atlas of all three systems, which differ in their needles alone."""
-    atlas = la.build_atlas(small_lung, SYSTEM)
+    atlas = la.build_atlas(small_lung, SYSTEM, rotations=12, stop_spacing_mm=4.0)
     return lambda system: replace(atlas, system=system)
 
 

@@ -93,11 +93,13 @@ def proof(small_lung: Lung, system: System) -> UnreachableProof:
 @pytest.fixture(scope="module")
 def plans(small_lung: Lung, system: System) -> list[la.Plan]:
     """Plans to points of the lung."""
-    atlas = la.build_atlas(small_lung, system)
+    atlas = la.build_atlas(small_lung, system, rotations=12, stop_spacing_mm=4.0)
     rng = np.random.default_rng(0)
     inside = np.argwhere(small_lung.labels == 0)
     found = []
     for point in small_lung.grid.lps(inside[rng.choice(len(inside), 14, replace=False)]):
+        if len(found) == 4:
+            break
         try:
             target = point_target(small_lung, point)
             found.append(next(la.plan(small_lung, system, target, atlas=atlas, seed=0, iterations=20)))
@@ -198,7 +200,7 @@ def test_what_a_plan_reaches_is_never_ruled_out(
 ) -> None:
     """Not as a whole, and no box that holds the plan's deployment, of whatever size."""
     rng = np.random.default_rng(5)
-    assert len(plans) >= 4
+    assert len(plans) == 4
     for plan in plans:
         target, pose = plan.target_lps, plan.scope.lps_from_scope_tip
         assert not proof.prove(target, most_boxes=10_000).proved
@@ -250,7 +252,7 @@ def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
     exits = cKDTree(small_lung.grid.lps(np.argwhere(_may_be_left(small_lung))))
     environment = proof._environment(tree.points_lps[-1])
     motions = find_motions(small_lung, system.scope, reach_mm=float(proof._insertions.max())).tips[:, :6]
-    drawn = random_tips_of_the_region(small_lung, least, rng, 20_000)
+    drawn = random_tips_of_the_region(small_lung, least, rng, 6_000)
     counted = aside = 0
     for tip, moved in [*((tip, True) for tip in motions), *((tip, False) for tip in drawn)]:
         if exits.query(tip[:3])[0] > proof._insertions.max():
@@ -262,7 +264,7 @@ def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
         aside += bool(pieces) and np.linalg.norm(tree.points_lps - tip[:3], axis=1).min() > 1.0
     assert len(motions) > 100
     assert counted > 0.5 * len(drawn)
-    assert aside > 30
+    assert aside > 9
 
 
 def test_a_weak_system_is_proved_not_to_reach_what_it_does_not(small_lung: Lung, system: System) -> None:
@@ -296,7 +298,9 @@ def test_a_weak_system_is_proved_not_to_reach_what_it_does_not(small_lung: Lung,
                 assert (again.proved, again.boxes) == (True, verdict.boxes)
             with pytest.raises(la.LungaccessError):
                 next(la.plan(small_lung, weak, point_target(small_lung, point), atlas=atlas, iterations=50))
-    assert proved >= 2
+        if proved == 2:
+            break
+    assert proved == 2
 
 
 def test_a_target_outside_the_image_is_an_error(proof: UnreachableProof) -> None:
@@ -305,21 +309,34 @@ def test_a_target_outside_the_image_is_an_error(proof: UnreachableProof) -> None
             proof.prove(np.array(point))
 
 
-def test_the_command(
-    tmp_path: Path, small_phantom: Phantom, plans: list[la.Plan], capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def words(tmp_path: Path, small_phantom: Phantom) -> list[str]:
+    """The command for a patient on disk, without its target."""
     folder = tmp_path / "patient"
     folder.mkdir()
     write_phantom(small_phantom, folder)
-    target = ",".join(f"{value:.3f}" for value in plans[0].target_lps)
-    words = ["certify", str(folder), "--system", "ultrathin", "--cache", str(tmp_path / "cache")]
-    code = main([*words, "--target", f"lps:{target}", "--most-boxes", "1000", "--json"])
+    return ["certify", str(folder), "--system", "ultrathin", "--cache", str(tmp_path / "cache")]
+
+
+def target_of(plan: la.Plan) -> list[str]:
+    return ["--target", "lps:" + ",".join(f"{value:.3f}" for value in plan.target_lps)]
+
+
+def test_the_command(words: list[str], plans: list[la.Plan], capsys: pytest.CaptureFixture[str]) -> None:
+    target = target_of(plans[0])
+    code = main([*words, *target, "--most-boxes", "1000", "--json"])
     said = json.loads(capsys.readouterr().out)
     assert code == (0 if said["proved_unreachable"] else 1)
     assert said["boxes"] > 0
     assert said["share_ruled_out"] == pytest.approx(1.0 - sum(each["share"] for each in said["open_places"]))
-    main([*words, "--target", f"lps:{target}", "--most-boxes", "1000", "--out", str(tmp_path / "open.png")])
+    assert main([*words, *target, "--most-boxes", "0"]) == ExitCode.BAD_INPUT
+    assert main(words) == ExitCode.BAD_INPUT
+
+
+@pytest.mark.slow
+def test_the_command_draws_what_is_open(
+    words: list[str], plans: list[la.Plan], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    main([*words, *target_of(plans[0]), "--most-boxes", "1000", "--out", str(tmp_path / "open.png")])
     assert "proved" in capsys.readouterr().out
     assert (tmp_path / "open.png").stat().st_size > 10_000
-    assert main([*words, "--target", f"lps:{target}", "--most-boxes", "0"]) == ExitCode.BAD_INPUT
-    assert main(words) == ExitCode.BAD_INPUT

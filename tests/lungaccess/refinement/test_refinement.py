@@ -356,7 +356,7 @@ def places_of(box: boxes.FieldBox) -> Float:
 
 
 def test_candidates_at_turned_tips_are_refined(small_lung: Lung) -> None:
-    atlas = la.build_atlas(small_lung, SYSTEM)
+    atlas = la.build_atlas(small_lung, SYSTEM, rotations=12, stop_spacing_mm=4.0)
     better = 0
     for search, candidate in islice(turned_candidates(small_lung, atlas), 4):
         refined = refine(search.task, candidate, iterations=ITERATIONS)

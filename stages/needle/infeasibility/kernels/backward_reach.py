@@ -34,6 +34,9 @@ HALF_DIAGONAL = 0.7072
 SPARE = 1e-6
 """For rounding, rad and mm."""
 
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+
 
 class BackwardReach(NamedTuple):
     """From which directions paths come to a target, on K shells.
@@ -101,7 +104,7 @@ def _all_blocked(obstacles, required, around, x, y, z):
     needed = required - around
     if needed <= 0.0 or distance_bound(clearance, geometry, x, y, z) >= needed:
         return False
-    _distance, label = exact_distance(labels, geometry, x, y, z, bits, -1, needed)
+    _distance, label = exact_distance(labels, geometry, x, y, z, bits, _NOBODY, needed)
     return label != 0
 
 

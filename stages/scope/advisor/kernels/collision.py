@@ -19,6 +19,10 @@ FINE_DEPTH_MM = 2.0
 EASY_MM = 0.1
 """Where a bound leaves so much clearance, nothing finer is computed: a finer step would gain little."""
 
+# Typed numbers: a kernel is compiled once more for every literal that it is called with.
+_NOBODY = np.int64(-1)
+_OUTSIDE = np.int64(OUTSIDE)
+
 
 class LumenArrays(NamedTuple):
     """Arrays of a lumen of N interior voxels, for kernels.
@@ -104,7 +108,7 @@ def clearance_beyond(lumen, radius, x, y, z):
     if middle < FINE_DEPTH_MM and middle + away < radius:
         return -1.0
     cap = radius + EXACT_REACH_MM
-    return exact_distance(lumen.solid, lumen.geometry, x, y, z, OUTSIDE, -1, cap)[0] - radius
+    return exact_distance(lumen.solid, lumen.geometry, x, y, z, _OUTSIDE, _NOBODY, cap)[0] - radius
 
 
 @inlined_kernel

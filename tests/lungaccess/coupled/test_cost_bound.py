@@ -33,6 +33,8 @@ from lungaccess.coupled.kernels.deployment_box import (
     TIP,
     TubeSurroundings,
     least_sweep,
+    pose_of,
+    tubes_blocked,
 )
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.candidate import Candidate
@@ -41,7 +43,9 @@ from lungaccess.problem.task import Task
 from stages.needle import direct_path
 from stages.needle.kernels import Limits
 from stages.tube import tube_constants
-from stages.tube.kernels import CURVED_LENGTH, MAX_EXTENSION, lateral_sweep
+from stages.tube.kernels import CURVED_LENGTH, MAX_EXTENSION, NEAR_PLEURA, NEAR_VESSEL, lateral_sweep
+from stages.tube.kernels.wall_exit import LEAVING, PHASE
+from stages.tube.validation import REASONS
 from tests.lungaccess.coupled.planning import SYSTEM, plans_of, same_run
 
 Points = NDArray[np.float64]
@@ -390,6 +394,49 @@ def _accepted_beside(
     path = direct_path(made.lps_from_tip, end)
     cost = arcs.evaluator.evaluate(Candidate(tip=tip, deployment=made, path=path))
     return (np.array([rotation, outer, inner]), cost) if math.isfinite(cost) else None
+
+
+@numba.njit
+def _all_refused(surroundings: Any, tubes: Any, tips: Any, box: Any) -> bool:
+    pose = pose_of(tips, np.zeros((len(tips), 2)), box)
+    return bool(tubes_blocked(surroundings, tubes, pose, box, least_sweep(tubes, box)))
+
+
+def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
+    small_lung: Lung, target: Target, atlas: la.Atlas
+) -> None:
+    """Tubes that a vessel or the pleura beside their exit refuses are refused with all that are near them."""
+    bound = CostBound(Task(lung=small_lung, system=SYSTEM, target=target), atlas)
+    bound.improve(0.0, 1)
+    surroundings = bound.queues[0].about[0].surroundings
+    tubes, tips = bound.queues[0].about[1], np.ascontiguousarray(atlas.motions.tips[:, None, :])
+    validator = DirectArcs(Task(lung=small_lung, system=SYSTEM, target=target), atlas).evaluator.tubes
+    entries, rng = atlas.deployments, np.random.default_rng(7)
+    accepted, at_hazard = 0, []
+    for entry in rng.integers(entries.count, size=6000):
+        site, wide = int(entries.site[entry]), 10.0 ** rng.uniform(-1.0, 1.0)
+        inner = max(float(entries.inner_mm[entry] + rng.normal(0.0, wide)), 0.1)
+        outer = float(np.clip(entries.outer_mm[entry] + rng.normal(0.0, wide), 0.0, inner))
+        rotation = float(entries.rotation_rad[entry] + rng.normal(0.0, 0.1 * wide))
+        base = atlas.motions.tip(site).lps_from_scope_tip
+        made = validator.choose(base, rotation, outer, inner, -1)
+        widths = np.array([0.4, 3.0, 3.0]) * 10.0 ** rng.uniform(-4.0, 0.0, 3)
+        if isinstance(made, str):
+            widths = np.full(3, 1e-6)
+        box = np.zeros(BOX_COLUMNS)
+        box[TIP] = site
+        box[[ROTATION, OUTER, INNER]] = (
+            np.array([rotation, outer, inner]) + rng.uniform(-1.0, 1.0, 3) * widths
+        )
+        box[[HALF_ROTATION, HALF_OUTER, HALF_INNER]] = widths
+        refused = _all_refused(surroundings, tubes, tips, box)
+        if not isinstance(made, str):
+            accepted += 1
+            assert not refused, (site, rotation, outer, inner, widths)
+        elif validator._trace[PHASE] == LEAVING and made in (REASONS[NEAR_VESSEL], REASONS[NEAR_PLEURA]):
+            at_hazard.append(refused)
+    assert accepted > 2000
+    assert len(at_hazard) > 20 and np.mean(at_hazard) > 0.5
 
 
 @pytest.mark.slow

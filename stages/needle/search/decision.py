@@ -13,7 +13,7 @@ from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
 from stages.needle.search.base import Search
-from stages.needle.search.optimal import OptimalSearch
+from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.resolution import ResolutionSearch
 
 ENDS_FROM = 100
@@ -25,9 +25,11 @@ PIECE = 200
 RESOLUTION_SHARE = 5 / 6
 """Share of the iterations without a path: in narrow passages it is nearly always the first, and so it is at
 most a fifth later than alone."""
+BETTER_SHARE = 1 / 3
+"""The same with a path: the portfolio has the rest, as each refined path ends at the cheapest near it."""
 PATIENCE = 1600
-"""Iterations in which nearly all paths are found.  Until then the proof has less than a tenth of the time,
-and afterwards most of it while it fills cubes."""
+"""Iterations in which nearly all paths are found.  Until then the proof has about a sixth of the time, and
+afterwards most of it while it fills cubes."""
 CUBES, MORE_CUBES = 2, 300
 """Cubes that the proof fills for an iteration, before and afterwards; an iteration takes as long as ten."""
 PLANES_FROM = 3000
@@ -45,15 +47,14 @@ class Decision:
     """Looks for a path, and for a proof that there is none.
 
     It is a `stages.needle.search.base.Search`.  The tree begins; then the resolution search, which finds
-    narrow passages soonest, has most of the iterations, and the tree the rest.  The optimal search improves
-    on what either has found.  The proof begins at once where the tree cannot leave the start, and else after
-    most paths are found.  Its cubes take turns with the searches; its planes, of which a single one may take
-    a second, have a thread of their own.
+    narrow passages soonest, has most of the iterations, and the tree the rest.  The portfolio that the tree
+    belongs to improves on what either has found.  The proof takes turns with the searches: start and target
+    are looked at early, cubes are filled a few at a time and, once most paths are found, many at a time.
+    Planes come last; as a single one may take a second, they have a thread of their own.
 
-    What path is found after how many iterations does not depend on slices or on the thread, since there is
-    no path where the proof succeeds.  A proof by planes may come sooner on a faster machine; the searches
-    wait for a plane that has taken as many iterations as it should, so that the proof goes on where there is
-    only one core.
+    What path is found after how many iterations does not depend on the thread, since there is no path where
+    the proof succeeds.  A proof by planes may come sooner on a faster machine; the searches wait for a plane
+    that has taken as many iterations as it should, so that the proof goes on where there is only one core.
 
     Attributes
     ----------
@@ -66,7 +67,7 @@ class Decision:
         self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
         self._asked = (environment, query, objective)
-        self.search = OptimalSearch(environment, query, seed=seed, objective=objective)
+        self.search = PortfolioSearch(environment, query, seed=seed, objective=objective)
         self._resolution: ResolutionSearch | None = None
         self._proof: NoPathProof | None = None
         self._planes: _PlanesInThread | None = None
@@ -114,7 +115,7 @@ class Decision:
             self._prove()
         yield self.search, FIRST_ITERATIONS - ENDS_FROM
         while True:
-            share = 0.5 if self.path is not None else RESOLUTION_SHARE
+            share = RESOLUTION_SHARE if self.path is None else BETTER_SHARE
             words = 0 if self.resolution.finished else round(share * PIECE)
             yield self.resolution, words
             yield self.search, PIECE - words

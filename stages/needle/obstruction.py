@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -75,12 +76,14 @@ def find_obstruction(environment: NeedleEnvironment, query: Query) -> Obstructio
     Only a target out of reach may be so without proof: with a goal tolerance, or wide limits of turning.
 
     """
-    return _reach(environment, query) or blocked_end(environment, query)
+    found = _reach(environment, query) or blocked_end(environment, query)
+    return found and _with_obstacle(environment, found)
 
 
 def blocked_end(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     """Return what proves that no path leaves the start or none ends at the target; None if nothing does.
 
+    It is without `obstacle_lps`, which takes longest.
     An environment whose paths are looked up instead of proved has no such proof.
     """
     if environment.limits.lookup_step_mm > 0.0:
@@ -97,12 +100,11 @@ def easiest_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruc
     )  # fmt: skip
     if not tried or not label or found[kernels.DISTANCE] >= found[kernels.NEEDED]:
         return None
-    return _found(environment, "path", False, label, found, query)
+    return _with_obstacle(environment, _found("path", False, label, found, query))
 
 
 def _pose(query: Query) -> tuple[float, ...]:
-    frame = query.lps_from_start
-    return tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+    return tuple(query.lps_from_start[:3, [3, 2]].T.ravel().tolist())
 
 
 def _seen(query: Query) -> tuple[float, float]:
@@ -110,32 +112,30 @@ def _seen(query: Query) -> tuple[float, float]:
     return float(rho), float(h)
 
 
-def _nearest(environment: NeedleEnvironment, label: int, point: Float, distance_mm: float) -> Float | None:
-    """Return the point (3,) of a voxel with this label that is nearest to a point, at a known distance."""
-    grid = environment.grid
-    part = grid.window(point, distance_mm + float(grid.spacing_mm.max()))
-    voxels = voxels_in(part, environment.obstacles.labels[part] == label)
+def _with_obstacle(environment: NeedleEnvironment, found: Obstruction) -> Obstruction:
+    """Add the nearest point of the voxels that are too near."""
+    if found.distance_mm is None:
+        return found
+    grid, point = environment.grid, found.point_lps
+    part = grid.window(point, found.distance_mm + float(grid.spacing_mm.max()))
+    voxels = voxels_in(part, environment.obstacles.labels[part] == found.label)
     if not len(voxels):
-        return None
+        return found
     half = environment.obstacles.geometry[:, 5]
     nearest = np.clip(grid.ijk(point), voxels - half, voxels + half)
     at = int(np.argmin(np.linalg.norm(grid.lps(nearest) - point, axis=1)))
-    return np.asarray(grid.lps(nearest[at]))
+    return replace(found, obstacle_lps=np.asarray(grid.lps(nearest[at])))
 
 
-def _found(
-    environment: NeedleEnvironment, place: str, proved: bool, label: int, found: Float, query: Query
-) -> Obstruction:
+def _found(place: str, proved: bool, label: int, found: Float, query: Query) -> Obstruction:
     rho, h = _seen(query)
-    point, distance = found[: kernels.INSERTED].copy(), float(found[kernels.DISTANCE])
     return Obstruction(
         place=place,
         proved=proved,
         label=int(label),
-        point_lps=point,
-        obstacle_lps=_nearest(environment, label, point, distance),
+        point_lps=found[: kernels.INSERTED].copy(),
         inserted_mm=float(found[kernels.INSERTED]) if place != "target" else None,
-        distance_mm=distance,
+        distance_mm=float(found[kernels.DISTANCE]),
         needed_mm=float(found[kernels.NEEDED]),
         direction_rad=math.atan2(rho, h),
         straight_mm=math.hypot(rho, h),
@@ -228,7 +228,7 @@ def _start(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
         environment.obstacles, environment.limits, _pose(query), query.inserted_mm, longest, query.branch,
         found,
     )  # fmt: skip
-    return _found(environment, "start", True, label, found, query) if label else None
+    return _found("start", True, label, found, query) if label else None
 
 
 def _target(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
@@ -242,4 +242,4 @@ def _target(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     if distance + environment.goal_tolerance_mm >= needed - kernels.SPARE_MM:
         return None
     found = np.array([x, y, z, math.nan, distance, needed])
-    return _found(environment, "target", True, label, found, query)
+    return _found("target", True, label, found, query)

@@ -12,7 +12,7 @@ smaller ones and the same is done again.  docs/explanation/certificate.md has th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import numpy as np
 
@@ -33,6 +33,8 @@ CUBES_MM = (0.5, 0.25)
 """Sides of the cubes, the faster ones first."""
 FIRST_CELL_MM, LARGEST_SLOPE_CELL = 0.5, 0.17
 """Largest sides of the first cells: of the size of a voxel, and of about 10 degrees."""
+ALL_CUBES = 1 << 31
+"""More than there are."""
 LEVELS = 9
 """How often cells are halved at most: then positions are known to 2 um."""
 CELLS_PER_BOW = 16.0
@@ -109,13 +111,16 @@ class NoPathProof:
         self._max_bytes = max_bytes
         self._kappa = max(environment.limits.kappa * (1.0 + ROUNDING), LEAST_KAPPA)
         self._tolerance = environment.goal_tolerance_mm + bounds.SPARE
+        self._chord = query.target - query.lps_from_start[:3, 3]
+        self._length = environment.limits.max_length_mm - query.inserted_mm + bounds.SPARE
         self._planes: list[Plane] = []
         self._coarse: list[Plane] = []
         self._too_steep = False
         self._steps = self._run()
 
-    def advance(self) -> bool:
-        """Do the next step, a plane of one level; return whether the proof has ended."""
+    def advance(self, most_cubes: int = ALL_CUBES) -> bool:
+        """Do a step: some cubes, a plane forward or all backward; return whether the proof has ended."""
+        self._most_cubes = most_cubes
         if self.outcome == "running":
             try:
                 next(self._steps, None)
@@ -138,26 +143,24 @@ class NoPathProof:
 
     def _run(self) -> Iterator[None]:
         """Try one kind of proof after the other."""
-        self._measure()
+        self._rule_out()
         if self.outcome != "running":
             return
+        yield
+        self._measure()
         for side in CUBES_MM:
-            yield
-            if self._parted(side):
+            if (yield from self._parted(side)):
                 self._end("no path", f"blocked, whatever the curvature, by cubes of {side:g} mm")
                 return
-        yield
+            yield
         self._aim_planes()
         if self.outcome == "running":
             yield from self._refine()
 
-    def _measure(self) -> None:
-        """Set up the line from start to target, and look whether the proof can hold or is already done."""
-        environment, query = self._environment, self._query
-        start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
-        chord = query.target - start
-        total = float(np.linalg.norm(chord))
-        length = environment.limits.max_length_mm - query.inserted_mm + bounds.SPARE
+    def _rule_out(self) -> None:
+        """Look whether the proof can hold or is already done."""
+        environment, query, length = self._environment, self._query, self._length
+        total = float(np.linalg.norm(self._chord))
         turn = min(environment.limits.max_turn_rad - query.turned_rad, self._kappa * length)
         if environment.limits.lookup_step_mm > 0.0:
             self._end("undecided", "paths of this environment need not be clear")
@@ -170,25 +173,33 @@ class NoPathProof:
         elif found := blocked_end(environment, query):
             self._end("no path", f"the {found.place} is too near to obstacles")
         else:
-            ahead = float(chord @ forward)
+            ahead = float(self._chord @ query.lps_from_start[:3, 2])
             aside = math.sqrt(max(total**2 - ahead**2, 0.0))
             if pruning.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_DISTANCE_MM:
                 self._end("no path", "the target lies outside the workspace of the start")
-        if self.outcome == "running":
-            normal = chord / total
-            column = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-            column /= np.linalg.norm(column)
-            self._frame = np.stack([start, normal, np.cross(normal, column), column])
-            self._paths = PathBounds.of(total, self._tolerance, self._kappa, length)
-            local = self._frame[1:] @ query.lps_from_start[:3, 2]
-            self._along = float(local[0])
-            self._scale = np.zeros(bounds.SCALE_SIZE)
-            self._scale[bounds.KAPPA] = self._kappa
-            if self._along > 0.0:
-                self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
-            self._tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
 
-    def _parted(self, side: float) -> bool:
+    def _measure(self) -> None:
+        """Set up the line from start to target."""
+        start = self._query.lps_from_start
+        total = float(np.linalg.norm(self._chord))
+        normal = self._chord / total
+        first = int(np.argmin(np.abs(normal)))
+        second, third = (first + 1) % 3, (first + 2) % 3
+        row, column = normal[first] * normal, np.zeros(3)
+        row[first] -= 1.0
+        column[second], column[third] = normal[third], -normal[second]
+        across = math.hypot(normal[second], normal[third])
+        self._frame = np.stack([start[:3, 3], normal, row / across, column / across])
+        self._paths = PathBounds.of(total, self._tolerance, self._kappa, self._length)
+        local = self._frame[1:] @ start[:3, 2]
+        self._along = float(local[0])
+        self._scale = np.zeros(bounds.SCALE_SIZE)
+        self._scale[bounds.KAPPA] = self._kappa
+        if self._along > 0.0:
+            self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] = local[1:] / local[0]
+        self._tangent = self._scale[bounds.FIRST_V : bounds.FIRST_U + 1] @ self._frame[2:]
+
+    def _parted(self, side: float) -> Generator[None, None, bool]:
         """Tell whether cubes that no path can pass part the target from the start."""
         if self._along <= 0.0:
             return False
@@ -197,14 +208,22 @@ class NoPathProof:
         between = math.ceil(self._paths.ends[bounds.TOTAL] / side)
         shape = np.array([before + between + before, 2 * beside, 2 * beside]) + 1
         size = math.prod(int(n) for n in shape)
-        if 5 * size > self._max_bytes or size >= 1 << 31:
+        if 5 * size > self._max_bytes or size >= ALL_CUBES:
             return False
-        return not cubes.flood(
-            self._environment.obstacles, self._environment.limits, self._query.branch,
-            self._query.inserted_mm, self._scale, self._paths.ends, self._frame, side,
-            np.array([-before, -beside, -beside]),
-            np.zeros(shape, dtype=np.bool_), np.zeros(size, dtype=np.int32),
-        )  # fmt: skip
+        seen, queue, span = np.zeros(shape, dtype=np.bool_), np.zeros(1, np.int32), np.zeros(2, np.int64)
+        while True:
+            room = min(int(span[cubes.END]) + cubes.NEIGHBOURS * self._most_cubes + 1, size)
+            if room > len(queue):
+                queue = np.concatenate([queue, np.zeros(min(room, size - len(queue)), np.int32)])
+            if cubes.flood(
+                self._environment.obstacles, self._environment.limits, self._query.branch,
+                self._query.inserted_mm, self._scale, self._paths.ends, self._frame, side,
+                np.array([-before, -beside, -beside]), seen, queue, span, self._most_cubes,
+            ):  # fmt: skip
+                return False
+            if span[cubes.BEGIN] == span[cubes.END]:
+                return True
+            yield
 
     def _aim_planes(self) -> None:
         """Choose the planes and the direction from which the limit of the angle counts."""
@@ -246,7 +265,7 @@ class NoPathProof:
                 self._backward(number)
                 if self.outcome != "running":
                     return
-                yield
+            yield
             self._coarse = self._planes
             line = self._frame[0], self._frame[1] + self._tangent, self._frame[2:]
             self.passage = tightest(self._planes, self._depth, self.cell_mm, self._paths, self._kappa, line)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from stages.needle.environment import NeedleEnvironment
@@ -13,38 +13,48 @@ from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
 from stages.needle.search.base import Search
-from stages.needle.search.optimal import OptimalSearch
+from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.resolution import ResolutionSearch
 
-FIRST_ITERATIONS = 200
-"""Of the tree alone: half of the paths are found by then, before the other search is made."""
-PROOF_FROM = 400
-"""Iterations before the proof is made: it takes as long to begin as the resolution search takes for a path
-that is not narrow."""
+ENDS_FROM = 100
+"""Iterations before start and target are looked at, which takes a tenth as long."""
+FIRST_ITERATIONS = 400
+"""Of the tree alone: nearly all paths that it finds sooner than the resolution search are found by then."""
 PIECE = 200
-"""Iterations between two looks at the proof, a few tenths of a millisecond."""
+"""Iterations between two steps of the proof, a few tenths of a millisecond."""
 RESOLUTION_SHARE = 5 / 6
 """Share of the iterations without a path: in narrow passages it is nearly always the first, and so it is at
 most a fifth later than alone."""
+BETTER_SHARE = 1 / 3
+"""The same with a path: the portfolio has the rest, as each refined path ends at the cheapest near it."""
+PATIENCE = 1600
+"""Iterations in which nearly all paths are found.  Until then the proof has about a sixth of the time, and
+afterwards most of it while it fills cubes."""
+CUBES, MORE_CUBES = 2, 300
+"""Cubes that the proof fills for an iteration, before and afterwards; an iteration takes as long as ten."""
+PLANES_FROM = 3000
+"""Iterations before the proof goes on with planes."""
+FEW_STATES = 1000
+"""With fewer on a plane, a step takes about a millisecond, and so no thread."""
 STATES_PER_ITERATION = 100
 """States on a plane of the proof for one iteration of the searches; these take a third of the time of so many
 iterations, so that the searches wait only where the proof has no core of its own."""
-STEP_ITERATIONS = 1000
+STEP_ITERATIONS = 300
 """Iterations for a step of the proof on top."""
-UNLOOKED_S = 0.001
-"""How long the proof goes on before it is looked at: some pieces of the searches."""
 
 
 class Decision:
-    """Looks for a path and, in a thread of its own, for a proof that there is none.
+    """Looks for a path, and for a proof that there is none.
 
     It is a `stages.needle.search.base.Search`.  The tree begins; then the resolution search, which finds
-    narrow passages soonest, has most of the iterations, and the tree the rest.  The optimal search improves
-    on what either has found.
+    narrow passages soonest, has most of the iterations, and the tree the rest.  The portfolio that the tree
+    belongs to improves on what either has found.  The proof takes turns with the searches: start and target
+    are looked at early, cubes are filled a few at a time and, once most paths are found, many at a time.
+    Planes come last; as a single one may take a second, they have a thread of their own.
 
-    What path is found after how many iterations does not depend on the thread, since there is none where
-    the proof succeeds.  A proof may come sooner on a faster machine; the searches wait for a step of it that
-    has taken as many iterations as it should, so that it goes on where there is only one core.
+    What path is found after how many iterations does not depend on the thread, since there is no path where
+    the proof succeeds.  A proof by planes may come sooner on a faster machine; the searches wait for a plane
+    that has taken as many iterations as it should, so that the proof goes on where there is only one core.
 
     Attributes
     ----------
@@ -57,9 +67,13 @@ class Decision:
         self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
         self._asked = (environment, query, objective)
-        self.search = OptimalSearch(environment, query, seed=seed, objective=objective)
+        self.search = PortfolioSearch(environment, query, seed=seed, objective=objective)
         self._resolution: ResolutionSearch | None = None
-        self._proof: _ProofInThread | None = None
+        self._proof: NoPathProof | None = None
+        self._planes: _PlanesInThread | None = None
+        self._looked = 0
+        self._turns = self._take_turns()
+        self._turn: tuple[Search, int] = (self.search, 0)
         self.path: ArcPath | None = None
         self.cost = math.inf
         self.finished = False
@@ -67,15 +81,18 @@ class Decision:
         self.iterations = 0
 
     def advance(self, iterations: int) -> bool:
-        """Search for so many iterations; without a path, go on with the proof beside it."""
-        better, left = False, iterations
-        while left > 0 and not better and not self.finished:
-            piece = left if self.path is not None else min(PIECE, left)
-            left -= piece
-            better = self._search(piece)
-            if self.path is None and self.iterations >= PROOF_FROM:
-                self._prove()
-        return better
+        """Search for so many iterations; without a path, go on with the proof too."""
+        while iterations > 0 and not self.finished:
+            search, left = self._turn
+            spent = min(left, iterations)
+            self._turn = (search, left - spent)
+            iterations -= spent
+            self.iterations += spent
+            if spent and self._went_on(search, spent):
+                return True
+            if left == spent:
+                self._turn = next(self._turns)
+        return False
 
     @property
     def resolution(self) -> ResolutionSearch:
@@ -91,15 +108,19 @@ class Decision:
         """The narrowest place that the proof left open; None with a path, and before the proof has looked."""
         return None if self.path is not None or self._proof is None else self._proof.passage
 
-    def _search(self, iterations: int) -> bool:
-        """Spend iterations on the searches; return whether there is a better path."""
-        begins = self.iterations < FIRST_ITERATIONS
-        self.iterations += iterations
-        if begins or self.resolution.finished:
-            return self._went_on(self.search, iterations)
-        share = 0.5 if self.path is not None else RESOLUTION_SHARE
-        first = self._went_on(self.resolution, math.ceil(share * iterations))
-        return self._went_on(self.search, math.ceil((1.0 - share) * iterations)) or first
+    def _take_turns(self) -> Iterator[tuple[Search, int]]:
+        """Yield which search goes on for how many iterations; let the proof go on in between."""
+        yield self.search, ENDS_FROM
+        if self.path is None:
+            self._prove()
+        yield self.search, FIRST_ITERATIONS - ENDS_FROM
+        while True:
+            share = RESOLUTION_SHARE if self.path is None else BETTER_SHARE
+            words = 0 if self.resolution.finished else round(share * PIECE)
+            yield self.resolution, words
+            yield self.search, PIECE - words
+            if self.path is None:
+                self._prove()
 
     def _went_on(self, search: Search, iterations: int) -> bool:
         """Advance one search; tell whether its path is cheaper than all before, and let the other know."""
@@ -113,23 +134,30 @@ class Decision:
         return True
 
     def _prove(self) -> None:
-        """Take over what the proof has found meanwhile, and let it go on."""
+        """Go on with the proof."""
         if self._proof is None:
             environment, query, _objective = self._asked
-            proof = NoPathProof(environment, query)
-            proof.advance()  # A tenth of a millisecond, which decides what is out of reach.
-            self._proof = _ProofInThread(proof)
-        self.outcome = self._proof.outcome_after(self.iterations)
+            self._proof = NoPathProof(environment, query)
+        if self._proof.states > 0 and self.iterations < PLANES_FROM:
+            return
+        if self._proof.states < FEW_STATES:
+            spent = self.iterations - self._looked
+            self._looked = self.iterations
+            self._proof.advance(spent * (CUBES if self.iterations < PATIENCE else MORE_CUBES))
+            self.outcome = self._proof.outcome
+        else:
+            self._planes = self._planes or _PlanesInThread(self._proof)
+            self.outcome = self._planes.outcome_after(self.iterations)
         self.finished = self.outcome == "no path"
 
 
-class _ProofInThread:
+class _PlanesInThread:
     """A proof that takes its steps in a thread, and stops where nobody looks at it."""
 
     def __init__(self, proof: NoPathProof) -> None:
         self._proof = proof
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="no-path-proof")
-        self._step: Future[None] | None = None
+        self._step: Future[bool] | None = None
         self._due = 0
 
     def outcome_after(self, iterations: int) -> str:
@@ -140,16 +168,5 @@ class _ProofInThread:
         if self._step is not None or self._proof.outcome != "running":
             return self._proof.outcome if self._step is None else "running"
         self._due = iterations + STEP_ITERATIONS + self._proof.states // STATES_PER_ITERATION
-        self._step = self._pool.submit(self._take_steps)
+        self._step = self._pool.submit(self._proof.advance)
         return "running"
-
-    @property
-    def passage(self) -> Passage | None:
-        """What the last finished level of the proof left."""
-        return self._proof.passage
-
-    def _take_steps(self) -> None:
-        """Take a step, and more of them while nobody would look."""
-        began = time.perf_counter()
-        while not self._proof.advance() and time.perf_counter() - began < UNLOOKED_S:
-            pass

@@ -59,6 +59,7 @@ class PortfolioSearch:
         self.iterations = 0
         """Iterations spent so far, by all searches."""
         self._environment, self._query, self._seed, self._objective = environment, query, seed, objective
+        self._adopted: tuple[ArcPath, float] | None = None
         self._made = [0, 0]
         self._patience = 0
         self._free = _Turns(self._free_turns())
@@ -78,6 +79,11 @@ class PortfolioSearch:
             if used == 0 and not found:
                 return False
         return False
+
+    def adopt(self, path: ArcPath, cost: float) -> None:
+        """Go on from a path that another search found for the same query and objective."""
+        self.path, self.cost = path, cost
+        self._adopted = path, cost
 
     def _next(self) -> _Turns:
         """Return the turns that have had less than their share, guided ones only if there are guide paths."""
@@ -107,10 +113,12 @@ class PortfolioSearch:
     def _free_turns(self) -> Iterator[Turn]:
         """Yield whose turn it is and for how many iterations, for ever."""
         best, size = self._new(FREE), FIRST_SIZE
-        while best.path is None:
+        while self.path is None:
             yield best, SLICE
         patience = best.iterations
         while True:
+            if self._adopted and self._adopted[1] < best.cost:
+                best.adopt(*self._adopted)
             searches = [best, *(self._new(FREE) for _ in range(size - 1))]
             best = yield from self._round(searches, patience)
             size = min(2 * size, LARGEST_SIZE)

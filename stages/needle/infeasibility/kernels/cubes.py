@@ -10,9 +10,16 @@ from stages.needle.infeasibility.kernels.blocked import clearance_above
 from stages.needle.infeasibility.kernels.bounds import SPARE, TOLERANCE, TOTAL
 from stages.needle.infeasibility.kernels.reachability_pruning import place_margin
 
+NEIGHBOURS = 26
+
+# What `span` holds: the first cube of the queue from which the flood has not gone on, and the end.
+BEGIN, END = 0, 1
+
 
 @numba.njit(cache=True, nogil=True)
-def flood(obstacles, limits, exempt_branch, inserted, scale, ends, frame, side, corner, seen, queue):
+def flood(
+    obstacles, limits, exempt_branch, inserted, scale, ends, frame, side, corner, seen, queue, span, most
+):  # fmt: skip
     """Fill the cubes that may be passed, from that of the start on; return whether one of the goal's is met.
 
     A path goes from one cube to another through a point of both, so to one of its 26 neighbours.
@@ -33,19 +40,26 @@ def flood(obstacles, limits, exempt_branch, inserted, scale, ends, frame, side, 
     corner : (3,) int64
         Cube numbers (depth, y, x) of the first cube; that of the start has numbers 0.
     seen : (H, Y, X) bool
-        All False; those looked at are set.
-    queue : (H Y X,) int32
+        All False at first; those looked at are set.
+    queue : (Q,) int32
+        Cubes that may be passed, with room for the NEIGHBOURS of so many.
+    span : (2,) int64
+        Part of the queue that is left, 0 at first; the flood is complete where it is empty.
+    most : int
+        Cubes from which the flood goes on, at most.
     """
     nh, ny, nx = seen.shape
     half = 0.8661 * side + SPARE
-    first = (-corner[0] * ny - corner[1]) * nx - corner[2]
-    queue[0] = first
-    seen[-corner[0], -corner[1], -corner[2]] = True
-    begin = 0
-    end = 1
-    while begin < end:
-        number = queue[begin]
-        begin += 1
+    if span[END] == 0:
+        queue[0] = (-corner[0] * ny - corner[1]) * nx - corner[2]
+        seen[-corner[0], -corner[1], -corner[2]] = True
+        span[END] = 1
+    end = span[END]
+    for at in range(span[BEGIN], span[BEGIN] + most):
+        if at == end:
+            break
+        number = queue[at]
+        span[BEGIN] = at + 1
         i = number // (ny * nx)
         j = number // nx - i * ny
         k = number - (i * ny + j) * nx
@@ -72,4 +86,5 @@ def flood(obstacles, limits, exempt_branch, inserted, scale, ends, frame, side, 
                     if above + half >= limits.required_mm:
                         queue[end] = (a * ny + b) * nx + c
                         end += 1
+        span[END] = end
     return False

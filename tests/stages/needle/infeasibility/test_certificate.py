@@ -158,6 +158,17 @@ def test_the_same_question_has_the_same_answer() -> None:
     assert run() == run()
 
 
+def test_cubes_filled_a_few_at_a_time_prove_the_same() -> None:
+    environment, found = environment_of(wall()), []
+    for cubes in (5, 1 << 31):
+        proof = NoPathProof(environment, query())
+        steps = 1
+        while not proof.advance(cubes):
+            steps += 1
+        found.append((proof.reason, steps > 100))
+    assert found == [(found[0][0], True), (found[0][0], False)] and "cubes" in found[0][0]
+
+
 def bits_of(cells: np.ndarray) -> np.ndarray:
     """Pack a bool array (Y, 64 W) as the kernels do."""
     out = np.zeros((cells.shape[0], cells.shape[1] // 64), dtype=np.uint64)

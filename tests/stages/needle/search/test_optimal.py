@@ -141,6 +141,27 @@ def test_a_decision_is_a_path_or_a_proof() -> None:
     assert not walled.advance(100)
 
 
+def test_a_blocked_start_is_decided_in_the_first_iterations() -> None:
+    canvas = Canvas.empty([-32, -32, -42], [32, 32, 42], 1.0)
+    canvas.add(np.linalg.norm(canvas.points - query().lps_from_start[:3, 3], axis=-1) < 3.0, VESSEL)
+    needle = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 60)
+    blocked = Decision(needle_environment(canvas.lung(), needle, Margins(), with_fissures=False), query())
+    blocked.advance(200)
+    assert blocked.outcome == "no path" and blocked.iterations == 100
+
+
+def test_a_decision_goes_on_to_better_paths_and_repeats() -> None:
+    def run() -> tuple[list[float], np.ndarray]:
+        decision = Decision(ball_environment(), query(), seed=3)
+        costs = [decision.cost for _ in range(40) if decision.advance(250)]
+        assert decision.path is not None and decision.path.length_mm == pytest.approx(costs[-1], abs=1e-3)
+        return costs, np.asarray(decision.path.arcs)
+
+    costs, arcs = run()
+    assert costs == sorted(costs, reverse=True) and len(costs) > 1
+    assert np.array_equal(arcs, run()[1])
+
+
 def test_obstacles_as_centres_and_as_boxes() -> None:
     """Half a voxel beside a column of obstacle voxels, centres are farther away than boxes."""
     canvas = Canvas.empty([-16, -16, -16], [16, 16, 16], 1.0)

@@ -405,37 +405,49 @@ def _all_refused(surroundings: Any, tubes: Any, tips: Any, box: Any) -> bool:
 def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
     small_lung: Lung, target: Target, atlas: la.Atlas
 ) -> None:
-    """Tubes that a vessel or the pleura beside their exit refuses are refused with all that are near them."""
-    bound = CostBound(Task(lung=small_lung, system=SYSTEM, target=target), atlas)
+    """Boxes about accepted tubes, at random and next to refused ones, and tubes refused at their exit."""
+    task = Task(lung=small_lung, system=SYSTEM, target=target)
+    bound = CostBound(task, atlas)
     bound.improve(0.0, 1)
-    surroundings = bound.queues[0].about[0].surroundings
-    tubes, tips = bound.queues[0].about[1], np.ascontiguousarray(atlas.motions.tips[:, None, :])
-    validator = DirectArcs(Task(lung=small_lung, system=SYSTEM, target=target), atlas).evaluator.tubes
+    surroundings, tubes = bound.queues[0].about[0].surroundings, bound.queues[0].about[1]
+    tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
+    validator = DirectArcs(task, atlas).evaluator.tubes
     entries, rng = atlas.deployments, np.random.default_rng(7)
-    accepted, at_hazard = 0, []
-    for entry in rng.integers(entries.count, size=6000):
-        site, wide = int(entries.site[entry]), 10.0 ** rng.uniform(-1.0, 1.0)
-        inner = max(float(entries.inner_mm[entry] + rng.normal(0.0, wide)), 0.1)
-        outer = float(np.clip(entries.outer_mm[entry] + rng.normal(0.0, wide), 0.0, inner))
-        rotation = float(entries.rotation_rad[entry] + rng.normal(0.0, 0.1 * wide))
+
+    def why_refused(site: int, place: Points) -> str | None:
+        rotation, outer, inner = place.tolist()
         base = atlas.motions.tip(site).lps_from_scope_tip
-        made = validator.choose(base, rotation, outer, inner, -1)
-        widths = np.array([0.4, 3.0, 3.0]) * 10.0 ** rng.uniform(-4.0, 0.0, 3)
-        if isinstance(made, str):
-            widths = np.full(3, 1e-6)
+        made = validator.choose(base, rotation, min(max(outer, 0.0), inner), inner, -1)
+        return made if isinstance(made, str) else None
+
+    def ruled_out(site: int, place: Points, widths: Points) -> bool:
         box = np.zeros(BOX_COLUMNS)
         box[TIP] = site
-        box[[ROTATION, OUTER, INNER]] = (
-            np.array([rotation, outer, inner]) + rng.uniform(-1.0, 1.0, 3) * widths
-        )
+        box[[ROTATION, OUTER, INNER]] = place + rng.uniform(-1.0, 1.0, 3) * widths
         box[[HALF_ROTATION, HALF_OUTER, HALF_INNER]] = widths
-        refused = _all_refused(surroundings, tubes, tips, box)
-        if not isinstance(made, str):
+        return _all_refused(surroundings, tubes, tips, box)
+
+    accepted, at_hazard = 0, []
+    for entry in rng.integers(entries.count, size=4000):
+        site = int(entries.site[entry])
+        begin = np.array(entries.choice(int(entry))[:3])
+        wide = 10.0 ** rng.uniform(-1.0, 1.0)
+        place = begin + rng.normal(0.0, 1.0, 3) * np.array([0.1, 1.0, 1.0]) * wide
+        place[1:] = np.clip(place[1], 0.0, max(place[2], 0.1)), max(place[2], 0.1)
+        reason = why_refused(site, place)
+        if reason is None:
             accepted += 1
-            assert not refused, (site, rotation, outer, inner, widths)
-        elif validator._trace[PHASE] == LEAVING and made in (REASONS[NEAR_VESSEL], REASONS[NEAR_PLEURA]):
-            at_hazard.append(refused)
-    assert accepted > 2000
+            widths = np.array([0.4, 3.0, 3.0]) * 10.0 ** rng.uniform(-4.0, 0.0, 3)
+            assert not ruled_out(site, place, widths), (site, place, widths)
+            continue
+        if validator._trace[PHASE] == LEAVING and reason in (REASONS[NEAR_VESSEL], REASONS[NEAR_PLEURA]):
+            at_hazard.append(ruled_out(site, place, np.full(3, 1e-6)))
+        good, bad = begin, place
+        for _ in range(24):
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if why_refused(site, middle) is None else (good, middle)
+        assert not ruled_out(site, good, np.full(3, 1e-6)), (site, good)
+    assert accepted > 1000
     assert len(at_hazard) > 20 and np.mean(at_hazard) > 0.5
 
 

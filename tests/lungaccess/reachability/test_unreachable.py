@@ -22,11 +22,15 @@ from anatomy.poses import bending_directions
 from anatomy.typed import Float
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.coupled.search.direct_arcs import DirectArcs
+from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
+from lungaccess.problem.task import Task
 from lungaccess.reachability.kernels import blocked
 from lungaccess.reachability.kernels import deployment_boxes as boxes
 from lungaccess.reachability.kernels import unreachable as kernel
+from lungaccess.reachability.kernels.blocked import ProofEnvironment
 from lungaccess.reachability.tip_places import PlacePiece
 from lungaccess.reachability.unreachable import UnreachableProof, _may_be_left
 from stages.needle.kernels.limits import Limits
@@ -136,14 +140,36 @@ def rotation_vector(frame: Float, forward: Float) -> tuple[float, float]:
     return (-seen[1] / aside * angle, seen[0] / aside * angle) if aside > 1e-12 else (0.0, 0.0)
 
 
-def deployment_of(frame: Float, plan: la.Plan) -> Float:
-    """Return direction, rotation and insertions of a plan as the middles of a box."""
-    pose, tube = plan.scope.lps_from_scope_tip, plan.tube
+def middles_of(frame: Float, pose: Float, rotation_rad: float, outer_mm: float, inner_mm: float) -> Float:
+    """Return the middles of a box that has a deployment from a pose of the scope tip in its middle."""
     east, north = rotation_vector(frame, pose[:3, 2])
     turned = Rotation.from_rotvec(east * frame[0] + north * frame[1]).as_matrix() @ frame.T
-    normal = turned.T @ bending_directions(pose, tube.rotation_rad)[0]
+    normal = turned.T @ bending_directions(pose, rotation_rad)[0]
     rotation = math.atan2(normal[1], normal[0])
-    return np.array([east, north, rotation, tube.outer_insertion_mm, tube.inner_insertion_mm])
+    return np.concatenate([[east, north, rotation, outer_mm, inner_mm], frame @ pose[:3, 3]])
+
+
+def boxes_offered(
+    proof: UnreachableProof,
+    lung: Lung,
+    target: Float,
+    environment: ProofEnvironment,
+    deployment: tuple[Float, float, float, float],
+    rng: np.random.Generator,
+) -> int:
+    """Offer the proof boxes of all sizes about a deployment that reaches a target; return how many."""
+    offered = 0
+    for piece in pieces_of(proof, lung, deployment[0][:3, 3]):
+        values = middles_of(piece.frame, *deployment)
+        for scale in (1e-4, 1e-3, 1e-2, 0.05, 0.2, 1.0):
+            halves = scale * HALVES * rng.uniform(0.1, 1.0, 8)
+            box = np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves])
+            assert not_ruled_out(
+                environment, proof._tubes, proof._insertions, proof._limits, target,
+                piece.frame, piece.cones, box,
+            ), (values, box)  # fmt: skip
+            offered += 1
+    return offered
 
 
 def test_no_box_with_a_deployment_that_can_be_is_blocked(
@@ -204,19 +230,42 @@ def test_what_a_plan_reaches_is_never_ruled_out(
     for plan in plans:
         target, pose = plan.target_lps, plan.scope.lps_from_scope_tip
         assert not proof.prove(target, most_boxes=10_000).proved
-        environment = proof._environment(target)
-        tested = 0
-        for piece in pieces_of(proof, small_lung, pose[:3, 3]):
-            values = np.concatenate([deployment_of(piece.frame, plan), piece.frame @ pose[:3, 3]])
-            for scale in (1e-4, 1e-3, 1e-2, 0.05, 0.2, 1.0):
-                halves = scale * HALVES * rng.uniform(0.1, 1.0, 8)
-                box = np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves])
-                assert not_ruled_out(
-                    environment, proof._tubes, proof._insertions, proof._limits, target,
-                    piece.frame, piece.cones, box,
-                ), (values, box)  # fmt: skip
-                tested += 1
-        assert tested >= 6
+        tube = plan.tube
+        deployment = pose, tube.rotation_rad, tube.outer_insertion_mm, tube.inner_insertion_mm
+        assert boxes_offered(proof, small_lung, target, proof._environment(target), deployment, rng) >= 6
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.parametrize("radius_mm", [121.0, 50.0])
+@pytest.mark.parametrize("patient", ["Patient1", "Patient2"])
+def test_what_direct_arcs_of_a_real_lung_reach_is_never_ruled_out(
+    data_dir: Path, patient: str, radius_mm: float
+) -> None:
+    """Each accepted arc from a deployment of the atlas to a peripheral target: 2,500 of each set."""
+    lung = la.load_patient(data_dir / "med-rad" / patient)
+    system = la.load_system("tight-inner", fissures_allowed=True)
+    needle = replace(system.require_needle("The test"), max_curvature_per_mm=1.0 / radius_mm)
+    system = replace(system, name="tight-inner and a needle", needle=needle)
+    atlas, rng = la.build_atlas(lung, system), np.random.default_rng(3)
+    real = UnreachableProof(lung, system, with_fissures=atlas.with_fissures)
+    accepted = 0
+    for point in rng.permutation(peripheral_targets(lung, 50, 0)):
+        target = point_target(lung, point)
+        arcs = DirectArcs(Task(lung=lung, system=system, target=target), atlas)
+        if accepted >= 2500 or not len(arcs.in_workspace):
+            continue
+        environment = real._environment(target.lps_mm)
+        for entry in rng.permutation(arcs.in_workspace)[:600]:
+            tip = atlas.motions.tip(int(atlas.deployments.site[entry]))
+            rotation, outer, inner, _shape = atlas.deployments.choice(int(entry))
+            candidate = arcs.evaluator.direct(tip, rotation, outer, inner)
+            if candidate is None or not math.isfinite(arcs.evaluator.evaluate(candidate)):
+                continue
+            deployment = tip.lps_from_scope_tip, rotation, outer, inner
+            assert boxes_offered(real, lung, target.lps_mm, environment, deployment, rng) >= 6
+            accepted += 1
+    assert accepted >= 2500
 
 
 def holds(environment, piece: PlacePiece, tip: Float, rng: np.random.Generator) -> bool:  # type: ignore[no-untyped-def]

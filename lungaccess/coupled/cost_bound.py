@@ -33,7 +33,7 @@ from stages.tube import tube_constants, tube_environment
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
 
 BOXES_A_STEP = 500
-"""Boxes that are divided beside one step of a search: in two threads they take about as long as it does, or twice as long."""
+"""Boxes that are divided beside one step of a search: in two threads they take as long, or twice as long."""
 BOXES_A_TIP = 2
 """A scope tip is begun with instead of dividing so many boxes."""
 TRIED_A_QUEUE = 2

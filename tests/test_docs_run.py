@@ -30,7 +30,7 @@ SCRIPTS = ("examples/stranger/stranger.py",)
 """Scripts whose files later commands of a page name; those of the gallery have a test of their own."""
 INSTEAD = {"--budget": "2", "--samples": "500", "--spacing": "15", "--iterations": "20", "--count": "3"}
 """How long the reader wants to wait, and how exact the answer has to be: less than on the pages."""
-QUICK = ("docs/explanation/tubes.md", "docs/explanation/replanning.md", "docs/explanation/ompl.md")
+QUICK = ("docs/explanation/replanning.md", "docs/explanation/ompl.md")
 """Pages that need no patient and run within seconds; all others are slow."""
 STUDY = """
 name = "nodules"

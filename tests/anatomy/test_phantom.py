@@ -79,6 +79,7 @@ def test_impossible_settings_are_refused(make: Callable[[], Phantom]) -> None:
         make()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
     one, same, other = (make_phantom(seed=s, size="small", spacing_mm=1.75) for s in (3, 3, 4))
     for name in ("ct", "labels", "lobes"):
@@ -339,6 +340,7 @@ def test_an_unwritable_folder_is_a_typed_error(tmp_path: Path) -> None:
         write_phantom(make_phantom(size="small", spacing_mm=1.75), tmp_path / "file" / "patient")
 
 
+@pytest.mark.slow
 def test_the_adult_has_eight_generations_of_adult_size(adult: Phantom) -> None:
     lines = adult.centerlines["airway"]
     assert (np.bincount(lines.generation)[:3] == [1, 2, 4]).all()

@@ -16,6 +16,7 @@ def tables() -> list[study.Table]:
     return [study.solve(*each, SPACING_MM, study.STEPS_A_TURN) for each in errors]
 
 
+@pytest.mark.slow
 def test_errors_are_foreseen(tables: list[study.Table]) -> None:
     counted = [study.simulate(table, COUNT, 0).reached.mean() for table in tables]
     predicted = [study.start_chances(table).max() for table in tables]

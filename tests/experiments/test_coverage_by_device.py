@@ -41,6 +41,7 @@ def test_a_count_is_made_once(small_lung: Lung, tmp_path: Path, monkeypatch: pyt
     assert made == [0, 1]
 
 
+@pytest.mark.slow
 def test_the_reached_are_those_with_a_free_arc(small_lung: Lung) -> None:
     system = load_system("ultrathin", fissures_allowed=True)
     atlas = la.build_atlas(small_lung, system, rotations=8, stop_spacing_mm=4.0)

@@ -14,6 +14,7 @@ from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import require_own_name
 
 
+@pytest.mark.slow
 def test_a_target_is_decided_once(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(study, "PLAN_S", 1.0)
     monkeypatch.setattr(study, "DECIDE_S", 2.0)

@@ -46,6 +46,7 @@ def test_asv_measures_every_workload_at_every_size() -> None:
         assert each.params == WORKLOADS[each.name].sizes
 
 
+@pytest.mark.slow
 def test_the_work_of_the_least_size_can_be_done() -> None:
     for name in ("build-index", "query-index", "shortest-tour", "tube-mechanics", "distance-field"):
         assert WORKLOADS[name].prepare(WORKLOADS[name].sizes[0])() is not None

@@ -283,6 +283,7 @@ def test_all_others_are_run_when_one_fails(monkeypatch: pytest.MonkeyPatch, tmp_
     assert (tmp_path / "tables.md").read_text().count("**No result.**") == 1
 
 
+@pytest.mark.slow
 def test_a_quick_study_stores_its_table(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, small_lung: Lung
 ) -> None:

@@ -12,6 +12,7 @@ from lungaccess.risk import RiskAssessor
 from lungaccess.risk.deviations import Deviations, deviated_pieces, deviated_starts
 
 
+@pytest.mark.slow
 def test_tubes_without_errors_end_where_the_plan_says(small_lung: Lung) -> None:
     plan = next(la.plan(small_lung, la.load_system("ultrathin"), la.resolve_target(small_lung), iterations=1))
     assessor = RiskAssessor(plan, small_lung)

@@ -3,8 +3,8 @@
     .venv/bin/python tests/first_contact/run.py          with the libraries of this Python
     .venv/bin/python tests/first_contact/run.py --fresh  in a virtual environment made from nothing
 
-With --fresh, --wheel, --python and --constraints say what is installed where; --first does only the tasks up
-to the demonstration, as packaging/release.py asks for each version of Python.
+With --fresh, --wheel, --python and --constraints say what is installed where; --first does only those of a
+first look, as packaging/release.py asks for each version of Python.
 
 The package is built and installed as a user would get it, so that a file that was forgotten is missed.
 Without --fresh, its compiled kernels are copied from the checkout, if they are there, and the libraries are

@@ -130,6 +130,7 @@ def _tampered_again_and_again(kind: Cache, cache: Path, seeds: range) -> None:
         assert not kind.made, f"{what}: it stays damaged"
 
 
+@pytest.mark.slow
 def test_a_tampered_cache_gives_the_right_result(kind: Cache, tmp_path: Path) -> None:
     _tampered_again_and_again(kind, tmp_path, range(IN_CI // 3))
 

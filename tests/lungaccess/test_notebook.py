@@ -150,6 +150,7 @@ def test_the_tutorial_is_stored_without_outputs(tutorial: nbformat.NotebookNode)
         assert cell.cell_type == "markdown" or (cell.outputs == [] and cell.execution_count is None)
 
 
+@pytest.mark.slow
 def test_the_tutorial_runs(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, str(Path(__file__).with_name("notebook_runner.py")), str(TUTORIAL)],

@@ -253,6 +253,7 @@ def test_hole_is_what_lets_growth_into_the_pocket() -> None:
     assert leak(airways, lumen) == 0
 
 
+@pytest.mark.slow
 def test_result_does_not_depend_on_the_run_or_the_order_of_memory(beside_a_hole: Airways) -> None:
     ct, lungs, _ = made_airway(pocket=True, hole=True)
     again = segment_airway(Volume(grid=ct.grid, array=np.ascontiguousarray(ct.array)), lungs)

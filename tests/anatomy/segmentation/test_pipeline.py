@@ -163,6 +163,7 @@ def _cut_airway(made: Segmentation) -> np.ndarray:
     return lumen
 
 
+@pytest.mark.slow
 def test_a_corrected_mask_is_kept_and_only_what_follows_is_done_again(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:
@@ -253,7 +254,7 @@ def require_made_good(patient: Phantom, made: Segmentation, folder: Path) -> Non
     assert not list(folder.glob(".*-*"))
 
 
-@pytest.mark.parametrize("moment", [2, 3])
+@pytest.mark.parametrize("moment", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_a_run_that_is_killed_in_its_last_steps_leaves_no_patient_and_is_made_good(
     patient: Phantom, made: Segmentation, copy: Path, monkeypatch: pytest.MonkeyPatch, moment: int
 ) -> None:
@@ -283,6 +284,7 @@ def test_an_edited_description_is_kept(patient: Phantom, made: Segmentation, cop
     assert not _again(patient, made, made.folder).kept_description
 
 
+@pytest.mark.slow
 def test_a_point_outside_the_lung_is_warned_of(patient: Phantom, copy: Path, made: Segmentation) -> None:
     heart = made.grid.lps(np.argwhere(patient.labels.array == LABELS["heart"]).mean(axis=0))
     point = ",".join(f"{x:.2f}" for x in heart)
@@ -371,6 +373,7 @@ def test_a_file_that_is_no_image_is_refused(tmp_path: Path) -> None:
         read_ct(tmp_path / "missing.nii.gz")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_a_patient_leaves_none_and_is_accepted_by_name(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:

@@ -97,6 +97,7 @@ def test_a_thin_airway_is_followed(seed: int) -> None:
     assert pieces == 1
 
 
+@pytest.mark.slow
 def test_a_tube_goes_on_beyond_a_short_narrow_place_and_not_beyond_a_long_one() -> None:
     _, beyond = follow(block(0.85, 1.65, AIR_HU, narrow=(54, 60)))
     assert np.nonzero(beyond)[0].max() > 80
@@ -138,6 +139,7 @@ def test_what_is_banned_is_not_entered() -> None:
     assert not (added & banned).any()
 
 
+@pytest.mark.slow
 def test_the_same_image_gives_the_same_tubes() -> None:
     hu = block(0.85, 1.65, AIR_HU)
     first, again = follow(hu), follow(hu)

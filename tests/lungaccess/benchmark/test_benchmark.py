@@ -82,6 +82,7 @@ def test_patients_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
             patients_of(folder)
 
 
+@pytest.mark.slow
 def test_by_the_rules_of_unc_paths_keep_from_voxel_centres(small_phantom: Phantom) -> None:
     """Every path from the phantom's airway is resampled and measured to every obstacle voxel's centre."""
     images = small_phantom.images
@@ -112,6 +113,7 @@ def test_by_the_rules_of_unc_paths_keep_from_voxel_centres(small_phantom: Phanto
     assert solved > 2
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("number", "every"),

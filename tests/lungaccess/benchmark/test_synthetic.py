@@ -93,6 +93,7 @@ def test_a_changed_generator_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None
         make_benchmark_phantom(case)
 
 
+@pytest.mark.slow
 def test_masks_read_from_files_have_the_hash_of_those_written(tmp_path: Path) -> None:
     made = unproved_phantom(phantom_named("child-02"))
     write_phantom(made, tmp_path / "child-02", with_ct=False)

@@ -112,7 +112,7 @@ def follow(
 
 
 def brute_distance(lung: Any, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distances to the voxels of a mask as solid boxes, at most 20 mm; all boxes are tried that may be nearest."""
+    """Distances to the voxels of a mask as solid boxes, at most 20 mm; each that may be nearest is tried."""
     spacing = np.asarray(SPACING_MM)
     local = transform_points(np.linalg.inv(lung.grid.lps_from_ijk), points) * spacing
     boxes = np.argwhere(mask) * spacing

@@ -133,6 +133,7 @@ def test_random_mutants_are_refused(
     assert not checks.of_mutant(mutant, system, target).accepted, kind
 
 
+@pytest.mark.slow
 def test_a_checker_that_has_seen_other_plans_says_the_same(
     cases: list[tuple[Any, Any, Case]], small_lung: Lung
 ) -> None:
@@ -143,6 +144,7 @@ def test_a_checker_that_has_seen_other_plans_says_the_same(
             assert checker.check(case.plan).findings == check(case.plan, small_lung).findings
 
 
+@pytest.mark.slow
 def test_a_run_that_was_interrupted_goes_on(
     small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ import contextlib
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import lungaccess as la
 from anatomy.errors import LungaccessError
@@ -39,6 +40,7 @@ def plans_through(lung: Lung, branches: np.ndarray) -> list[Plan]:
     return plans
 
 
+@pytest.mark.slow
 def test_an_exit_from_a_main_bronchus_is_refused_for_that_alone(small_lung: Lung) -> None:
     tree = replace(small_lung.tree)
     vars(tree)["mediastinal"] = np.zeros(tree.n_branches, dtype=bool)

@@ -31,6 +31,7 @@ def require_refused(done: subprocess.CompletedProcess[str]) -> None:
     assert "Traceback" not in done.stderr and "room on the disk" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_patient_that_cannot_be_stored(patient: Path, tmp_path: Path) -> None:
     require_refused(limited(100_000, "info", str(patient), "--cache", str(tmp_path / "cache"), "-q"))
     assert not list((tmp_path / "cache").iterdir())

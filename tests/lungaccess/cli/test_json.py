@@ -155,6 +155,7 @@ def test_info_and_tour_as_json(patient: Path, tmp_path: Path, capsys: pytest.Cap
     assert tour == json.loads((tmp_path / "tour" / "tour.json").read_text())
 
 
+@pytest.mark.slow
 def test_alternatives_and_needle_as_json(
     patient: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

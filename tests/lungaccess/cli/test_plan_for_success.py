@@ -37,6 +37,7 @@ def test_what_cannot_be_asked_together_is_refused_in_words(
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_plan_and_its_chance(patient: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--target", "lps:-45.6,47.0,-65.1", "--system", "ultrathin", "--objective", "success"]
     budget = ["--iterations", "2", "--no-pictures", "--json"]

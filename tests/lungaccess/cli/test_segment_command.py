@@ -40,6 +40,7 @@ def _refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return _one_line(shown)
 
 
+@pytest.mark.slow
 def test_a_ct_becomes_a_patient_that_info_reads(
     ct_file: Path, small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,6 +85,7 @@ def test_tubes_are_clear_behind_the_exit(atlas: la.Atlas, small_lung: Lung) -> N
         assert dry[s > found.exit_mm[n] + 0.02].all()
 
 
+@pytest.mark.slow
 def test_no_tube_leaves_trachea_or_main_bronchi(atlas: la.Atlas, small_lung: Lung) -> None:
     """They lie in the mediastinum, whatever the masks hold beside them; nothing else is lost by that."""
     tree, free = small_lung.tree, replace(small_lung.tree)

@@ -474,6 +474,7 @@ def test_a_plan_states_its_gap_and_the_same_run_states_the_same(
     assert same_run(plans) == same_run(plans_of(small_lung, target, atlas, iterations=80, gap=0.0))
 
 
+@pytest.mark.slow
 def test_a_wide_gap_ends_the_search_at_once(small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
     *_, last = plans_of(small_lung, target, atlas, iterations=1000, gap=20.0)
     assert last.iterations < 1000

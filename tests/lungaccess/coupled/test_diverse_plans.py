@@ -163,6 +163,7 @@ def test_an_atlas_serves_another_needle(small_lung: Lung, atlas: la.Atlas) -> No
     assert alternatives(small_lung, other, target, atlas=atlas, count=1)[0].plan.system == other
 
 
+@pytest.mark.slow
 def test_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_lung)
     words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]

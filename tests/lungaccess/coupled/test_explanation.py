@@ -91,6 +91,7 @@ class TestScope:
             )
             assert (atlas.motions.count > 0) == fits
 
+    @pytest.mark.slow
     def test_no_airway_in_lung_tissue(self, small_lung: Lung) -> None:
         """The lung is far from every airway: a thinner scope is no help, and none is advised."""
         labels = small_lung.labels.copy(order="F")
@@ -104,6 +105,7 @@ class TestScope:
         assert error.reasons["scope: tips with a proved motion"] == 0 and error.advice == ""
 
 
+@pytest.mark.slow
 def test_tubes_that_never_leave(small_lung: Lung) -> None:
     system = replace(SYSTEM, tubes=replace(SYSTEM.tubes, min_wall_angle_deg=90.0))
     error = explained(small_lung, system, la.resolve_target(small_lung))
@@ -117,6 +119,7 @@ def test_tubes_that_never_leave(small_lung: Lung) -> None:
 class TestNeedle:
     """The needle does not get there."""
 
+    @pytest.mark.slow
     def test_outside_the_workspace(self, small_lung: Lung, atlas_of: Any) -> None:
         atlas = atlas_of(SYSTEM)
         error = explained(small_lung, SYSTEM, la.resolve_target(small_lung, FAR_TARGET), atlas=atlas)
@@ -124,6 +127,7 @@ class TestNeedle:
         outside = error.reasons["needle: deployments whose workspace does not hold the target"]
         assert outside == atlas.deployments.count > 0
 
+    @pytest.mark.slow
     def test_walled_in_by_a_vessel(self, small_lung: Lung) -> None:
         """A shell of vessel about a target that was reached before."""
         target = la.resolve_target(small_lung)
@@ -152,6 +156,7 @@ class TestNeedle:
         assert next(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM))) is not None
 
 
+@pytest.mark.slow
 class TestAdvice:
     """What is advised gives a plan that the check accepts."""
 

@@ -80,6 +80,7 @@ def plans(small_lung: Lung, atlas: la.Atlas, target: Target) -> dict[str, list[P
     }
 
 
+@pytest.mark.slow
 class TestPlans:
     """What `plan` yields with this method."""
 
@@ -109,6 +110,7 @@ class TestPlans:
 class TestSearch:
     """What the search counts."""
 
+    @pytest.mark.slow
     def test_counts_add_up(self, atlas: la.Atlas, target: Target, obstacles: Obstacles) -> None:
         counts: list[Counter[str]] = []
         for rejects in (True, False):
@@ -146,6 +148,7 @@ class TestSearch:
 class TestTubes:
     """The validator with meshes and the planner's proof with fields are different code for one rule."""
 
+    @pytest.mark.slow
     def test_they_agree(self, atlas: la.Atlas, small_lung: Lung, obstacles: Obstacles) -> None:
         validator = TubeValidator(SYSTEM, obstacles)
         proof = DeploymentValidator(

@@ -114,6 +114,7 @@ def test_a_wrong_end_and_a_wrong_needle_are_refused(small_lung: Lung, plans: lis
     assert "needle.present" in refusals(with_needle)
 
 
+@pytest.mark.slow
 def test_no_plan_says_how_near_the_tip_comes(small_lung: Lung, system: System, atlas: la.Atlas) -> None:
     tips = atlas.deployments.positions
     free = np.argwhere(small_lung.labels == 0)[::97]

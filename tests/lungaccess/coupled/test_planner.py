@@ -46,6 +46,7 @@ class TestRepeatability:
         assert same_run(first) == same_run(again)
         assert [p.digest for p in first] == [p.digest for p in again]
 
+    @pytest.mark.slow
     def test_the_atlas_made_inside_gives_the_same_plans(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
@@ -97,11 +98,13 @@ class TestBudget:
         plans.close()  # type: ignore[attr-defined]
         assert costs[0] > costs[1] > costs[2]
 
+    @pytest.mark.slow
     def test_a_futile_search_without_budget_ends(self, small_lung: Lung, atlas: la.Atlas) -> None:
         far = la.resolve_target(small_lung, FAR_TARGET)
         with pytest.raises(la.NoPlan, match="outside the needle's workspace"):
             list(la.plan(small_lung, SYSTEM, far, atlas=atlas))
 
+    @pytest.mark.slow
     def test_progress(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
         told: list[ProgressEvent] = []
         list(la.plan(small_lung, SYSTEM, target, time_s=0.6, on_progress=told.append))
@@ -207,6 +210,7 @@ class TestBadInput:
             la.plan(small_lung, SYSTEM, far, atlas=atlas)
 
 
+@pytest.mark.slow
 class TestProcesses:
     """Several processes at once."""
 

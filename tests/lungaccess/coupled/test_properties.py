@@ -60,6 +60,7 @@ def test_every_plan_keeps_every_rule(
     assert report.accepted, [f.name for f in report.findings if not f.ok]
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6), share=st.floats(0.0, 1.0), stage=st.sampled_from(["needle", "tube"]))
 @ANY
 def test_a_vessel_put_on_the_way_is_noticed(
@@ -79,6 +80,7 @@ def test_a_vessel_put_on_the_way_is_noticed(
     assert any(not f.ok and ("vessel" in f.name or "contain" in f.name) for f in report.findings)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=1)
 def test_a_new_search_goes_around_what_was_put_in_the_way(
@@ -104,6 +106,7 @@ def test_a_new_search_goes_around_what_was_put_in_the_way(
         assert problems(plan, crossed) == []
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 10**6),
     moved=st.sampled_from(["route", "tube", "needle", "target"]),

@@ -17,7 +17,7 @@ from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from stages.needle.path import ArcPath
 
-pytestmark = pytest.mark.data
+pytestmark = [pytest.mark.data, pytest.mark.slow]
 
 ITERATIONS = 300
 RESAMPLE_MM = 0.02

@@ -154,6 +154,7 @@ class TestBlocked:
         assert tried == [False] * 5
 
 
+@pytest.mark.slow
 class TestFar:
     """The target is out of reach."""
 

@@ -132,6 +132,7 @@ def _are_feasible(patient: Path, exits: dict[str, Any]) -> None:
         )
 
 
+@pytest.mark.slow
 def test_the_latest_question_wins(patient: Path) -> None:
     async def talk(client: Client, _explorer: Explorer) -> None:
         await client.ask("prepare", what_if=SYSTEM)
@@ -151,6 +152,7 @@ def test_the_latest_question_wins(patient: Path) -> None:
     with_client(source_of(patient), talk)
 
 
+@pytest.mark.slow
 def test_other_answers_do_not_wait_for_a_long_search(patient: Path) -> None:
     async def talk(client: Client, _explorer: Explorer) -> None:
         await client.ask("prepare", what_if=SYSTEM)

@@ -206,7 +206,8 @@ def test_a_process_that_dies_is_told_and_started_again() -> None:
     with_client(NOBODY, talk)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_the_command_ends_with_its_processes(number: signal.Signals, patient: Path) -> None:
     start = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
     cache = patient.parent / "cache"

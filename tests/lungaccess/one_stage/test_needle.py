@@ -117,13 +117,9 @@ def wall_starts(lung: Lung, reach_mm: float) -> list[np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "planner",
-    [
-        "rrt",
-        "decide",
-        *(pytest.param(p, marks=pytest.mark.slow) for p in PLANNERS if p not in ("rrt", "decide")),
-    ],
+    "planner", ["decide", *(pytest.param(p, marks=pytest.mark.slow) for p in PLANNERS if p != "decide")]
 )
 def test_a_needle_that_begins_at_the_wall_leaves_the_lumen(
     small_lung: Lung, system: System, planner: str
@@ -222,6 +218,7 @@ def test_an_open_question_tells_where_a_path_would_pass(small_lung: Lung, system
     assert "0.40 mm wide, 5.0 mm ahead" in shown.get() and "0.03 mm" in shown.get()
 
 
+@pytest.mark.slow
 def test_command(
     small_lung: Lung, small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

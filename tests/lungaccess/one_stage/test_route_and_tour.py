@@ -145,6 +145,7 @@ def test_a_lesion_out_of_reach_is_left_out_and_named(small_lung: Lung) -> None:
         plan_tour(small_lung, np.array([[9e3, 0.0, 0.0]]))
 
 
+@pytest.mark.slow
 def test_exits_of_a_tour_with_required_plans_have_a_coupled_plan(
     small_lung: Lung, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -179,6 +180,7 @@ def test_exits_of_a_tour_with_required_plans_have_a_coupled_plan(
         plan_tour(small_lung, lesion, atlas=short, iterations=2)
 
 
+@pytest.mark.slow
 def test_tour_command_writes_its_files(small_phantom: Phantom, small_lung: Lung, tmp_path: Path) -> None:
     folder = tmp_path / "patient"
     write_phantom(small_phantom, folder)

@@ -83,6 +83,7 @@ def test_numbers_have_a_range(size: float, samples: int, small_plan: Plan, breat
         insert_plan(small_plan, breathing_lung, size=size, samples=samples)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_film_and_a_picture(
     small_plan: Plan,
     breathing_lung: Lung,

@@ -131,6 +131,7 @@ def test_points_of_a_cube_agree_with_each_alone(
             assert np.array_equal(together.kinds, alone)
 
 
+@pytest.mark.slow
 def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     plain, searched, again = (
         map_reach(small_lung, SYSTEM, spacing_mm=12.0, atlas=atlas, trees=trees) for trees in (0, 1, 1)
@@ -287,6 +288,7 @@ def test_neighbours_come_before() -> None:
                 assert other < n and tuple(places[other]) == tuple(before)
 
 
+@pytest.mark.slow
 def test_devices_are_compared(small_lung: Lung) -> None:
     stiff = replace(SYSTEM, name="stiff", needle=replace(SYSTEM.needle, max_curvature_per_mm=0.002))
     thick = replace(
@@ -323,6 +325,7 @@ def test_bad_input_is_refused(
         reach.gained_and_lost_ml(replace(reach, kinds=finer))
 
 
+@pytest.mark.slow
 def test_the_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr("lungaccess.problem.patients.load_patient", lambda *_args, **_options: small_lung)
     command = ["reach", "patient", "--system", "ultrathin", "--spacing", "30", "--out", str(tmp_path)]

@@ -292,6 +292,7 @@ def random_tips_of_the_region(lung: Lung, least_mm: float, rng: np.random.Genera
     return np.asarray(tips[in_tip_region(tree, tips)[1]])
 
 
+@pytest.mark.slow
 def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
     small_lung: Lung, system: System, proof: UnreachableProof
 ) -> None:
@@ -316,6 +317,7 @@ def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
     assert aside > 9
 
 
+@pytest.mark.slow
 def test_a_weak_system_is_proved_not_to_reach_what_it_does_not(small_lung: Lung, system: System) -> None:
     """A thicker scope, tubes that hardly leave it, and a short needle that hardly bends."""
     weak = replace(
@@ -371,6 +373,7 @@ def target_of(plan: la.Plan) -> list[str]:
     return ["--target", "lps:" + ",".join(f"{value:.3f}" for value in plan.target_lps)]
 
 
+@pytest.mark.slow
 def test_the_command(words: list[str], plans: list[la.Plan], capsys: pytest.CaptureFixture[str]) -> None:
     target = target_of(plans[0])
     code = main([*words, *target, "--most-boxes", "1000", "--json"])

@@ -355,6 +355,7 @@ def places_of(box: boxes.FieldBox) -> Float:
     return np.asarray((index - offset) @ np.linalg.inv(matrix).T)
 
 
+@pytest.mark.slow
 def test_candidates_at_turned_tips_are_refined(small_lung: Lung) -> None:
     atlas = la.build_atlas(small_lung, SYSTEM, rotations=12, stop_spacing_mm=4.0)
     better = 0

@@ -55,6 +55,7 @@ def test_left_is_left_in_the_slices(page: browser.Browser, small_lung: Lung) -> 
     assert told_apart.all()
 
 
+@pytest.mark.slow
 def test_everything_breathes_together(
     page: browser.Browser, breathing_plans: tuple[Plan, ...], breathing_lung: Lung
 ) -> None:

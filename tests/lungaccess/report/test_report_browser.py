@@ -50,6 +50,7 @@ def test_nothing_is_asked_of_the_network(page: browser.Browser) -> None:
     assert [name for name in names if not name.startswith("data:")] == []
 
 
+@pytest.mark.slow
 def test_the_slider_moves_scope_tubes_and_needle_to_where_the_plan_has_them(
     page: browser.Browser, plans: tuple[Plan, ...]
 ) -> None:
@@ -118,6 +119,7 @@ def test_every_control_can_have_the_focus(page: browser.Browser) -> None:
     assert lost == []
 
 
+@pytest.mark.slow
 def test_switches_show_and_hide(page: browser.Browser) -> None:
     keys = page.run("return [...document.querySelectorAll('input[data-key]')].map((box) => box.dataset.key)")
     assert {"scope", "tubes", "needle", "airway", "vessel", "lung", "fissure", "plan-0", "plan-1"} <= set(
@@ -163,6 +165,7 @@ def test_another_plan_can_be_followed(page: browser.Browser, plans: tuple[Plan, 
     page.run(CHOOSE, "followed", "0")
 
 
+@pytest.mark.slow
 def test_the_bronchoscopy_shows_the_airway(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.set(0.1)")
     red, blue = page.run(RED_AND_BLUE)
@@ -189,6 +192,7 @@ def test_playing_moves_the_slider(page: browser.Browser) -> None:
     assert page.state()["position"] == stopped
 
 
+@pytest.mark.slow
 def test_a_phone_needs_no_sideways_scrolling_and_a_dark_page_is_dark_and_shows_lungs(
     breathing_page: Path,
 ) -> None:
@@ -209,6 +213,7 @@ def test_a_phone_needs_no_sideways_scrolling_and_a_dark_page_is_dark_and_shows_l
         assert np.median(seen) > 1.3
 
 
+@pytest.mark.slow
 def test_lungs_stand_out_from_a_light_ground(page: browser.Browser) -> None:
     seen = contrasts_of_lungs(page)
     page.run("document.querySelector('button[data-fit=plan]').click()")

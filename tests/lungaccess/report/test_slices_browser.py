@@ -142,6 +142,7 @@ def test_wheel_zoom_pan_and_keys_work_without_a_click_first(fresh: browser.Brows
     np.testing.assert_allclose(cross(fresh) - before, [0, spacing[1], spacing[2]], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_window_maps_hounsfield_units_to_greys(fresh: browser.Browser) -> None:
     """By its presets, its fields and a drag with the right button."""
     fresh.run(CHOOSE, "tint", False)
@@ -261,6 +262,7 @@ def test_opacity_of_a_structure(fresh: browser.Browser) -> None:
         assert same is (value == 45)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_the_cross_is_exact_to_a_voxel_on_any_grid(tmp_path: Path, mirrored: bool) -> None:
     """Turned, anisotropic and left-handed: indices there and back, and a trilinear value."""
@@ -295,6 +297,7 @@ def test_the_cross_is_exact_to_a_voxel_on_any_grid(tmp_path: Path, mirrored: boo
             assert value == pytest.approx(wanted[n], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_double_click_in_the_3d_view_puts_the_cross_there(fresh: browser.Browser) -> None:
     place = fresh.run(
         """const c = document.getElementById('scene'), at = [c.clientWidth / 2, c.clientHeight / 2];
@@ -334,6 +337,7 @@ def test_hours_of_the_prompts_are_those_of_the_picture(
     assert all(each["text"] in shown for each in stored)
 
 
+@pytest.mark.slow
 def test_playing_pauses_before_every_bifurcation(fresh: browser.Browser, data: dict[str, Any]) -> None:
     scope = data["plans"][0]["scope"]
     along = pack.unpack(scope["arc_length_mm"])

@@ -137,6 +137,7 @@ def test_two_clicks_measure(page: browser.Browser, plans: tuple[Plan, ...]) -> N
     assert page.run("return document.getElementById('measure').getAttribute('aria-pressed')") == "false"
 
 
+@pytest.mark.slow
 def test_the_cut_goes_through_the_needle_and_faces_the_viewer(
     page: browser.Browser, plans: tuple[Plan, ...]
 ) -> None:
@@ -168,6 +169,7 @@ def test_what_is_near_can_be_brought_out_or_not(page: browser.Browser) -> None:
     assert page.run(PICTURE, 1, "scene") == before
 
 
+@pytest.mark.slow
 def test_pictures_and_films_are_saved(page: browser.Browser, tmp_path: Path) -> None:
     page.command("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
     page.run("document.getElementById('save-picture').click()")

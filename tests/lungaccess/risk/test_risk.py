@@ -361,6 +361,7 @@ def test_bad_input_is_refused(plan: Plan, small_lung: Lung, tmp_path: Path) -> N
             find_tolerances(plan, small_lung, probability=probability)
 
 
+@pytest.mark.slow
 def test_the_command(
     plan: Plan, small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:

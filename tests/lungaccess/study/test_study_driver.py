@@ -187,6 +187,7 @@ def test_only_a_few_runs_wait_at_the_scheduler_and_nothing_of_the_others_stays(
     assert beginnings[-1] == beginnings[0], "statistics that dask keeps for good"
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_study_and_keeps_what_is_stored(
     tmp_path: Path, cache: Path, cluster: str, made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -237,6 +237,7 @@ with ResultsFile(Path(sys.argv[1]), create=True) as results:
 """
 
 
+@pytest.mark.slow
 def test_two_processes_share_a_new_file(path: Path, runs: list[Run]) -> None:
     added: list[int] = []
 

@@ -101,6 +101,7 @@ def test_a_plan_is_checked_and_a_bad_target_is_an_answer(runs: list[Run], cache:
     assert answer(runs[0], cache).digest == good.digest
 
 
+@pytest.mark.slow
 def test_success_against_least_cost_with_the_same_luck(cache: Path, tmp_path: Path) -> None:
     """Each plan states its chance on the same draws; it is that of the results file, too."""
     planners = [{"name": "cost"}, {"name": "safe", "method": "success", "iterations": 1}]
@@ -144,6 +145,7 @@ def test_other_files_than_those_of_the_study_are_refused(runs: list[Run], tmp_pa
         open_patient(patient, tmp_path)
 
 
+@pytest.mark.slow
 def test_few_patients_are_kept(runs: list[Run], cache: Path) -> None:
     for spacing in (4.0, 5.0, 6.0, 7.0):
         one_run.prepare(replace(runs[0].problem, site_spacing_mm=spacing, rotations=2), cache)

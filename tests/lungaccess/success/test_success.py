@@ -119,6 +119,7 @@ def test_a_diverse_set_trades_success_for_length_and_clearance(
         assert not (each.on_front and any(better))
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_plans(small_lung: Lung, atlas: la.Atlas, targets: list[Target]) -> None:
     target = targets[0]
     one, other = (

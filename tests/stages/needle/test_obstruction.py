@@ -163,6 +163,7 @@ def test_reach_names_limit_and_radius(tolerance: float) -> None:
     assert behind.proved
 
 
+@pytest.mark.slow
 def test_a_start_that_is_blocked_has_no_path_for_any_search() -> None:
     """Of the places that are called blocked, none is passed by random arcs from there."""
     rng = np.random.default_rng(0)

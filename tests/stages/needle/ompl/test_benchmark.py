@@ -28,6 +28,7 @@ from tests.stages.needle.ompl.problems import (
 )
 
 
+@pytest.mark.slow
 def test_the_benchmark_of_ompl_takes_all_planners(problem: NeedleProblem, tmp_path: Path) -> None:
     log = tmp_path / "needle.log"
     results = benchmark(

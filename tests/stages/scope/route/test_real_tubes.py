@@ -51,6 +51,7 @@ def test_all_routes_of_an_airway_tree_are_proved_and_replanned(data_dir: Path) -
     assert line.moved(moved).depth_mm(again.curve.sampled(100)).min() >= 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vein", ["hepaticVein", "portalVein"])
 def test_what_is_called_proved_in_a_vein_keeps_its_limits(data_dir: Path, vein: str) -> None:
     """Voxels 5 mm high; some ends cannot be reached with this curvature, most can."""

@@ -4,7 +4,7 @@
 
 The planner has `PLAN_S` seconds for its first plan, and the proof has the rest of `DECIDE_S`.  The proof is
 also offered, with few boxes, every target that has a plan: it must never rule one out.  What is finished is
-kept in a file beside the result, and a run that was stopped goes on from there.
+kept in a file for each patient beside the result, and a run that was stopped goes on from there.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ RADII_MM = (121.0, 50.0)
 """Of the needle."""
 PLAN_S, DECIDE_S = 20.0, 60.0
 """Most time for the first plan, and for plan and proof together, s."""
-BOXES_OF_A_PLANNED = 200_000
+BOXES_OF_A_PLANNED = 20_000
 TARGETS_A_LUNG, QUICK_TARGETS_A_LUNG = 50, 2
 PLANNED, PROVED, OPEN = "planned", "proved unreachable", "open"
 
@@ -146,9 +146,9 @@ def main() -> None:
             "time": f"{PLAN_S:g} s for a first plan, {DECIDE_S:g} s with the proof, after the preparation",
         },
     )
-    records = Records(Path(options.results) / setting / "decided_targets_finished" / "records.json")
+    finished = Path(options.results) / setting / "decided_targets_finished"
     for patient in options.patients[:1] if options.quick else options.patients:
-        lung = anatomy(patient)
+        lung, records = anatomy(patient), Records(finished / f"{patient}.json")
         points = peripheral_targets(lung, per_lung, options.seed)
         atlas = la.build_atlas(lung, la.load_system(options.system, fissures_allowed=True))
         for label, system in systems(options.system):

@@ -125,13 +125,13 @@ def add_case(result: Result, label: str, times: Float, refused: int, limit_s: fl
         result.add(f"{label}: of the solved, within 0.1 s", early, unit="%", note=note)
 
 
-def draw(found: Times, limit_s: float) -> Figure:
-    """Draw the share solved over planning time, with the paper's points up to a minute."""
+def draw(found: Times, limits_s: dict[str, float]) -> Figure:
+    """Draw the share solved over planning time, up to the limit, with the paper's points up to a minute."""
     figure = style.new_figure(7.5, 5.2)
     axes = figure.subplots()
-    grid = np.geomspace(0.005, limit_s, 300)
     cases = list(dict.fromkeys(case for case, _planner in found))
     for (case, planner), (times, _refused) in found.items():
+        grid = np.geomspace(0.005, limits_s[planner], 300)
         share = [100.0 * float((times <= at).mean()) for at in grid]
         axes.plot(
             grid, share, "-" if planner == OURS else ":", color=f"C{cases.index(case)}", linewidth=1.4,
@@ -176,11 +176,11 @@ def main() -> None:
             run_study(asked, file, workers=options.workers)
         for run in runs_of(asked):
             wanted[run.problem.case, planner] = wanted.get((run.problem.case, planner), 0) + 1
+    limits_s = {OURS: size.ours_s, PAPERS: size.papers_s}
     found, result.progress = finished(times_by_case(file), wanted)
     for (case, planner), (times, refused) in found.items():
-        limit_s = size.ours_s if planner == OURS else size.papers_s
-        add_case(result, f"{case}, {planner}", times, refused, limit_s)
-    result.figure = draw(found, size.ours_s)
+        add_case(result, f"{case}, {planner}", times, refused, limits_s[planner])
+    result.figure = draw(found, limits_s)
     write_result(result, options.results)
 
 

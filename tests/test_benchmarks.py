@@ -23,6 +23,7 @@ def test_every_stage_has_a_benchmark_of_a_new_process() -> None:
     assert {"kernels", "needle", "route", "scope", "segmentation", "tube"} <= named
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", kinds(), ids=lambda kind: kind.__module__)
 def test_a_new_process_finds_what_it_imports(
     kind: type[FreshProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -254,7 +254,8 @@ def require_made_good(patient: Phantom, made: Segmentation, folder: Path) -> Non
     assert not list(folder.glob(".*-*"))
 
 
-@pytest.mark.parametrize("moment", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", [2, 3])
 def test_a_run_that_is_killed_in_its_last_steps_leaves_no_patient_and_is_made_good(
     patient: Phantom, made: Segmentation, copy: Path, monkeypatch: pytest.MonkeyPatch, moment: int
 ) -> None:

@@ -14,9 +14,7 @@ from tests.anatomy.tubes import outside_mm
 
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize(
-    ("patient", "generations"), [("Patient1", 7), pytest.param("Patient2", 12, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("patient", "generations"), [("Patient1", 7), ("Patient2", 12)])
 def test_tree_of_a_patient(data_dir: Path, patient: str, generations: int):
     lumen = read_mask(data_dir / "med-rad" / patient / "bronchialTree.nii.gz")
     tree = tree_from_mask(lumen)
@@ -41,7 +39,7 @@ def test_tree_of_a_patient(data_dir: Path, patient: str, generations: int):
 
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize("patient", ["Patient1", pytest.param("Patient2", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("patient", ["Patient1", "Patient2"])
 def test_every_part_of_the_lumen_is_near_its_tree(data_dir: Path, patient: str):
     from scipy.spatial import KDTree
 

@@ -34,14 +34,8 @@ def planning(patient: Path, out: Path, *more: str, cache: Path | None = None) ->
     )
 
 
-@pytest.mark.parametrize(
-    "more",
-    [
-        ("--json",),
-        pytest.param((), marks=pytest.mark.slow),
-        pytest.param(("--processes", "2"), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [("--json",), (), ("--processes", "2")])
 def test_ctrl_c_keeps_the_best_plan(more: tuple[str, ...], patient: Path, tmp_path: Path) -> None:
     """A real SIGINT, as from a terminal to the whole group, as soon as the first plan is announced."""
     process = planning(patient, tmp_path / "out", *more)

@@ -402,6 +402,7 @@ def _all_refused(surroundings: Any, tubes: Any, tips: Any, box: Any) -> bool:
     return bool(tubes_blocked(surroundings, tubes, pose, box, least_sweep(tubes, box)))
 
 
+@pytest.mark.slow
 def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
     small_lung: Lung, target: Target, atlas: la.Atlas
 ) -> None:

@@ -218,6 +218,7 @@ class TestFar:
         assert one == two
 
 
+@pytest.mark.slow
 def test_when_the_time_is_up_the_rest_is_listed_and_no_claim_is_made(
     far: Explanation, small_lung: Lung, atlas_of: AtlasOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:

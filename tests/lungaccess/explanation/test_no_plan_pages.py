@@ -104,6 +104,7 @@ class TestBrowser:
             next(key for key in before if key.startswith("start "))
         ]
 
+    @pytest.mark.slow
     def test_the_list_of_places_brings_the_slices_back_to_the_target(self, window: browser.Browser) -> None:
         target = window.state()["place_lps"]
         window.run("window.lungaccessReport.set(arguments[0])", [mm + 7.0 for mm in target])

@@ -189,6 +189,7 @@ def is_running(pid: int) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_told_and_started_again() -> None:
     async def talk(client: Client, explorer: Explorer) -> None:
         await client.ask("place", point=[0, 0, 0])
@@ -207,7 +208,7 @@ def test_a_process_that_dies_is_told_and_started_again() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_ends_with_its_processes(number: signal.Signals, patient: Path) -> None:
     start = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
     cache = patient.parent / "cache"

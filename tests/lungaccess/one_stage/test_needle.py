@@ -118,9 +118,7 @@ def wall_starts(lung: Lung, reach_mm: float) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "planner", ["decide", *(pytest.param(p, marks=pytest.mark.slow) for p in PLANNERS if p != "decide")]
-)
+@pytest.mark.parametrize("planner", PLANNERS)
 def test_a_needle_that_begins_at_the_wall_leaves_the_lumen(
     small_lung: Lung, system: System, planner: str
 ) -> None:

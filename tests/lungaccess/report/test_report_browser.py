@@ -156,6 +156,7 @@ def test_several_plans_have_numbers_and_styles(page: browser.Browser) -> None:
     page.run("document.querySelector(`input[data-key='plan-1']`).click(); window.lungaccessReport.set(1)")
 
 
+@pytest.mark.slow
 def test_another_plan_can_be_followed(page: browser.Browser, plans: tuple[Plan, ...]) -> None:
     page.run(CHOOSE, "followed", "1")
     page.run("window.lungaccessReport.set(1)")

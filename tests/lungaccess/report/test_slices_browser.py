@@ -251,6 +251,7 @@ def test_a_click_into_the_plane_along_the_needle_stays_in_it(fresh: browser.Brow
     assert moved @ np.array(plane["right"]) > 0.0 and moved @ np.array(plane["up"]) > 0.0
 
 
+@pytest.mark.slow
 def test_opacity_of_a_structure(fresh: browser.Browser) -> None:
     before = fresh.run("return document.getElementById('slice-axial').toDataURL()")
     change = """const s = document.querySelector("input[data-structure='vessel']");

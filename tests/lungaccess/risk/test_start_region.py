@@ -105,6 +105,7 @@ def test_what_it_cannot_answer_is_refused(plan: Plan, small_lung: Lung) -> None:
         la.safe_start_region(plan, forbidding)
 
 
+@pytest.mark.slow
 def test_the_command_says_it_first(
     plan: Plan, small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

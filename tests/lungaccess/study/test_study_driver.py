@@ -121,6 +121,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_worker_has_one_thread_from_its_beginning(tmp_path: Path) -> None:
     """It imports what the script imports, before dask can change anything."""
     script = tmp_path / "script.py"

@@ -173,6 +173,7 @@ class TestBetween:
         found = NearbyShapes(curved).at(40, curved.insertions_mm[40], curved.rotations_rad[40])
         assert found is not None and found.arcs == pytest.approx(curved.arcs_of(40), abs=1e-9)
 
+    @pytest.mark.slow
     def test_the_whole_way_is_that_of_the_grid(self) -> None:
         made = tube_shapes(PAIR, ShapeLimits(max_extension_mm=20.0), ShapeGrid(stop_mm=2.0, rotations=6))
         limits = made.limits

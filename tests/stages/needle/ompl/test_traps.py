@@ -97,6 +97,7 @@ def peak_mib() -> float:
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_queries(problem: NeedleProblem) -> None:
     def some(count: int) -> None:
         for seed in range(count):
@@ -145,6 +146,7 @@ print(json.dumps(problem.solution().arcs.tolist()))
 """
 
 
+@pytest.mark.slow
 def test_planners_of_ompl_repeat_in_a_new_process_with_the_same_seed() -> None:
     root = Path(ompl_planner.__file__).parents[3]
     processes = [

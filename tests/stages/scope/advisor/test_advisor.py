@@ -165,6 +165,7 @@ def test_a_session_leads_to_the_goal(forked: tuple[Lung, Lumen], target: np.ndar
     assert strayed.fits(np.array([state.array for state in states])).all()
 
 
+@pytest.mark.slow
 def test_a_session_leads_back_out_of_the_wrong_airway(forked: tuple[Lung, Lumen]) -> None:
     """Down the right bronchus against all advice, then as advised: back to the carina, into the left one."""
     _right, wrong = path_to(forked, RIGHT)

@@ -32,7 +32,7 @@ RADII_MM = (121.0, 50.0)
 """Of the needle."""
 PLAN_S, DECIDE_S = 20.0, 60.0
 """Most time for the first plan, and for plan and proof together, s."""
-BOXES_OF_A_PLANNED = 20_000
+BOXES_OF_A_PLANNED = 200_000
 TARGETS_A_LUNG, QUICK_TARGETS_A_LUNG = 50, 2
 PLANNED, PROVED, OPEN = "planned", "proved unreachable", "open"
 

@@ -16,11 +16,8 @@ if TYPE_CHECKING:
 _CHECKOUT = Path(__file__).resolve().parents[1]
 
 
-# No test may depend on the speed of the machine.  `--hypothesis-profile thorough` draws more examples.
-for _profile, _examples in (("lungaccess", 25), ("thorough", 250)):
-    settings.register_profile(
-        _profile, deadline=None, max_examples=_examples, suppress_health_check=[HealthCheck.too_slow]
-    )
+# No test may depend on the speed of the machine.
+settings.register_profile("lungaccess", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("lungaccess")
 
 

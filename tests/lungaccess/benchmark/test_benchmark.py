@@ -115,10 +115,7 @@ def test_by_the_rules_of_unc_paths_keep_from_voxel_centres(small_phantom: Phanto
 
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize(
-    ("number", "every"),
-    [pytest.param(1, 1, marks=pytest.mark.slow), pytest.param(2, 1, marks=pytest.mark.slow), (2, 4)],
-)
+@pytest.mark.parametrize(("number", "every"), [(1, 1), (2, 1), (2, 4)])
 def test_published_queries_agree_with_the_recorded_peer(data_dir: Path, number: int, every: int) -> None:
     """What the peer solves is solved, what it refuses is proved to have no path; paths are resampled."""
     from anatomy.io.med_rad import load_med_rad

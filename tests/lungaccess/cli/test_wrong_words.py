@@ -1,4 +1,4 @@
-"""A hundred wrong command lines: none ends in a traceback, each says what was found and what to do."""
+"""Two hundred wrong command lines: none ends in a traceback, each says what was found and what to do."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from tests.lungaccess.cli.wrong_words import World, arguments_of, kind_of, ranges_of, wrong_words
 
-INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "100"))
+INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "200"))
 """How many wrong command lines are tried."""
 PHASES = (Phase.explicit, Phase.generate)
 """The words of a failure are short: making them shorter would only take time."""

@@ -205,7 +205,6 @@ class TestFar:
         lps, ras = record["target"]["lps_mm"], record["target"]["ras_mm"]
         assert ras == [-lps[0], -lps[1], lps[2]]
 
-    @pytest.mark.slow
     def test_the_same_input_gives_the_same_explanation(
         self, far: Explanation, small_lung: Lung, atlas_of: AtlasOf
     ) -> None:

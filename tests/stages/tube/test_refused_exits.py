@@ -18,7 +18,7 @@ BASE, FORWARD = (-6.0, 0.0, -4.0), (0.95, 0.0, 0.31)
 INSERTED_MM = 14.0
 REQUIRED_MM = 0.6 + MARGIN
 LOW, HIGH = np.array([-9.0, -4.0, -8.0]), np.array([11.0, 4.0, 8.0])
-SCENES = 40
+SCENES = 30
 
 
 @numba.njit

@@ -102,10 +102,23 @@ TEMPLATE = (
     _segment("LB9", "LB9+10", (0.82, 0.15, -0.58), 13, LEFT_LOWER),
     _segment("LB10", "LB9+10", (0.10, 0.65, -0.78), 14, LEFT_LOWER),
 )
+CENTRAL = (
+    "right main bronchus",
+    "left main bronchus",
+    "right upper lobe bronchus",
+    "left upper lobe bronchus",
+    "left lower lobe bronchus",
+)
+"""Main bronchi and the lobar ones that leave them."""
 
 
-def _skeleton(scale: float, rng: np.random.Generator) -> dict[str, tuple[Float, Float]]:
-    """Return start and end `(3,)` LPS mm of every bronchus of the template, slightly varied."""
+def _skeleton(
+    scale: float, rng: np.random.Generator, central_length: float
+) -> dict[str, tuple[Float, Float]]:
+    """Return start and end `(3,)` LPS mm of every bronchus of the template, slightly varied.
+
+    `central_length` is a factor of the lengths of main and lobar bronchi.
+    """
     top = scale * TRACHEA_LENGTH_MM * np.array([rng.uniform(-0.02, 0.02), -0.12, 1.0])
     ends = {"trachea": (top, np.zeros(3))}
     for bronchus in TEMPLATE:
@@ -113,6 +126,7 @@ def _skeleton(scale: float, rng: np.random.Generator) -> dict[str, tuple[Float, 
         direction = unit(unit(np.array(bronchus.direction)) + jitter)
         start = ends[bronchus.parent][1]
         length = scale * bronchus.length_mm * (1 + LENGTH_JITTER * rng.uniform(-1, 1))
+        length *= central_length if bronchus.name in CENTRAL else 1.0
         ends[bronchus.name] = (start, start + length * direction)
     return ends
 
@@ -161,7 +175,7 @@ def grow_airways(
     Returns the tree, whose `diameter_mm` is the lumen's, and the rule it follows.  Branch 0 is the
     trachea, 1 and 2 are the right and the left main bronchus.
     """
-    ends = _skeleton(scale, rng)
+    ends = _skeleton(scale, rng, traits.bronchus_length)
     resected = traits.resected_lobe
     clouds = _segment_clouds(ends, territory, resected)
     counts = _supplied(clouds)

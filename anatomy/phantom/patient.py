@@ -19,7 +19,7 @@ from anatomy.phantom.bullae import Bulla
 from anatomy.phantom.chest import make_chest
 from anatomy.phantom.ct import simulate_ct
 from anatomy.phantom.nodules import Nodule
-from anatomy.phantom.plan import plan_patient
+from anatomy.phantom.plan import PlannedTree, plan_patient
 from anatomy.phantom.rasterize import (
     LABELS,
     Canvas,
@@ -105,11 +105,12 @@ def make_phantom(
     *,
     noise_hu: float = 18.0,
     traits: Traits = PLAIN,
+    precise: bool = False,
 ) -> Phantom:
     """Make a synthetic patient.
 
-    The same arguments give the same voxels, bit for bit.  +x is the patient's left, +y posterior, +z
-    superior; the carina is the origin.
+    The same arguments give the same voxels, bit for bit, on the same kind of processor.  +x is the patient's
+    left, +y posterior, +z superior; the carina is the origin.
 
     Parameters
     ----------
@@ -123,6 +124,9 @@ def make_phantom(
         Standard deviation of the noise in the CT.
     traits : Traits
         Build, disease and operation.
+    precise : bool
+        Draw the body in double precision: the last digit, in which kinds of processors differ, then decides
+        no voxel.
 
     Returns
     -------
@@ -152,20 +156,24 @@ def make_phantom(
     fills = (resected, RESECTED_INTO[resected]) if resected else (0, 0)
     chest = make_chest(rng, scale, fills=fills, emphysema=traits.emphysema)
     plan = plan_patient(make_territory(chest, rng), scale, spacing_mm, rng, traits)
-    canvas = draw_body(chest, phantom_grid(chest, spacing_mm), traits.open_fissures)
+    canvas = draw_body(chest, phantom_grid(chest, spacing_mm), traits.open_fissures, precise=precise)
     for bulla in plan.bullae:
         draw_bulla(canvas, bulla.centre_lps, bulla.radius_mm)
     for nodule in plan.nodules:
         draw_ball(canvas, nodule.centre_lps, nodule.radius_mm)
     lines, base = {}, 0
+    hilar = np.zeros(canvas.labels.shape, dtype=np.bool_, order="F")
+    from_mm = scale * traits.hilar_vessel_mm
     for kind, tree in (("airway", plan.airways), ("artery", plan.arteries), ("vein", plan.veins)):
         keep = draw_tree(canvas, tree, base, kind)
         lines[kind] = centerlines(tree.sprouts, tree.inner_mm, tree.outer_mm, keep)
+        if kind != "airway" and from_mm:
+            hilar |= _wide(canvas, tree, base, from_mm)
         base += len(tree.sprouts.parent)
     return Phantom(
         seed=seed,
         size=size,
-        images=_images(canvas, f"phantom {size} {seed}", plan.nodules),
+        images=_images(canvas, f"phantom {size} {seed}", plan.nodules, hilar if from_mm else None),
         # The noise comes last of all draws, and from a copy, so that it is the same whenever it is asked for.
         render=lambda: simulate_ct(canvas, noise_hu, deepcopy(rng)),
         labels=Volume(grid=canvas.grid, array=canvas.labels),
@@ -198,20 +206,37 @@ def _require_settings(seed: int, spacing_mm: float | None, size: str, noise_hu: 
     return SCALES[size], spacing_mm
 
 
-def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...]) -> PatientImages:
+def _wide(canvas: Canvas, tree: PlannedTree, base: int, from_mm: float) -> Mask:
+    """Return the voxels of the branches, drawn after `base` others, whose diameter is `from_mm` or more."""
+    start = np.concatenate([[0], np.cumsum(tree.sprouts.counts)[:-1]])
+    table = np.zeros(base + len(start) + 2, dtype=np.bool_)
+    table[base + 1 : -1] = 2.0 * np.maximum.reduceat(tree.outer_mm, start) >= from_mm
+    # The last entry stands for nodules, which belong to no branch.
+    owner = np.where(canvas.owner < 0, len(table) - 1, canvas.owner)
+    return np.asarray(table[owner])
+
+
+def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...], hilar: Mask | None) -> PatientImages:
+    """Return the masks; `hilar` are the voxels of vessels that count as mediastinum, if any do."""
+
     def labelled(*names: str) -> Volume:
         table = np.zeros(256, dtype=np.bool_)
         table[[LABELS[n] for n in names]] = True
         return Volume(grid=canvas.grid, array=table[canvas.labels])
 
+    lung = (canvas.lobes > 0) & (canvas.labels != LABELS["bulla"])
+    vessels = labelled("artery", "vein")
+    if hilar is not None:
+        lung &= ~hilar
+        vessels = Volume(grid=canvas.grid, array=vessels.array & lung)
     return PatientImages(
         name=name,
         kind="phantom",
         grid=canvas.grid,
         lumen=labelled("lumen"),
         wall=labelled("wall"),
-        vessels=labelled("artery", "vein"),
-        lung=Volume(grid=canvas.grid, array=(canvas.lobes > 0) & (canvas.labels != LABELS["bulla"])),
+        vessels=vessels,
+        lung=Volume(grid=canvas.grid, array=lung),
         fissures=labelled("fissure"),
         nodules=labelled("nodule"),
         targets_lps=tuple(n.centre_lps for n in nodules),

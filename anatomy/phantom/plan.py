@@ -10,6 +10,7 @@ from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.bronchi import grow_airways
 from anatomy.phantom.bullae import Bulla, place_bullae
 from anatomy.phantom.nodules import Nodule, place_nodules
+from anatomy.phantom.rim import ends_below_pleura
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
 from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way
@@ -96,7 +97,8 @@ def plan_patient(
     )
     sprouts, rule = grow_airways(territory, scale, rng, traits)
     airways = _plan_airways(sprouts, spacing_mm)
-    arteries = _plan_arteries(sprouts, scale, vessels)
+    rim_mm = scale * traits.vessel_rim_mm
+    arteries = _below_rim(_plan_arteries(sprouts, scale, vessels), territory, rim_mm)
     tubes = _obstacles(airways, arteries)
     large = tubes.radii > NODULE_NEIGHBOUR_MM * scale
     nodules = place_nodules(territory, tubes.centres[large], tubes.radii[large], scale, rng, bullae)
@@ -108,6 +110,7 @@ def plan_patient(
     rule = replace(rule, smallest_diameter_mm=vessels.limit_mm, root_diameter_mm=calibre * root_mm)
     grown = grow_veins(territory, obstacles, rule, scale, rng)
     veins = _plan_veins(grown, obstacles, scale, replace(vessels, calibre=1.0))
+    veins = _below_rim(veins, territory, rim_mm)
     return PatientPlan(airways=airways, arteries=arteries, veins=veins, nodules=nodules, bullae=bullae)
 
 
@@ -169,6 +172,14 @@ def _plan_veins(grown: Sprouts, obstacles: Obstacles, scale: float, rule: Vessel
     freedom = (np.array(veins.diameter_mm) > CENTRAL_VEIN_MM * scale).astype(np.uint8)
     freedom[0] = 2
     return _vessels(veins, radius, obstacles, rule.spacing_mm, len(veins.points[0]), freedom)
+
+
+def _below_rim(tree: PlannedTree, territory: Territory, rim_mm: float) -> PlannedTree:
+    """Let vessels end below the rim; without a rim the tree is as it was."""
+    if rim_mm == 0.0:
+        return tree
+    sprouts, radius, kept = ends_below_pleura(tree.sprouts, tree.outer_mm, tree.freedom, territory, rim_mm)
+    return PlannedTree(sprouts=sprouts, inner_mm=radius, outer_mm=radius, freedom=tree.freedom[kept])
 
 
 def _obstacles(*trees: PlannedTree) -> Obstacles:

@@ -71,8 +71,11 @@ def phantom_grid(chest: Chest, spacing_mm: float) -> Grid:
     return Grid.from_spacing(shape, (spacing_mm,) * 3, origin)
 
 
-def draw_body(chest: Chest, grid: Grid, open_fissures: float = 0.0) -> Canvas:
-    """Draw everything but trees, nodules and bullae; a share of each lung's fissures is left out."""
+def draw_body(chest: Chest, grid: Grid, open_fissures: float = 0.0, *, precise: bool = False) -> Canvas:
+    """Draw everything but trees, nodules and bullae; a share of each lung's fissures is left out.
+
+    In single precision, which is faster, a few voxels at the surfaces depend on the kind of processor.
+    """
     shape = grid.shape
     images = [np.zeros(shape, dtype=np.uint8, order="F") for _ in range(6)]
     canvas = Canvas(
@@ -87,7 +90,8 @@ def draw_body(chest: Chest, grid: Grid, open_fissures: float = 0.0) -> Canvas:
     )
     half = shape[0] // 2
     first = grid.lps_from_ijk[:3, 3]
-    axes = [(first[a] + grid.spacing_mm[a] * np.arange(shape[a])).astype(np.float32) for a in range(3)]
+    real = np.float64 if precise else np.float32
+    axes = [(first[a] + grid.spacing_mm[a] * np.arange(shape[a])).astype(real) for a in range(3)]
     for side, columns in zip(chest.sides, (slice(0, half), slice(half, None)), strict=True):
         for k in range(0, shape[2], SLAB):
             block = (columns, slice(None), slice(k, k + SLAB))

@@ -54,6 +54,15 @@ class Territory:
         index = self.index(point)
         return bool(self.lobes[index] == lobe and self.lobe_depth_mm[index] >= depth_mm)
 
+    def depth_mm(self, points: Float) -> Float:
+        """Return how deep below the pleura points `(N, 3)` lie, mm, by linear interpolation."""
+        from scipy.ndimage import map_coordinates
+
+        at = ((points - self.origin) / self.spacing_mm).T
+        # The map has the distance to the centre of a voxel outside, half a voxel beyond the pleura.
+        found = map_coordinates(self.pleura_depth_mm, at, order=1, mode="nearest")
+        return np.asarray(found, dtype=np.float64) - 0.5 * self.spacing_mm
+
 
 def _spread_points(
     lobes: UInt8, origin: Float, spacing_mm: float, rng: np.random.Generator

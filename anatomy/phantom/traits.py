@@ -21,6 +21,10 @@ LEAST_EXPONENT, GREATEST_EXPONENT = 1.5, 3.2
 """Below, segments would have no airway; above, twigs are nearly as wide as bronchi."""
 GREATEST_VESSEL_LIMIT_MM = 4.0
 """Above, hardly a vessel is left."""
+LEAST_BRONCHUS_LENGTH, GREATEST_BRONCHUS_LENGTH = 0.8, 1.5
+"""Beyond, lobar bronchi leave their lobes."""
+GREATEST_RIM_MM, GREATEST_HILAR_VESSEL_MM = 10.0, 25.0
+"""A wider rim would leave the lobes of a child without vessels; no vessel is wider than 25 mm."""
 
 
 @frozen_value
@@ -40,6 +44,14 @@ class Traits:
         Diameter of a vessel by that of the airway lumen that supplies as much tissue: 1 to 3.
     vessel_limit_mm : float
         Diameter at which vessels end, in an adult: at most 4.
+    bronchus_length : float
+        Factor of the lengths of main and lobar bronchi: 0.8 to 1.5.
+    vessel_rim_mm : float
+        Depth of the rim below the pleura, in an adult, into which no vessel runs: at most 10.
+    hilar_vessel_mm : float
+        Diameter, in an adult, from which vessels count as mediastinum, as in most segmentations: they are
+        in neither the mask of the vessels nor that of the lungs, and the mask of the vessels ends with the
+        lungs.  At most 25; 0: all vessels are in the mask.
     open_fissures : float
         Share of each lung's fissures that is missing, from the hilum outwards: 0 to 1.
     resected : str
@@ -61,6 +73,9 @@ class Traits:
     slenderness: float = 3.0
     vessel_calibre: float = 1.0
     vessel_limit_mm: float = 1.3
+    bronchus_length: float = 1.0
+    vessel_rim_mm: float = 0.0
+    hilar_vessel_mm: float = 0.0
     open_fissures: float = 0.0
     resected: str = ""
     emphysema: float = 0.0
@@ -72,6 +87,9 @@ class Traits:
             ("slenderness", 1.0, 10.0),
             ("vessel_calibre", 1.0, 3.0),
             ("vessel_limit_mm", 0.5, GREATEST_VESSEL_LIMIT_MM),
+            ("bronchus_length", LEAST_BRONCHUS_LENGTH, GREATEST_BRONCHUS_LENGTH),
+            ("vessel_rim_mm", 0.0, GREATEST_RIM_MM),
+            ("hilar_vessel_mm", 0.0, GREATEST_HILAR_VESSEL_MM),
             ("open_fissures", 0.0, 1.0),
             ("emphysema", 0.0, 1.0),
         ):

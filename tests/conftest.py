@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
+    import lungaccess as la
     from anatomy.lung import Lung
     from anatomy.phantom import Phantom
 
@@ -46,3 +47,11 @@ def small_lung(small_phantom: Phantom) -> Lung:
     from anatomy.build import build_lung
 
     return build_lung(small_phantom.images)
+
+
+@pytest.fixture(scope="session")
+def small_atlas(small_lung: Lung) -> la.Atlas:
+    """Return what the preset `ultrathin` can do in `small_lung`; the needle does not matter."""
+    import lungaccess as la
+
+    return la.build_atlas(small_lung, la.load_system("ultrathin"))

@@ -13,8 +13,9 @@ from lungaccess.risk.deviations import Deviations, deviated_pieces, deviated_sta
 
 
 @pytest.mark.slow
-def test_tubes_without_errors_end_where_the_plan_says(small_lung: Lung) -> None:
-    plan = next(la.plan(small_lung, la.load_system("ultrathin"), la.resolve_target(small_lung), iterations=1))
+def test_tubes_without_errors_end_where_the_plan_says(small_lung: Lung, small_atlas: la.Atlas) -> None:
+    target = la.resolve_target(small_lung)
+    plan = next(la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=1))
     assessor = RiskAssessor(plan, small_lung)
     none = Deviations(**assessor.no_deviations(1))
     start, pieces = deviated_starts(plan, small_lung, none)[0], deviated_pieces(plan, none)[0]

@@ -59,16 +59,16 @@ def breathing_lung(small_phantom: Phantom, small_lung: Lung) -> Lung:
 
 
 @pytest.fixture(scope="session")
-def small_atlas(breathing_lung: Lung) -> la.Atlas:
-    """What scope and tubes can do in the small phantom."""
-    return la.build_atlas(breathing_lung, la.load_system("ultrathin"))
+def breathing_atlas(breathing_lung: Lung, small_atlas: la.Atlas) -> la.Atlas:
+    """What scope and tubes can do in the small phantom, with its breathing."""
+    return replace(small_atlas, lung=breathing_lung)
 
 
 @pytest.fixture(scope="session")
-def small_plan(small_atlas: la.Atlas) -> Plan:
+def small_plan(breathing_atlas: la.Atlas) -> Plan:
     """A plan to the nodule of the small phantom, which the check accepts."""
-    lung = small_atlas.lung
-    *_, best = la.plan(lung, small_atlas.system, la.resolve_target(lung), atlas=small_atlas, iterations=20)
+    lung, system = breathing_atlas.lung, breathing_atlas.system
+    *_, best = la.plan(lung, system, la.resolve_target(lung), atlas=breathing_atlas, iterations=20)
     return best
 
 

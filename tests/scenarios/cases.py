@@ -85,6 +85,8 @@ ALL_PLANNERS_DEVICE = "flexure-needle"
 """The device for which all planners are run; for others, only the first."""
 DEFAULT_DEVICES = (ALL_PLANNERS_DEVICE, "lung-default")
 """Those of the default tests."""
+LONG_PLANNERS = ("kuntz2015",)
+"""Those that the default tests leave out."""
 CASES = tuple(
     Case(anatomy=anatomy, device=device, planner=planner)
     for anatomy in ANATOMIES

@@ -19,7 +19,10 @@ from tests.scenarios.runs import Answer, costlier, lost, needle_answers
 from tests.scenarios.scenes import Scenes
 from tests.scenarios.shared_queries import SharedQueries
 
-SYNTHETIC = [pytest.param(anatomy, id=anatomy.name) for anatomy in ANATOMIES if not anatomy.is_real]
+SYNTHETIC = [
+    pytest.param(anatomy, id=anatomy.name, marks=() if number == 0 else pytest.mark.slow)
+    for number, anatomy in enumerate(each for each in ANATOMIES if not each.is_real)
+]
 
 
 def require_no_regression(stored: dict[str, Any], answers: list[Answer]) -> None:

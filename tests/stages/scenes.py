@@ -140,7 +140,7 @@ def brute_clearance(
     if exempt_branch >= 0:
         chosen &= ~((hit == AIRWAY) & ((window >> BRANCH_SHIFT).astype(int) - 1 == exempt_branch))
     centres = (np.argwhere(chosen) + first) * spacing
-    out = np.minimum(_box_distance(local, centres, spacing), cap_mm)
+    out = np.minimum(box_distance(local, centres, spacing), cap_mm)
     if bits & OUTSIDE:
         faces = np.concatenate(
             [local + 0.5 * spacing, (np.array(grid.shape) - 0.5) * spacing - local], axis=1
@@ -149,7 +149,7 @@ def brute_clearance(
     return out
 
 
-def _box_distance(points: np.ndarray, centres: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+def box_distance(points: np.ndarray, centres: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Return distances to boxes: of the nearest centres so many that no other box can be nearer."""
     out = np.full(len(points), np.inf)
     left, wanted = np.arange(len(points)), min(40, len(centres))

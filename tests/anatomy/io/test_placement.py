@@ -161,6 +161,7 @@ def test_a_mask_in_other_voxels_says_by_how_much_borders_moved(med_rad_folder, m
     assert "borders moved by up to 6.7 mm" in said[0]
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_crop_of_published_fissures_gives_the_same_fissures(data_dir, tmp_path):
     """As in a folder of the collection whose fissures begin at voxel (28, 46, 100)."""

@@ -172,6 +172,7 @@ def test_the_population_warns_and_moves_each_height_as_it_says(small_lung: Lung)
     assert np.abs(motion.displacements_mm(at, RIGHT)[:, 2] - expected).max() < 0.5
 
 
+@pytest.mark.slow
 def test_a_field_of_the_lungs_alone_is_continued_beyond_them(
     source: MotionSource, motion: Motion, small_lung: Lung
 ) -> None:

@@ -76,6 +76,7 @@ def depth(image: Int16, scale: int) -> Int16:
     return out
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(images, st.data())
 def test_reconstruction_is_the_limit_of_the_iteration(image: Int16, data: st.DataObject) -> None:
@@ -239,6 +240,7 @@ def test_leak_through_a_hole_in_the_wall_is_undone_where_it_is(beside_a_hole: Ai
     assert (airways.lumen & far).sum() > 0.8 * far.sum(), "both bronchi go on beyond the leak"
 
 
+@pytest.mark.slow
 def test_without_leak_control_the_pocket_is_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growing, "WIDE_MM2", 1e9)
     monkeypatch.setattr(growing, "FRONT_SLACK_MM2", 1e9)

@@ -88,6 +88,7 @@ def _run(code: str, *words: str, **settings: str) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
+@pytest.mark.slow
 def test_growth_keeps_within_its_arrays_at_every_border() -> None:
     _run(PURE_PYTHON, NUMBA_DISABLE_JIT="1")
 

@@ -99,6 +99,7 @@ def test_arrays_cannot_be_changed(lungs: Lungs) -> None:
         lungs.left[0, 0, 0] = True
 
 
+@pytest.mark.slow
 def test_the_result_is_repeatable(patient: Phantom, lungs: Lungs) -> None:
     again = segment_lungs(patient.ct)
     assert (again.left == lungs.left).all()
@@ -109,6 +110,7 @@ def test_the_result_is_repeatable(patient: Phantom, lungs: Lungs) -> None:
 _ORDERS = [(2, 0, 1), *(pytest.param(each, marks=pytest.mark.slow) for each in ((0, 1, 2), (1, 2, 0)))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", _ORDERS)
 def test_the_way_voxels_are_stored_does_not_matter(
     patient: Phantom, lungs: Lungs, order: tuple[int, int, int]
@@ -125,12 +127,14 @@ def test_the_way_voxels_are_stored_does_not_matter(
     assert dice(turned.right, right) > 0.995
 
 
+@pytest.mark.slow
 def test_low_dose_noise_does_not_matter(patient: Phantom) -> None:
     noise = np.random.default_rng(0).normal(0.0, 100.0, patient.ct.array.shape)
     noisy = segment_lungs(_with(patient, np.clip(patient.ct.array + noise, -1024, 3071)))
     assert dice(noisy.mask, patient.images.lung.array) >= LEAST_DICE
 
 
+@pytest.mark.slow
 def test_a_field_of_view_that_cuts_the_lungs_is_segmented_and_warned_of(patient: Phantom) -> None:
     truth = patient.images.lung.array
     hits = [np.flatnonzero(truth.any(axis=axes)) for axes in ((1, 2), (0, 2))]
@@ -144,6 +148,7 @@ def test_a_field_of_view_that_cuts_the_lungs_is_segmented_and_warned_of(patient:
     assert all(any(f"cut off at the {side}" in warning for warning in cut.warnings) for side in sides)
 
 
+@pytest.mark.slow
 def test_a_scan_that_ends_within_the_lung_is_warned_of(patient: Phantom) -> None:
     truth = patient.images.lung.array
     levels = np.flatnonzero(truth.any(axis=(0, 1)))
@@ -154,6 +159,7 @@ def test_a_scan_that_ends_within_the_lung_is_warned_of(patient: Phantom) -> None
     assert any("lower end" in warning for warning in cut.warnings)
 
 
+@pytest.mark.slow
 def test_lungs_that_touch_are_parted(patient: Phantom) -> None:
     left, right = _sides(patient)
     hu = np.array(patient.ct.array)

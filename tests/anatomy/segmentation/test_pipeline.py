@@ -113,6 +113,7 @@ def test_lobes_and_fissures_are_those_of_the_patient(patient: Phantom, made: Seg
     assert not [said for said in images.warnings if "fissure" in said]
 
 
+@pytest.mark.slow
 def test_lobes_that_are_not_known_are_not_claimed(patient: Phantom, made: Segmentation, copy: Path) -> None:
     """Without lobes of one lung there are no fissures to be trusted: the check must say so."""
     half = made.parts.lobes * made.parts.left
@@ -274,6 +275,7 @@ def test_a_killed_run_leaves_no_patient_and_is_made_good(
     require_made_good(patient, made, tmp_path / "patient")
 
 
+@pytest.mark.slow
 def test_an_edited_description_is_kept(patient: Phantom, made: Segmentation, copy: Path) -> None:
     description = copy / "patient.toml"
     edited = description.read_text().replace('name = "P"', 'name = "Patient A"')
@@ -296,6 +298,7 @@ def test_a_point_outside_the_lung_is_warned_of(patient: Phantom, copy: Path, mad
     assert any("outside the image" in warning for warning in far.warnings)
 
 
+@pytest.mark.slow
 def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentation, tmp_path: Path) -> None:
     folder = tmp_path / "totalsegmentator"
     folder.mkdir()

@@ -105,6 +105,7 @@ def test_a_tube_goes_on_beyond_a_short_narrow_place_and_not_beyond_a_long_one() 
     assert 48 < np.nonzero(before)[0].max() < 62
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, *slow(2, 3, 4, 5)])
 def test_nothing_is_followed_into_lung(seed: int) -> None:
     tubes, added = follow(block(0.0, 0.0, LUNG_HU, seed))
@@ -112,6 +113,7 @@ def test_nothing_is_followed_into_lung(seed: int) -> None:
     assert not added.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius_mm", [1.0, 2.4, *slow(0.6, 1.6)])
 def test_a_vessel_at_the_end_is_not_followed(radius_mm: float) -> None:
     tubes, added = follow(block(radius_mm, radius_mm, BLOOD_HU))
@@ -119,6 +121,7 @@ def test_a_vessel_at_the_end_is_not_followed(radius_mm: float) -> None:
     assert not added.any()
 
 
+@pytest.mark.slow
 def test_lung_without_anything_bright_is_no_obstacle() -> None:
     rng = np.random.default_rng(0)
     hu = np.rint(LUNG_HU + 25.0 * rng.standard_normal(SHAPE)).astype(np.int16)
@@ -131,6 +134,7 @@ def test_a_cord_without_lumen_is_not_followed() -> None:
     assert tubes.n_tubes == 0
 
 
+@pytest.mark.slow
 def test_what_is_banned_is_not_entered() -> None:
     banned = np.zeros(SHAPE, dtype=np.bool_)
     banned[60:] = True

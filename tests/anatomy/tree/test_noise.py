@@ -30,6 +30,7 @@ def test_noise_over_a_lumen_is_refused(small_phantom: Phantom, share: float, wha
         tree_from_mask(Volume(grid=lumen.grid, array=np.asfortranarray(noisy)))
 
 
+@pytest.mark.slow
 def test_blobs_are_refused(small_phantom: Phantom) -> None:
     lumen = small_phantom.images.lumen
     smooth = ndimage.gaussian_filter(np.random.default_rng(1).random(lumen.array.shape), 1.5)

@@ -48,8 +48,8 @@ KEYS = {
 
 
 @pytest.fixture(scope="module")
-def plan(small_lung: Lung) -> Plan:
-    *_, best = la.plan(small_lung, SYSTEM, la.resolve_target(small_lung), iterations=60)
+def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
+    *_, best = la.plan(small_lung, SYSTEM, la.resolve_target(small_lung), atlas=small_atlas, iterations=60)
     return best
 
 

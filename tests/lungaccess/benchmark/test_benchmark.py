@@ -181,6 +181,7 @@ def test_a_query_that_is_ruled_out_is_answered_once(small_phantom: Phantom) -> N
     assert len(rows) == 1 and not rows[0].planner and "target out of reach" in rows[0].reason
 
 
+@pytest.mark.slow
 def test_command(small_phantom: Phantom, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder, out = tmp_path / "patients" / "Patient1", tmp_path / "runs.csv"
     write_phantom(small_phantom, folder)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
@@ -22,7 +21,7 @@ from lungaccess.problem.system import System, load_system, system_fingerprint
 from stages.scope import ScopeMotion
 from tests.lungaccess.pursuit import pursued
 from tests.lungaccess.rigid import arc, turned
-from tests.stages.scenes import forked_tree
+from tests.stages.scenes import box_distance, forked_tree
 
 SPACING_MM = (1.0, 0.9, 1.1)
 SHAPE = (150, 64, 104)
@@ -112,18 +111,12 @@ def follow(
 
 
 def brute_distance(lung: Any, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distances to the voxels of a mask as solid boxes, at most 20 mm; each that may be nearest is tried."""
+    """Distances to the voxels of a mask as solid boxes, at most 20 mm."""
     spacing = np.asarray(SPACING_MM)
     local = transform_points(np.linalg.inv(lung.grid.lps_from_ijk), points) * spacing
     boxes = np.argwhere(mask) * spacing
     boxes = boxes[((boxes >= local.min(axis=0) - 21.0) & (boxes <= local.max(axis=0) + 21.0)).all(axis=1)]
-    if not len(boxes):
-        return np.full(len(points), 20.0)
-    centres = cKDTree(boxes)
-    to_centre, _nearest = centres.query(local)
-    near = centres.query_ball_point(local, np.minimum(to_centre, 20.0) + 0.51 * np.linalg.norm(spacing))
-    gaps = (np.maximum(np.abs(boxes[n] - p) - 0.5 * spacing, 0.0) for n, p in zip(near, local, strict=True))
-    return np.array([min(20.0, np.linalg.norm(gap, axis=1).min(initial=20.0)) for gap in gaps])
+    return np.minimum(box_distance(local, boxes, spacing), 20.0)
 
 
 def is_airway_of(labels: np.ndarray, branch: int) -> np.ndarray:

@@ -83,6 +83,7 @@ def by_brute_force(motion: Motion, ball: Ball) -> float:
     return least
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), enough=st.floats(0.5, 4.0))
 def test_the_least_gap_is_that_of_brute_force(seed: int, enough: float) -> None:

@@ -59,6 +59,7 @@ def test_a_lesion_out_of_reach_is_answered_with_reasons(small_lung: Lung, system
     assert advice.as_json()["thinner_scopes"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_shows(
     tmp_path: Path, small_phantom: Phantom, small_lung: Lung, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,6 +7,9 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ HEAVY = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_doctor_sees_every_library(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["doctor", "--json", "--cache", str(tmp_path)]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
@@ -74,12 +78,17 @@ def test_kernels_are_warm_if_no_older_than_their_source(
     assert installation.kernel_cache().folders == (str(home),)
 
 
+@cache
+def script_of(shell: str) -> str:
+    """Return what `lungaccess completion` writes; making it takes seconds."""
+    with redirect_stdout(StringIO()) as written:
+        assert cli.main(["completion", shell]) == ExitCode.OK
+    return written.getvalue()
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_knows_commands_options_and_choices(
-    shell: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert cli.main(["completion", shell]) == ExitCode.OK
-    script = capsys.readouterr().out
+def test_completion_knows_commands_options_and_choices(shell: str, tmp_path: Path) -> None:
+    script = script_of(shell)
     for word in (*" ".join(commands()).split(), "voxel-sum", "allow-fissures"):
         assert word in script, word
     if shutil.which(shell) is not None:
@@ -92,11 +101,8 @@ def test_completion_knows_commands_options_and_choices(
     ("words", "offered"),
     [(["pl"], "plan"), (["plan", "--obj"], "--objective"), (["plan", "--objective", "le"], "length")],
 )
-def test_bash_completes(
-    words: list[str], offered: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    cli.main(["completion", "bash"])
-    (tmp_path / "script").write_text(capsys.readouterr().out)
+def test_bash_completes(words: list[str], offered: str, tmp_path: Path) -> None:
+    (tmp_path / "script").write_text(script_of("bash"))
     typed = " ".join(["lungaccess", *words])
     ask = f'source "$1"; COMP_WORDS=({typed}); COMP_CWORD={len(words)}; _lungaccess; echo "${{COMPREPLY[@]}}"'
     done = subprocess.run(

@@ -7,12 +7,12 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from lungaccess.problem.target import Target
-from tests.lungaccess.coupled.planning import SYSTEM, TARGET
+from tests.lungaccess.coupled.planning import TARGET
 
 
 @pytest.fixture(scope="session")
-def atlas(small_lung: Lung) -> la.Atlas:
-    return la.build_atlas(small_lung, SYSTEM)
+def atlas(small_atlas: la.Atlas) -> la.Atlas:
+    return small_atlas
 
 
 @pytest.fixture(scope="session")

@@ -115,6 +115,7 @@ def test_the_same_atlas_twice(coarse: la.Atlas, small_lung: Lung) -> None:
     assert again.deployments.refused == coarse.deployments.refused
 
 
+@pytest.mark.slow
 def test_fissures(coarse: la.Atlas, small_lung: Lung) -> None:
     assert small_lung.has_fissures and coarse.with_fissures
     allowed = la.build_atlas(small_lung, replace(SYSTEM, fissures_allowed=True), **COARSE)
@@ -143,6 +144,7 @@ def test_a_scope_too_thick(small_lung: Lung) -> None:
     assert not atlas.motions.passages.passable.any()
 
 
+@pytest.mark.slow
 def test_progress(small_lung: Lung) -> None:
     told: list[float] = []
     la.build_atlas(small_lung, SYSTEM, **COARSE, progress=told.append)

@@ -30,6 +30,7 @@ def found(small_lung: Lung, atlas: la.Atlas) -> tuple[Alternative, ...]:
     return alternatives(small_lung, SYSTEM, target, atlas=atlas, count=8, separation_mm=3.0)
 
 
+@pytest.mark.slow
 def test_plans_differ_and_pass_the_check(found: tuple[Alternative, ...], small_lung: Lung) -> None:
     assert len(found) >= 3
     for one, other in itertools.combinations(found, 2):

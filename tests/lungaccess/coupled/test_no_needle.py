@@ -43,7 +43,9 @@ def plans(small_lung: Lung, system: System, atlas: la.Atlas) -> list[list[la.Pla
     for entry in np.linspace(0, atlas.deployments.count - 1, 12).astype(int):
         try:
             target = point_target(small_lung, atlas.deployments.positions[entry] + OFF_MM)
-            found.append(list(la.plan(small_lung, system, target, atlas=atlas, iterations=5)))
+            found.append(
+                list(la.plan(small_lung, system, target, atlas=atlas, iterations=5, counterfactuals=False))
+            )
         except la.LungaccessError:
             continue
     return found

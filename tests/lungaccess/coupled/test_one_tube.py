@@ -40,7 +40,10 @@ def plans(small_lung: Lung, system: System, atlas: la.Atlas) -> list[la.Plan]:
         point = atlas.deployments.positions[entry] + 20.0 * atlas.deployments.tangents[entry]
         try:
             target = point_target(small_lung, point)
-            found.append(next(la.plan(small_lung, system, target, atlas=atlas, seed=0, iterations=10)))
+            made = la.plan(
+                small_lung, system, target, atlas=atlas, seed=0, iterations=10, counterfactuals=False
+            )
+            found.append(next(made))
         except la.LungaccessError:
             continue
     return found

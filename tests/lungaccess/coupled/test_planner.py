@@ -156,6 +156,7 @@ class NearestArcs:
 class TestOwnSearch:
     """A search that is added to `METHODS`."""
 
+    @pytest.mark.slow
     def test_it_becomes_a_method_of_the_planner(
         self, small_lung: Lung, target: Target, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -23,10 +23,9 @@ MORE = replace(SYSTEM, name="more invasive", needle=replace(SYSTEM.needle, diame
 
 
 @pytest.fixture(scope="module")
-def atlas_of(small_lung: Lung) -> Callable[[System], la.Atlas]:
+def atlas_of(small_atlas: la.Atlas) -> Callable[[System], la.Atlas]:
     """The atlas of all three systems, which differ in their needles alone."""
-    atlas = la.build_atlas(small_lung, SYSTEM, rotations=12, stop_spacing_mm=4.0)
-    return lambda system: replace(atlas, system=system)
+    return lambda system: replace(small_atlas, system=system)
 
 
 def planned(lung: Lung, systems: list[System], **options: Any) -> list[la.Plan]:

@@ -48,6 +48,7 @@ def refusals(plan: Plan, lung: Lung) -> set[str]:
     return {finding.name for finding in la.check(plan, lung).findings if not finding.ok}
 
 
+@pytest.mark.slow
 def test_the_check_accepts_them(plans: list[Plan], small_lung: Lung) -> None:
     assert len(plans) == COUNT
     assert [refusals(plan, small_lung) for plan in plans] == [set()] * COUNT

@@ -62,6 +62,7 @@ def test_the_widest_window_is_wider_than_that_of_the_least_cost(
     assert same_run(plans) == same_run(again) and [p.digest for p in plans] == [p.digest for p in again]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phases", [(0.0, 0.5), (0.4, 0.7)])
 def test_given_phases_are_held_at_falling_cost(
     breathing: Lung, target: Target, atlas: la.Atlas, phases: tuple[float, float]

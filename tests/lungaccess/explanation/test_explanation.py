@@ -238,6 +238,7 @@ def test_when_the_time_is_up_the_rest_is_listed_and_no_claim_is_made(
     assert [part.outcome for part in made.parts][:3] == ["done"] * 3
 
 
+@pytest.mark.slow
 def test_a_headline_names_the_least_invasive_preset_that_does(far: Explanation) -> None:
     report: Any = type("Report", (), {"accepted": True})()
     done = tuple(

@@ -117,6 +117,7 @@ class TestBrowser:
         assert state["place_lps"] == pytest.approx(target) == state["slices"]["place_lps"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_json", [False, True])
 def test_the_command_leaves_what_it_learned_and_exits_1(
     as_json: bool, small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

@@ -42,6 +42,7 @@ async def fetched(explorer: Explorer, link: str) -> bytes:
         return await answer.read()
 
 
+@pytest.mark.slow
 def test_a_click_its_plan_its_files_and_the_command(
     patient: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,6 +218,7 @@ def test_the_reach_is_that_of_the_map_and_a_smaller_radius_keeps_it(patient: Pat
     assert np.count_nonzero(maps[30.0] == KINDS["direct arc"]) >= np.count_nonzero(reached)
 
 
+@pytest.mark.slow
 def test_names_of_patients_and_places_come_as_plain_text(patient: Path) -> None:
     async def talk(client: Client, _explorer: Explorer) -> None:
         facts, _none = await client.first("patient")

@@ -173,6 +173,7 @@ def test_bad_messages_get_typed_errors_and_the_page_stays() -> None:
     with_client(NOBODY, talk)
 
 
+@pytest.mark.slow
 def test_a_patient_that_is_none_is_an_error_of_its_question() -> None:
     async def talk(client: Client, _explorer: Explorer) -> None:
         message = (await client.ask("patient"))[-1][0]

@@ -136,6 +136,7 @@ def test_the_needle_command_takes_names(folder, capsys):
     assert "the surface of the organ" in " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_the_published_start_of_a_liver_has_a_needle(data_dir):
     organ = load_organ(data_dir / "med-rad-liver" / "Patient1")

@@ -10,7 +10,7 @@ from lungaccess.plans.plan import Plan
 
 
 @pytest.fixture(scope="session")
-def plan(small_lung: Lung) -> Plan:
-    system = la.load_system("ultrathin")
-    *_, best = la.plan(small_lung, system, la.resolve_target(small_lung), iterations=100)
+def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
+    target = la.resolve_target(small_lung)
+    *_, best = la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=100)
     return best

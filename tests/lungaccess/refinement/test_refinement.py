@@ -126,6 +126,7 @@ class TestRefine:
         new = refine(task, old, iterations=ITERATIONS)
         assert new is not None and new.path.length_mm < old.path.length_mm - 0.5
 
+    @pytest.mark.slow
     def test_a_cost_map_is_followed(self, case: Case) -> None:
         grid = case.task.lung.grid
         share = np.linspace(0.2, 1.0, grid.shape[1], dtype=np.float32)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+import lungaccess as la
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from tests.lungaccess.report import browser
@@ -15,8 +16,8 @@ from tests.lungaccess.report.pages import make_plans, plan_file, report_data, wi
 
 
 @pytest.fixture(scope="session")
-def plans(small_lung: Lung) -> tuple[Plan, ...]:
-    return make_plans(small_lung)
+def plans(small_lung: Lung, small_atlas: la.Atlas) -> tuple[Plan, ...]:
+    return make_plans(small_lung, small_atlas)
 
 
 @pytest.fixture(scope="session")

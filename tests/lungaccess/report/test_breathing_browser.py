@@ -97,6 +97,7 @@ def test_the_lumen_breathes_in_the_slices(
     page.run("window.lungaccessReport.breathe(1)")
 
 
+@pytest.mark.slow
 def test_the_breath_plays_and_is_held(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.breathe(0.2); document.getElementById('breathe').click()")
     frames = 0

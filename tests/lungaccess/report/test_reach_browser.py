@@ -18,6 +18,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_the_map_opens_and_its_slices_follow_the_sliders(small_lung: Lung, tmp_path: Path) -> None:
     reach = make_reach(small_lung)
     file = reach_file(reach, small_lung, tmp_path)

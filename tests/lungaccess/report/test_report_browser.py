@@ -175,6 +175,7 @@ def test_the_bronchoscopy_shows_the_airway(page: browser.Browser) -> None:
     assert page.run(PICTURE, 0.1, "inside") != page.run(PICTURE, 0.2, "inside")
 
 
+@pytest.mark.slow
 def test_playing_moves_the_slider(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.set(0)")
     # A machine on which a frame lasts long comes to a bifurcation in the first one.

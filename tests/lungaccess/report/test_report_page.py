@@ -310,6 +310,7 @@ def test_a_plan_that_is_none_is_bad_input(tmp_path: Path) -> None:
 # The reachability map ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_map_decodes_to_itself(small_lung: Lung, tmp_path: Path) -> None:
     reach = make_reach(small_lung)
     packed = packed_map(reach)

@@ -140,6 +140,7 @@ def test_a_cut_takes_away_what_is_before_it(page: browser.Browser) -> None:
     assert picked[25.0] is None
 
 
+@pytest.mark.slow
 def test_picking_finds_the_point_within_half_a_millimetre(page: browser.Browser) -> None:
     """Of balls, against the intersection of the ray with them, computed here, from several sides."""
     rng = np.random.default_rng(5)

@@ -96,6 +96,7 @@ def click(page: browser.Browser, canvas: str, column: float, row: float, **more:
     page.frame()
 
 
+@pytest.mark.slow
 def test_a_click_puts_the_cross_of_all_slices_there(fresh: browser.Browser) -> None:
     tip = np.array(fresh.state()["tip_lps"])
     np.testing.assert_allclose(cross(fresh), tip, atol=1e-9)
@@ -115,6 +116,7 @@ def test_a_click_puts_the_cross_of_all_slices_there(fresh: browser.Browser) -> N
     assert fresh.messages() == []
 
 
+@pytest.mark.slow
 def test_wheel_zoom_pan_and_keys_work_without_a_click_first(fresh: browser.Browser, small_lung: Lung) -> None:
     before = cross(fresh)
     fresh.run(POINTER, "slice-axial", "wheel", 180, 180, {"deltaY": -120})

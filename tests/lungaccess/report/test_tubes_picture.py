@@ -87,6 +87,7 @@ def test_the_curves_are_those_of_the_equilibrium(tmp_path: Path, drawn: list[Fig
     assert behind.get_xlim()[0] == pytest.approx(-620.0) and ahead.get_xlim()[1] == pytest.approx(60.0)
 
 
+@pytest.mark.slow
 def test_what_is_unstable_dips_below_the_line(tmp_path: Path, drawn: list[Figure]) -> None:
     mechanics = mechanics_of(0.0125, 0.0125)
     all_of_them = mechanics.equilibria((0.0, math.pi + 0.2), (-620.0, -600.0))
@@ -104,6 +105,7 @@ def test_every_axis_has_a_unit(tmp_path: Path, drawn: list[Figure]) -> None:
     assert len(labels) == 4 and all("(mm)" in label for label in labels)
 
 
+@pytest.mark.slow
 def test_earlier_steps_are_drawn_in_grey(tmp_path: Path, drawn: list[Figure]) -> None:
     mechanics = mechanics_of(0.025, 0.0)
     found = deploy(mechanics, kuntz2015(mechanics.tubes, 0.0, 20.0, 50.0), step_mm=5.0)

@@ -72,6 +72,7 @@ def test_the_view_approaches_the_target(page: browser.Browser, plans: tuple[Plan
     page.run("document.querySelector('button[data-fit=plan]').click()")
 
 
+@pytest.mark.slow
 def test_pointing_names_what_is_there_and_how_far_from_the_needle(
     page: browser.Browser, plans: tuple[Plan, ...]
 ) -> None:

@@ -19,8 +19,9 @@ from lungaccess.risk.sensitivity import sensitivities
 
 
 @pytest.fixture(scope="module")
-def plan(small_lung: Lung) -> Plan:
-    *_, best = la.plan(small_lung, la.load_system("ultrathin"), la.resolve_target(small_lung), iterations=30)
+def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
+    target = la.resolve_target(small_lung)
+    *_, best = la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=30)
     return best
 
 

@@ -96,6 +96,7 @@ def test_a_search_without_time_estimates_its_plan_with_all_draws(
     assert (first.succeeds.samples, last.succeeds.samples) == (OPEN_LOOP.samples[0], OPEN_LOOP.fresh)
 
 
+@pytest.mark.slow
 def test_a_diverse_set_trades_success_for_length_and_clearance(
     small_lung: Lung, atlas: la.Atlas, targets: list[Target]
 ) -> None:
@@ -129,6 +130,7 @@ def test_the_same_seed_gives_the_same_plans(small_lung: Lung, atlas: la.Atlas, t
     assert one == other
 
 
+@pytest.mark.slow
 def test_the_estimate_of_first_order_tells_who_hits_the_goal(
     small_lung: Lung, atlas: la.Atlas, targets: list[Target]
 ) -> None:

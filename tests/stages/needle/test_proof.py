@@ -75,6 +75,7 @@ def spare_clearance(lung: Lung, limits: Limits, points: Float, s: Float, branch:
 class TestBlocker:
     """`blocker_on_arc` is a proof: it neither passes a blocked arc nor refuses a clear one."""
 
+    @pytest.mark.slow
     @given(scene=crowded_environments())
     @settings(max_examples=150)
     def test_without_exemption(self, scene: Any) -> None:

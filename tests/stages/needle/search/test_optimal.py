@@ -67,6 +67,7 @@ def shortest_around_a_ball(radius_mm: float, keep_mm: float, half_mm: float) -> 
     return best
 
 
+@pytest.mark.slow
 def test_the_length_goes_to_that_of_the_shortest_path_around_a_ball() -> None:
     """The plane path is an upper bound of the optimum; voxels make the ball a little larger or smaller."""
     environment = ball_environment()

@@ -58,6 +58,7 @@ def run(search: OptimalSearch | PortfolioSearch, iterations: int, slice_of: int 
     return search.cost
 
 
+@pytest.mark.slow
 def test_a_portfolio_finds_paths_that_a_single_search_does_not_leave_its_own_for() -> None:
     environment = two_valleys()
     single, portfolio = (

@@ -72,12 +72,14 @@ class TestAgainstEnumeration:
     def test_the_same_least_cost_or_none_in_many_mazes(self, maze: Maze, resolution: Resolution) -> None:
         self.compare(maze, resolution)
 
+    @pytest.mark.slow
     @given(maze=crowded_mazes())
     @settings(max_examples=10)
     def test_with_more_directions(self, maze: Maze) -> None:
         maze = replace(maze, needle=replace(maze.needle, max_length_mm=41.0))
         self.compare(maze, Resolution(coarse_mm=12.0, fine_mm=12.0, coarse_rolls=2, fine_rolls=8))
 
+    @pytest.mark.slow
     @given(maze=crowded_mazes(), seed=st.integers(0, 2**32 - 1))
     @settings(max_examples=10)
     def test_the_same_least_cost_of_a_map(self, maze: Maze, seed: int) -> None:

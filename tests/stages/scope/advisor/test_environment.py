@@ -45,7 +45,8 @@ def test_the_true_radius_is_kept_along_every_link(forked: tuple[Lung, Lumen], ra
     environment = ScopeEnvironment(model=model, field=navigation_field(lumen, 0))
     states = random_states(lumen, model, np.random.default_rng(7), 400)
     fits = environment.fits(states)
-    nearest = np.array([wall_mm(lumen, chain_points(model, state)).min() for state in states])
+    chains = np.array([chain_points(model, state) for state in states])
+    nearest = wall_mm(lumen, chains.reshape(-1, 3)).reshape(len(chains), -1).min(axis=1)
     assert (nearest[fits] >= radius).all()
     assert (nearest[~fits] < radius + MIN_GAP_MM + 1e-9).all()
     assert fits.sum() > 10, "some must fit, or nothing was tested"

@@ -48,6 +48,7 @@ def dijkstra_of(lumen: Lumen, steps: np.ndarray, weights: np.ndarray, goal: int)
     return dijkstra(graph, indices=goal)
 
 
+@pytest.mark.slow
 @given(lumen=lumens(), data=st.data())
 def test_the_field_is_dijkstras_to_the_last_bit(lumen: Lumen, data: st.DataObject) -> None:
     goal = data.draw(st.integers(0, lumen.count - 1))

@@ -157,6 +157,7 @@ def test_wrong_exits_are_refused() -> None:
         subtree_to(tree, [[exit_at(0, 10)]], exit_cost_mm=[[-1.0]])
 
 
+@pytest.mark.slow
 def test_thirty_lesions_with_scattered_exits_are_solved_by_integers() -> None:
     """Their sets of open lesions are too many for the dynamic program; both relaxations bound the answer."""
     rng = np.random.default_rng(6)

@@ -2,8 +2,8 @@
 
     python -m experiments.synthetic_manifest FILE
 
-FILE is written as the package ships it.  A benchmark never changes: if the two differ, the generator did, and
-what is needed is a new version of the benchmark, not a new manifest of this one.
+FILE is written as the package ships it.  A released benchmark never changes: if the two differ, the generator
+did, and what is needed is a new version of the benchmark, not a new manifest of this one.
 """
 
 from __future__ import annotations

@@ -85,7 +85,9 @@ def manifest_sha256() -> str:
 
 def unproved_phantom(case: BenchmarkPhantom) -> Phantom:
     """Make a phantom, whether or not it is that of the manifest."""
-    made = make_phantom(seed=case.seed, size=case.size, spacing_mm=case.spacing_mm, traits=case.traits)
+    made = make_phantom(
+        seed=case.seed, size=case.size, spacing_mm=case.spacing_mm, traits=case.traits, precise=True
+    )
     return replace(made, images=replace(made.images, name=case.name))
 
 

@@ -1,4 +1,4 @@
-"""The fifty phantoms of `synthetic-v1`: families, seeds and traits.  They never change within a version."""
+"""The fifty phantoms of `synthetic-v1`: families, seeds and traits; a released version never changes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ SYSTEMS = ("lung-default", "ultrathin", "therapeutic-scope")
 TARGETS_A_LUNG = 10
 ADULT_MM, CHILD_MM = 1.0, 0.8
 """Edges of the voxels: those of a usual reconstruction, finer for the narrower airways of a child."""
-SLENDERNESS = 5.0
+BRONCHUS_LENGTH, VESSEL_LIMIT_MM, VESSEL_RIM_MM, HILAR_VESSEL_MM = 1.35, 0.9, 5.0, 9.0
+"""Set so that the medians of a phantom come near those of two patients' masks, see the measurements."""
 OPEN_SHARES = (0.0, 0.45)
 """Of the fissures: every second phantom has complete ones."""
 LOBES = ("right upper", "left upper", "right lower", "left lower", "right middle")
@@ -85,9 +86,12 @@ def _phantom(family: Family, number: int) -> BenchmarkPhantom:
     child = family == "child"
     traits = Traits(
         stature=_spread(0.95, 1.13, number, 3),
-        flow_exponent=_spread(1.8, 2.1, number, 7),
-        slenderness=SLENDERNESS,
+        flow_exponent=_spread(1.9, 2.1, number, 7),
         vessel_calibre=_spread(1.3, 1.7, number, 1),
+        bronchus_length=BRONCHUS_LENGTH,
+        vessel_limit_mm=VESSEL_LIMIT_MM,
+        vessel_rim_mm=VESSEL_RIM_MM,
+        hilar_vessel_mm=HILAR_VESSEL_MM,
         open_fissures=OPEN_SHARES[number % 2],
         resected=LOBES[(number - 1) % len(LOBES)] if family == "resected" else "",
         emphysema=_spread(0.3, 1.0, number, 9) if family == "emphysematous" else 0.0,

@@ -91,6 +91,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
     assert (one.labels.array != other.labels.array).mean() > 0.01
 
 
+@pytest.mark.slow
 def test_making_a_phantom_leaves_the_global_random_state_alone() -> None:
     np.random.seed(7)  # noqa: NPY002
     undisturbed = np.random.random(3)  # noqa: NPY002

@@ -144,6 +144,7 @@ def answer_of(words: list[str], capsys: pytest.CaptureFixture[str], code: int = 
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_info_and_tour_as_json(patient: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cache = ["--cache", str(patient.parent / "cache")]
     found = answer_of(["info", str(patient), *cache], capsys)

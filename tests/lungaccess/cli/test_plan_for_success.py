@@ -19,7 +19,7 @@ from lungaccess.plans.plan import Plan
         (["--objective", "success", "--processes", "2"], "neither --method"),
         (["--objective", "success", "--system", "auto"], "one system"),
         (["--objective", "success", "--procedure", "measured-top"], "measured-tip"),
-        (["--objective", "success", "--system", "tubes-only"], "needle"),
+        pytest.param(["--objective", "success", "--system", "tubes-only"], "needle", marks=pytest.mark.slow),
         (["--objective", "window", "--system", "auto"], "one system"),
         (["--objective", "window"], "masks_phase"),
         (["--objective", "success", "--phases", "0:0.3"], "--objective window"),

@@ -127,6 +127,7 @@ def test_relative_rotation_of_two_curved_tubes(tmp_path: Path, capsys: pytest.Ca
     assert found["lateral_sweep_mm"] > 0.5
 
 
+@pytest.mark.slow
 def test_a_snap_exits_1_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "snapping.toml"
     file.write_text(SNAPPING)

@@ -243,6 +243,7 @@ def test_no_winding_path_of_many_costs_less_than_what_is_still_to_be_paid() -> N
     assert 0.5 < _attacked_costs(5000, 12) <= 1.0 + 1e-3
 
 
+@pytest.mark.slow
 def test_no_deployment_of_a_box_sweeps_less_than_its_bound() -> None:
     tubes = tube_constants(SYSTEM.tubes, SYSTEM.margins)
     rng, slack = np.random.default_rng(0), []

@@ -149,6 +149,7 @@ def test_the_page_has_no_style_and_no_script_of_its_own() -> None:
             ) == text.count("http://www.w3.org")
 
 
+@pytest.mark.slow
 def test_bad_messages_get_typed_errors_and_the_page_stays() -> None:
     async def talk(client: Client, _explorer: Explorer) -> None:
         for text in ("", "{}", "[1", '{"ask": "nothing", "id": 4}', '{"ask": "plan", "id": 5}'):

@@ -283,6 +283,7 @@ def test_every_plan_of_the_page_has_its_chance(data: dict[str, Any]) -> None:
 # Commands ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_page_and_movie(
     plans: tuple[Plan, ...], small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

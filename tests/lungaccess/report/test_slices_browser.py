@@ -19,6 +19,7 @@ from lungaccess.report.html import document
 from tests.lungaccess.report import browser
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.browser,
     pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there"),
 ]
@@ -96,7 +97,6 @@ def click(page: browser.Browser, canvas: str, column: float, row: float, **more:
     page.frame()
 
 
-@pytest.mark.slow
 def test_a_click_puts_the_cross_of_all_slices_there(fresh: browser.Browser) -> None:
     tip = np.array(fresh.state()["tip_lps"])
     np.testing.assert_allclose(cross(fresh), tip, atol=1e-9)
@@ -116,7 +116,6 @@ def test_a_click_puts_the_cross_of_all_slices_there(fresh: browser.Browser) -> N
     assert fresh.messages() == []
 
 
-@pytest.mark.slow
 def test_wheel_zoom_pan_and_keys_work_without_a_click_first(fresh: browser.Browser, small_lung: Lung) -> None:
     before = cross(fresh)
     fresh.run(POINTER, "slice-axial", "wheel", 180, 180, {"deltaY": -120})
@@ -144,7 +143,6 @@ def test_wheel_zoom_pan_and_keys_work_without_a_click_first(fresh: browser.Brows
     np.testing.assert_allclose(cross(fresh) - before, [0, spacing[1], spacing[2]], atol=1e-6)
 
 
-@pytest.mark.slow
 def test_the_window_maps_hounsfield_units_to_greys(fresh: browser.Browser) -> None:
     """By its presets, its fields and a drag with the right button."""
     fresh.run(CHOOSE, "tint", False)
@@ -253,7 +251,6 @@ def test_a_click_into_the_plane_along_the_needle_stays_in_it(fresh: browser.Brow
     assert moved @ np.array(plane["right"]) > 0.0 and moved @ np.array(plane["up"]) > 0.0
 
 
-@pytest.mark.slow
 def test_opacity_of_a_structure(fresh: browser.Browser) -> None:
     before = fresh.run("return document.getElementById('slice-axial').toDataURL()")
     change = """const s = document.querySelector("input[data-structure='vessel']");
@@ -265,7 +262,6 @@ def test_opacity_of_a_structure(fresh: browser.Browser) -> None:
         assert same is (value == 45)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_the_cross_is_exact_to_a_voxel_on_any_grid(tmp_path: Path, mirrored: bool) -> None:
     """Turned, anisotropic and left-handed: indices there and back, and a trilinear value."""
@@ -300,7 +296,6 @@ def test_the_cross_is_exact_to_a_voxel_on_any_grid(tmp_path: Path, mirrored: boo
             assert value == pytest.approx(wanted[n], abs=1e-6)
 
 
-@pytest.mark.slow
 def test_a_double_click_in_the_3d_view_puts_the_cross_there(fresh: browser.Browser) -> None:
     place = fresh.run(
         """const c = document.getElementById('scene'), at = [c.clientWidth / 2, c.clientHeight / 2];
@@ -340,7 +335,6 @@ def test_hours_of_the_prompts_are_those_of_the_picture(
     assert all(each["text"] in shown for each in stored)
 
 
-@pytest.mark.slow
 def test_playing_pauses_before_every_bifurcation(fresh: browser.Browser, data: dict[str, Any]) -> None:
     scope = data["plans"][0]["scope"]
     along = pack.unpack(scope["arc_length_mm"])
@@ -370,7 +364,6 @@ def test_playing_pauses_before_every_bifurcation(fresh: browser.Browser, data: d
     assert fresh.messages() == []
 
 
-@pytest.mark.slow
 def test_without_the_pause_box_playing_goes_on(fresh: browser.Browser) -> None:
     """From just before the place of a pause, which is passed only without the box."""
     first = next(tick for tick in fresh.state()["pauses"] if tick > 0)
@@ -392,7 +385,6 @@ def test_without_the_pause_box_playing_goes_on(fresh: browser.Browser) -> None:
     assert stopped[True] == (pytest.approx(first), False)
 
 
-@pytest.mark.slow
 def test_openings_are_named_where_they_are(fresh: browser.Browser, data: dict[str, Any]) -> None:
     """Their places in the picture are computed again from the camera; a ring is around the one to take."""
     plan = data["plans"][0]

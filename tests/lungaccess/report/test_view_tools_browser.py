@@ -13,6 +13,7 @@ from tests.lungaccess.report import browser
 from tests.lungaccess.report.scripts import CHOOSE, PICTURE, PROJECT, SLIDE
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.browser,
     pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there"),
 ]
@@ -44,7 +45,6 @@ def test_the_first_view_fits_the_plan(page: browser.Browser, plans: tuple[Plan, 
     assert np.linalg.norm(np.ptp(places, axis=0)) > 0.3 * min(width, height)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "edges"),
     [("back", "LRFH"), ("left", "APFH"), ("right", "PAFH"), ("feet", "RLPA"), ("front", "RLFH")],
@@ -72,7 +72,6 @@ def test_the_view_approaches_the_target(page: browser.Browser, plans: tuple[Plan
     page.run("document.querySelector('button[data-fit=plan]').click()")
 
 
-@pytest.mark.slow
 def test_pointing_names_what_is_there_and_how_far_from_the_needle(
     page: browser.Browser, plans: tuple[Plan, ...]
 ) -> None:
@@ -138,7 +137,6 @@ def test_two_clicks_measure(page: browser.Browser, plans: tuple[Plan, ...]) -> N
     assert page.run("return document.getElementById('measure').getAttribute('aria-pressed')") == "false"
 
 
-@pytest.mark.slow
 def test_the_cut_goes_through_the_needle_and_faces_the_viewer(
     page: browser.Browser, plans: tuple[Plan, ...]
 ) -> None:
@@ -170,7 +168,6 @@ def test_what_is_near_can_be_brought_out_or_not(page: browser.Browser) -> None:
     assert page.run(PICTURE, 1, "scene") == before
 
 
-@pytest.mark.slow
 def test_pictures_and_films_are_saved(page: browser.Browser, tmp_path: Path) -> None:
     page.command("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
     page.run("document.getElementById('save-picture').click()")

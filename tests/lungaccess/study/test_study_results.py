@@ -202,6 +202,7 @@ with ResultsFile(path, create=True) as results:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["pages", "limit"])
 def test_a_full_disk_is_an_error_and_loses_nothing(path: Path, runs: list[Run], how: str) -> None:
     done = subprocess.run(

@@ -68,6 +68,7 @@ def direct_arcs(lung: Lung, atlas: la.Atlas, target: Target) -> DirectArcs:
     return DirectArcs(task, atlas)
 
 
+@pytest.mark.slow
 def test_it_succeeds_more_often_than_the_plan_of_least_cost(
     small_lung: Lung, atlas: la.Atlas, targets: list[Target]
 ) -> None:

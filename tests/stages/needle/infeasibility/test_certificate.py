@@ -86,6 +86,7 @@ def test_a_hole_that_is_too_narrow() -> None:
     assert finds(environment_of(narrow, required_clearance_mm=0.9), query())
 
 
+@pytest.mark.slow
 def test_a_hole_that_only_a_tighter_curve_passes() -> None:
     """Away, back and on to the target, a path comes about 257 mm^2 / radius aside half-way: 4, 6 or 9 mm."""
     aside = wall(3.0, 8.0)

@@ -22,7 +22,7 @@ from lungaccess.checking.record import wanted_clearance_mm
 from lungaccess.checking.scope import beyond_carina_mm, branches_to
 from lungaccess.checking.scope_motion import motion_of
 from lungaccess.checking.steering import turning
-from lungaccess.checking.wall_exit import derived_exit, wall_angle_rad, wall_run_mm
+from lungaccess.checking.wall_exit import WALL_ANGLE_TOLERANCE_RAD, derived_exit, wall_angle_rad, wall_run_mm
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_version
@@ -149,11 +149,14 @@ def _with_exit(plan: Plan, environment: Environment) -> Plan:
     curve_cut = shapes.integrate(plan.scope.lps_from_scope_tip, shapes.cut_at(pieces, way_out.arc_mm))
     frame = int(np.abs(curve_cut.arc_mm - way_out.arc_mm).argmin())
     run, _most = wall_run_mm(plan, environment, curve_cut, replace(way_out, frame=frame))
+    angle = wall_angle_rad(lung, point, curve.tangents[way_out.frame])
+    least = float(np.deg2rad(plan.system.tubes.min_wall_angle_deg))
     stated = WallExit(
         branch=way_out.branch,
         point_lps=point,
         arc_length_mm=way_out.arc_mm,
-        wall_angle_rad=wall_angle_rad(lung, point, curve.tangents[way_out.frame]),
+        # No angle was stated, and the check knows it no better: where it may be the least one, it is.
+        wall_angle_rad=max(angle, min(least, angle + WALL_ANGLE_TOLERANCE_RAD)),
         wall_run_mm=run,
     )
     whole = replace(tube, exit=stated, lateral_sweep_mm=sweep, follow_the_leader_error_mm=leader)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lungaccess.checking import Checker, Motions
+from lungaccess.checking.wall_exit import WALL_ANGLE_TOLERANCE_RAD
 from lungaccess.plans.plan import Plan
 
 Change = Callable[[Motions], Motions]
@@ -79,3 +80,20 @@ def test_tampered_motions_are_refused_and_it_says_why(lung: Any, plan: Plan, nam
     assert any(each.name.startswith(finding) for each in report.refusals), [
         str(each) for each in report.refusals
     ]
+
+
+@pytest.mark.parametrize(("more_rad", "accepted"), [(0.1 * WALL_ANGLE_TOLERANCE_RAD, True), (0.06, False)])
+def test_an_angle_to_the_wall_is_judged_as_exactly_as_the_check_knows_it(
+    lung: Any, plan: Plan, more_rad: float, accepted: bool
+) -> None:
+    """Who states no angle is refused only where the planner's own angle would be, whatever it was."""
+    checker = Checker(lung)
+    made = checker.completed(motions_of(plan), plan.system, plan.target_lps, method="stranger")
+    least_deg = float(np.rad2deg(made.tube.exit.wall_angle_rad + more_rad))
+    tubes = replace(plan.system.tubes, min_wall_angle_deg=least_deg)
+    system = replace(plan.system, name="steep exits alone", tubes=tubes)
+    steep = checker.completed(motions_of(plan), system, plan.target_lps, method="stranger")
+    report = checker.check(steep, system, target_lps=plan.target_lps)
+    assert report.accepted == accepted, str(report)
+    if not accepted:
+        assert any(each.name.startswith("tube.exit.angle") for each in report.refusals)

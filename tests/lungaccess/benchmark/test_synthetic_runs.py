@@ -39,7 +39,7 @@ from tests.lungaccess.study.test_study_command import stored
 
 pytestmark = pytest.mark.slow
 DEVICE, TARGETS, ITERATIONS = "ultrathin", 3, 20
-CHILD, BREATHING = "child-01", "breathing-01"
+CHILD, BREATHING = "child-01", "breathing-04"
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,9 @@
 Who plans elsewhere says how the devices move, nothing else: the states of the scope, the insertions of the
 tubes, the arcs of the needle, and the poses between them.  A plan states more, such as where the tubes
 leave the lumen.  Filled in here, those statements are true by construction, so that the check of such a
-plan speaks of its motions alone; poses that were stated stay as they are.
+plan speaks of its motions alone; poses that were stated stay as they are.  The angle to the wall is known to
+`WALL_ANGLE_TOLERANCE_RAD` alone: where it may be the least one that is allowed, that is what is filled in, as
+a planner could have stated it.
 """
 
 from __future__ import annotations
@@ -155,7 +157,6 @@ def _with_exit(plan: Plan, environment: Environment) -> Plan:
         branch=way_out.branch,
         point_lps=point,
         arc_length_mm=way_out.arc_mm,
-        # No angle was stated, and the check knows it no better: where it may be the least one, it is.
         wall_angle_rad=max(angle, min(least, angle + WALL_ANGLE_TOLERANCE_RAD)),
         wall_run_mm=run,
     )

@@ -14,6 +14,8 @@ import math
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inner_kernel
+
 MOST_STEPS = 60
 """Of a fixed point whose error falls by the norm of the gradient, 0.2 to 0.4 in a lung, with each step."""
 CONVERGED_MM = 1e-9
@@ -31,7 +33,7 @@ def cell_of(place, first, step, count):
     return cell, at - cell
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def displacement_at(nodes, frame, x, y, z):
     """Return the displacement at a point, mm."""
     i, fi = cell_of(x, frame[0], frame[3], nodes.shape[0])
@@ -50,7 +52,7 @@ def displacement_at(nodes, frame, x, y, z):
     return dx, dy, dz
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def gradient_at(nodes, frame, x, y, z, out):
     """Fill `out` (3, 3) with the derivative of the displacement (rows) along x, y, z (columns) in a cell."""
     i, fi = cell_of(x, frame[0], frame[3], nodes.shape[0])
@@ -109,7 +111,7 @@ def points_pulled_back(nodes, frame, share, points, out):
     return worst
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _eigenvalue_ends(g):
     """Return least and greatest eigenvalue of the symmetric part of a matrix (3, 3), in closed form."""
     mean = (g[0, 0] + g[1, 1] + g[2, 2]) / 3.0
@@ -160,7 +162,7 @@ def fill_cell_bounds(nodes, spacing, out):
                 out[i, j, k, 2] = math.sqrt(squares) + spread
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def stretch_near(cells, frame, begin, end, x, y, z, reach):
     """Return least stretch from share `begin` to `end`, and greatest norm of the gradient, near a point.
 

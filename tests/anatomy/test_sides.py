@@ -125,6 +125,7 @@ def test_a_thick_bridge_is_cut(half_width_mm: float) -> None:
     assert border.sum() <= 3 * (2 * half_width_mm / 1.5 + 1) ** 2
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     spacing=st.tuples(*[st.sampled_from([0.5, 0.7, 0.8, 1.0, 1.7])] * 3),

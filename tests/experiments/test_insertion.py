@@ -234,6 +234,7 @@ class TestClosedLoop:
         assert made.closed_loop.median_error_mm < 0.4 * made.open_loop.median_error_mm
         assert made.closed_loop.error_95_mm < 0.6 * made.open_loop.error_95_mm
 
+    @pytest.mark.slow
     def test_more_targets_are_reached_around_an_obstacle(self) -> None:
         errors = Errors(curvature_sd=0.1, roll_sd_deg=10.0, position_noise_mm=0.2, direction_noise_deg=0.5)
         reserve = ReplanSettings(curvature_reserve=0.2)
@@ -258,6 +259,7 @@ class TestClosedLoop:
         assert arrived[1].tip_error_mm < 0.2 * arrived[0].tip_error_mm
         assert any(replan.reserve_spent for replan in arrived[1].replans)
 
+    @pytest.mark.slow
     def test_dead_reckoning_tames_a_noisy_tracker(self) -> None:
         noisy = Errors(position_noise_mm=0.6, direction_noise_deg=1.0, target_noise_mm=0.6)
         trusting, careful = (median_errors(noisy, gain=gain).closed_loop for gain in (1.0, 0.3))

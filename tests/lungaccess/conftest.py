@@ -15,7 +15,7 @@ from scipy import ndimage
 
 import lungaccess as la
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Grid, Volume
+from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.motion.prepare import prepare_motion
 from anatomy.phantom import Phantom
@@ -117,7 +117,7 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         kind="toy",
         key="0" * 64,
         folder=None,
-        labels=labels,
+        labels=read_only(np.asfortranarray(labels)),
         grid=grid,
         cost=None,
         has_fissures=fissures,

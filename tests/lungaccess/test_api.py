@@ -87,6 +87,7 @@ def test_errors_have_one_base() -> None:
     assert la.LungaccessError is LungaccessError
 
 
+@pytest.mark.slow
 def test_from_files_to_a_checked_plan_and_back(small_phantom: Phantom, tmp_path: Path) -> None:
     """What the documentation shows, on a patient written to disk."""
     write_phantom(small_phantom, tmp_path / "patient")
@@ -111,6 +112,7 @@ def test_a_folder_that_is_no_patient(tmp_path: Path) -> None:
         la.load_patient(tmp_path, cache=tmp_path / "cache")
 
 
+@pytest.mark.slow
 def test_the_patient_in_memory_and_from_files_is_the_same(
     small_phantom: Phantom, small_lung: Lung, tmp_path: Path
 ) -> None:

@@ -49,6 +49,7 @@ def test_every_planner_and_device_has_something_to_lose(expected: dict[str, Any]
         assert sum(cost is not None for name in names for cost in expected["needles"][name]["costs"]) >= 6
 
 
+@pytest.mark.slow
 def test_a_planner_without_the_clearance_test_is_refused(
     synthetic: Scenes, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

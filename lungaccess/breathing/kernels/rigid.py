@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.typed import Float
 
 POLAR_STEPS = 30
@@ -31,7 +32,7 @@ class Rigid(NamedTuple):
     gradient: Float
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def inverse_transposed(m, out):
     """Fill `out` (3, 3) with the transposed inverse of a matrix: its cofactors by its determinant."""
     for r in range(3):

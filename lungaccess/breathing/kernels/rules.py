@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at, pulled_back, stretch_near
@@ -108,7 +109,7 @@ def place(breath, rigid, stretch, point, guess):
     return rest, speed, math.sqrt(lx * lx + ly * ly + lz * lz)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def kept_from_straying(breath, kept, lever):
     """Return the clearance by the motion that leaves `kept` wherever tissue strays, mm.
 
@@ -117,7 +118,7 @@ def kept_from_straying(breath, kept, lever):
     return (kept + breath.hysteresis * lever) / (1.0 - breath.hysteresis)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def step_left(stretch, breath, at, rest, speed, lever, reach, kept):
     """Return how far along the device a clearance of `kept` is proved, if `reach` mm about `at` are free.
 
@@ -138,7 +139,7 @@ def step_left(stretch, breath, at, rest, speed, lever, reach, kept):
     return spare / (1.0 + half * slope + breath.hysteresis / (1.0 - breath.hysteresis))
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _drift(stretch, speed, lever, near, norm):
     """Return by how much distances to voxels within `near` mm of X change in the stretch, and their slope.
 
@@ -148,7 +149,7 @@ def _drift(stretch, speed, lever, near, norm):
     return stretch.half * most, stretch.half * (stretch.most_rate + stretch.half * stretch.most_change)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def gap_to_voxels(tissue, breath, stretch, at, rest, speed, lever, bits, branch, kept):
     """Return the proved step beside deformed voxels, by how much they surely are too near, and the label.
 
@@ -188,7 +189,7 @@ def gap_to_voxels(tissue, breath, stretch, at, rest, speed, lever, bits, branch,
     return min(step, far), high + uncertain - kept_all, label
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def step_clear_of(tissue, breath, stretch, at, rest, speed, lever, bits, branch, kept):
     """Return the proved step, and the label that limits it, where `kept` mm from voxels are to be kept."""
     if bits & AIRWAY:
@@ -206,7 +207,7 @@ def step_clear_of(tissue, breath, stretch, at, rest, speed, lever, bits, branch,
     return max(step, other), nearest if nearest else label
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def step_in_lumen(tissue, breath, stretch, at, rest, speed, lever):
     """Return the proved step in which the axis is in a lumen, or cuts a corner of it."""
     depth = distance_bound(tissue.lumen, tissue.lumen_geometry, at[0], at[1], at[2])
@@ -218,7 +219,7 @@ def step_in_lumen(tissue, breath, stretch, at, rest, speed, lever):
     return step_left(stretch, breath, at, rest, speed, lever, min(depth + CORNER_MM, MOST_MM), 0.0)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def step_of(tissue, breath, stretch, at, rest, speed, lever, kind, kept, radius):
     """Return the proved step of a rule beyond the exit, and the reason that limits it."""
     bits, branch = tissue.bits, tissue.branch

@@ -7,6 +7,7 @@ import math
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inner_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at
@@ -54,7 +55,7 @@ _LUMEN = np.int64(LUMEN)
 _NOBODY = np.int64(-1)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def stretch_between(rigid, amplitude, reference, begin, end):
     """Return the stretch of the phases from `begin` to `end`."""
     share = amplitude * (0.5 * (begin + end) - reference)
@@ -65,7 +66,7 @@ def stretch_between(rigid, amplitude, reference, begin, end):
     return Stretch(share, half, rotation, rate, most_rate, most_change)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def miss_of_target(breath, rigid, stretch, end, target):
     """Return the distance of a point of the devices from a place of the masks, and how it changes, mm."""
     qx, qy, qz, vx, vy, vz = carried(
@@ -82,7 +83,7 @@ def miss_of_target(breath, rigid, stretch, end, target):
     return miss, stretch.half * (speed + stretch.half * stretch.most_change * lever)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _point_at(points, arc, n, s, ahead, out, at):
     """Fill `out` (3,) with the point at arc length `s`, between `n` and `n + 1`, and `at[3:]` with its way.
 
@@ -96,7 +97,7 @@ def _point_at(points, arc, n, s, ahead, out, at):
     return abs(arc[ahead] - s)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _step_at(tissue, breath, rigid, stretch, point, row, guess):
     """Return the proved step at a point by the rule of its section, and the reason that limits it."""
     rest, speed, lever = place(breath, rigid, stretch, point, guess)
@@ -106,7 +107,7 @@ def _step_at(tissue, breath, rigid, stretch, point, row, guess):
     return step_of(tissue, breath, stretch, guess, rest, speed, lever, kind, row[KEPT], row[RADIUS])
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, guess):
     """Return the first point of a section, from `done` on, that is not proved, -1 if all are, and why."""
     n, last = max(int(row[BEGIN]), done), int(row[END])
@@ -124,7 +125,7 @@ def _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, 
         s = min(s + step, arc[last])
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _hazard_at(tissue, breath, rigid, stretch, point, row, guess):
     """Return the proved step back from a point in the lumen, infinite where the tube is free of the wall."""
     rest, speed, lever = place(breath, rigid, stretch, point, guess)
@@ -135,7 +136,7 @@ def _hazard_at(tissue, breath, rigid, stretch, point, row, guess):
     return step_clear_of(tissue, breath, stretch, guess, rest, speed, lever, bits, _NOBODY, row[KEPT])
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _comes_free(tissue, breath, rigid, stretch, points, sections, first, guess):
     """Tell whether a tube is free of the wall somewhere between a point and its exit."""
     for s in range(sections.shape[0]):
@@ -148,7 +149,7 @@ def _comes_free(tissue, breath, rigid, stretch, points, sections, first, guess):
     return False
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
     """Return the first point, back from the exit, where what lies behind the wall is not proved clear.
 
@@ -178,7 +179,7 @@ def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
     return -1, 0
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _row_of(sections, n):
     """Return the section of a point; of two that share it, the first."""
     for s in range(sections.shape[0]):
@@ -212,7 +213,7 @@ def refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect, done
     return n, reason, points.shape[0]
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _excess(tissue, breath, rigid, stretch, point, row, reason, guess):
     """Return a bound of the clearance less what is required that holds in all phases of the stretch."""
     rest, speed, lever = place(breath, rigid, stretch, point, guess)
@@ -240,7 +241,7 @@ def _excess(tissue, breath, rigid, stretch, point, row, reason, guess):
     return over
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
     """Tell whether a rule is broken in all phases of the stretch, near a point that is not proved, and where.
 

@@ -149,7 +149,7 @@ def displacement(chord, half_turn, begin, end, offset, tilt):
     return offset * _sine_share(1.0 - begin, half_turn) + (chord + offset) * tilt * swing
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def region_kept(limits, branch, arcs, stations, count, angle, offset, tilt, worst):
     """Tell whether every start at most `offset` mm and `tilt` rad off has a clear path within all limits.
 
@@ -193,7 +193,7 @@ def _sine_over(angle):
     return 1.0 - angle * angle / 6.0 if angle < 1e-4 else math.sin(angle) / angle
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _cell_kept(limits, branch, arcs, cell, offset, tilt, turned, miss):
     """Tell whether a cell is clear of what every path of the family may do there."""
     k = int(cell[ARC])

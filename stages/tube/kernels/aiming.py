@@ -146,7 +146,7 @@ def _change(design, near, shape, want_aside, want_ahead, change):
     return True
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def aim_shape(design, near, shape, base, target):
     """Turn and insert tubes that are not planar so that their tip comes to a point.
 

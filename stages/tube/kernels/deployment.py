@@ -92,7 +92,7 @@ def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
     return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def tip_of_arcs(base, normal, arcs):
     """Return the pose at the end of a shape's arcs; see `validate_arcs`."""
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])

@@ -12,6 +12,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import normal_on_arc, pose_on_arc, sine_length, versine_length
+from anatomy.kernels.compiling import inner_kernel
 
 OVERLAP_CURVATURE, INNER_CURVATURE, CURVED_LENGTH, OUTER_RADIUS, INNER_RADIUS, MARGIN = range(6)
 MIN_WALL_ANGLE, MAX_SWEEP, MAX_EXTENSION, MAX_PROTRUSION, MAX_WALL_RUN, N_TUBES = range(6, 12)
@@ -79,7 +80,7 @@ def tip_pose(tubes, base, normal, outer, inner):
     return pose
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def off_track(tubes, outer, inner, tip):
     """Return how far the point at arc length `tip` ends up from where the tip first got there, in mm."""
     x0, z0 = planar_point(tubes, min(tip, outer), tip, tip)
@@ -99,7 +100,7 @@ def lateral_sweep(tubes, outer, inner):
     return sampled_sweep(tubes, outer, inner, 1)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def sampled_sweep(tubes, outer, inner, every):
     """Return the lateral sweep at its two sharp peaks and at one of `every` samples of the rest: no more."""
     curved = tubes[CURVED_LENGTH]

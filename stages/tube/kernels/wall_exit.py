@@ -85,7 +85,7 @@ def _reason(label):
     return NEAR_OTHER_BRANCH
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _wall_normal(labels, geometry, x, y, z):
     """Return the outward unit normal of the lumen at a border point, in corner axes scaled to mm.
 
@@ -128,7 +128,7 @@ def wall_angle(labels, geometry, pose):
     return math.asin(min(max(sine, -1.0), 1.0))
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
     """Find where the axis leaves the lumen between two arc lengths of a piece, and judge it as an exit."""
     _field, labels, geometry, _bits, _lumen, _lumen_geometry, mediastinal = environment
@@ -150,7 +150,7 @@ def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
     trace[REFUSAL] = FLAT_EXIT if trace[WALL_ANGLE] < tubes[MIN_WALL_ANGLE] else trace[HAZARD]
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _first_in_lumen(environment, pose, bend, begin, end):
     """Return the first of points LOOK_MM apart that lies in a lumen, `end` among them; -1 if none does."""
     labels, geometry = environment.labels, environment.geometry
@@ -163,7 +163,7 @@ def _first_in_lumen(environment, pose, bend, begin, end):
     return -1.0
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _tissue_gap(environment, trace, x, y, z, required):
     """Return the clearance beyond `required` outside the lumen and the label that limits it.
 
@@ -185,7 +185,7 @@ def _tissue_gap(environment, trace, x, y, z, required):
     return gap, label
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _lumen_step(environment, trace, x, y, z, radius, required):
     """Note branch and hazards of a point in the lumen; return the step to the next one.
 
@@ -219,7 +219,7 @@ def refused_exits(tubes, s, lack, first_outer):
     return end + max(tubes[INNER_RADIUS] - FINE_STEP_MM, 0.0)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _run_in_wall(environment, pose, bend, begin, end, radius):
     """Return how much of a stretch is nearer to an airway than `radius`: at least the true length.
 
@@ -238,7 +238,7 @@ def _run_in_wall(environment, pose, bend, begin, end, radius):
     return run
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def _march_beyond(environment, tubes, trace, pose, bend, s0, s, end, radius, clearance):
     """Follow one arc from `s` to `end`, out of the lumen; see `march`."""
     required = radius + clearance

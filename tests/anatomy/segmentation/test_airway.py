@@ -308,6 +308,7 @@ def found(patient: Phantom) -> Airways:
     return segment_airway(patient.ct, stand_in_lungs(patient))
 
 
+@pytest.mark.slow
 def test_phantom_lumen_is_one_piece_of_faces(found: Airways) -> None:
     assert ndimage.label(found.lumen, FACES)[1] == 1
 

@@ -175,6 +175,7 @@ def test_lungs_that_touch_are_parted(patient: Phantom) -> None:
     assert dice(parted.right, right) > 0.97
 
 
+@pytest.mark.slow
 def test_a_nodule_on_the_pleura_stays_inside(patient: Phantom, lungs: Lungs) -> None:
     require_nodule_inside(patient, lungs, 4.0)
 

@@ -28,6 +28,8 @@ from anatomy.segmentation.quality import quality_of
 from anatomy.segmentation.request import Given, SegmentationRequest
 from experiments.support.segmentation.hard_images import phantom_image, turned
 
+pytestmark = pytest.mark.slow
+
 ALL = ("lungs", "airway", "nodule", "vessels", "lobes", "cost map")
 VOXEL_MM = 1.25
 """Those of the patient, so that nothing is interpolated, which tests of their own do."""
@@ -113,7 +115,6 @@ def test_lobes_and_fissures_are_those_of_the_patient(patient: Phantom, made: Seg
     assert not [said for said in images.warnings if "fissure" in said]
 
 
-@pytest.mark.slow
 def test_lobes_that_are_not_known_are_not_claimed(patient: Phantom, made: Segmentation, copy: Path) -> None:
     """Without lobes of one lung there are no fissures to be trusted: the check must say so."""
     half = made.parts.lobes * made.parts.left
@@ -152,7 +153,6 @@ def test_nothing_is_done_twice(patient: Phantom, made: Segmentation, copy: Path)
         assert (getattr(again.parts, name) == getattr(made.parts, name)).all()
 
 
-@pytest.mark.slow
 def test_the_same_ct_gives_the_same_images(patient: Phantom, made: Segmentation, tmp_path: Path) -> None:
     assert _voxels(_again(patient, made, tmp_path / "other").folder) == _voxels(made.folder)
 
@@ -164,7 +164,6 @@ def _cut_airway(made: Segmentation) -> np.ndarray:
     return lumen
 
 
-@pytest.mark.slow
 def test_a_corrected_mask_is_kept_and_only_what_follows_is_done_again(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:
@@ -181,7 +180,6 @@ def test_a_corrected_mask_is_kept_and_only_what_follows_is_done_again(
     assert settled.corrected == ("airway",)
 
 
-@pytest.mark.slow
 def test_taking_a_correction_back_restores_what_was_made(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:
@@ -193,7 +191,6 @@ def test_taking_a_correction_back_restores_what_was_made(
     assert _voxels(copy) == _voxels(made.folder)
 
 
-@pytest.mark.slow
 def test_a_segmentation_of_slicer_over_a_part_of_the_image_is_taken(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:
@@ -255,7 +252,6 @@ def require_made_good(patient: Phantom, made: Segmentation, folder: Path) -> Non
     assert not list(folder.glob(".*-*"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("moment", [2, 3])
 def test_a_run_that_is_killed_in_its_last_steps_leaves_no_patient_and_is_made_good(
     patient: Phantom, made: Segmentation, copy: Path, monkeypatch: pytest.MonkeyPatch, moment: int
@@ -266,7 +262,6 @@ def test_a_run_that_is_killed_in_its_last_steps_leaves_no_patient_and_is_made_go
     require_made_good(patient, made, copy)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("moment", [1, 2, 3, 6, 9, 14, 20])
 def test_a_killed_run_leaves_no_patient_and_is_made_good(
     patient: Phantom, made: Segmentation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
@@ -275,7 +270,6 @@ def test_a_killed_run_leaves_no_patient_and_is_made_good(
     require_made_good(patient, made, tmp_path / "patient")
 
 
-@pytest.mark.slow
 def test_an_edited_description_is_kept(patient: Phantom, made: Segmentation, copy: Path) -> None:
     description = copy / "patient.toml"
     edited = description.read_text().replace('name = "P"', 'name = "Patient A"')
@@ -287,7 +281,6 @@ def test_an_edited_description_is_kept(patient: Phantom, made: Segmentation, cop
     assert not _again(patient, made, made.folder).kept_description
 
 
-@pytest.mark.slow
 def test_a_point_outside_the_lung_is_warned_of(patient: Phantom, copy: Path, made: Segmentation) -> None:
     heart = made.grid.lps(np.argwhere(patient.labels.array == LABELS["heart"]).mean(axis=0))
     point = ",".join(f"{x:.2f}" for x in heart)
@@ -298,7 +291,6 @@ def test_a_point_outside_the_lung_is_warned_of(patient: Phantom, copy: Path, mad
     assert any("outside the image" in warning for warning in far.warnings)
 
 
-@pytest.mark.slow
 def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentation, tmp_path: Path) -> None:
     folder = tmp_path / "totalsegmentator"
     folder.mkdir()
@@ -340,7 +332,6 @@ def test_masks_of_other_programs_replace_steps(patient: Phantom, made: Segmentat
         segment(_request(patient, tmp_path / "out", totalsegmentator=tmp_path))
 
 
-@pytest.mark.slow
 def test_thick_slices_are_marked(patient: Phantom, tmp_path: Path) -> None:
     step = 4
     matrix = patient.ct.grid.lps_from_ijk.copy()
@@ -377,7 +368,6 @@ def test_a_file_that_is_no_image_is_refused(tmp_path: Path) -> None:
         read_ct(tmp_path / "missing.nii.gz")
 
 
-@pytest.mark.slow
 def test_what_cannot_be_a_patient_leaves_none_and_is_accepted_by_name(
     patient: Phantom, made: Segmentation, copy: Path
 ) -> None:
@@ -398,7 +388,6 @@ def test_what_cannot_be_a_patient_leaves_none_and_is_accepted_by_name(
         segment(replace(request, accept=("one-lungs",)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "flips"),
     [

@@ -129,6 +129,7 @@ def test_lung_without_anything_bright_is_no_obstacle() -> None:
     assert tubes.n_tubes == 0
 
 
+@pytest.mark.slow
 def test_a_cord_without_lumen_is_not_followed() -> None:
     tubes, _ = follow(block(0.0, 1.65, AIR_HU))
     assert tubes.n_tubes == 0

@@ -22,6 +22,7 @@ def test_tunnels_are_counted() -> None:
     assert tunnels(diagonal_ring) == 1, "voxels that share an edge are connected"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "what"), [(0.3, "tunnels"), (0.08, "separate pieces")])
 def test_noise_over_a_lumen_is_refused(small_phantom: Phantom, share: float, what: str) -> None:
     lumen = small_phantom.images.lumen

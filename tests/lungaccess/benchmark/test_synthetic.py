@@ -84,6 +84,7 @@ def test_targets_are_those_of_the_manifest(name: str, tmp_path: Path) -> None:
     assert measured_entry(phantom_named(name), tmp_path) == entries()[name]
 
 
+@pytest.mark.slow
 def test_a_changed_generator_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     case = phantom_named("child-01")
     other = replace(case, traits=replace(case.traits, vessel_calibre=case.traits.vessel_calibre + 0.1))

@@ -13,7 +13,7 @@ import pytest
 
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
-from anatomy.grid import Grid, Volume, transform_points
+from anatomy.grid import Grid, Volume, read_only, transform_points
 from experiments.support.mutants.mutant import changed
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
@@ -84,7 +84,7 @@ def toy_lung() -> Any:
         kind="toy",
         key="abc123",
         grid=grid,
-        labels=labels,
+        labels=read_only(labels),
         tree=tree,
         cost=None,
         has_fissures=True,

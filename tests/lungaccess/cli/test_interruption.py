@@ -57,6 +57,7 @@ def test_ctrl_c_keeps_the_best_plan(more: tuple[str, ...], patient: Path, tmp_pa
         assert "Estimated to succeed" in out and "Geometry proved and checked." in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_end_before_the_first_plan_exits_130(patient: Path, tmp_path: Path, end: signal.Signals) -> None:
     process = planning(patient, tmp_path / "out", cache=tmp_path / "cache")

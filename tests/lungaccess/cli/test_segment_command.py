@@ -108,6 +108,7 @@ def test_planning_on_thick_slices_must_be_allowed(
     assert "slices 5.0 mm apart" not in _one_line(capsys.readouterr().err)
 
 
+@pytest.mark.slow
 def test_what_is_no_chest_ct_is_refused(
     ct_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

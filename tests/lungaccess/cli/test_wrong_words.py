@@ -1,4 +1,4 @@
-"""Two hundred wrong command lines: none ends in a traceback, each says what was found and what to do."""
+"""A hundred wrong command lines: none ends in a traceback, each says what was found and what to do."""
 
 from __future__ import annotations
 
@@ -9,24 +9,20 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-import lungaccess as la
-from anatomy.phantom import make_phantom, write_phantom
 from lungaccess.cli import app as cli
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from tests.lungaccess.cli.wrong_words import World, arguments_of, kind_of, ranges_of, wrong_words
 
-INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "200"))
+INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "100"))
 """How many wrong command lines are tried."""
 PHASES = (Phase.explicit, Phase.generate)
 """The words of a failure are short: making them shorter would only take time."""
@@ -39,14 +35,13 @@ BROKEN_TOML = {
 }
 
 
-def make_world(folder: Path, toy_plan: Plan) -> World:
+def make_world(folder: Path, patient: Path, small_plan: Plan, toy_plan: Plan) -> World:
     """Fill a folder with a patient, a plan and all kinds of bad files."""
-    write_phantom(make_phantom(seed=3, size="small", spacing_mm=1.75), folder / "PATIENT")
-    lung = la.load_patient(folder / "PATIENT", cache=folder / "cache")
-    found = _first_plan(lung)
+    shutil.copytree(patient, folder / "PATIENT")
+    shutil.copytree(patient.parent / "cache", folder / "cache")
     for name in ("plan", "bad"):
         (folder / name).mkdir()
-    found.save(folder / "plan" / "plan.json")
+    small_plan.save(folder / "plan" / "plan.json")
     toy_plan.save(folder / "bad" / "foreign.json")
     bad = folder / "bad"
     bad.joinpath("text").write_text("no number, no table\n")
@@ -79,20 +74,9 @@ def make_world(folder: Path, toy_plan: Plan) -> World:
     )
 
 
-def _first_plan(lung: Any) -> Plan:
-    """Return a plan to the first nodule that can be reached."""
-    system = la.load_system("ultrathin")
-    for number in range(1, len(lung.targets_lps) + 1):
-        try:
-            return next(la.plan(lung, system, la.resolve_target(lung, nodule=number), iterations=0))
-        except NoPlan:
-            continue
-    raise AssertionError("the synthetic patient has no nodule in reach")
-
-
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory, toy_plan: Plan) -> World:
-    return make_world(tmp_path_factory.mktemp("wrong"), toy_plan)
+def world(tmp_path_factory: pytest.TempPathFactory, patient: Path, small_plan: Plan, toy_plan: Plan) -> World:
+    return make_world(tmp_path_factory.mktemp("wrong"), patient, small_plan, toy_plan)
 
 
 @pytest.fixture(autouse=True)

@@ -42,6 +42,7 @@ def sampling_of(search: AtlasSearch) -> tuple[LocalSampling, np.ndarray]:
     return LocalSampling(local_search, search.arcs, chosen, rng), chosen
 
 
+@pytest.mark.slow
 def test_what_is_sampled_is_proved_and_near_the_atlas(searches: list[AtlasSearch]) -> None:
     seen = 0
     for search in searches:
@@ -62,6 +63,7 @@ def test_what_is_sampled_is_proved_and_near_the_atlas(searches: list[AtlasSearch
     assert seen >= 4
 
 
+@pytest.mark.slow
 def test_a_target_between_all_workspaces_is_reached(searches: list[AtlasSearch]) -> None:
     """Not one entry has these targets in its workspace; a deployment between the entries has."""
     between = [search for search in searches if not len(search.arcs.in_workspace)]

@@ -49,6 +49,7 @@ def plans(small_lung: Lung, system: System, atlas: la.Atlas) -> list[la.Plan]:
     return found
 
 
+@pytest.mark.slow
 def test_the_only_tube_goes_through_the_wall_and_the_needle_on(
     small_lung: Lung, system: System, plans: list[la.Plan]
 ) -> None:

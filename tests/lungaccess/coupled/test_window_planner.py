@@ -77,6 +77,7 @@ def test_given_phases_are_held_at_falling_cost(
     assert la.check(plans[-1], breathing).accepted
 
 
+@pytest.mark.slow
 def test_tissue_that_strays_leaves_less_to_an_aim(
     small_lung: Lung, breathing: Lung, target: Target, atlas: la.Atlas
 ) -> None:

@@ -90,6 +90,7 @@ def explain_without(lung: Lung, target: Target, failure: la.NoPlan, atlas: la.At
         return explain_no_plan(lung, SYSTEM, target, failure, atlas=atlas, time_s=None, atlas_of=none)
 
 
+@pytest.mark.slow
 class TestBlocked:
     """The target is walled in by a vessel."""
 
@@ -252,6 +253,7 @@ def test_a_headline_names_the_least_invasive_preset_that_does(far: Explanation) 
     assert headline.endswith("; flexure-needle would reach it")
 
 
+@pytest.mark.slow
 def test_an_airway_that_blocks_is_named_by_its_branch(
     walled: tuple[Lung, Target], blocked: tuple[Explanation, la.Atlas]
 ) -> None:

@@ -81,6 +81,7 @@ def window(page: Path) -> Iterator[browser.Browser]:
         yield opened
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 @pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there")
 class TestBrowser:

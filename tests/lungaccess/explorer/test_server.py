@@ -257,6 +257,7 @@ def test_the_command_ends_with_its_processes(number: signal.Signals, patient: Pa
     assert not any(is_running(child) for child in children)
 
 
+@pytest.mark.slow
 def test_two_pages_do_not_see_each_other(patient: Path) -> None:
     async def run() -> None:
         async with (

@@ -173,6 +173,7 @@ class TestProgram:
         np.testing.assert_allclose(shares[1:], 1.0, rtol=0.1)
         assert shares[0] < 1.0
 
+    @pytest.mark.slow
     def test_its_gradients_are_those_of_differences(self, case: Case) -> None:
         problem, solver = set_up(case)
         rng = np.random.default_rng(4)

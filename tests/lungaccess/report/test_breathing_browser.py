@@ -14,6 +14,7 @@ from tests.lungaccess.report import browser
 from tests.lungaccess.report.scripts import CHOOSE, PICTURE
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.browser,
     pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there"),
 ]
@@ -55,7 +56,6 @@ def test_left_is_left_in_the_slices(page: browser.Browser, small_lung: Lung) -> 
     assert told_apart.all()
 
 
-@pytest.mark.slow
 def test_everything_breathes_together(
     page: browser.Browser, breathing_plans: tuple[Plan, ...], breathing_lung: Lung
 ) -> None:
@@ -97,7 +97,6 @@ def test_the_lumen_breathes_in_the_slices(
     page.run("window.lungaccessReport.breathe(1)")
 
 
-@pytest.mark.slow
 def test_the_breath_plays_and_is_held(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.breathe(0.2); document.getElementById('breathe').click()")
     frames = 0

@@ -87,6 +87,7 @@ def test_label_volumes_agree_with_the_labels(data: dict[str, Any], small_lung: L
     assert set(np.unique(codes.array)) == set(volumes.CODES.values())
 
 
+@pytest.mark.slow
 def test_ct_bytes_say_the_hounsfield_units(small_lung: Lung, plans: tuple[Plan, ...]) -> None:
     grid = small_lung.grid
     lps = grid.lps(np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1))

@@ -161,6 +161,7 @@ def _pixel_area(footprint: Footprint) -> float:
 # Files -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_overview_is_a_whole_picture(toy_plan: Any, toy_lung: Any, tmp_path: Path) -> None:
     path = report.overview_png(toy_plan, toy_lung, tmp_path / "overview.png")
     width, height = _size(path)

@@ -26,6 +26,7 @@ from tests.lungaccess.report.made_scene import (
 )
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.browser,
     pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there"),
 ]
@@ -140,7 +141,6 @@ def test_a_cut_takes_away_what_is_before_it(page: browser.Browser) -> None:
     assert picked[25.0] is None
 
 
-@pytest.mark.slow
 def test_picking_finds_the_point_within_half_a_millimetre(page: browser.Browser) -> None:
     """Of balls, against the intersection of the ray with them, computed here, from several sides."""
     rng = np.random.default_rng(5)

@@ -252,6 +252,7 @@ def test_the_base_moves_most_and_exhalation_lasts_longest() -> None:
     assert np.mean(phase(np.linspace(0.0, 1.0, 1001)) < 0.1) > 0.4
 
 
+@pytest.mark.slow
 def test_heights_in_the_lung(small_lung: Lung) -> None:
     inside = small_lung.grid.lps(np.argwhere(small_lung.mask("lung").array))
     top, bottom = inside[np.argmax(inside[:, 2])], inside[np.argmin(inside[:, 2])]

@@ -85,6 +85,7 @@ def test_a_planner_may_have_iterations_of_its_own(cache: Path) -> None:
     assert found[0].problem.key == found[1].problem.key
 
 
+@pytest.mark.slow
 def test_a_plan_is_checked_and_a_bad_target_is_an_answer(runs: list[Run], cache: Path) -> None:
     good, bad = answer(runs[0], cache), answer(runs[2], cache)
     assert (good.outcome, good.status, good.solved, good.accepted) == (PLAN, EXACT, True, True)

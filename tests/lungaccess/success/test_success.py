@@ -87,6 +87,7 @@ def test_it_succeeds_more_often_than_the_plan_of_least_cost(
     assert len(gains) == 2 and min(gains) > -0.01 and max(gains) > 0.05
 
 
+@pytest.mark.slow
 def test_a_search_without_time_estimates_its_plan_with_all_draws(
     small_lung: Lung, atlas: la.Atlas, targets: list[Target]
 ) -> None:

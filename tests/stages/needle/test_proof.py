@@ -112,10 +112,17 @@ class TestBlocker:
         lung = canvas.lung()
         limits = limits_of(required_mm=1.0, radius_mm=0.5)
         bend = (0.0, 1.0, 0.0, 0.0)
-        assert proof.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 8.0, 0.0, -1) == VESSEL
-        assert proof.blocker_on_arc(arrays(lung), limits, (0, 0, 0, 0, 0, 1.0), bend, 2.0, 0.0, -1) == 0
         assert (
-            proof.blocker_on_arc(arrays(lung), limits, (5.0, 0, 0, 0, 0, 1.0), bend, 9.5, 0.0, -1) == OUTSIDE
+            proof.blocker_on_arc(arrays(lung), limits, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), bend, 8.0, 0.0, -1)
+            == VESSEL
+        )
+        assert (
+            proof.blocker_on_arc(arrays(lung), limits, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), bend, 2.0, 0.0, -1)
+            == 0
+        )
+        assert (
+            proof.blocker_on_arc(arrays(lung), limits, (5.0, 0.0, 0.0, 0.0, 0.0, 1.0), bend, 9.5, 0.0, -1)
+            == OUTSIDE
         )
 
     @pytest.mark.parametrize("start", [(0.0, 0.0, 11.0), (math.nan, 0.0, 0.0)])
@@ -137,7 +144,7 @@ class TestExemption:
         canvas.airway(x < -1, x < 2, 0)
         lung = canvas.lung()
         values = limits_of(required_mm=0.9, radius_mm=0.4, exempt_mm=5.0, **limits)
-        pose, bend = (0.0, 0, 0, 0, 0, 1.0), (0.0, 1.0, 0, 0)
+        pose, bend = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 0.0)
         return int(proof.blocker_on_arc(arrays(lung), values, pose, bend, length, begun, branch))
 
     def test_the_wall_is_exempt_at_first(self) -> None:
@@ -160,7 +167,7 @@ class TestExemption:
         values = limits_of(required_mm=0.9, radius_mm=0.4, exempt_mm=5.0)
         for gap, clear in ((0.41, True), (0.39, False)):
             pose = (-1.0 + gap, 0.0, 0.0, 0.0, 0.0, 1.0)
-            label = proof.blocker_on_arc(environment, values, pose, (0.0, 1.0, 0, 0), 3.0, 0.0, 0)
+            label = proof.blocker_on_arc(environment, values, pose, (0.0, 1.0, 0.0, 0.0), 3.0, 0.0, 0)
             assert (label == 0) == clear
             assert clear or label & LUMEN
 
@@ -171,7 +178,7 @@ class TestExemption:
         canvas.add(canvas.ball([0.0, 0.0, 3.0], 0.6), VESSEL)
         values = limits_of(required_mm=0.9, radius_mm=0.4, exempt_mm=5.0)
         pose = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-        label = proof.blocker_on_arc(arrays(canvas.lung()), values, pose, (0.0, 1.0, 0, 0), 4.0, 0.0, 0)
+        label = proof.blocker_on_arc(arrays(canvas.lung()), values, pose, (0.0, 1.0, 0.0, 0.0), 4.0, 0.0, 0)
         assert label & VESSEL
 
 

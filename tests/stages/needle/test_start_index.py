@@ -63,6 +63,7 @@ def test_the_index_agrees_with_a_scan(
         assert np.array_equal(found_lengths, lengths[expected])
 
 
+@pytest.mark.slow
 def test_an_atlas_answers_the_same(small_lung: Lung) -> None:
     entries = la.build_atlas(small_lung, SYSTEM, rotations=8).deployments
     environment = needle_environment(small_lung, SYSTEM.needle, SYSTEM.margins, with_fissures=False)

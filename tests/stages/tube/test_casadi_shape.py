@@ -12,6 +12,7 @@ from tests.stages.tube.pairs import WIDE
 from tests.stages.tube.test_shapes import ANY, COARSE, PAIR, TRIPLE, point_at, tube
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tubes", "count"),
     [((WIDE.inner, WIDE.outer), 1), (PAIR, 2), (TRIPLE, 1)],

@@ -67,7 +67,7 @@ def mark_probed(states, window, scale, depths, probed, corners):
                     )
 
 
-@numba.njit(cache=True, nogil=True)
+@inner_kernel
 def clearance_above(obstacles, limits, spare, exempt_branch, inserted, x, y, z):
     """Return a clearance in mm that the true one of a point is never above, as far as it is worth knowing.
 

@@ -127,7 +127,7 @@ def _curvature_range(b):
     return largest, bend * (1.0 + ROUNDING) / (slow * slow * slow)
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def prove_span(control, knots, first, cones, index, cell_start, cell_cones, limit, needed, at_mm, bounds):
     """Decide whether one span keeps `limit` in curvature and `needed` in depth, everywhere.
 
@@ -199,7 +199,7 @@ def prove_spans(
         )
 
 
-@numba.njit(cache=True)
+@inner_kernel
 def basis_rows(knots, first, u, rows):
     """Fill `rows` (3, 4) with the four basis functions at `u` and their first and second derivatives."""
     k1, k2, k3 = knots[first + 1], knots[first + 2], knots[first + 3]

@@ -57,6 +57,7 @@ def wall(hole_mm: float = 0.0, at: float = 0.0) -> np.ndarray:
     return (np.abs(Z) < 2.0) & (np.hypot(X - at, Y) >= hole_mm)
 
 
+@pytest.mark.slow
 def test_a_wall_is_proved_and_a_hole_is_not() -> None:
     assert outcome(environment_of(wall()), query()) == "no path"
     assert outcome(environment_of(wall(4.0)), query()) != "no path"

@@ -69,6 +69,7 @@ def test_a_portfolio_finds_paths_that_a_single_search_does_not_leave_its_own_for
     assert single.max() > 1.02 * portfolio.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", [SHORTEST, INVERSE])
 def test_each_path_is_cheaper_clear_and_within_the_limits(objective: Objective) -> None:
     environment = clutter(1)

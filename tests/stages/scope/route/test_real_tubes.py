@@ -36,6 +36,7 @@ def trials(line: Centreline, links: Links, count: int) -> list[tuple[np.ndarray,
     return found
 
 
+@pytest.mark.slow
 def test_all_routes_of_an_airway_tree_are_proved_and_replanned(data_dir: Path) -> None:
     (file,) = (data_dir / "airway-tree").glob("*.vtu")
     line = from_tree(read_centerlines(file, frame="lps"))

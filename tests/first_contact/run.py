@@ -67,12 +67,16 @@ def main() -> int:
             place = fresh_place(home, asked.wheel, asked.python, asked.constraints)
         else:
             place = place_with_these_libraries(home)
-        alone = next((n for n, task in enumerate(tasks) if task.get("together")), len(tasks))
-        for task in tasks[:alone]:
-            faults += do_task(task, place)
+        beside = [task for task in tasks if task.get("beside")]
+        others = [task for task in tasks if not task.get("beside")]
+        alone = next((n for n, task in enumerate(others) if task.get("together")), len(others))
         with ThreadPoolExecutor(2) as pool:
-            for found in pool.map(lambda task: do_task(task, place), tasks[alone:]):
-                faults += found
+            begun = [pool.submit(do_task, task, place) for task in beside]
+            for task in others[:alone]:
+                faults += do_task(task, place)
+            begun += [pool.submit(do_task, task, place) for task in others[alone:]]
+            for each in begun:
+                faults += each.result()
     print(f"{len(tasks)} tasks, {len(faults)} faults", flush=True)
     return 1 if faults else 0
 

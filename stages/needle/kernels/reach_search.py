@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import numba
+import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel
 from stages.needle.kernels.connections import seen_from
@@ -16,6 +17,8 @@ from stages.needle.kernels.reach_arcs import CLEARANCE, COST, SEARCHED, UNREACHE
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
 
+_ONE = np.int64(1)
+
 
 @inner_kernel
 def _grow(obstacles, limits, objective, start, branch, q, nodes, parents, iterations, share, state):
@@ -23,7 +26,7 @@ def _grow(obstacles, limits, objective, start, branch, q, nodes, parents, iterat
     for c in range(nodes.shape[1]):
         nodes[0, c] = start[c] if c < 6 else 0.0
     count, _used, solved = grow_rrt(
-        obstacles, limits, objective, branch, q, nodes, parents, 1, iterations, share, state, math.inf
+        obstacles, limits, objective, branch, q, nodes, parents, _ONE, iterations, share, state, math.inf
     )
     return count - 1 if solved else 0
 

@@ -86,7 +86,9 @@ def script_of(shell: str) -> str:
     return written.getvalue()
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize(
+    "shell", ["bash", *(pytest.param(name, marks=pytest.mark.slow) for name in ("zsh", "fish"))]
+)
 def test_completion_knows_commands_options_and_choices(shell: str, tmp_path: Path) -> None:
     script = script_of(shell)
     for word in (*" ".join(commands()).split(), "voxel-sum", "allow-fissures"):

@@ -74,6 +74,7 @@ def test_a_target_between_all_workspaces_is_reached(searches: list[AtlasSearch])
     assert next(steps).candidate is not None
 
 
+@pytest.mark.slow
 def test_those_that_miss_by_least_come_first(searches: list[AtlasSearch]) -> None:
     search = searches[0]
     target, entries = search.task.target.lps_mm, search.atlas.deployments

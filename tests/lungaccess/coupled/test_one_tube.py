@@ -64,6 +64,7 @@ def test_the_only_tube_goes_through_the_wall_and_the_needle_on(
         assert report.accepted, report
 
 
+@pytest.mark.slow
 def test_a_plan_with_an_outer_tube_that_is_not_there_is_refused(
     small_lung: Lung, plans: list[la.Plan]
 ) -> None:
@@ -72,6 +73,7 @@ def test_a_plan_with_an_outer_tube_that_is_not_there_is_refused(
     assert "tube.outer_length" in {finding.name for finding in report.refusals}
 
 
+@pytest.mark.slow
 def test_a_plan_is_the_same_after_it_was_saved(tmp_path: Path, plans: list[la.Plan]) -> None:
     plans[0].save(tmp_path / "plan.json")
     assert la.Plan.load(tmp_path / "plan.json").system == plans[0].system

@@ -39,7 +39,10 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize(("end", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, 130)])
+@pytest.mark.parametrize(
+    ("end", "code"),
+    [(signal.SIGKILL, -signal.SIGKILL), pytest.param(signal.SIGTERM, 130, marks=pytest.mark.slow)],
+)
 def test_no_process_stays(end: signal.Signals, code: int) -> None:
     words, where = [sys.executable, "-c", SEARCH], {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=where) as process:

@@ -163,6 +163,7 @@ def test_edges_of_the_page_grid_are_those_of_the_lung() -> None:
     assert np.prod(coarse.shape) <= 1.05 * volumes.COARSE_VOXELS
 
 
+@pytest.mark.slow
 def test_a_lung_without_nodules_and_fissures_has_fewer_surfaces(bare_lung: Any) -> None:
     bare = SimpleNamespace(**{**vars(bare_lung), "nodules": None})
     assert [each["key"] for each in meshes.structure_meshes(bare)] == ["lung", "vessel", "airway"]

@@ -15,6 +15,7 @@ from scipy.stats import binomtest, chi, norm
 
 import lungaccess as la
 from anatomy.errors import PlanFileError, SettingsError
+from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.settings import override
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
@@ -202,7 +203,7 @@ def test_no_device_goes_farther_than_it_can(plan: Plan) -> None:
 
 def test_leaving_a_main_bronchus_pierces_the_pleura(plan: Plan, small_lung: Lung) -> None:
     tree = replace(small_lung.tree)
-    vars(tree)["mediastinal"] = np.arange(tree.n_branches) == plan.tube.exit.branch
+    vars(tree)["mediastinal"] = read_only(np.arange(tree.n_branches) == plan.tube.exit.branch)
     there = RiskAssessor(plan, replace(small_lung, tree=tree))
     outcomes = there.outcomes(Deviations(**no_deviations(1, there.n_arcs)))
     assert outcomes.touched[0] == OUTSIDE

@@ -156,6 +156,7 @@ def test_the_estimate_of_first_order_tells_who_hits_the_goal(
         assert np.abs(spread.goal_chances - counted).max() < 0.2
 
 
+@pytest.mark.slow
 def test_without_errors_every_candidate_is_certain(
     small_lung: Lung, atlas: la.Atlas, targets: list[Target]
 ) -> None:
@@ -165,6 +166,7 @@ def test_without_errors_every_candidate_is_certain(
     assert np.allclose(spread.chances, 1.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_where_there_is_no_plan_it_says_why(small_lung: Lung, atlas: la.Atlas, targets: list[Target]) -> None:
     short = replace(SYSTEM, name="short", needle=replace(SYSTEM.needle, max_length_mm=1.0))
     with pytest.raises(la.NoPlan) as failure:

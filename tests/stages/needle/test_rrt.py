@@ -48,7 +48,7 @@ def grow(
         environment.limits,
         OBJECTIVE,
         -1,
-        goal,
+        tuple(goal.tolist()),
         nodes,
         parents,
         1,
@@ -185,7 +185,7 @@ class TestRrt:
                 environment.limits,
                 OBJECTIVE,
                 -1,
-                GOAL,
+                tuple(GOAL.tolist()),
                 nodes,
                 parents,
                 count,
@@ -220,7 +220,7 @@ class TestRrt:
         nodes, parents = np.zeros((5000, tree.NODE_COLUMNS)), np.zeros(5000, dtype=np.int64)
         nodes[0, :6] = 0.0, 0.0, -46.0, 0.0, 0.0, 1.0
         _, _, solved = rrt.grow_rrt(
-            environment.obstacles, environment.limits, OBJECTIVE, -1, np.array([0.0, 0.0, 46.0]), nodes,
+            environment.obstacles, environment.limits, OBJECTIVE, -1, (0.0, 0.0, 46.0), nodes,
             parents, 1, 20000, 0.5, np.array([1], dtype=np.uint64), math.inf,
         )  # fmt: skip
         assert solved

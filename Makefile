@@ -5,6 +5,8 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.14 python3; 
 	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
 # Modules are compiled when they are first imported: most of a library never is.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --retries 10 -c constraints.txt
+# What was compiled at the first import is kept, also where the environment says otherwise.
+unexport PYTHONDONTWRITEBYTECODE
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 

@@ -1,7 +1,7 @@
 """Compare devices in a study.
 
 A study is every case with every planner and every seed; `lungaccess study run` reads the same values from
-a TOML file. The runs are stored in one SQLite file. Here each case has ten random targets in the periphery
+a TOML file. The runs are stored in one SQLite file. Here each case has six random targets in the periphery
 of the lungs.
 """
 
@@ -17,7 +17,7 @@ if __name__ == "__main__":  # the worker processes import this file
             "name": "reach of two needles",
             "budget": {"iterations": 10, "first_plan": True},
             "case": [
-                {"name": name, "anatomy": "phantom-3", "system": name, "peripheral": {"per_lung": 5}}
+                {"name": name, "anatomy": "phantom-3", "system": name, "peripheral": {"per_lung": 3}}
                 for name in ("ultrathin", "flexure-needle")
             ],
             "planner": [{"name": "atlas"}],

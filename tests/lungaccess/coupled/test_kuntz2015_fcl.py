@@ -124,6 +124,7 @@ class TestSearch:
         assert counts[0][FOUND] == counts[1][FOUND] >= 2
         assert counts[0][OUT_OF_WORKSPACE] > ITERATIONS / 2 and counts[1][OUT_OF_WORKSPACE] == 0
 
+    @pytest.mark.slow
     def test_what_the_proof_refuses_is_kept_and_not_yielded(
         self, atlas: la.Atlas, target: Target, obstacles: Obstacles, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -133,6 +134,7 @@ class TestSearch:
         assert len(search.refused_by_proof) == search.counts[FOUND] >= 2
         assert {refusal.stage for refusal in search.refused_by_proof} == {"needle"}
 
+    @pytest.mark.slow
     def test_an_rrt_without_time_finds_nothing(
         self, atlas: la.Atlas, target: Target, obstacles: Obstacles
     ) -> None:

@@ -68,6 +68,7 @@ def test_the_tip_of_the_tubes_is_at_the_target(
         assert report.accepted, report.refusals
 
 
+@pytest.mark.slow
 def test_plans_become_better_and_are_the_same_again(
     small_lung: Lung, system: System, atlas: la.Atlas, plans: list[list[la.Plan]]
 ) -> None:

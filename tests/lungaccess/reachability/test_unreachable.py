@@ -173,6 +173,7 @@ def boxes_offered(
     return offered
 
 
+@pytest.mark.slow
 def test_no_box_with_a_deployment_that_can_be_is_blocked(
     small_lung: Lung, tubes: Float, proof: UnreachableProof, plans: list[la.Plan]
 ) -> None:

@@ -31,7 +31,7 @@ _QUERY = """
 SELECT p.case_name, p.x_lps_mm, p.y_lps_mm, p.z_lps_mm, c.name, r.cpu_time, l.plan
 FROM runs r JOIN outcomes o ON o.runid = r.id JOIN plannerConfigs c ON c.id = r.plannerid
      JOIN problems p ON p.experimentid = r.experimentid LEFT JOIN plans l ON l.runid = r.id
-WHERE NOT o.failed ORDER BY p.case_name, p.target, c.name"""
+WHERE NOT o.failed ORDER BY r.id"""
 
 
 def method_choice(words: str, iterations: int | None) -> PlannerChoice:
@@ -105,7 +105,9 @@ def benchmark_study(
 
 def _case(folder: Path, case: BenchmarkPhantom, system: str, targets: int | None) -> Case:
     points = entries()[case.name].targets_lps
-    chosen = points[:TARGETS_A_LUNG][:targets] + points[TARGETS_A_LUNG:][:targets]
+    # In turns, so that runs of the first targets remain those of a study of more.
+    pairs = tuple(zip(points[:TARGETS_A_LUNG], points[TARGETS_A_LUNG:], strict=True))[:targets]
+    chosen = [point for pair in pairs for point in pair]
     return Case(
         name=f"{case.name}/{system}",
         anatomy=case.name,
@@ -118,7 +120,8 @@ def _case(folder: Path, case: BenchmarkPhantom, system: str, targets: int | None
 def submissions_of(path: Path, machine: str = "") -> list[Submission]:
     """Return the submissions that the results of a study of the benchmark make, one of each method.
 
-    Times are processor time of the search; where it found nothing, of the whole run.
+    Times are processor time of the search; where it found nothing, of the whole run.  Of several runs
+    of a query, such as with more iterations, the last counts.
 
     Raises
     ------
@@ -128,7 +131,7 @@ def submissions_of(path: Path, machine: str = "") -> list[Submission]:
         If they are not of this benchmark.
     """
     queries = {(f"{each.phantom}/{each.system}", each.target_lps): each for each in all_queries().values()}
-    answers: dict[str, list[SubmittedAnswer]] = {}
+    answers: dict[str, dict[str, SubmittedAnswer]] = {}
     with ResultsFile(path) as results:
         for case, x, y, z, planner, cpu_s, text in results.rows(_QUERY):
             query = queries.get((case, (x, y, z)))
@@ -138,11 +141,11 @@ def submissions_of(path: Path, machine: str = "") -> list[Submission]:
                     expected=f"runs of {VERSION} alone",
                     remedy=f"Make them with: lungaccess benchmark {VERSION} run",
                 )
-            answers.setdefault(planner, []).append(
-                SubmittedAnswer(query=query.name, cpu_s=cpu_s) if not text else _answer(query, text)
-            )
+            answer = SubmittedAnswer(query=query.name, cpu_s=cpu_s) if not text else _answer(query, text)
+            answers.setdefault(planner, {})[query.name] = answer
     return [
-        Submission(planner=planner, machine=machine, answers=tuple(own)) for planner, own in answers.items()
+        Submission(planner=planner, machine=machine, answers=tuple(own[name] for name in sorted(own)))
+        for planner, own in sorted(answers.items())
     ]
 
 

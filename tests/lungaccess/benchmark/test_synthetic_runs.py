@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -100,6 +101,22 @@ def test_the_first_targets_of_each_lung_are_taken(undisturbed: Path) -> None:
     (submission,) = submissions_of(undisturbed)
     numbers = [all_queries()[each.query].target for each in submission.answers]
     assert numbers == [1, 2, 3, 11, 12, 13]
+
+
+def test_more_targets_and_iterations_go_on_from_the_runs_that_are_stored(
+    cases: Path, cache: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "results.db"
+    shutil.copy(undisturbed, path)
+    asked: dict[str, Any] = {"phantoms": [CHILD], "systems": [DEVICE]}
+    more = benchmark_study(cases, **asked, targets=TARGETS + 1, iterations=ITERATIONS)
+    done = run_study(more, path, workers=1, cache=cache)
+    assert (done.stored_before, done.added) == (2 * TARGETS, 2)
+    longer = benchmark_study(cases, **asked, targets=1, iterations=ITERATIONS + 1)
+    assert run_study(longer, path, workers=1, cache=cache).added == 2
+    (submission,) = submissions_of(path)
+    numbers = [all_queries()[each.query].target for each in submission.answers]
+    assert numbers == [1, 2, 3, 4, 11, 12, 13, 14], "no query is answered twice"
 
 
 def scores_of(submission: Submission, cases: Path, cache: Path, **options: Any) -> list[Score]:

@@ -192,6 +192,7 @@ def tubes_alone(
     """
     turned, outer, inner = choice
     tube = Deployed(turned, 0.0 if tubes.outer is None else outer, inner, 0.0)
+    # A copy, which can be written, as of a plan's frame: for one kind of array kernels are compiled once.
     frame, empty = np.array(lps_from_scope_tip), np.zeros((0, kernel.N_PIECE))
     return Devices(frame, _tube_values(tubes, tube), empty, empty[None][:0], np.zeros(0), TUBE_PIECES, 0.0)
 

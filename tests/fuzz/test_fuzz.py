@@ -19,7 +19,7 @@ from tests.fuzz.targets import GRID, Target, targets
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 TARGETS = targets()
-IN_CI, IN_ALL = 1000, 100_000
+IN_CI, IN_ALL = 2000, 100_000
 
 
 def _run(names: Iterable[str], seed: int, count: int, keep: Path) -> dict[str, Any]:

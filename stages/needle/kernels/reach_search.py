@@ -18,6 +18,7 @@ from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ARC_LENGTH, BEND, PATH_COST, PATH_LENGTH, pose_of
 
 _ONE = np.int64(1)
+"""Rows of a tree that is its root alone; for a plain 1 all of the RRT would be compiled once more."""
 
 
 @inner_kernel

@@ -296,7 +296,7 @@ def numbers(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [path] if isinstance(value, float | int) and not isinstance(value, bool) else []
 
 
-@settings(max_examples=10)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_any_number_edited_is_refused(plan: Plan, lung: Any, data: st.DataObject) -> None:
     """Pick a number anywhere in the file, change it by a little, make the digest fit: refused."""

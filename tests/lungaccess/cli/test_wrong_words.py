@@ -1,4 +1,4 @@
-"""Sixty wrong command lines, or more: none ends in a traceback, each says what was found and what to do."""
+"""Two hundred wrong command lines: none ends in a traceback, each says what was found and what to do."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.plan import Plan
 from tests.lungaccess.cli.wrong_words import World, arguments_of, kind_of, ranges_of, wrong_words
 
-INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "60"))
+INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "200"))
 """How many wrong command lines are tried."""
 PHASES = (Phase.explicit, Phase.generate)
 """The words of a failure are short: making them shorter would only take time."""

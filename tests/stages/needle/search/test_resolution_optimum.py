@@ -62,7 +62,7 @@ class TestAgainstEnumeration:
         assert expected.possible - 0.01 <= found <= expected.sure + 0.01
 
     @given(maze=crowded_mazes(), resolution=st.sampled_from(EIGHTS))
-    @settings(max_examples=4)
+    @settings(max_examples=10)
     def test_the_same_least_cost_or_none(self, maze: Maze, resolution: Resolution) -> None:
         self.compare(maze, resolution)
 

@@ -192,7 +192,7 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
     if last > 0:
         for i in range(last):
             right[i] = base_angles[i] - psi[0, i] - beta[i] * rate[0, i] - error
-        _relative(dpsi, drate, 0, beta, rearmost, matrix)
+        _relative(dpsi, drate, _FIRST_NODE, beta, rearmost, matrix)
         _solve(matrix, right)
         size = np.abs(right).max()
         if not size < LARGEST_TURN:

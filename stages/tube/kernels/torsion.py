@@ -52,23 +52,23 @@ def _pair_up(torsional, pieces, moments, directions, k, pairs):
 
 
 @inner_kernel
-def _pull(pairs, count, work, stage):
-    """Fill `work[stage]` (1 + columns, n) with psi'' at `work[ANGLES]`, and with its derivatives."""
-    rows, n = work.shape[1], work.shape[2]
+def _pull(pairs, count, angles, pull):
+    """Fill `pull` (1 + columns, n) with psi'' at `angles`, and with its derivatives."""
+    rows, n = pull.shape
     for row in range(rows):
         for i in range(n):
-            work[stage, row, i] = 0.0
+            pull[row, i] = 0.0
     for p in range(count):
         i, j = int(pairs[p, FIRST]), int(pairs[p, SECOND])
         one, two = pairs[p, PULL_FIRST], pairs[p, PULL_SECOND]
-        angle = work[ANGLES, 0, j] - work[ANGLES, 0, i] + pairs[p, REST]
+        angle = angles[0, j] - angles[0, i] + pairs[p, REST]
         sine, cosine = math.sin(angle), math.cos(angle)
-        work[stage, 0, i] -= one * sine
-        work[stage, 0, j] += two * sine
+        pull[0, i] -= one * sine
+        pull[0, j] += two * sine
         for row in range(1, rows):
-            change = cosine * (work[ANGLES, row, j] - work[ANGLES, row, i])
-            work[stage, row, i] -= one * change
-            work[stage, row, j] += two * change
+            change = cosine * (angles[row, j] - angles[row, i])
+            pull[row, i] -= one * change
+            pull[row, j] += two * change
 
 
 @inner_kernel
@@ -99,19 +99,19 @@ def _add_stretch(nodes, at, h, dh, share, a1, a2, a3, work):
 def _look_from(nodes, at, h, dh, stretches, pairs, count, work):
     """Fill the four stages of `work` of the step of `h` down from node `at`."""
     _look_ahead(nodes, at, h, 0.0, 0.0, 0.0, 0.0, work)
-    _pull(pairs, count, work, 0)
+    _pull(pairs, count, work[ANGLES], work[0])
     _look_ahead(nodes, at, h, C2, A21, 0.0, 0.0, work)
     if stretches:
         _add_stretch(nodes, at, h, dh, C2, A21, 0.0, 0.0, work)
-    _pull(pairs, count, work, 1)
+    _pull(pairs, count, work[ANGLES], work[1])
     _look_ahead(nodes, at, h, C3, A31, A32, 0.0, work)
     if stretches:
         _add_stretch(nodes, at, h, dh, C3, A31, A32, 0.0, work)
-    _pull(pairs, count, work, 2)
+    _pull(pairs, count, work[ANGLES], work[2])
     _look_ahead(nodes, at, h, 1.0, A41, A42, A43, work)
     if stretches:
         _add_stretch(nodes, at, h, dh, 1.0, A41, A42, A43, work)
-    _pull(pairs, count, work, 3)
+    _pull(pairs, count, work[ANGLES], work[3])
 
 
 @inner_kernel

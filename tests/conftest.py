@@ -15,16 +15,6 @@ if TYPE_CHECKING:
     from anatomy.phantom import Phantom
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
-_SAME_KERNELS = ("tests/stages/", "tests/lungaccess/one_stage/")
-"""In each folder below these, the files use the same kernels; elsewhere each file has fixtures of its own."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one of several processes do all tests of a group, so that no two compile the same kernels."""
-    for item in items:
-        file = item.nodeid.split("::")[0]
-        group = file.rpartition("/")[0] if file.startswith(_SAME_KERNELS) else file
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 # No test may depend on the speed of the machine.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from anatomy import poses as frames
@@ -60,15 +62,16 @@ def places_of_tips(lung: Lung, not_lumen: Array, least_depth_mm: float) -> tuple
     depth, half_mm = lung.lumen_depth, 0.5 * float(np.linalg.norm(lung.grid.spacing_mm))
     greatest = ndimage.maximum_filter(depth.corners, size=2, origin=-1)[:-1, :-1, :-1]
     voxels = np.argwhere((greatest + 1) / UNITS_PER_MM + half_mm >= least_depth_mm)
+    to_lps = np.linalg.inv(depth.geometry[:, :3]).T
+    geometry = lung.obstacle_field(with_fissures=False).geometry
+    # Of a narrow scope that would be all of the lattice.
+    voxels = voxels[_beside_lumen((voxels + 0.5 - depth.geometry[:, 3]) @ to_lps, not_lumen, geometry)]
     part = (np.arange(PARTS) + 0.5) / PARTS
     parts = np.stack(np.meshgrid(part, part, part, indexing="ij"), axis=-1).reshape(-1, 3)
-    to_lps = np.linalg.inv(depth.geometry[:, :3]).T
     centres = (voxels[:, None] + parts - depth.geometry[:, 3]) @ to_lps
     hold = np.zeros(centres.shape[:2], dtype=bool)
-    deep_enough(
-        depth.corners, depth.geometry, not_lumen, lung.obstacle_field(with_fissures=False).geometry,
-        centres, least_depth_mm - half_mm / PARTS, hold,
-    )  # fmt: skip
+    least = least_depth_mm - half_mm / PARTS
+    deep_enough(depth.corners, depth.geometry, not_lumen, geometry, centres, least, hold)
     mask: Mask = np.zeros(greatest.shape, dtype=bool, order="F")
     mask[tuple(voxels[hold.any(axis=1)].T)] = True
     regions, _ = ndimage.label(mask, np.ones((3, 3, 3)))
@@ -78,6 +81,16 @@ def places_of_tips(lung: Lung, not_lumen: Array, least_depth_mm: float) -> tuple
     entered = np.unique(regions[tuple(at[inside].T)])
     mask &= np.isin(regions, entered[entered > 0])
     return mask, np.asarray(centres[hold & mask[tuple(voxels.T)][:, None]])
+
+
+def _beside_lumen(points: Float, not_lumen: Array, geometry: Float) -> Mask:
+    """Tell which points `(N, 3)` lie in a voxel of the lumen, next to one, or beyond the grid."""
+    at = np.floor(points @ geometry[:, :3].T + geometry[:, 3]).astype(np.int64)
+    beside: Mask = ((at < 0) | (at >= not_lumen.shape)).any(axis=1)
+    last = np.array(not_lumen.shape) - 1
+    for step in product((-1, 0, 1), repeat=3):
+        beside |= not_lumen[tuple(np.clip(at + step, 0, last).T)] == 0
+    return beside
 
 
 def place_pieces(lung: Lung, centres: Float, leaving: Mask, reach_mm: float) -> list[PlacePiece]:

@@ -40,23 +40,6 @@ from stages.tube.kernels import ACCEPTED, N_TRACE, NEAR_VESSEL, validate_deploym
 
 
 @numba.njit
-def not_ruled_out(environment, tubes, insertions, limits, target, frame, cones, box):  # type: ignore[no-untyped-def]
-    sums, costs = np.zeros(3), np.zeros(boxes.SIDES)
-    return kernel.may_reach(
-        environment,
-        tubes,
-        insertions,
-        limits,
-        (target[0], target[1], target[2]),
-        frame,
-        cones,
-        box,
-        sums,
-        costs,
-    )[0]
-
-
-@numba.njit
 def outside_workspace(limits, seen, sums):  # type: ignore[no-untyped-def]
     return kernel._outside_workspace(limits, seen, sums, 0.1)
 
@@ -123,12 +106,12 @@ def random_tips(proof: UnreachableProof, rng: np.random.Generator, n: int) -> li
     return [(piece, rng.uniform(*piece.places) @ piece.frame) for piece in chosen]
 
 
-def pieces_of(proof: UnreachableProof, lung: Lung, place: Float) -> list[PlacePiece]:
-    """Return the pieces that hold the tree point nearest to a place."""
+def pieces_of(proof: UnreachableProof, lung: Lung, place: Float) -> list[int]:
+    """Return the numbers of the pieces that hold the tree point nearest to a place."""
     nearest = lung.tree.points_lps[np.linalg.norm(lung.tree.points_lps - place, axis=1).argmin()]
     return [
-        piece
-        for piece in proof.space.pieces
+        number
+        for number, piece in enumerate(proof.space.pieces)
         if ((piece.cones[:, :3] == nearest).all(axis=1) & (piece.cones[:, 6] > 0.0)).any()
     ]
 
@@ -159,18 +142,27 @@ def boxes_offered(
     rng: np.random.Generator,
 ) -> int:
     """Offer the proof boxes of all sizes about a deployment that reaches a target; return how many."""
-    offered = 0
-    for piece in pieces_of(proof, lung, deployment[0][:3, 3]):
-        values = middles_of(piece.frame, *deployment)
+    offered, owners = [], []
+    for number in pieces_of(proof, lung, deployment[0][:3, 3]):
+        values = middles_of(proof.space.pieces[number].frame, *deployment)
         for scale in (1e-4, 1e-3, 1e-2, 0.05, 0.2, 1.0):
             halves = scale * HALVES * rng.uniform(0.1, 1.0, 8)
-            box = np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves])
-            assert not_ruled_out(
-                environment, proof._tubes, proof._insertions, proof._limits, target,
-                piece.frame, piece.cones, box,
-            ), (values, box)  # fmt: skip
-            offered += 1
-    return offered
+            offered.append(np.concatenate([values + rng.uniform(-1.0, 1.0, 8) * halves, halves]))
+            owners.append(number)
+    count = len(offered)
+    found = kernel.Found(
+        outcome=np.full(count, kernel.TOO_MANY, dtype=np.uint8),
+        share=np.zeros(count),
+        looked=np.zeros(count, dtype=np.int64),
+        left=np.zeros((count, boxes.BOX_COLUMNS)),
+    )
+    kernel.rule_out(
+        environment, proof._tubes, proof._insertions, proof._limits, target, proof.space.arrays,
+        np.array(offered), np.array(owners, dtype=np.int32), np.arange(count), 1, False, found,
+    )  # fmt: skip
+    for outcome, box in zip(found.outcome, offered, strict=True):
+        assert outcome != kernel.RULED_OUT, box
+    return count
 
 
 @pytest.mark.slow
@@ -309,7 +301,7 @@ def test_every_tip_of_the_region_is_in_a_box_of_its_piece(
     for tip, moved in [*((tip, True) for tip in motions), *((tip, False) for tip in drawn)]:
         if exits.query(tip[:3])[0] > proof._insertions.max():
             continue
-        pieces = pieces_of(proof, small_lung, tip[:3])
+        pieces = [proof.space.pieces[number] for number in pieces_of(proof, small_lung, tip[:3])]
         assert all(holds(environment, piece, tip, rng) for piece in pieces)
         assert pieces or not moved
         counted += len(pieces)

@@ -91,7 +91,7 @@ def add_cost_over_time(result: Result, runs: list[dict[str, object]]) -> None:
     last = max(float(str(run["time_s"])) for run in runs)
     for time_s in (t for t in cost_over_time.TIMES_S if t < last):
         excess = cost_over_time.excess_percent(runs, time_s)
-        note = f"median of {len(runs)} runs, {np.max(excess):.1f} % at most"
+        note = f"median of {len(runs)} runs; mean {np.mean(excess):.1f} %, {np.max(excess):.1f} % at most"
         words = f"fig. 9: cost after {time_s:g} s above that after {last:g} s"
         result.add(words, float(np.median(excess)), unit="%", note=note)
     for name in ("direct", "sampled"):

@@ -34,6 +34,9 @@ from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_inser
 
 BOXES_A_STEP = 500
 """Boxes that are divided beside one step of a search: in two threads they take as long, or twice as long."""
+STEPS_OF_A_PLAN = 16
+MOST_BOXES_A_STEP = 4000
+"""After each so many steps without a cheaper plan they are so many more; the most take 0.1 s."""
 BOXES_A_TIP = 2
 """A scope tip is begun with instead of dividing so many boxes."""
 TRIED_A_QUEUE = 2
@@ -243,15 +246,20 @@ class GapGoal:
                 f"The gap is {gap}", expected="a share of 0 or more", remedy="State 0.05 for five per cent"
             )
         self.bound, self._gap = bound, gap
+        self._cost, self._steps = math.inf, 0
 
     def is_met(self, cost: float) -> bool:
         """Tell whether a plan of this cost is so near to the best possible.
 
-        If it is not, the bound is improved in other threads until the next call.
+        If it is not, the bound is improved in other threads until the next call, the more the longer the
+        cost has stayed the same.
         """
         met = cost <= (1.0 + self._gap) * self.bound.value
+        self._steps = self._steps + 1 if cost == self._cost else 0
+        self._cost = cost
         if not met:
-            self.bound.start(cost, BOXES_A_STEP)
+            boxes = BOXES_A_STEP * (1 + self._steps // STEPS_OF_A_PLAN)
+            self.bound.start(cost, min(boxes, MOST_BOXES_A_STEP))
         return met
 
 

@@ -86,7 +86,7 @@ def places_of_tips(lung: Lung, not_lumen: Array, least_depth_mm: float) -> tuple
 def _beside_lumen(points: Float, not_lumen: Array, geometry: Float) -> Mask:
     """Tell which points `(N, 3)` lie in a voxel of the lumen, next to one, or beyond the grid."""
     at = np.floor(points @ geometry[:, :3].T + geometry[:, 3]).astype(np.int64)
-    beside: Mask = ((at < 0) | (at >= not_lumen.shape)).any(axis=1)
+    beside: Mask = np.any((at < 0) | (at >= not_lumen.shape), axis=1)
     last = np.array(not_lumen.shape) - 1
     for step in product((-1, 0, 1), repeat=3):
         beside |= not_lumen[tuple(np.clip(at + step, 0, last).T)] == 0

@@ -34,9 +34,10 @@ from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_inser
 
 BOXES_A_STEP = 500
 """Boxes that are divided beside one step of a search: in two threads they take as long, or twice as long."""
-STEPS_OF_A_PLAN = 16
-MOST_BOXES_A_STEP = 4000
-"""After each so many steps without a cheaper plan they are so many more; the most take 0.1 s."""
+STEADY_STEPS, MOST_TIMES = 16, 8
+"""After each so many steps without a cheaper plan they are so many more, up to so many times as many."""
+STEPS_TOGETHER = 4
+"""Steps of a search, at most, before both threads are waited for: more boxes take both more equally long."""
 BOXES_A_TIP = 2
 """A scope tip is begun with instead of dividing so many boxes."""
 TRIED_A_QUEUE = 2
@@ -96,6 +97,11 @@ class CostBound:
     def value(self) -> float:
         """The bound: 0 before it has begun."""
         self.finish()
+        return self._value
+
+    @property
+    def known(self) -> float:
+        """The bound when the boxes were last divided to the end, while others may be divided now."""
         return self._value
 
     @property
@@ -246,20 +252,24 @@ class GapGoal:
                 f"The gap is {gap}", expected="a share of 0 or more", remedy="State 0.05 for five per cent"
             )
         self.bound, self._gap = bound, gap
-        self._cost, self._steps = math.inf, 0
+        self._cost, self._steady, self._ahead = math.inf, 0, 0
 
     def is_met(self, cost: float) -> bool:
         """Tell whether a plan of this cost is so near to the best possible.
 
-        If it is not, the bound is improved in other threads until the next call, the more the longer the
-        cost has stayed the same.
+        If it is not, the bound is improved in other threads: the more, the longer the cost has stayed the
+        same.  Then some of the next calls do not wait for them.
         """
-        met = cost <= (1.0 + self._gap) * self.bound.value
-        self._steps = self._steps + 1 if cost == self._cost else 0
+        self._steady = self._steady + 1 if cost == self._cost else 0
         self._cost = cost
+        self._ahead -= 1
+        if self._ahead > 0:
+            return cost <= (1.0 + self._gap) * self.bound.known
+        met = cost <= (1.0 + self._gap) * self.bound.value
         if not met:
-            boxes = BOXES_A_STEP * (1 + self._steps // STEPS_OF_A_PLAN)
-            self.bound.start(cost, min(boxes, MOST_BOXES_A_STEP))
+            times = min(1 + self._steady // STEADY_STEPS, MOST_TIMES)
+            self._ahead = min(times, STEPS_TOGETHER)
+            self.bound.start(cost, times * BOXES_A_STEP)
         return met
 
 

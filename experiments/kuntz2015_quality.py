@@ -10,7 +10,6 @@ FILE and not repeated, so an interrupted study goes on where it was.
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -205,7 +204,7 @@ def main() -> None:
         not_reproduced=list(NOT_REPRODUCED),
     )  # fmt: skip
     lung = anatomy(options.patient)
-    atlas = la.build_atlas(lung, replace(la.load_system(options.system), fissures_allowed=True))
+    atlas = la.build_atlas(lung, la.load_system(options.system, fissures_allowed=True))
     result.conditions |= {
         "lung": lung.name, "system": atlas.system.name, "fissures": "may be crossed",
         "time": "processor time without the atlas, one core",

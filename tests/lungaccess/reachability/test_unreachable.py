@@ -160,6 +160,7 @@ def boxes_offered(
         environment, proof._tubes, proof._insertions, proof._limits, target, proof.space.arrays,
         np.array(offered), np.array(owners, dtype=np.int32), np.arange(count), 1, False, found,
     )  # fmt: skip
+    assert (found.looked == 1).all()
     for outcome, box in zip(found.outcome, offered, strict=True):
         assert outcome != kernel.RULED_OUT, box
     return count

@@ -103,7 +103,7 @@ class UnreachableProof:
     Parameters
     ----------
     between : callable, optional
-        Called between the steps of the preparation, which takes up to half a minute; it may raise to end it.
+        Called between the steps of the preparation, in patients tens of seconds; it may raise to end it.
 
     Raises
     ------

@@ -113,8 +113,11 @@ class Tiles:
     def _found(self, key: int, tile: tuple[int, ...]) -> Iterator[Cluster]:
         begin = np.asarray(tile) * TILE
         body = _bodies(key, window_of(self.lung, begin - 1, begin + TILE + 1))
+        core = body[1:-1, 1:-1, 1:-1]
+        if not core.any():
+            return
         index = np.argwhere(on_surface(body))
-        names = body[1:-1, 1:-1, 1:-1][tuple(index.T)]
+        names = core[tuple(index.T)]
         for name in np.unique(names):
             voxels = index[names == name] + begin
             yield Cluster(
@@ -132,21 +135,22 @@ def _keys(select: Select) -> list[int]:
     return [bit for bit in BITS if select.bits & bit]
 
 
-def _bodies(key: int, labels: Labels) -> Int:
+def _bodies(key: int, labels: Labels) -> Labels:
     """Return 0 where the structure is not, else 1; of airways, the number of the branch plus 2."""
     if key == NOT_LUMEN:
-        return np.asarray((labels & structures.LUMEN) == 0, dtype=np.int64)
+        return np.asarray((labels & structures.LUMEN) == 0, dtype=np.uint16)
     mask = (labels & key) != 0
-    return np.where(mask, branch_of(labels) + 2, 0) if key == structures.AIRWAY else mask.astype(np.int64)
+    names = branch_of(labels) + 2 if key == structures.AIRWAY else mask
+    return np.where(mask, names, 0).astype(np.uint16)
 
 
-def on_surface(body: Int) -> Bool:
+def on_surface(body: Labels) -> Bool:
     """Tell which inner voxels have a face neighbour of another body, and are not 0 themselves.
 
     The voxel nearest to a point outside of a body is one of these.
     """
     core = body[1:-1, 1:-1, 1:-1]
-    found = np.zeros(core.shape, dtype=bool)
+    found = np.zeros_like(core, dtype=bool)
     for axis in range(3):
         for side in (slice(0, -2), slice(2, None)):
             beside = [slice(1, -1)] * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,12 @@ _CHECKOUT = Path(__file__).resolve().parents[1]
 # No test may depend on the speed of the machine.
 settings.register_profile("lungaccess", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("lungaccess")
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector all that the tests have imported."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -132,6 +132,7 @@ def _ends_in_the_rim(phantom: Phantom) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_fewer_vessels_end_in_the_rim(plain: Phantom) -> None:
     """Some are left at the mediastinum, where they have not left the rim yet."""
     rimmed = small(replace(PLAIN, vessel_rim_mm=RIM_MM))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.scenarios import expected as expectations
-from tests.scenarios.cases import ANATOMIES, CASES, DEFAULT_DEVICES, LONG_PLANNERS, Case
+from tests.scenarios.cases import ANATOMIES, CASES, DEFAULT_DEVICE, LONG_PLANNERS, Case
 from tests.scenarios.runs import Answer, answer_for
 from tests.scenarios.scenes import Scenes
 
@@ -19,13 +19,13 @@ AnswersOf = Callable[[Case], list[Answer]]
 def marked(cases: Sequence[Case] = CASES) -> list[Any]:
     """Return cases as parameters: those of real patients need the data and are slow.
 
-    Of the first anatomy the cases of some devices are run, unless their planner takes long; the rest is slow.
+    Of the first anatomy the cases of one device are run, unless their planner takes long; the rest is slow.
     """
 
     def marks(case: Case) -> tuple[pytest.MarkDecorator, ...]:
         if case.anatomy.is_real:
             return (pytest.mark.data, pytest.mark.slow)
-        first = case.anatomy == ANATOMIES[0] and case.device in DEFAULT_DEVICES
+        first = case.anatomy == ANATOMIES[0] and case.device == DEFAULT_DEVICE
         return () if first and case.planner not in LONG_PLANNERS else (pytest.mark.slow,)
 
     return [pytest.param(case, id=case.name, marks=marks(case)) for case in cases]

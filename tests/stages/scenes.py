@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.fields import distance_field
+from anatomy.fields import DistanceField, corner_geometry, distance_corners
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FIELD_BITS, FISSURE, LUMEN, OUTSIDE
@@ -64,7 +65,11 @@ def lung_of(labels: np.ndarray, grid: Grid, tree: AirwayTree, **more: Any) -> Lu
     labels[:] = OUTSIDE
     labels[1:-1, 1:-1, 1:-1] = inner
     has_fissures = bool((labels & FISSURE).any())
-    names = [name for name in FIELD_BITS if has_fissures or "fissure" not in name]
+    fields = {
+        name: _field(name, (labels & bits) != 0, grid)
+        for name, bits in FIELD_BITS.items()
+        if has_fissures or "fissure" not in name
+    }
     values: dict[str, Any] = {
         "name": "scene", "kind": "scene", "key": "scene", "nodules": None, "cost": None, "starts": (),
         "targets_lps": (), "breath_hold": None, "sources": {}, "warnings": (),
@@ -72,11 +77,22 @@ def lung_of(labels: np.ndarray, grid: Grid, tree: AirwayTree, **more: Any) -> Lu
     return Lung(
         grid=grid,
         labels=labels,
-        fields={name: distance_field(name, (labels & FIELD_BITS[name]) != 0, grid) for name in names},
-        lumen_depth=distance_field("lumen_depth", (labels & LUMEN) == 0, grid),
+        fields=fields,
+        lumen_depth=_field("lumen_depth", (labels & LUMEN) == 0, grid),
         tree=tree,
         **{**values, **more},
     )
+
+
+def _field(name: str, mask: np.ndarray, grid: Grid) -> DistanceField:
+    corners = _corners(mask.tobytes(order="F"), mask.shape, tuple(grid.spacing_mm))
+    return DistanceField(name=name, corners=corners, geometry=corner_geometry(grid))
+
+
+@lru_cache(maxsize=64)
+def _corners(mask: bytes, shape: tuple[int, ...], spacing_mm: tuple[float, ...]) -> np.ndarray:
+    """Return the distances of a mask: many tests draw the same scene, and several structures are the same."""
+    return distance_corners(np.frombuffer(mask, dtype=bool).reshape(shape, order="F"), spacing_mm)
 
 
 def line_tree(a: Any, b: Any, radius_mm: float, step_mm: float = 0.5) -> AirwayTree:
@@ -152,9 +168,10 @@ def brute_clearance(
 def box_distance(points: np.ndarray, centres: np.ndarray, spacing: np.ndarray) -> np.ndarray:
     """Return distances to boxes: of the nearest centres so many that no other box can be nearer."""
     out = np.full(len(points), np.inf)
-    left, wanted = np.arange(len(points)), min(40, len(centres))
+    left, wanted = np.arange(len(points)), min(8, len(centres))
+    tree = cKDTree(centres, balanced_tree=False, compact_nodes=False)
     while len(left) and len(centres):
-        away, index = cKDTree(centres).query(points[left], k=[*range(1, wanted + 1)])
+        away, index = tree.query(points[left], k=[*range(1, wanted + 1)])
         gap = np.maximum(np.abs(points[left][:, None] - centres[index]) - 0.5 * spacing, 0.0)
         out[left] = np.sqrt((gap**2).sum(axis=-1)).min(axis=1)
         unsure = away[:, -1] - 0.5 * float(np.linalg.norm(spacing)) < out[left]

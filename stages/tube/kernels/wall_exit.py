@@ -20,7 +20,7 @@ from anatomy.typed import Bool, Float, Labels, UInt16
 from stages.tube.kernels.planar import INNER_RADIUS, MAX_WALL_RUN, MIN_WALL_ANGLE, OUTER_RADIUS
 
 # trace
-PHASE, LEFT_AT, BRANCH, WALL_ANGLE, HAZARD, WALL_RUN, REFUSAL, N_TRACE = range(8)
+PHASE, LEFT_AT, BRANCH, WALL_ANGLE, HAZARD, WALL_RUN, REFUSAL, CLEAR_TO, N_TRACE = range(9)
 
 IN_LUMEN, LEAVING, IN_WALL, IN_TISSUE = 0.0, 1.0, 2.0, 3.0
 
@@ -186,11 +186,12 @@ def _tissue_gap(environment, trace, x, y, z, required):
 
 
 @inner_kernel
-def _lumen_step(environment, trace, x, y, z, radius, required):
-    """Note branch and hazards of a point in the lumen; return the step to the next one.
+def _lumen_step(environment, trace, x, y, z, at, radius, required):
+    """Note branch and hazards of a point in the lumen, at an arc length; return the step to the next one.
 
     Where the tube touches the wall, what lies behind it must be as clear as in the tissue, unless the
-    tube comes free again before it leaves.
+    tube comes free again before it leaves.  No distance falls faster than the tube advances, so it is
+    searched anew only where the last one leaves the answer open: CLEAR_TO is where it would be 0.
     """
     _field, labels, geometry, bits, lumen, lumen_geometry, _mediastinal = environment
     trace[BRANCH] = (label_at(labels, geometry, x, y, z) >> BRANCH_SHIFT) - 1
@@ -198,11 +199,14 @@ def _lumen_step(environment, trace, x, y, z, radius, required):
     if depth >= radius:
         trace[HAZARD] = ACCEPTED
         return max(depth - radius, FINE_STEP_MM)
-    reach = required + EXACT_REACH_MM
-    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY, -1, reach)
+    step = max(0.5 * depth, FINE_STEP_MM)
+    if trace[CLEAR_TO] - at - required >= step + MIN_GAP_MM:
+        return step
+    distance, label = exact_distance(labels, geometry, x, y, z, bits & ~AIRWAY, -1, required + EXACT_REACH_MM)
+    trace[CLEAR_TO] = at + distance
     if distance - required < FINE_STEP_MM:
         trace[HAZARD] = _reason(label)
-        return max(0.5 * depth, FINE_STEP_MM)
+        return step
     return max(min(0.5 * depth, distance - required), FINE_STEP_MM)
 
 
@@ -284,7 +288,8 @@ def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
                 if s >= length:
                     return ACCEPTED
                 last = s
-                s = min(s + _lumen_step(environment, trace, x, y, z, radius, radius + clearance), length)
+                step = _lumen_step(environment, trace, x, y, z, s0 + s, radius, radius + clearance)
+                s = min(s + step, length)
                 continue
             if s0 + s == 0.0:
                 return NO_EXIT

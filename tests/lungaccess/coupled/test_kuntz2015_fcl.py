@@ -346,6 +346,7 @@ class TestNeedle:
             assert curvature * chord_mm(curvature) ** 2 / 8.0 <= SAGITTA_MM + 1e-12
 
 
+@pytest.mark.slow
 def test_the_attack_reports_what_the_planner_missed(
     atlas: la.Atlas, target: Target, obstacles: Obstacles, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,7 +33,9 @@ from tests.lungaccess.resample import problems
 class TestRepeatability:
     """Iterations, not time, decide."""
 
-    @pytest.mark.parametrize(("method", "iterations"), [("atlas", 150), ("kuntz2015", 3000)])
+    @pytest.mark.parametrize(
+        ("method", "iterations"), [("atlas", 150), pytest.param("kuntz2015", 3000, marks=pytest.mark.slow)]
+    )
     def test_the_same_seed_gives_the_same_bytes(
         self, small_lung: Lung, atlas: la.Atlas, method: str, iterations: int
     ) -> None:

@@ -46,6 +46,7 @@ def window_of(plan: la.Plan) -> la.BreathingWindow:
     return plan.window
 
 
+@pytest.mark.slow
 def test_the_widest_window_is_wider_than_that_of_the_least_cost(
     breathing: Lung, target: Target, atlas: la.Atlas
 ) -> None:

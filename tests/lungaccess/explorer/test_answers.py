@@ -168,6 +168,7 @@ def test_other_answers_do_not_wait_for_a_long_search(patient: Path) -> None:
     with_client(source_of(patient), talk)
 
 
+@pytest.mark.slow
 def test_no_plan_is_explained_and_unreachable_needs_a_proof(patient: Path) -> None:
     async def talk(client: Client, _explorer: Explorer) -> None:
         what_if = SYSTEM | {"needle_length_mm": 6.0}

@@ -109,6 +109,7 @@ def places(lung: Lung, count: int) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_tour_of_a_patient(small_lung: Lung) -> None:
     lesions = places(small_lung, 5)
     answer = plan_tour(small_lung, lesions)

@@ -145,7 +145,9 @@ def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     assert searched.gained_and_lost_ml(plain) == (gained.sum() * 12.0**3 / 1000.0, 0.0)
 
 
-@pytest.mark.parametrize(("trees", "kind", "count"), [(0, DIRECT, 4), (1, SEARCHED, 1)])
+@pytest.mark.parametrize(
+    ("trees", "kind", "count"), [(0, DIRECT, 4), pytest.param(1, SEARCHED, 1, marks=pytest.mark.slow)]
+)
 def test_a_reachable_voxel_has_a_plan_that_the_checker_accepts(
     trees: int, kind: int, count: int, reach: ReachMap, small_lung: Lung, atlas: la.Atlas
 ) -> None:

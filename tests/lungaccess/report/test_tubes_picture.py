@@ -53,7 +53,15 @@ def graph(figure: Figure, label: str) -> tuple[Any, Any]:
     return axes[number], axes[number + 1]
 
 
-@pytest.mark.parametrize("curvatures", [(0.025,), (0.025, 0.0), (0.0, 0.0), (0.004, 0.004, 0.003)])
+@pytest.mark.parametrize(
+    "curvatures",
+    [
+        (0.025,),
+        (0.025, 0.0),
+        pytest.param((0.0, 0.0), marks=pytest.mark.slow),
+        pytest.param((0.004, 0.004, 0.003), marks=pytest.mark.slow),
+    ],
+)
 def test_one_two_and_three_tubes(curvatures: tuple[float, ...], tmp_path: Path) -> None:
     mechanics = mechanics_of(*curvatures)
     insertions = (60.0, 40.0, 20.0)[: len(curvatures)]

@@ -178,6 +178,7 @@ def test_a_process_of_its_own_gives_the_same_plan(runs: list[Run], cache: Path) 
     assert found.findings == here.findings
 
 
+@pytest.mark.slow
 def test_a_run_under_a_weighted_sum(cache: Path) -> None:
     """Whatever the spelling, the key is that of the sum; planner and needle alone are judged by it."""
     text = "inverse_clearance=2,length_mm=0.1"

@@ -34,7 +34,9 @@ def test_a_planner_may_be_allocated_by_the_setup(environment: NeedleEnvironment)
     require(problem.solution())
 
 
-@pytest.mark.parametrize("name", OMPL_PLANNERS)
+@pytest.mark.parametrize(
+    "name", [*OMPL_PLANNERS[:1], *(pytest.param(name, marks=pytest.mark.slow) for name in OMPL_PLANNERS[1:])]
+)
 def test_planners_of_ompl_run_on_the_same_problem(problem: NeedleProblem, name: str) -> None:
     asked = query(NEAR)
     problem.pose(asked, goal_tolerance_mm=4.0)

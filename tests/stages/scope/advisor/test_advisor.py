@@ -40,7 +40,9 @@ def path_to(
     return advisor, advisor.path(start_state(lumen, lung.tree, model), seed=seed)
 
 
-@pytest.mark.parametrize("target", GOALS)
+@pytest.mark.parametrize(
+    "target", [GOALS[0], *(pytest.param(goal, marks=pytest.mark.slow) for goal in GOALS[1:])]
+)
 def test_every_branch_is_reached_and_no_pose_touches_the_wall(
     forked: tuple[Lung, Lumen], target: np.ndarray
 ) -> None:

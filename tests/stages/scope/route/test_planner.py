@@ -175,6 +175,7 @@ def test_genetic_repair_repeats_from_a_seed_and_claims_no_more_than_it_tests() -
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("star", [False, True])
 def test_baselines_connect_the_goal_inside_the_lumen(star: bool) -> None:
     tube = fork(radius=2.5)

@@ -11,7 +11,7 @@ import lungaccess as la
 lung = la.load_patient("phantom-3")
 system = la.load_system("ultrathin")
 target = la.resolve_target(lung, nodule=1)
-atlas = la.build_atlas(lung, system)  # what scope and tubes can do, for all searches
+atlas = la.open_atlas(lung, system)  # what scope and tubes can do, for all searches
 figure, ax = plt.subplots(figsize=(6, 4))
 for weight in [0.0, 0.05, 0.2, 1.0]:
     objective = la.Objective(inverse_clearance=1.0, length=weight)

@@ -21,6 +21,7 @@ def test_devices_differ_and_hold_together() -> None:
     assert weak and all(system.tubes.max_strain == 0.04 for system in weak)
 
 
+@pytest.mark.slow
 def test_a_count_is_made_once(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
 

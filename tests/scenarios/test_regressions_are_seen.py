@@ -63,6 +63,7 @@ def test_a_planner_without_the_clearance_test_is_refused(
     assert any("the check refuses" in fault for answer in answers for fault in answer.faults)
 
 
+@pytest.mark.slow
 def test_reasons_without_a_stage_are_seen(
     synthetic: Scenes, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,4 +1,4 @@
-"""Two hundred wrong command lines: none ends in a traceback, each says what was found and what to do."""
+"""Wrong command lines, drawn at random: none ends in a traceback, each says what was found and what to do."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.plan import Plan
 from tests.lungaccess.cli.wrong_words import World, arguments_of, kind_of, ranges_of, wrong_words
 
-INVOCATIONS = int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "200"))
+IN_CI, IN_ALL = 50, int(os.environ.get("LUNGACCESS_WRONG_INVOCATIONS", "500"))
 """How many wrong command lines are tried."""
 PHASES = (Phase.explicit, Phase.generate)
 """The words of a failure are short: making them shorter would only take time."""
@@ -103,15 +103,34 @@ def judge(words: list[str], code: int, out: str, err: str) -> None:
         assert out == "", said
 
 
-@settings(max_examples=INVOCATIONS, derandomize=True, phases=PHASES, suppress_health_check=list(HealthCheck))
-@given(data=st.data())
-def test_a_wrong_command_line_is_explained(
-    data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]
-) -> None:
+def tried(count: int) -> settings:
+    return settings(
+        max_examples=count, derandomize=True, phases=PHASES, suppress_health_check=list(HealthCheck)
+    )
+
+
+def require_explanation(data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]) -> None:
     words = data.draw(wrong_words(world))
     capsys.readouterr()
     code = cli.main(words)
     judge(words, code, *capsys.readouterr())
+
+
+@tried(IN_CI)
+@given(data=st.data())
+def test_a_wrong_command_line_is_explained(
+    data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
+    require_explanation(data, world, capsys)
+
+
+@pytest.mark.slow
+@tried(IN_ALL)
+@given(data=st.data())
+def test_hundreds_of_wrong_command_lines_are_explained(
+    data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
+    require_explanation(data, world, capsys)
 
 
 @pytest.mark.parametrize(

@@ -124,6 +124,7 @@ def test_tour_of_a_patient(small_lung: Lung) -> None:
     assert written["shortest"]["tree_points_in_order"][0] == 0
 
 
+@pytest.mark.slow
 def test_a_price_on_tissue_brings_exits_nearer(small_lung: Lung) -> None:
     lesions = places(small_lung, 5)
     free, costly = (plan_tour(small_lung, lesions, tissue_weight=w) for w in (0.0, 50.0))

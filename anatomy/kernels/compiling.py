@@ -10,3 +10,10 @@ inner_kernel = numba.njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=
 borrowing_kernel = numba.njit(cache=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 """Compile such a function to borrow its arrays, which it must not make or keep: counting who else holds them
 takes longer than a look at a field, and twice as long where two threads count."""
+
+inlined_kernel = numba.njit(cache=True, inline="always")
+"""Compile such a function as a part of its one caller.
+
+Apart, it would be optimised again in each kernel above.  Not for one that asks whether an argument is None,
+nor for one whose result chooses between kinds of arguments: that is not decided while types are found.
+"""

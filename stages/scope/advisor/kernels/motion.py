@@ -189,7 +189,7 @@ def best_motion(lumen, scope, state, look_ahead, weights, offsets, table):
     )
 
 
-@inner_kernel
+@inlined_kernel
 def take_sub_step(lumen, scope, state, look_ahead, step, row, looks, out, joints):
     """Write the state after a sub-step towards a candidate; tell whether every pose looked at is free.
 

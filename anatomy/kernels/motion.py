@@ -14,7 +14,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 
 MOST_STEPS = 60
 """Of a fixed point whose error falls by the norm of the gradient, 0.2 to 0.4 in a lung, with each step."""
@@ -52,7 +52,7 @@ def displacement_at(nodes, frame, x, y, z):
     return dx, dy, dz
 
 
-@inlined_kernel
+@merged_kernel
 def gradient_at(nodes, frame, x, y, z, out):
     """Fill `out` (3, 3) with the derivative of the displacement (rows) along x, y, z (columns) in a cell."""
     i, fi = cell_of(x, frame[0], frame[3], nodes.shape[0])
@@ -111,7 +111,7 @@ def points_pulled_back(nodes, frame, share, points, out):
     return worst
 
 
-@inlined_kernel
+@merged_kernel
 def _eigenvalue_ends(g):
     """Return least and greatest eigenvalue of the symmetric part of a matrix (3, 3), in closed form."""
     mean = (g[0, 0] + g[1, 1] + g[2, 2]) / 3.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import merged_kernel
 from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.segmentation.kernels.states import BANNED, FREE, LUMEN
 
@@ -120,7 +120,7 @@ def rings_of(state, shape, mark, queue, size):
     return 1 - characteristic
 
 
-@inlined_kernel
+@merged_kernel
 def ban_pockets(hu, state, near, size, mark, wide, rim, dark_hu, queue, parent, behind, layer_ends, layers):
     """Ban the cross-sections of a piece that are wide and not dark, and what lies behind them.
 

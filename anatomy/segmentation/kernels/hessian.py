@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.segmentation.kernels.eigenvalues import eigenvalues
 
 ZERO, ONE, HALF, QUARTER, TWO = (np.float64(x) for x in (0.0, 1.0, 0.5, 0.25, 2.0))
@@ -37,7 +37,7 @@ def second_differences(image, k, j, i, factors):
     return ii, jj, kk, ij, ik, jk
 
 
-@inlined_kernel
+@merged_kernel
 def _vesselness(low, middle, high, strength, settings):
     """Return R(x; sigma) of eigenvalues by magnitude whose last two are negative [Fu2018, sec. IV-A.3]."""
     flat = middle / high

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import merged_kernel
 from anatomy.segmentation.kernels.states import LUMEN
 
 WALL = np.uint8(2)
@@ -20,7 +20,7 @@ REPLACING_HU = np.int16(0)
 AIR_HU = -1000.0
 
 
-@inlined_kernel
+@merged_kernel
 def closing_at(hu, state, at, row):
     """Close the image with its lumen painted, with a pixel and its four neighbours, at one voxel.
 
@@ -159,7 +159,7 @@ def join_corners(hu, state, shape, lumen, count):
     return count
 
 
-@inlined_kernel
+@merged_kernel
 def _corner_path(hu, state, here, steps, lumen, count):
     """Join a voxel to `here + sum of steps` by the face-connected path whose brightest voxel is darkest."""
     best = np.int32(1 << 20)

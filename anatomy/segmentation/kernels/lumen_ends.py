@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.segmentation.kernels.states import LUMEN
 
 BACK_MM = np.array([3.0, 6.0])
@@ -60,7 +60,7 @@ def position_of(flat, shape, spacing_mm, point):
     point[2] = flat % shape[2] * spacing_mm[2]
 
 
-@inlined_kernel
+@merged_kernel
 def is_farthest(far, at, reach):
     """Tell whether no voxel within `reach` of one is farther from the start."""
     nk, nj, ni = far.shape
@@ -73,7 +73,7 @@ def is_farthest(far, at, reach):
     return True
 
 
-@inlined_kernel
+@merged_kernel
 def section_mm2(far, point, spacing_mm):
     """Return about the cross-section of the lumen at a point: its volume in a box over the box's side."""
     reach = THIN_REACH

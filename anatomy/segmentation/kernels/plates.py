@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.segmentation.kernels.eigenvalues import eigenvalues
 from anatomy.segmentation.kernels.hessian import second_differences
 
@@ -17,7 +17,7 @@ def _cross(a, b, c, d, e, f):
     return b * f - c * e, c * d - a * f, a * e - b * d
 
 
-@inlined_kernel
+@merged_kernel
 def _eigenvector(xx, yy, zz, xy, xz, yz, value):
     """Return the unit vector of a single eigenvalue: the longest cross product of two rows; 0 if none."""
     xx, yy, zz = xx - value, yy - value, zz - value

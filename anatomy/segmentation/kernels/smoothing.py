@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 
 
 @inner_kernel
@@ -26,7 +26,7 @@ def _weighted_rows(rows, weights, centre, out):
             out[i] += weight * (before[i] + after[i])
 
 
-@inlined_kernel
+@merged_kernel
 def _along_row(padded, weights, out):
     """The same along one row; `padded` holds it with `len(weights) - 1` values more at each end."""
     radius = weights.shape[0] - 1

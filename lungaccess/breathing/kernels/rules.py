@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at, pulled_back, stretch_near
@@ -207,7 +207,7 @@ def step_clear_of(tissue, breath, stretch, at, rest, speed, lever, bits, branch,
     return max(step, other), nearest if nearest else label
 
 
-@inlined_kernel
+@merged_kernel
 def step_in_lumen(tissue, breath, stretch, at, rest, speed, lever):
     """Return the proved step in which the axis is in a lumen, or cuts a corner of it."""
     depth = distance_bound(tissue.lumen, tissue.lumen_geometry, at[0], at[1], at[2])

@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import merged_kernel
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, OUTSIDE
 from anatomy.kernels.motion import gradient_at
 from lungaccess.breathing.kernels.rigid import inverse_transposed
@@ -29,7 +29,7 @@ def _across(d, fb, fc):
     return (1.0 - fc) * ((1.0 - fb) * d[0] + fb * d[1]) + fc * ((1.0 - fb) * d[2] + fb * d[3])
 
 
-@inlined_kernel
+@merged_kernel
 def _fill_column_changes(nodes, step, i, j, k, ends, own, edges, out):
     """Fill `out` (3, 4): how much each column of the gradient differs from `own` in part of a cell, squared.
 
@@ -57,7 +57,7 @@ def _cells_of(low, width, first, step, count):
     return at, min(max(int(at), 0), count - 2), min(max(int(at + width), 0), count - 2)
 
 
-@inlined_kernel
+@merged_kernel
 def _gradient_change(breath, x, y, z, reach, own):
     """Return how far, in Frobenius norm, the gradient is from `own` (3, 3) in a box of half side `reach`."""
     step, nodes = breath.frame[3], breath.nodes
@@ -82,7 +82,7 @@ def _gradient_change(breath, x, y, z, reach, own):
     return math.sqrt(worst) * (1.0 + 1e-6)
 
 
-@inlined_kernel
+@merged_kernel
 def _nearest_in_box(m, low, high, y, way):
     """Return a lower and an upper bound of the least length of `m y` over a box; `y` begins in the box.
 
@@ -114,7 +114,7 @@ def _nearest_in_box(m, low, high, y, way):
     return max(least, 0.0), length, (way[0] * v0 + way[1] * v1 + way[2] * v2) / length
 
 
-@inlined_kernel
+@merged_kernel
 def deformed_distance(tissue, breath, share, at, bits, branch, reach, stretch, way, chord, needed, slope):
     """Return bounds of the distance to deformed voxels within `reach` mm of X, the nearest label, and a step.
 

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at
@@ -55,7 +55,7 @@ _LUMEN = np.int64(LUMEN)
 _NOBODY = np.int64(-1)
 
 
-@inlined_kernel
+@merged_kernel
 def stretch_between(rigid, amplitude, reference, begin, end):
     """Return the stretch of the phases from `begin` to `end`."""
     share = amplitude * (0.5 * (begin + end) - reference)
@@ -107,7 +107,7 @@ def _step_at(tissue, breath, rigid, stretch, point, row, guess):
     return step_of(tissue, breath, stretch, guess, rest, speed, lever, kind, row[KEPT], row[RADIUS])
 
 
-@inlined_kernel
+@merged_kernel
 def _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, guess):
     """Return the first point of a section, from `done` on, that is not proved, -1 if all are, and why."""
     n, last = max(int(row[BEGIN]), done), int(row[END])
@@ -136,7 +136,7 @@ def _hazard_at(tissue, breath, rigid, stretch, point, row, guess):
     return step_clear_of(tissue, breath, stretch, guess, rest, speed, lever, bits, _NOBODY, row[KEPT])
 
 
-@inlined_kernel
+@merged_kernel
 def _comes_free(tissue, breath, rigid, stretch, points, sections, first, guess):
     """Tell whether a tube is free of the wall somewhere between a point and its exit."""
     for s in range(sections.shape[0]):
@@ -149,7 +149,7 @@ def _comes_free(tissue, breath, rigid, stretch, points, sections, first, guess):
     return False
 
 
-@inlined_kernel
+@merged_kernel
 def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
     """Return the first point, back from the exit, where what lies behind the wall is not proved clear.
 
@@ -241,7 +241,7 @@ def _excess(tissue, breath, rigid, stretch, point, row, reason, guess):
     return over
 
 
-@inlined_kernel
+@merged_kernel
 def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
     """Tell whether a rule is broken in all phases of the stretch, near a point that is not proved, and where.
 

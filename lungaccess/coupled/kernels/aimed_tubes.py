@@ -10,7 +10,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from lungaccess.coupled.kernels.candidate import why_refused
 from stages.needle.kernels import cost_of_arc
 from stages.tube.kernels import (
@@ -63,7 +63,7 @@ def _cost_beyond(obstacles, objective, base, normal, pieces, begin):
     return total
 
 
-@inlined_kernel
+@merged_kernel
 def _pieces_of(constants, outer, inner, shape):
     """Return begin, end, direction and curvature of each piece of tubes `(P, 4)`."""
     if shape.number[0] > 0:

@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.needle.kernels import blocker_on_arc, cost_of_arc, least_cosine, map_costs_on_arc
 from stages.tube.kernels import (
     ACCEPTED,
@@ -85,7 +85,7 @@ def _needle_cost(needle, pose, vias, count, target, cost_limit):
     return cost
 
 
-@inlined_kernel
+@merged_kernel
 def _needle_clear(needle, pose, vias, count, target, branch):
     """Tell whether all arcs through the vias are proved clear."""
     length = 0.0
@@ -101,7 +101,7 @@ def _needle_clear(needle, pose, vias, count, target, branch):
     return True
 
 
-@inlined_kernel
+@merged_kernel
 def _shape_nearby(design, near, shape, x):
     """Fill `shape` with that of a choice; return whether there is one, and whether it is the one nearby."""
     n = design.lengths.shape[0]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import most_distance
 from lungaccess.coupled.kernels.cost_to_go import LARGEST_SINE, CostToGo, angle_at, cost_from
 from lungaccess.coupled.kernels.deployment_box import (
@@ -147,7 +147,7 @@ def as_far_as(environment, begin, end, begin_off, end_off, least):
     return least * (environment.per_clearance * total / steps + environment.per_mm)
 
 
-@inlined_kernel
+@merged_kernel
 def along_tangent(environment, tip, tangent, swing, away, far, limit):
     """Bound the cost of every path from near a tip, which follows its direction at first, then any way.
 
@@ -300,7 +300,7 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box, s
     return math.inf if tubes_blocked(environment.surroundings, tubes, pose, box, sweep) else bound
 
 
-@inlined_kernel
+@merged_kernel
 def _by_halfway(environment, target, tip, tangent, swing, off, away, least, box):
     """Bound the cost of paths that cross the sphere halfway to the target in a range; see the module."""
     kappa = environment.kappa

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import most_distance
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
 
@@ -71,7 +71,7 @@ def _in_plane(angle, size):
     return math.sin(min(0.5 * angle, 1.5)) * math.sqrt((1.0 + size * size) * (1.0 + farther * farther))
 
 
-@inlined_kernel
+@merged_kernel
 def _reduce(levels, shell):
     """Fill the levels of a shell above the first."""
     for level in range(1, LEVELS):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance, most_distance
 from anatomy.kernels.labels import BRANCH_SHIFT, LUMEN
 from stages.tube.kernels import (
@@ -159,7 +159,7 @@ def least_sweep(tubes, box):
     return max(least - SPARE, 0.0)
 
 
-@inlined_kernel
+@merged_kernel
 def _branches_of_lumen(surroundings, point, reach, branches):
     """Return the branches of all lumen within `reach` of a point, and of what was found before: see NONE."""
     labels, geometry = surroundings.labels, surroundings.geometry

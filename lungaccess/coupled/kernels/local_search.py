@@ -15,7 +15,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.random import uniform
 from lungaccess.coupled.kernels.candidate import INNER, OUTER, ROTATION, SCOPE_POSE, validated_cost
 from stages.tube.kernels import N_TRACE, take_member, take_over
@@ -49,7 +49,7 @@ def _normal(state):
     return radius * math.cos(2.0 * math.pi * uniform(state))
 
 
-@inlined_kernel
+@merged_kernel
 def _add_via(vias, count, start, target, spread, state):
     """Put a via point near a chord of the path from the tube's tip `start`, and return how many there are."""
     at = min(int(uniform(state) * (count + 1)), count)
@@ -89,7 +89,7 @@ def _vary_relative_rotations(design, x, spread, state):
             x[OUTER + 2 * n - 1 - i] += RELATIVE_SPREAD_RAD * spread * _normal(state)
 
 
-@inlined_kernel
+@merged_kernel
 def _vary(design, x, vias, count, start, target, state):
     """Change a choice at random, by spreads from small to large; return how many vias it then has."""
     spread = math.exp(math.log(SMALLEST_SPREAD) * uniform(state))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from lungaccess.coupled.kernels.cost_to_go import angle_at
 from lungaccess.coupled.kernels.deployment_box import (
     HALF_INNER,
@@ -36,7 +36,7 @@ def minus(a, b, scale):
     return (a[0] - scale * b[0], a[1] - scale * b[1], a[2] - scale * b[2])
 
 
-@inlined_kernel
+@merged_kernel
 def least_distance(tubes, kappa, pose, box, tip, tangent, target, off):
     """Return how far the tips of a box with the target in reach are at least, mm; inf if there is none.
 

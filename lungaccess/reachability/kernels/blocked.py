@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
 from lungaccess.reachability.kernels.deployment_boxes import HALF, INNER, OUTER, SPARE_MM, heading, sample_of
@@ -98,7 +98,7 @@ def deep_enough(depth, depth_geometry, not_lumen, geometry, points, needed, out)
             out[n, p] = _is_deep(depth, depth_geometry, not_lumen, geometry, place, needed)
 
 
-@inlined_kernel
+@merged_kernel
 def no_tip_near(environment, place, away):
     """Tell whether no tip of the scope may be within `away` of a place."""
     geometry = environment.depth_geometry
@@ -127,7 +127,7 @@ def tips_in_lumen(environment, family, tubes, box, away):
     return distance_bound(environment.depth, environment.depth_geometry, tip[0], tip[1], tip[2]) > away
 
 
-@inlined_kernel
+@merged_kernel
 def tips_blocked(environment, tubes, limits, seen, family, box, away):
     """Tell whether all tips, within `away` of the middle one, are in the lumen or blocked ahead."""
     pose, rho, ahead, _size, _moved, _second = seen
@@ -155,7 +155,7 @@ def tips_blocked(environment, tubes, limits, seen, family, box, away):
     return never_along(environment.backward, pose, away + spare, angle, exempt)
 
 
-@inlined_kernel
+@merged_kernel
 def _lacking(environment, point, away, required):
     """Return how much clearance all tubes lack that pass within `away` of a point, mm.
 
@@ -177,7 +177,7 @@ def _lacking(environment, point, away, required):
     return required - (exact if label != 0 else required) - away
 
 
-@inlined_kernel
+@merged_kernel
 def _is_out(environment, point, away):
     """Tell whether all tubes that pass within `away` of a point are noticeably out of every lumen there."""
     required = away + UNNOTICED_MM

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels import CURVED_LENGTH, INNER_CURVATURE, OVERLAP_CURVATURE, planar_point
 
 # Columns of a box: the middles of its sides, and their half widths.
@@ -103,7 +103,7 @@ def place_of(frame, box):
     return middle, _norm((box[HALF + PLACE_X], box[HALF + PLACE_Y], box[HALF + PLACE_Z]))
 
 
-@inlined_kernel
+@merged_kernel
 def _shape_of(tubes, box):
     """Tell what the tubes of a box have in common, so that their shape depends smoothly on the insertions.
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from lungaccess.reachability.kernels.blocked import (
     no_tip_near,
     tips_blocked,
@@ -106,7 +106,7 @@ def _away_from_point(cones, m, place):
     )
 
 
-@inlined_kernel
+@merged_kernel
 def _may_look(cones, place, away, forward, tilt):
     """Tell whether a tip within `away` of a place may look to within `tilt` of a direction."""
     nearest = np.inf
@@ -156,7 +156,7 @@ def _outside_workspace(limits, seen, sums, away):
     return forward_only and ahead + sums[2] + second + spare < 0.0
 
 
-@inlined_kernel
+@merged_kernel
 def may_reach(environment, tubes, insertions, limits, target, frame, cones, box, sums, costs):
     """Tell whether a deployment of a box may be one with the target in its workspace: False if none can.
 

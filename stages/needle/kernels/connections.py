@@ -17,7 +17,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import any_normal, arc_to_point
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import merged_kernel
 from stages.needle.kernels.limits import TINY
 
 
@@ -160,7 +160,7 @@ def shortest_legs(pose, q, kappa):
     return (kappa, -nx, -ny, -nz), away / kappa, second, back / kappa
 
 
-@inlined_kernel
+@merged_kernel
 def _tangent_after(pose, bend, turn):
     c, s = math.cos(turn), math.sin(turn)
     return c * pose[3] + s * bend[1], c * pose[4] + s * bend[2], c * pose[5] + s * bend[3]

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import SMALL_ANGLE, point_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_estimate
 from anatomy.typed import Float32
 from stages.needle.kernels.limits import TINY
@@ -89,7 +89,7 @@ def _directions(geometry, x, y, z):
     )
 
 
-@inlined_kernel
+@merged_kernel
 def _first_crossing(kappa, slope, bow, change):
     """Return the arc length, below half a circle, at which a monotone coordinate has changed by `change`.
 
@@ -109,7 +109,7 @@ def _first_crossing(kappa, slope, bow, change):
     return 2.0 * math.atan(half) / kappa
 
 
-@inlined_kernel
+@merged_kernel
 def _next_extremum(kappa, tangents, normals, s, length):
     """Return the arc length beyond `s` at which some coordinate is extreme, `length` if there is none."""
     stop = length
@@ -133,7 +133,7 @@ def _voxel(shape, cell):
     return cell[0] + shape[0] * (cell[1] + shape[1] * cell[2])
 
 
-@inlined_kernel
+@merged_kernel
 def _most_voxels(geometry, bend, length):
     """Return a number of voxels that an arc cannot exceed: one, and one for every face it can cross."""
     faces = 0.0
@@ -215,7 +215,7 @@ def voxels_on_arc(shape, geometry, pose, bend, length):
     return voxels[: count + 1], lengths[: count + 1], pieces
 
 
-@inlined_kernel
+@merged_kernel
 def _sort(values):
     """Sort a few hundred numbers in place, by the method of Shell; it compiles faster than `ndarray.sort`."""
     gap = len(values)

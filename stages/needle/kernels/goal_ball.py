@@ -12,7 +12,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, two_arcs
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 
@@ -39,7 +39,7 @@ def turn_into_ball(rho, h, kappa, tolerance):
     return turn if turn >= 0.0 else turn + 2.0 * math.pi
 
 
-@inlined_kernel
+@merged_kernel
 def least_turn_into_ball(rho, h, kappa, tolerance):
     """Return the least turn (rad) of a path CS into the ball about a point, inf if there is none.
 

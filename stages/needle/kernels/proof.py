@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import LUMEN
 from anatomy.typed import Float, Labels, UInt16
@@ -50,7 +50,7 @@ class Obstacles(NamedTuple):
     bits: int
 
 
-@inlined_kernel
+@merged_kernel
 def _early_blocker(obstacles, required, pose, bend, begin, length):
     """Look for an obstacle at a few points of an arc, the middle first; 0 if none is met."""
     clearance, labels, geometry, bits = obstacles
@@ -66,7 +66,7 @@ def _early_blocker(obstacles, required, pose, bend, begin, length):
     return 0
 
 
-@inlined_kernel
+@merged_kernel
 def _blocker_by_lookup(obstacles, step, pose, bend, length):
     """Look up the voxels at the ends of steps of an arc [Fu2018, fig. 6, right]: no proof."""
     _clearance, labels, geometry, bits = obstacles

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY
 from stages.needle.kernels.connections import single_arc_exceeds
@@ -280,7 +280,7 @@ def reach_by_arcs(
             found[n, CLEARANCE] = least_clearance(obstacles, limits, pose, bend, length, 0.0, math.inf)
 
 
-@inlined_kernel
+@merged_kernel
 def _ball_around(points, members):
     """Return the centre and the radius of a ball that holds points, slightly too large."""
     centre = np.zeros(3)

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import UNITS_PER_MM, exact_distance, interpolate_squared
 from stages.needle.kernels.limits import TINY
 
@@ -24,7 +24,7 @@ STEEPEST_SINE = 0.9
 _NOBODY = np.int64(-1)
 
 
-@inlined_kernel
+@merged_kernel
 def _is_blocked(obstacles, required, x, y, z):
     """Tell whether a point is nearer than `required` to an obstacle; exact distances only where in doubt."""
     total, spread = interpolate_squared(obstacles.clearance, obstacles.geometry, x, y, z)
@@ -39,7 +39,7 @@ def _is_blocked(obstacles, required, x, y, z):
     return distance < required
 
 
-@inlined_kernel
+@merged_kernel
 def _point_at_chord(start, aside, c):
     """Return the point of an arc that is `c` away from its start, for `aside` see `inverted_aside`."""
     wx, wy, wz = c * aside[0], c * aside[1], c * aside[2]
@@ -65,7 +65,7 @@ def inverted_aside(start, q):
     return (chord2, (share * (dx - h * start[3]), share * (dy - h * start[4]), share * (dz - h * start[5])))
 
 
-@inlined_kernel
+@merged_kernel
 def _greatest_spread(aside, spread, c):
     """Return how far arcs from one start may be apart where they are `c` away from it; inf if not bounded.
 
@@ -120,7 +120,7 @@ def blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
     return -1.0
 
 
-@inlined_kernel
+@merged_kernel
 def is_blocked_bundle(obstacles, limits, start, q, radius, hints, entry):
     """Tell whether all arcs to the points within `radius` of `q` are blocked, as far as they are close."""
     chord2, aside = inverted_aside(start, q)

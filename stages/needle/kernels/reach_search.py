@@ -10,7 +10,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.reach_arcs import CLEARANCE, COST, SEARCHED, UNREACHED, least_clearance
@@ -32,7 +32,7 @@ def _grow(obstacles, limits, objective, start, branch, q, nodes, parents, iterat
     return count - 1 if solved else 0
 
 
-@inlined_kernel
+@merged_kernel
 def _record_path(obstacles, limits, nodes, parents, last, row):
     """Fill `row` with cost and least clearance of the path to the node `last`."""
     least = math.inf

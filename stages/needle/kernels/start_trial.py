@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import merged_kernel
 from anatomy.kernels.field import MIN_GAP_MM
 from stages.needle.kernels.connections import nearest_turn, seen_from, single_arc_exceeds
 from stages.needle.kernels.goal_ball import workspace_length
@@ -91,7 +91,7 @@ def try_starts(
                 kinds[n] = SEARCHED
 
 
-@inlined_kernel
+@merged_kernel
 def _by_arc(obstacles, limits, branch, pose, goal):
     """Tell whether the single arc that ends at the goal, or nearest to it, is clear and within all limits."""
     length, bend, turn = arc_to_point(pose, goal)
@@ -106,7 +106,7 @@ def _by_arc(obstacles, limits, branch, pose, goal):
     return blocker_on_arc(obstacles, limits, pose, bend, length, 0.0, branch) == 0
 
 
-@inlined_kernel
+@merged_kernel
 def _by_vias(obstacles, limits, objective, branch, vias, goal, nodes, parents, state):
     """Try the shortest path, then paths through one via point each; True if one is clear."""
     rows = add_goal(obstacles, limits, objective, branch, nodes, parents, _ONE, _ROOT, goal, math.inf, state)

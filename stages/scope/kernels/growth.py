@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.typed import Float
 from stages.scope.kernels.body import move_along, nearest_setting, point_along, room_along, room_at, turn_room
 
@@ -68,7 +68,7 @@ def nearest_on_route(points, near, x, y, z):
     return near, best
 
 
-@inlined_kernel
+@merged_kernel
 def pursuit(points, base, near, ahead_mm):
     """Return the curvature vector of the arc to a place on the route `ahead_mm` beyond a point of it."""
     gone = 0.0

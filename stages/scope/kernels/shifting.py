@@ -7,11 +7,11 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.scope.kernels.body import BLOCKED, move_along, room_along, turn_room
 
 
-@inlined_kernel
+@merged_kernel
 def goes_by_straight(twist, bend, to_twist, to_bend):
     """Tell whether a change in place moves the section less if it is straightened before it twists."""
     change = math.hypot(to_bend - bend, max(abs(bend), abs(to_bend)) * (to_twist - twist))
@@ -31,7 +31,7 @@ def put_tip(base, twist, bend, length, tip, scratch):
         tip[6 + k] = cosine * scratch[k] + sine * scratch[3 + k]
 
 
-@inlined_kernel
+@merged_kernel
 def last_slide(states):
     """Return the state from which the last advance begins, -1 if there is none."""
     for n in range(states.shape[0] - 2, -1, -1):

@@ -11,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.deployment import tip_of_arcs
 from stages.tube.kernels.one_shape import MAX_EXTENSION as MOST_OUT
 from stages.tube.kernels.one_shape import in_order, near_shape, take_over, whole_way
@@ -146,7 +146,7 @@ def _change(design, near, shape, want_aside, want_ahead, change):
     return True
 
 
-@inlined_kernel
+@merged_kernel
 def aim_shape(design, near, shape, base, target):
     """Turn and insert tubes that are not planar so that their tip comes to a point.
 

@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.torsion import twist
 
 TURN = 2.0 * math.pi
@@ -34,7 +34,7 @@ def _between_rear_ends(design, cutting, beta, owners, nodes, steps, tip_angles, 
     return value, slope
 
 
-@inlined_kernel
+@merged_kernel
 def _extremum(design, cutting, beta, owners, nodes, steps, tip_angles, low, high, rising):
     """Return the extremum between two angles where the slope changes sign; `rising` is that of `low`."""
     for _ in range(BISECTIONS):
@@ -47,7 +47,7 @@ def _extremum(design, cutting, beta, owners, nodes, steps, tip_angles, low, high
     return 0.5 * (low + high)
 
 
-@inlined_kernel
+@merged_kernel
 def _root(design, cutting, beta, owners, nodes, steps, tip_angles, low, high, wanted, rising):
     """Return where a monotone piece has a value, by Newton's method within a shrinking bracket."""
     y = 0.5 * (low + high)

@@ -13,7 +13,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import merged_kernel
 
 SHORTEST_PIECE_MM = 1e-9
 """Shorter pieces are rounding and are left out."""
@@ -23,7 +23,7 @@ SHORTEST_PIECE_MM = 1e-9
 NEAR, FAR, NEAR_OWNER, FAR_OWNER, SOFTNESS, BENT, BENT_TUBE, STEPS, PIECE_COLUMNS = range(9)
 
 
-@inlined_kernel
+@merged_kernel
 def _breakpoints(lengths, bends, beta, found):
     """Fill `found` (B, 2) with arc lengths, rising, and the tubes that move them; return how many."""
     count = 1
@@ -100,7 +100,7 @@ def cut(design, beta, step, pieces, moments, directions):
     return count, steps
 
 
-@inlined_kernel
+@merged_kernel
 def _count_steps(stiffness, pieces, moments, count, step):
     """Choose the number of steps of each piece by how fast torsion can change there; return their sum."""
     n = moments.shape[1]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numba
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels import planar
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
 from stages.tube.kernels.wall_exit import (
@@ -123,7 +123,7 @@ def _record(entries, row, site, rotation, outer, inner, trace, pose, reasons):
     return 1
 
 
-@inlined_kernel
+@merged_kernel
 def _last_row(wanted):
     """Return the last row (S, S) in which anything is wanted, -1 if there is none."""
     last = wanted.shape[0] - 1

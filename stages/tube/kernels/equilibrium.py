@@ -16,7 +16,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.assembly import PIECE_COLUMNS, cut
 from stages.tube.kernels.pose import lay, turned
 from stages.tube.kernels.torsion import twist
@@ -100,7 +100,7 @@ def determinant_at(dpsi, drate, at, beta, s, matrix, right):
     return _solve(matrix, right)
 
 
-@inlined_kernel
+@merged_kernel
 def _least_behind(dpsi, drate, beta, matrix, right):
     """Return the least determinant from the front plate to the rearmost end.
 
@@ -133,7 +133,7 @@ def _least_behind(dpsi, drate, beta, matrix, right):
     return least
 
 
-@inlined_kernel
+@merged_kernel
 def _turns_back(dpsi, drate, beta, at, matrix, before, right):
     """Tell whether two directions in which the tubes can turn lose stability together within one step.
 
@@ -177,7 +177,7 @@ def least_determinant(nodes, beta):
     return min(least, _least_behind(dpsi, drate, beta, matrix, right))
 
 
-@inlined_kernel
+@merged_kernel
 def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
     """Move the tip angles towards the wanted base angles; return the largest error before, rad."""
     _s, psi, rate, dpsi, drate = nodes
@@ -222,7 +222,7 @@ def newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles,
     return worst
 
 
-@inlined_kernel
+@merged_kernel
 def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
     """Find tip angles by raising the precurvature from nothing; return the last error, rad."""
     pieces, moments, directions, count = cutting
@@ -247,7 +247,7 @@ def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_ang
     return worst if done == 1.0 else math.inf
 
 
-@inlined_kernel
+@merged_kernel
 def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
     """Start from angles all round until a stable equilibrium is found; return the last error, rad.
 

@@ -11,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, BENT_TUBE, SOFTNESS
 from stages.tube.kernels.pose import COMMUTATOR, GAUSS, step_of
 
@@ -79,7 +79,7 @@ def _curvature_change(softness, moments, directions, share, h, dh, ends, changes
         out[3] += x * dangle
 
 
-@inlined_kernel
+@merged_kernel
 def _twist_change(softness, moments, directions, h, dh, ends, changes, first, second, out):
     """Write the change of a Magnus step's twist."""
     _curvature_change(softness, moments, directions, GAUSS, h, dh, ends, changes, first)

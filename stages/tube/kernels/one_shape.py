@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.typed import Bool, Float, Int
 from stages.tube.kernels.assembly import SHORTEST_PIECE_MM as SAME_MM
 from stages.tube.kernels.pose import frames_at, lay
@@ -188,7 +188,7 @@ def whole_way(design, shape):
     return result[SWEEP] <= design.limits[MAX_SWEEP]
 
 
-@inlined_kernel
+@merged_kernel
 def required_beside(shape):
     """Return what has to be free around a shape beside its radius and the margins, mm."""
     return shape.result[SWEEP] + shape.result[ERROR]

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
 from stages.tube.kernels.wall_exit import (
     ACCEPTED,
@@ -85,7 +85,7 @@ def cut_at_stops(arcs, stop, stretches, ends, middles, radii):
     return rows
 
 
-@inlined_kernel
+@merged_kernel
 def _off(ends, middles, one, other, place):
     """Return how far two shapes are from each other between two stops, at most."""
     worst = bow = 0.0

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, FAR, NEAR, PIECE_COLUMNS, cut
 from stages.tube.kernels.equilibrium import TOLERANCE, least_determinant, newton, scratch_for
 from stages.tube.kernels.pose import GAUSS, curvature, frames_at, lay
@@ -123,7 +123,7 @@ def largest_strain(design, strained, beta, cutting, nodes, steps):
     return worst
 
 
-@inlined_kernel
+@merged_kernel
 def _mean_curvature(cutting, nodes, steps, k, begin, end):
     """Return the mean curvature (x, y) of piece `k` between two arc lengths."""
     s, psi, rate, _dpsi, _drate = nodes
@@ -152,7 +152,7 @@ def _changes(cutting, nodes, steps, k):
     return changed, size
 
 
-@inlined_kernel
+@merged_kernel
 def _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places):
     """Write the arcs of a deployment to `arcs`, from row `first` on.
 

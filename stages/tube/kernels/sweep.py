@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 
 
 @inner_kernel
@@ -18,7 +18,7 @@ def _distance(bodies, one, other, j):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@inlined_kernel
+@merged_kernel
 def _bow(bodies, a, i, b, j, c, k):
     """Return the size of the second difference of three points."""
     total = 0.0
@@ -28,7 +28,7 @@ def _bow(bodies, a, i, b, j, c, k):
     return math.sqrt(total)
 
 
-@inlined_kernel
+@merged_kernel
 def _off_track(bodies, other, j, final, last):
     """Return the distance of a point of a body to the final one, a polyline, near the same arc length."""
     best = math.inf
@@ -46,7 +46,7 @@ def _off_track(bodies, other, j, final, last):
     return math.sqrt(max(best, 0.0))
 
 
-@inlined_kernel
+@merged_kernel
 def _diagonal_bow(bodies, states, parents, state):
     """Return the largest second difference, along the body, of how far points stray when the tip is there."""
     worst = 0.0

@@ -15,7 +15,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.assembly import FAR, FAR_OWNER, NEAR, NEAR_OWNER, SOFTNESS, STEPS
 
 # Nystroem's method of order 5 for y'' = f(y) [Hairer1993, sec. II.14].
@@ -33,7 +33,7 @@ ANGLES, SCRATCH_ROWS = 4, 5
 FIRST, SECOND, PULL_FIRST, PULL_SECOND, REST, PAIR_COLUMNS = range(6)
 
 
-@inlined_kernel
+@merged_kernel
 def _pair_up(torsional, pieces, moments, directions, k, pairs):
     """Fill `pairs` with the pairs of bent tubes in piece `k`; return how many there are."""
     count = 0
@@ -95,7 +95,7 @@ def _add_stretch(nodes, at, h, dh, share, a1, a2, a3, work):
             work[ANGLES, c + 1, i] += dh[at - 1, c] * (2.0 * h * bent - share * rate[at, i])
 
 
-@inlined_kernel
+@merged_kernel
 def _look_from(nodes, at, h, dh, stretches, pairs, count, work):
     """Fill the four stages of `work` of the step of `h` down from node `at`."""
     _look_ahead(nodes, at, h, 0.0, 0.0, 0.0, 0.0, work)
@@ -139,7 +139,7 @@ def _step(nodes, at, h, dh, stretches, pairs, count, work):
                 drate[at - 1, c, i] -= dh[at - 1, c] * turned
 
 
-@inlined_kernel
+@merged_kernel
 def _coast(nodes, at, h, dh):
     """Take a step of -h from node `at` where no two tubes are bent: torsion stays."""
     _s, psi, rate, dpsi, drate = nodes

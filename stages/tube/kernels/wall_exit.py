@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float, Labels, UInt16
@@ -85,7 +85,7 @@ def _reason(label):
     return NEAR_OTHER_BRANCH
 
 
-@inlined_kernel
+@merged_kernel
 def _wall_normal(labels, geometry, x, y, z):
     """Return the outward unit normal of the lumen at a border point, in corner axes scaled to mm.
 
@@ -128,7 +128,7 @@ def wall_angle(labels, geometry, pose):
     return math.asin(min(max(sine, -1.0), 1.0))
 
 
-@inlined_kernel
+@merged_kernel
 def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
     """Find where the axis leaves the lumen between two arc lengths of a piece, and judge it as an exit."""
     _field, labels, geometry, _bits, _lumen, _lumen_geometry, mediastinal = environment
@@ -163,7 +163,7 @@ def _first_in_lumen(environment, pose, bend, begin, end):
     return -1.0
 
 
-@inlined_kernel
+@merged_kernel
 def _tissue_gap(environment, trace, x, y, z, required):
     """Return the clearance beyond `required` outside the lumen and the label that limits it.
 
@@ -185,7 +185,7 @@ def _tissue_gap(environment, trace, x, y, z, required):
     return gap, label
 
 
-@inlined_kernel
+@merged_kernel
 def _lumen_step(environment, trace, x, y, z, at, radius, required):
     """Note branch and hazards of a point in the lumen, at an arc length; return the step to the next one.
 
@@ -223,7 +223,7 @@ def refused_exits(tubes, s, lack, first_outer):
     return end + max(tubes[INNER_RADIUS] - FINE_STEP_MM, 0.0)
 
 
-@inlined_kernel
+@merged_kernel
 def _run_in_wall(environment, pose, bend, begin, end, radius):
     """Return how much of a stretch is nearer to an airway than `radius`: at least the true length.
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 
 SHELL_MM = 1.0
@@ -97,7 +97,7 @@ def _squares_along(row, count, squares, places, ends):
         row[n] = squares[at] + (n - places[at]) ** 2
 
 
-@inlined_kernel
+@merged_kernel
 def _all_blocked(obstacles, required, around, x, y, z):
     """Tell whether every point within `around` of a point is nearer to an obstacle than required."""
     clearance, labels, geometry, bits = obstacles
@@ -206,7 +206,7 @@ def never_from(reach, x, y, z, around, free):
     return True
 
 
-@inlined_kernel
+@merged_kernel
 def _in_both(h, one, other):
     """Return a ball that holds where two balls, h apart, meet: its middle as a share of the way, its radius.
 

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 
 ONE = np.uint64(1)
 ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -94,7 +94,7 @@ def spread(target, source, first, last, width, shift, scratch):
         target[to] = value
 
 
-@inlined_kernel
+@merged_kernel
 def dilate(target, source, box, square, disc, dy, dx, scratch, row):
     """OR a bitmap into another, moved by whole cells, dilated by a square of half side `square` and a disc.
 
@@ -220,7 +220,7 @@ def refine(coarse, halve_slopes, out):
                             out[to_v, to_u, y, w] |= wide[y, w]
 
 
-@inlined_kernel
+@merged_kernel
 def _every_other(word):
     """Return the lower 32 bits of a word, moved to its even places."""
     word &= np.uint64(0xFFFFFFFF)

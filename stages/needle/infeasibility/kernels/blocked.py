@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import exact_distance, interpolate_squared
 from anatomy.kernels.labels import LUMEN
 from stages.needle.infeasibility.kernels.bitmaps import ONE, and_shifted, find_box, or_shifted
@@ -165,7 +165,7 @@ def keep_clear(states, window, scale, depths, corners, grades, slacks):
                 )
 
 
-@inlined_kernel
+@merged_kernel
 def _free_within(grades, most, out):
     """Set the bits of the cells whose grade is at most `most`."""
     for y in range(grades.shape[0]):

@@ -16,7 +16,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import merged_kernel
 from stages.needle.infeasibility.kernels.bitmaps import dilate, find_box, or_box, or_shifted
 from stages.needle.infeasibility.kernels.bounds import (
     CELL,
@@ -129,7 +129,7 @@ def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_wi
                     out[tv, tu, y, w] &= wide[y, w]
 
 
-@inlined_kernel
+@merged_kernel
 def _gather(target, target_box, limits, table, boxes, v, u, reach):
     """OR the bitmaps of all directions within `reach` cells of (v, u), as far as the box `limits` goes."""
     nv, nu = table.shape[1], table.shape[2]

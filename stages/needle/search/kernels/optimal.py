@@ -7,7 +7,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import seen_from, shortest_path
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
@@ -161,7 +161,7 @@ def build(obstacles, limits, objective, branch, goal, nodes, parents, vias, coun
     return last
 
 
-@inlined_kernel
+@merged_kernel
 def _is_promising(nodes, vias, count, limits, rate, best):
     """Tell whether the path through via points could cost less than `best`, by its length alone."""
     total = nodes[0, PATH_COST]
@@ -175,7 +175,7 @@ def _is_promising(nodes, vias, count, limits, rate, best):
     return total < best
 
 
-@inlined_kernel
+@merged_kernel
 def _mutate(vias, trial, count, goal, limits, state):
     """Write a variation of via points to `trial`; return how many it has.
 

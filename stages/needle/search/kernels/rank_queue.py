@@ -14,7 +14,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 
 LOOK_AHEAD = 3
 
@@ -46,7 +46,7 @@ def _into_heap(entry_f, heap_f, heap, state, entry):
     heap[at] = entry
 
 
-@inlined_kernel
+@merged_kernel
 def _off_heap(heap_f, heap, state):
     """Take the entry with the smallest f off the heap."""
     top = heap[0]

@@ -14,7 +14,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import pose_on_arc
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.goal_ball import least_length_from, shortest_into_ball, single_into_ball
@@ -62,7 +62,7 @@ def _estimate(nodes, row, rates, goal, limits, reference):
     return nodes[row, PATH_COST] + rates[0] * ahead + rates[1] * missing
 
 
-@inlined_kernel
+@merged_kernel
 def _push_level(
     limits, rates, goal, reference, words, merge, store, queue, state, counts, at, level, f, most
 ):

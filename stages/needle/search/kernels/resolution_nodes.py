@@ -11,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 
 ROUNDING = 1e-9
 """Share of the best cost by which a path must be cheaper to be looked for."""
@@ -106,7 +106,7 @@ def _hash(nodes, row, merge, across):
     return h & 0x7FFFFFFFFFFFFFFF
 
 
-@inlined_kernel
+@merged_kernel
 def _at_faces(nodes, row, merge):
     """Return the axes, as bits, along which an equal pose may lie in the next cell."""
     bits = 0
@@ -117,7 +117,7 @@ def _at_faces(nodes, row, merge):
     return bits
 
 
-@inlined_kernel
+@merged_kernel
 def _in_one_cell(nodes, a, b, merge):
     for m in range(6):
         size = merge[0] if m < 3 else merge[1]
@@ -126,7 +126,7 @@ def _in_one_cell(nodes, a, b, merge):
     return True
 
 
-@inlined_kernel
+@merged_kernel
 def _equal(nodes, a, b, n_rolls):
     """Tell whether two poses are equal up to rounding, and their directions of bending are the same set."""
     for m in range(6):

@@ -18,7 +18,7 @@ import math
 import numba
 
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.proof import blocker_on_arc
 
@@ -121,7 +121,7 @@ def _arc_cost(obstacles, limits, objective, branch, p, along, q, kappa, behind, 
     return cost
 
 
-@inlined_kernel
+@merged_kernel
 def _sort_by_cost(order, costs, begin, end):
     """Write the states of a layer to their places in `order`, the cheapest first, by the method of Shell."""
     for n in range(begin, end):

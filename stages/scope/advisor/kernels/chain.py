@@ -17,7 +17,7 @@ import numba
 import numpy as np
 
 from anatomy.kernels.arcs import sine_length, versine_length
-from stages.scope.advisor.kernels.inlining import inlined_kernel
+from anatomy.kernels.compiling import inlined_kernel
 
 STATE = 14
 

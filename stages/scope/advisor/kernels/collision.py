@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from anatomy.kernels.compiling import inlined_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import OUTSIDE
 from anatomy.typed import Float, Int32, Labels
 from stages.scope.advisor.kernels.chain import circle_curvature, joints_of, move_base
-from stages.scope.advisor.kernels.inlining import inlined_kernel
 
 FINE_DEPTH_MM = 2.0
 """Below this the depth at voxel centres is exact; above it may be a lower bound."""

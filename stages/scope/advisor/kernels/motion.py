@@ -7,11 +7,10 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inlined_kernel, inner_kernel
 from anatomy.kernels.random import uniform
 from stages.scope.advisor.kernels.chain import circle_curvature, move_base, tip_of
 from stages.scope.advisor.kernels.collision import base_fits, body_fits, distance_to, voxel_of
-from stages.scope.advisor.kernels.inlining import inlined_kernel
 
 REACH = 5
 """Candidates on either side of the middle one, for twist and for bend."""
@@ -189,7 +188,7 @@ def best_motion(lumen, scope, state, look_ahead, weights, offsets, table):
     )
 
 
-@inlined_kernel
+@inner_kernel
 def take_sub_step(lumen, scope, state, look_ahead, step, row, looks, out, joints):
     """Write the state after a sub-step towards a candidate; tell whether every pose looked at is free.
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.typed import Float, Int
 from stages.scope.route.kernels.lumen import cone_depth, deep_enough
 
@@ -164,7 +164,7 @@ def _add_row(band, slope, first, lo, hi, value, row, weight):
             band[at, at - other] += weight * row[i] * row[j]
 
 
-@inlined_kernel
+@merged_kernel
 def _add_objective(band, slope, f, lo, hi, rows, v, sample, weights):
     """Add the objective of a sample to the normal equations."""
     centring, bending = _objective_weights(sample, weights)
@@ -183,7 +183,7 @@ def _add_objective(band, slope, f, lo, hi, rows, v, sample, weights):
                     )
 
 
-@inlined_kernel
+@merged_kernel
 def _curvature_row(rows, v, limit, norm, nx, ny, nz, speed2, speed3, row):
     """Fill `row` (12,) with the derivatives of the curvature by the four control points."""
     nx /= norm
@@ -203,7 +203,7 @@ def _curvature_row(rows, v, limit, norm, nx, ny, nz, speed2, speed3, row):
         row[3 * c + 2] = rows[1, c] * az + rows[2, c] * bz
 
 
-@inlined_kernel
+@merged_kernel
 def _add_end(band, slope, at, dx, dy, dz, distance, active, penalty, weights):
     """Add a free end, whose first unknown is `at`, to the normal equations."""
     tolerance = weights[TOLERANCE]
@@ -218,7 +218,7 @@ def _add_end(band, slope, at, dx, dy, dz, distance, active, penalty, weights):
                 band[at + i, i - j] += penalty * d[i] * d[j] / (distance * tolerance) ** 2
 
 
-@inlined_kernel
+@merged_kernel
 def normal_equations(program, control, multipliers, penalty, hints, band, slope):
     """Fill `slope` with the gradient of the augmented Lagrangian and `band` with its Gauss-Newton matrix."""
     lo, hi, weights = program.lo, program.hi, program.weights

@@ -19,7 +19,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.scope.route.kernels.lagrangian import lagrangian, normal_equations
 
 BAND = 12
@@ -66,7 +66,7 @@ def _solve(band, slope, damping, factor, step):
     return True
 
 
-@inlined_kernel
+@merged_kernel
 def _descend(program, control, multipliers, penalty, hints, violation, steps, work):
     """Minimise the augmented Lagrangian by at most `steps` least-squares steps; return how many were taken.
 

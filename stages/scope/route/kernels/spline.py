@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.scope.route.kernels.lumen import depth_at
 
 DEEPEST = 10
@@ -40,7 +40,7 @@ def _blossom(control, knots, first, x0, x1, x2, axis):
     return f0 + (x2 - k3) / (k4 - k3) * (f1 - f0)
 
 
-@inlined_kernel
+@merged_kernel
 def bezier_piece(control, knots, first, out):
     """Fill `out` (4, 3) with the Bezier points of the span governed by control points `first` to +3."""
     a = knots[first + 3]
@@ -72,7 +72,7 @@ def _halve(piece, left, right):
         right[3, axis] = piece[3, axis]
 
 
-@inlined_kernel
+@merged_kernel
 def _curvature_range(b):
     """Return the largest of three curvatures, ends and middle, of a Bezier piece, and a bound on all of it.
 
@@ -127,7 +127,7 @@ def _curvature_range(b):
     return largest, bend * (1.0 + ROUNDING) / (slow * slow * slow)
 
 
-@inlined_kernel
+@merged_kernel
 def prove_span(control, knots, first, cones, index, cell_start, cell_cones, limit, needed, at_mm, bounds):
     """Decide whether one span keeps `limit` in curvature and `needed` in depth, everywhere.
 

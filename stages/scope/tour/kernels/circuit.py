@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 
 
 @inner_kernel
@@ -20,7 +20,7 @@ def parallel(a, b):
     return a * b / (a + b)
 
 
-@inlined_kernel
+@merged_kernel
 def _count(parent, vertex_of, count):
     """Fill `count` (K,) with the number of loops, one a lesion, that pass the stretch to each vertex."""
     count[:] = 0
@@ -31,7 +31,7 @@ def _count(parent, vertex_of, count):
             v = parent[v]
 
 
-@inlined_kernel
+@merged_kernel
 def _reduced(parent, resistance, vertex_of, lesion, below):
     """Merge in series and parallel from the ends of the tree to its root."""
     below[:] = math.inf

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -103,34 +103,22 @@ def judge(words: list[str], code: int, out: str, err: str) -> None:
         assert out == "", said
 
 
-def tried(count: int) -> settings:
-    return settings(
-        max_examples=count, derandomize=True, phases=PHASES, suppress_health_check=list(HealthCheck)
-    )
+def explained(count: int) -> Callable[..., None]:
+    """Return the test of so many wrong command lines."""
+
+    @settings(max_examples=count, derandomize=True, phases=PHASES, suppress_health_check=list(HealthCheck))
+    @given(data=st.data())
+    def test(data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+        words = data.draw(wrong_words(world))
+        capsys.readouterr()
+        code = cli.main(words)
+        judge(words, code, *capsys.readouterr())
+
+    return test
 
 
-def require_explanation(data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]) -> None:
-    words = data.draw(wrong_words(world))
-    capsys.readouterr()
-    code = cli.main(words)
-    judge(words, code, *capsys.readouterr())
-
-
-@tried(IN_CI)
-@given(data=st.data())
-def test_a_wrong_command_line_is_explained(
-    data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]
-) -> None:
-    require_explanation(data, world, capsys)
-
-
-@pytest.mark.slow
-@tried(IN_ALL)
-@given(data=st.data())
-def test_hundreds_of_wrong_command_lines_are_explained(
-    data: st.DataObject, world: World, capsys: pytest.CaptureFixture[str]
-) -> None:
-    require_explanation(data, world, capsys)
+test_a_wrong_command_line_is_explained = explained(IN_CI)
+test_hundreds_of_wrong_command_lines_are_explained = pytest.mark.slow(explained(IN_ALL))
 
 
 @pytest.mark.parametrize(

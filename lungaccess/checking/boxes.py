@@ -70,54 +70,6 @@ class Boxes:
             left, count = left[~sure], min(4 * count, len(cluster.voxels))
         return out
 
-    def least_mm(self, path_lps: Float) -> float:
-        """Return the smallest of the exact distances from the points of a path."""
-        points = np.asarray(path_lps, dtype=np.float64).reshape(-1, 3)
-        at_most, at_least = self._bounds_mm(points)
-        open_points = at_least < at_most
-        if not open_points.any():
-            return at_most
-        return min(at_most, float(self.distance_mm(points[open_points]).min()))
-
-    def _bounds_mm(self, points: Float) -> tuple[float, Float]:
-        """Return the least distance of some of the points, and lower bounds `(N,)` for all.
-
-        The distance changes no faster than one walks along the path.
-        """
-        chosen = np.unique(np.append(np.arange(0, len(points), STRIDE), len(points) - 1))
-        exact = self.distance_mm(points[chosen])
-        walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
-        behind = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
-        ahead = np.minimum(behind + 1, len(chosen) - 1)
-        bounds = np.maximum(
-            exact[behind] - np.abs(walked - walked[chosen[behind]]),
-            exact[ahead] - np.abs(walked - walked[chosen[ahead]]),
-        )
-        return float(exact.min()), np.maximum(bounds, 0.0)
-
-    def segments_mm(self, path_lps: Float, within_mm: float) -> Float:
-        """Return the `(N - 1,)` distances from the segments between consecutive points to the boxes.
-
-        Measured with FCL to the exact surface of the boxes nearer than `within_mm`, 0 where an end lies
-        inside them, and at most `within_mm`.  FCL overlooks what is nearest to some segments that are
-        parallel to faces, so a segment is never farther away than either of its ends.
-        """
-        points = np.asarray(path_lps, dtype=np.float64)
-        length = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        bounds = self._bounds_mm(points)[1]
-        out = np.full(len(points) - 1, within_mm)
-        near = np.flatnonzero(np.maximum(bounds[:-1], bounds[1:]) - length < within_mm)
-        if len(near):
-            ends = np.union1d(near, near + 1)
-            mesh = MeshDistance(self.surface_near(points[ends], within_mm + float(length.max())))
-            out[near] = np.minimum(mesh.segment_distance_mm(points[near], points[near + 1]), within_mm)
-            exact = np.full(len(points), within_mm)
-            exact[ends] = self.distance_mm(points[ends])
-            out = np.minimum(out, np.minimum(exact[:-1], exact[1:]))
-        inside = self.holds(points)
-        out[inside[:-1] | inside[1:]] = 0.0
-        return out
-
     def surface_near(self, points: Float, within_mm: float) -> SurfaceMesh:
         """Return the exact surface of the surface voxels that come nearer than `within_mm` to a point."""
         local = self._tiles.local_mm(points)
@@ -134,6 +86,62 @@ class Boxes:
         mask = np.zeros(grid.shape, dtype=bool)
         mask[tuple((voxels - low).T)] = True
         return box_surface(mask, grid)
+
+
+class PathDistances:
+    """Distances from the points of a path, `(N, 3)` LPS mm, and the segments between them to boxes."""
+
+    def __init__(self, boxes: Boxes, path_lps: Float) -> None:
+        self._boxes = boxes
+        self._points = np.asarray(path_lps, dtype=np.float64).reshape(-1, 3)
+        self._at_most, self._at_least = self._bounds_mm()
+
+    def _bounds_mm(self) -> tuple[float, Float]:
+        """Return the least distance of some of the points, and lower bounds `(N,)` for all.
+
+        The distance changes no faster than one walks along the path.
+        """
+        points = self._points
+        chosen = np.unique(np.append(np.arange(0, len(points), STRIDE), len(points) - 1))
+        exact = self._boxes.distance_mm(points[chosen])
+        walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+        behind = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
+        ahead = np.minimum(behind + 1, len(chosen) - 1)
+        bounds = np.maximum(
+            exact[behind] - np.abs(walked - walked[chosen[behind]]),
+            exact[ahead] - np.abs(walked - walked[chosen[ahead]]),
+        )
+        return float(exact.min()), np.maximum(bounds, 0.0)
+
+    def least_mm(self) -> float:
+        """Return the smallest of the exact distances from the points."""
+        open_points = self._at_least < self._at_most
+        if not open_points.any():
+            return self._at_most
+        return min(self._at_most, float(self._boxes.distance_mm(self._points[open_points]).min()))
+
+    def segments_mm(self, within_mm: float) -> Float:
+        """Return the `(N - 1,)` distances from the segments between consecutive points to the boxes.
+
+        Measured with FCL to the exact surface of the boxes nearer than `within_mm`, 0 where an end lies
+        inside them, and at most `within_mm`.  FCL overlooks what is nearest to some segments that are
+        parallel to faces, so a segment is never farther away than either of its ends.
+        """
+        points, bounds = self._points, self._at_least
+        length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        out = np.full(len(points) - 1, within_mm)
+        near = np.flatnonzero(np.maximum(bounds[:-1], bounds[1:]) - length < within_mm)
+        if len(near):
+            ends = np.union1d(near, near + 1)
+            surface = self._boxes.surface_near(points[ends], within_mm + float(length.max()))
+            distance = MeshDistance(surface).segment_distance_mm(points[near], points[near + 1])
+            out[near] = np.minimum(distance, within_mm)
+            exact = np.full(len(points), within_mm)
+            exact[ends] = self._boxes.distance_mm(points[ends])
+            out = np.minimum(out, np.minimum(exact[:-1], exact[1:]))
+        inside = self._boxes.holds(points)
+        out[inside[:-1] | inside[1:]] = 0.0
+        return out
 
 
 def _to_bounding_box(cluster: Cluster, local: Float) -> Float:

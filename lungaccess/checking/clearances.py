@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.typed import Float
-from lungaccess.checking.boxes import Boxes
+from lungaccess.checking.boxes import Boxes, PathDistances
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.shapes import STEP_MM
 from lungaccess.plans.plan import Plan
@@ -59,13 +59,14 @@ def check_clear(
 
     The finding shows the segment with the least to spare, and the distance that is needed there.
     """
-    least = boxes.least_mm(points)
+    distances = PathDistances(boxes, points)
+    least = distances.least_mm()
     words = MEANING[name.split(".")[-1]]
     if not limited:
         found.measured(name, least, "mm", f"{words}, which may be crossed")
         return least
     within = float(needed_mm.max()) + BEYOND_MM
-    gap = boxes.segments_mm(points, within)
+    gap = distances.segments_mm(within)
     worst = int((gap - needed_mm).argmin())
     value, limit = float(gap[worst]), float(needed_mm[worst])
     if value >= within:

@@ -10,6 +10,7 @@ import numpy as np
 from anatomy import structures
 from anatomy.typed import Float, Labels
 from lungaccess.checking import shapes
+from lungaccess.checking.boxes import PathDistances
 from lungaccess.checking.channel import check_channel, deployed_strain_factor
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance, structures_known
 from lungaccess.checking.environment import Environment
@@ -192,7 +193,7 @@ def _check_clearance(
             f"tube.clearance.{name}", boxes, points, needed[first:], found,
             limited=name != "fissure" or plan.fissures_are_obstacles,
         )  # fmt: skip
-        most = boxes.least_mm(curve.points[way_out.frame :])
+        most = PathDistances(boxes, curve.points[way_out.frame :]).least_mm()
         diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
         check_stated_clearance(plan, "tube", name, (least, most), diagonal, found)
 

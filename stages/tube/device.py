@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import field
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, NamedTuple
 
@@ -108,7 +109,7 @@ class Tube:
                 )
             at = end
 
-    @property
+    @cached_property
     def parts(self) -> TubeParts:
         """The tube cut where its precurvature or its slots change."""
         return tube_parts(

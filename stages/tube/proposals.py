@@ -226,26 +226,24 @@ def propose_designs(
         thickest = min(thickest, straight / bent * (1.0 - ROUNDING) - 0.5 * bore)
     uncurved = replace(tubes.inner, curved_length_mm=0.0, precurvature_per_mm=0.0, bent_pieces=())
     steepest = (uncurved.most_bent_per_mm(tubes.max_strain, tubes.passing_mm) - bent) * (1.0 - ROUNDING)
-    variants = product(
-        np.linspace(limits.thinnest_wall_mm, thickest, WALLS).tolist(),
+    outers = [
+        replace(tubes.outermost, inner_diameter_mm=bore, outer_diameter_mm=bore + 2.0 * wall_mm)
+        for wall_mm in np.linspace(limits.thinnest_wall_mm, thickest, WALLS).tolist()
+    ]
+    curves = product(
         np.linspace(shortest, longest, LENGTHS).tolist(),
         np.linspace(steepest / CURVATURES, steepest, CURVATURES).tolist(),
     )
-    found = [evaluate_design(_design(tubes, bore, *variant), outer_mm, inner_mm) for variant in variants]
+    inners = [
+        replace(uncurved, curved_length_mm=curve_mm, precurvature_per_mm=curvature_per_mm)
+        for curve_mm, curvature_per_mm in curves
+    ]
+    found = [
+        evaluate_design(replace(tubes, outer=outer, inner=inner), outer_mm, inner_mm)
+        for outer, inner in product(outers, inners)
+    ]
     kept = _worth_a_look([each for each in found if each.lateral_sweep_mm <= max_sweep_mm])
     return tuple(sorted(kept, key=lambda each: (each.lateral_sweep_mm, -each.tip_offset_mm)))
-
-
-def _design(
-    tubes: ConcentricTubes, bore_mm: float, wall_mm: float, curve_mm: float, curvature_per_mm: float
-) -> ConcentricTubes:
-    return replace(
-        tubes,
-        outer=replace(tubes.outermost, inner_diameter_mm=bore_mm, outer_diameter_mm=bore_mm + 2.0 * wall_mm),
-        inner=replace(
-            tubes.inner, curved_length_mm=curve_mm, precurvature_per_mm=curvature_per_mm, bent_pieces=()
-        ),
-    )
 
 
 def evaluate_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:

@@ -3,12 +3,12 @@
     .venv/bin/python tests/first_contact/run.py          with the libraries of this Python
     .venv/bin/python tests/first_contact/run.py --fresh  in a virtual environment made from nothing
 
-With --fresh, --wheel, --python and --constraints say what is installed where; --first does only those of a
-first look, as packaging/release.py asks for each version of Python.
+--wheel says what is installed; with --fresh, --python and --constraints say where.  --first does only the
+tasks of a first look, as packaging/release.py asks for each version of Python.
 
 The package is built and installed as a user would get it, so that a file that was forgotten is missed.
-Without --fresh, its compiled kernels are copied from the checkout, if they are there, and the libraries are
-those of the Python that runs this: a user's first minute of compiling is then not part of it.
+Without --fresh, what the checkout has compiled is copied, modules and kernels, and the libraries are those of
+the Python that runs this: a user's first minute of compiling is then not part of it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> int:
         "--keep", type=Path, help="do the tasks in this folder, which must be new, and keep it"
     )
     options.add_argument("--first", action="store_true", help="only the tasks that are marked as first")
-    options.add_argument("--wheel", default=str(ROOT), help="with --fresh: what is installed; the checkout")
+    options.add_argument("--wheel", default=str(ROOT), help="what is installed; the checkout if not stated")
     options.add_argument("--python", default=sys.executable, help="with --fresh: this one if not stated")
     options.add_argument(
         "--constraints", default="constraints.txt", help="with --fresh: of the checkout; '' for none"
@@ -66,7 +66,7 @@ def main() -> int:
         if asked.fresh:
             place = fresh_place(home, asked.wheel, asked.python, asked.constraints)
         else:
-            place = place_with_these_libraries(home)
+            place = place_with_these_libraries(home, asked.wheel)
         beside = [task for task in tasks if task.get("beside")]
         others = [task for task in tasks if not task.get("beside")]
         alone = next((n for n, task in enumerate(others) if task.get("together")), len(others))
@@ -102,17 +102,17 @@ def fresh_place(home: Path, package: str, python: str, constraints: str) -> Plac
     return _place(home, inside, {})
 
 
-def place_with_these_libraries(home: Path) -> Place:
-    """Install the package alone, beside the libraries of this Python, with kernels that are compiled."""
+def place_with_these_libraries(home: Path, package: str) -> Place:
+    """Install a wheel or a checkout alone, beside these libraries, with what the checkout has compiled."""
     site = home / "site"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    subprocess.run([*pip, "--target", str(site), str(ROOT)], check=True)
-    for package in PACKAGES:
-        for source in (ROOT / package).rglob("*.py"):
+    subprocess.run([*pip, "--no-compile", "--target", str(site), package], check=True)
+    for top in PACKAGES:
+        for source in (ROOT / top).rglob("*.py"):
             installed = site / source.relative_to(ROOT)
             if installed.is_file() and installed.read_bytes() == source.read_bytes():
                 shutil.copystat(source, installed)
-        for compiled in (ROOT / package).rglob("*.nb[ic]"):
+        for compiled in (ROOT / top).rglob("__pycache__/*"):
             target = site / compiled.relative_to(ROOT)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(compiled, target)

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from anatomy import structures
 from lungaccess.checking import shapes
-from lungaccess.checking.boxes import Boxes
+from lungaccess.checking.boxes import Boxes, PathDistances
 from lungaccess.checking.poses import angle_between
 from lungaccess.checking.space import Select, airway_except, has, labels_at, not_lumen
 from lungaccess.checking.tiles import Tiles
@@ -129,7 +129,7 @@ def test_least_distance_of_a_path_is_that_of_its_points(
     t = np.linspace(0.0, 1.0, 150)[:, None]
     path = np.concatenate([a + t * (b - a) for a, b in zip(corners[:-1], corners[1:], strict=True)])
     boxes = Boxes(tiles, select, 20.0)
-    assert boxes.least_mm(path) == boxes.distance_mm(path).min()
+    assert PathDistances(boxes, path).least_mm() == boxes.distance_mm(path).min()
 
 
 @settings(max_examples=25)
@@ -141,7 +141,7 @@ def test_segments_and_points_give_the_same_clearance(
     a, b = drawn_points(data, 2)
     path = a + np.linspace(0.0, 1.0, 200)[:, None] * (b - a)
     boxes = Boxes(tiles, select, 20.0)
-    segments, exact = boxes.segments_mm(path, within), boxes.distance_mm(path)
+    segments, exact = PathDistances(boxes, path).segments_mm(within), boxes.distance_mm(path)
     step = float(np.linalg.norm(path[1] - path[0]))
     ends = np.minimum(exact[:-1], exact[1:])
     assert (segments <= np.minimum(ends, within) + 1e-9).all()
@@ -153,7 +153,7 @@ def test_a_segment_is_never_farther_than_its_ends(tiles: Tiles) -> None:
     path = np.linspace([47.625, -26.0, 5.0], [47.625, 26.0, 5.0], 200)
     boxes = Boxes(tiles, has(structures.OBSTACLES | structures.FISSURE), 20.0)
     exact = boxes.distance_mm(path)
-    segments = boxes.segments_mm(path, 1.0)
+    segments = PathDistances(boxes, path).segments_mm(1.0)
     assert (segments <= np.minimum(exact[:-1], exact[1:])).all()
     assert (exact > 0.0).sum() > 50
 

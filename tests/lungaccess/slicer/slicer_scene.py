@@ -1,4 +1,7 @@
-"""A scene as 3D Slicer's own classes load and save it, and what is compared with the plan in LPS mm."""
+"""A scene as 3D Slicer's own classes load and save it, and what is compared with the plan in LPS mm.
+
+3D Slicer's classes are imported where they are used: that takes seconds.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import slicer  # type: ignore[import-not-found]
-import vtk
-from vtk.util.numpy_support import vtk_to_numpy
 
 RAS = np.array([-1.0, -1.0, 1.0])
 """What takes a point of 3D Slicer's to LPS and back."""
@@ -26,6 +26,8 @@ class SlicerScene:
     """
 
     def __init__(self, path: Path, scratch: Path) -> None:
+        import slicer
+
         self.scene = slicer.vtkMRMLScene()
         cache, files = slicer.vtkCacheManager(), slicer.vtkDataIOManager()
         scratch.mkdir(exist_ok=True)
@@ -89,11 +91,17 @@ def rotations_lps(node: Any) -> np.ndarray:
 
 def model_points_lps(node: Any) -> np.ndarray:
     """Return the vertices of a model."""
+    from vtk.util.numpy_support import vtk_to_numpy
+
     return np.asarray(vtk_to_numpy(node.GetPolyData().GetPoints().GetData()), dtype=np.float64) * RAS
 
 
 def segments(node: Any) -> dict[str, tuple[Any, np.ndarray]]:
     """Return each segment by its name, with the centres of its voxels, LPS mm."""
+    import slicer
+    import vtk
+    from vtk.util.numpy_support import vtk_to_numpy
+
     found, segmentation = {}, node.GetSegmentation()
     for number in range(segmentation.GetNumberOfSegments()):
         identity, segment = segmentation.GetNthSegmentID(number), segmentation.GetNthSegment(number)
@@ -112,6 +120,8 @@ def segments(node: Any) -> dict[str, tuple[Any, np.ndarray]]:
 
 def moved_lps(transform: Any, points_lps: np.ndarray) -> np.ndarray:
     """Return where a transform shows points."""
+    import vtk
+
     to_world = vtk.vtkGeneralTransform()
     transform.GetTransformToWorld(to_world)
     return np.array([to_world.TransformPoint((point * RAS).tolist()) for point in points_lps]) * RAS

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.slicer.export import PROVED_COLOUR, STEP_MM, STRUCTURES, TRIED_COLOUR
 from lungaccess.slicer.markups import TARGET_COLOUR
 from lungaccess.slicer.segments import SEGMENTS, label_map
-
-vtk = pytest.importorskip("vtk", reason="slicer-core, 3D Slicer's own classes, is not installed")
-pytest.importorskip("slicer", reason="slicer-core, 3D Slicer's own classes, is not installed")
-
-from tests.lungaccess.slicer.slicer_scene import (  # noqa: E402
+from tests.lungaccess.slicer.slicer_scene import (
     SlicerScene,
     control_points_lps,
     model_points_lps,
@@ -31,6 +28,9 @@ from tests.lungaccess.slicer.slicer_scene import (  # noqa: E402
     segments,
 )
 
+pytestmark = pytest.mark.skipif(
+    find_spec("slicer") is None, reason="slicer-core, 3D Slicer's own classes, is not installed"
+)
 TOLERANCE_MM = 1e-3
 DEVICES = ("scope", "tubes", "needle")
 BODIES = {"start region proved": PROVED_COLOUR, "start region tried": TRIED_COLOUR}
@@ -145,6 +145,8 @@ def test_the_patients_left_is_on_the_left_of_the_screen(
 
 
 def test_names_colours_and_units(scene: SlicerScene, small_plan: Plan) -> None:
+    import vtk
+
     colours = dict(zip(DEVICES, (c.colour for c in small_plan.curves()), strict=True)) | {
         "points": TARGET_COLOUR
     }

@@ -13,6 +13,7 @@ from anatomy.errors import SettingsError
 from stages.tube.following import deploy
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.proposals import (
+    DesignProposal,
     MakerLimits,
     SequenceComparison,
     evaluate_design,
@@ -66,13 +67,16 @@ class TestSequences:
             _ = SequenceComparison(deployed=(), refused={"together": "snaps"}).best
 
 
-class TestDesigns:
-    FOUND = propose_designs(WIDE, 30.0, 50.0, 2.0, LIMITS)
+@pytest.fixture(scope="module")
+def designs() -> tuple[DesignProposal, ...]:
+    return propose_designs(WIDE, 30.0, 50.0, 2.0, LIMITS)
 
-    def test_they_are_sorted_and_within_all_limits(self) -> None:
-        sweeps = [each.lateral_sweep_mm for each in self.FOUND]
+
+class TestDesigns:
+    def test_they_are_sorted_and_within_all_limits(self, designs: tuple[DesignProposal, ...]) -> None:
+        sweeps = [each.lateral_sweep_mm for each in designs]
         assert sweeps == sorted(sweeps) and sweeps[-1] <= 2.0 and len(sweeps) > 10
-        for each in self.FOUND:
+        for each in designs:
             inner, outer = each.tubes.inner, each.tubes.outer
             assert inner.rest_strain <= WIDE.max_strain
             assert 20.0 <= inner.curved_length_mm <= 50.0
@@ -80,8 +84,8 @@ class TestDesigns:
             assert outer.outer_diameter_mm <= 2.0 - 0.1 + 1e-12
             assert outer.outer_diameter_mm - outer.inner_diameter_mm >= 0.1 - 1e-12
 
-    def test_the_mechanics_agree_with_what_is_said(self) -> None:
-        for each in self.FOUND[:: len(self.FOUND) // 6]:
+    def test_the_mechanics_agree_with_what_is_said(self, designs: tuple[DesignProposal, ...]) -> None:
+        for each in designs[:: len(designs) // 6]:
             mechanics = TubeMechanics((each.tubes.inner, each.tubes.outer))
             found = deploy(mechanics, kuntz2015(mechanics.tubes, 0.0, 30.0, 50.0), step_mm=0.5)
             tip = found.final.base_from_tip
@@ -89,7 +93,7 @@ class TestDesigns:
             assert np.hypot(*tip[:2, 3]) == pytest.approx(each.tip_offset_mm, abs=1e-6)
             assert math.cos(each.tip_angle_rad) == pytest.approx(tip[2, 2], abs=1e-9)
 
-    def test_none_is_beaten_by_another_in_every_respect(self) -> None:
+    def test_none_is_beaten_by_another_in_every_respect(self, designs: tuple[DesignProposal, ...]) -> None:
         values = np.array(
             [
                 (
@@ -98,7 +102,7 @@ class TestDesigns:
                     each.tip_angle_rad,
                     each.tubes.inner.curved_length_mm,
                 )
-                for each in self.FOUND
+                for each in designs
             ]
         )
         clear = np.array([0.05, 0.05, 0.02, 0.0])
@@ -106,17 +110,19 @@ class TestDesigns:
             others = np.delete(values, number, axis=0)
             assert not (others + clear < value + [0, 0, 0, 1e-9]).all(axis=1).any()
 
-    def test_there_is_a_design_that_reaches_as_far_without_sweep(self) -> None:
+    def test_there_is_a_design_that_reaches_as_far_without_sweep(
+        self, designs: tuple[DesignProposal, ...]
+    ) -> None:
         """Its curve is as long as it is inserted."""
         present = evaluate_design(WIDE, 30.0, 50.0)
         assert present.lateral_sweep_mm > 2.0
-        still = [each for each in self.FOUND if each.lateral_sweep_mm == 0.0]
+        still = [each for each in designs if each.lateral_sweep_mm == 0.0]
         assert max(each.tip_offset_mm for each in still) > present.tip_offset_mm
         assert all(each.tubes.inner.curved_length_mm == 50.0 for each in still)
 
-    def test_a_smaller_sweep_leaves_fewer_designs(self) -> None:
+    def test_a_smaller_sweep_leaves_fewer_designs(self, designs: tuple[DesignProposal, ...]) -> None:
         few = propose_designs(WIDE, 30.0, 50.0, 0.5, LIMITS)
-        assert 0 < len(few) < len(self.FOUND)
+        assert 0 < len(few) < len(designs)
         assert few[-1].lateral_sweep_mm <= 0.5
 
     def test_the_longest_curve_is_respected(self) -> None:
@@ -125,8 +131,8 @@ class TestDesigns:
         assert max(each.tubes.inner.curved_length_mm for each in found) == 30.0
         assert min(each.lateral_sweep_mm for each in found) > 0.0
 
-    def test_a_thicker_channel_allows_a_thicker_wall(self) -> None:
-        walls = {each.tubes.outer.outer_diameter_mm for each in self.FOUND}
+    def test_a_thicker_channel_allows_a_thicker_wall(self, designs: tuple[DesignProposal, ...]) -> None:
+        walls = {each.tubes.outer.outer_diameter_mm for each in designs}
         wide = propose_designs(WIDE, 30.0, 50.0, 2.0, MakerLimits(channel_diameter_mm=2.4))
         assert max(each.tubes.outer.outer_diameter_mm for each in wide) > max(walls)
 

@@ -24,9 +24,10 @@ settings.load_profile("lungaccess")
 
 
 def pytest_collection_finish() -> None:
-    """Spare the garbage collector all that the tests have imported."""
+    """Spare the garbage collector all that the tests have imported, and most of its short rounds."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000)
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicHermiteSpline
 
 from anatomy.errors import SettingsError
 from anatomy.grid import read_only
@@ -122,6 +121,8 @@ class Equilibrium:
 
     def _derivatives_at(self, s: float) -> tuple[Float, Float]:
         """Return the derivatives of angles and torsion by all tip angles but the last, `(n - 1, n)`."""
+        from scipy.interpolate import CubicHermiteSpline  # Its import takes as long as all of numpy's.
+
         arc_lengths, _psi, _rate, dpsi, drate = self._relative_nodes()
         if s <= 0.0 or len(arc_lengths) == 1:
             return dpsi[0], drate[0]

@@ -121,7 +121,7 @@ class Equilibrium:
 
     def _derivatives_at(self, s: float) -> tuple[Float, Float]:
         """Return the derivatives of angles and torsion by all tip angles but the last, `(n - 1, n)`."""
-        from scipy.interpolate import CubicHermiteSpline  # Its import takes as long as all of numpy's.
+        from scipy.interpolate import CubicHermiteSpline
 
         arc_lengths, _psi, _rate, dpsi, drate = self._relative_nodes()
         if s <= 0.0 or len(arc_lengths) == 1:

@@ -22,6 +22,7 @@ from lungaccess.problem.system import system_fingerprint
 from lungaccess.problem.target import stated_target
 from lungaccess.slicer import check_curve
 from stages.tube import DeploymentValidator, exit_points
+from tests.lungaccess.slicer.slicer_scene import RAS, SlicerScene, control_points_lps
 
 Edit = Callable[[list[dict[str, Any]]], list[dict[str, Any]]]
 Edited = Callable[[str, Edit], Any]
@@ -145,8 +146,6 @@ def test_from_an_edited_scene_to_a_new_plan_and_back(
 ) -> None:
     """The three commands of docs/how_to/slicer.md, with a scene that 3D Slicer's own classes have saved."""
     pytest.importorskip("slicer", reason="slicer-core, 3D Slicer's own classes, is not installed")
-    from tests.lungaccess.slicer.slicer_scene import RAS, SlicerScene, control_points_lps
-
     scene = SlicerScene(exported / "scene.mrml", tmp_path / "scratch")
     points, needle = scene.node("points", "MarkupsFiducial"), scene.node("needle", "MarkupsCurve")
     aim = small_plan.target_lps + [1.0, 0.5, -0.5]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 from pathlib import Path
 
 from anatomy.errors import SettingsError
@@ -22,8 +23,18 @@ def default_cache() -> Path:
     stated = os.environ.get("LUNGACCESS_CACHE")
     if stated:
         return Path(stated)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "lungaccess"
+    return user_cache() / "lungaccess"
+
+
+def user_cache() -> Path:
+    """Return the user's folder for what can be made again; one for temporary files if there is no home."""
+    base = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
+    if base:
+        return Path(base)
+    try:
+        return Path.home() / ".cache"
+    except RuntimeError:
+        return Path(tempfile.gettempdir())
 
 
 def cache_limit_bytes() -> int:

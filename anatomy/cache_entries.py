@@ -77,12 +77,12 @@ class CacheEntry:
             return False
 
 
-def cache_entries(cache: Path, formats: Mapping[str, int]) -> tuple[CacheEntry, ...]:
+def cache_entries(cache: Path, formats: Mapping[str, str]) -> tuple[CacheEntry, ...]:
     """Return what a cache holds, the least recently used first.
 
     Parameters
     ----------
-    formats : mapping of str to int
+    formats : mapping of str to str
         The present format by kind; entries of a kind that is not named count as current.
     """
     found = []
@@ -94,7 +94,7 @@ def cache_entries(cache: Path, formats: Mapping[str, int]) -> tuple[CacheEntry, 
     return tuple(sorted(found, key=lambda entry: (entry.last_used, entry.path.name)))
 
 
-def _entry(path: Path, formats: Mapping[str, int]) -> CacheEntry | None:
+def _entry(path: Path, formats: Mapping[str, str]) -> CacheEntry | None:
     """Return what a path in a cache is, None if it is nothing of ours."""
     if UNFINISHED_PATTERN.fullmatch(path.name):
         return _made(path, "unfinished", {}, path.stat().st_mtime, formats)
@@ -116,7 +116,7 @@ def _header(path: Path) -> dict[str, Any]:
     return {}
 
 
-def _made(path: Path, kind: str, stated: Any, last_used: float, formats: Mapping[str, int]) -> CacheEntry:
+def _made(path: Path, kind: str, stated: Any, last_used: float, formats: Mapping[str, str]) -> CacheEntry:
     """Return an entry with its size; `stated` is what it says of itself."""
     facts = stated if isinstance(stated, dict) else {}
     sizes = {each.name: each.stat().st_size for each in ([path] if path.is_file() else path.iterdir())}
@@ -195,14 +195,14 @@ def overdue(
         yield entry
 
 
-def make_room(cache: Path, most_bytes: int, formats: Mapping[str, int], *, keep: tuple[Path, ...]) -> None:
+def make_room(cache: Path, most_bytes: int, formats: Mapping[str, str], *, keep: tuple[Path, ...]) -> None:
     """Remove what a cache may not hold any longer, after something was stored; what cannot go stays.
 
     Parameters
     ----------
     most_bytes : int
         How large the cache may be.
-    formats : mapping of str to int
+    formats : mapping of str to str
         See `cache_entries`.
     keep : tuple of Path
         What is in use and stays, even if it alone is larger.

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 def kept_record(
     kind: str,
-    version: int,
+    version: str,
     depends_on: Mapping[str, Any],
     *,
     make: Callable[[], T],
@@ -40,8 +40,8 @@ def kept_record(
     ----------
     kind : str
         What it is, one of `anatomy.cache_entries`; the file is named after it.
-    version : int
-        To be raised when `make` returns something else for the same `depends_on`.
+    version : str
+        Another one where `make` returns something else for the same `depends_on`, as other kernels may.
     depends_on : mapping
         Plain values.
     parts, rebuilt : callable

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -22,6 +23,7 @@ from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.io.files import DAMAGE
 from anatomy.lung import Lung
+from anatomy.machine_code.sources import kernel_digest
 from anatomy.motion.motion import stored_motion
 from anatomy.patient import PatientImages
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
@@ -63,7 +65,7 @@ def open_lung(
         If the cache cannot be written.
     """
     key = lung_key(sources)
-    folder = (cache or default_cache()) / key
+    folder = (cache or default_cache()) / folder_name(key)
     stored = _load(folder, warn=True)
     if stored is not None:
         note_use(folder / META)
@@ -72,8 +74,18 @@ def open_lung(
     if progress:
         progress("reading images")
     lung = _build_into(folder, key, read(), progress)
-    make_room(folder.parent, most_bytes, {"anatomy": FORMAT}, keep=(folder,))
+    make_room(folder.parent, most_bytes, {"anatomy": stored_format()}, keep=(folder,))
     return lung
+
+
+def stored_format() -> str:
+    """Return what tells stored lungs of this version and these kernels from all others."""
+    return f"{FORMAT}-{kernel_digest('anatomy')}"
+
+
+def folder_name(key: str) -> str:
+    """Return the name of the folder of a lung with this key, as these kernels make it."""
+    return hashlib.sha256(f"{key} {stored_format()}".encode()).hexdigest()[:24]
 
 
 def _build_into(
@@ -153,7 +165,7 @@ def _save_rest(lung: Lung, folder: Path) -> None:
     }
     np.savez(folder / "tree.npz", **tree_arrays)
     meta = {
-        "format": FORMAT,
+        "format": stored_format(),
         "name": lung.name,
         "kind": lung.kind,
         "key": lung.key,
@@ -186,10 +198,10 @@ def _load(folder: Path, *, warn: bool = False) -> Lung | None:
         return None
     try:
         meta = json.loads((folder / META).read_text())
-        if meta["format"] != FORMAT:
+        if meta["format"] != stored_format():
             return None
         stated = meta.pop("checksum")
-        its_own = meta["key"] == folder.name
+        its_own = folder_name(meta["key"]) == folder.name
         if its_own and stated == values_checksum(meta) and are_unchanged(folder, meta["files"]):
             return _from_meta(folder, meta)
     except (*DAMAGE, LungaccessError):

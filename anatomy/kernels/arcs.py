@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 
-import numba
+from anatomy.kernels.compiling import kernel
 
 SMALL_ANGLE = 1e-4
 """Below it the series is exact to double precision, and the quotient is not."""
 
 
-@numba.njit(cache=True)
+@kernel()
 def sine_length(kappa, s):
     """Return `sin(kappa s) / kappa`, the advance along the start tangent."""
     a = kappa * s
@@ -23,7 +23,7 @@ def sine_length(kappa, s):
     return math.sin(a) / kappa
 
 
-@numba.njit(cache=True)
+@kernel()
 def versine_length(kappa, s):
     """Return `(1 - cos(kappa s)) / kappa`, the advance towards the bend."""
     a = kappa * s
@@ -32,7 +32,7 @@ def versine_length(kappa, s):
     return (1.0 - math.cos(a)) / kappa
 
 
-@numba.njit(cache=True)
+@kernel()
 def any_normal(tx, ty, tz):
     """Return a unit vector perpendicular to a unit vector."""
     if abs(tx) < 0.6:
@@ -43,7 +43,7 @@ def any_normal(tx, ty, tz):
     return nx / norm, ny / norm, nz / norm
 
 
-@numba.njit(cache=True)
+@kernel()
 def arc_to_point(pose, q):
     """Return length, bend and turn (rad) of the arc that starts at `pose` and ends at the point `q`.
 
@@ -66,7 +66,7 @@ def arc_to_point(pose, q):
     return turn / kappa, (kappa, rx / rho, ry / rho, rz / rho), turn
 
 
-@numba.njit(cache=True)
+@kernel()
 def point_on_arc(pose, bend, s):
     """Return the point at arc length `s` as a tuple."""
     px, py, pz, tx, ty, tz = pose
@@ -76,7 +76,7 @@ def point_on_arc(pose, bend, s):
     return px + a * tx + b * nx, py + a * ty + b * ny, pz + a * tz + b * nz
 
 
-@numba.njit(cache=True)
+@kernel()
 def pose_on_arc(pose, bend, s):
     """Return the pose at arc length `s`, its tangent normalised."""
     x, y, z = point_on_arc(pose, bend, s)
@@ -89,7 +89,7 @@ def pose_on_arc(pose, bend, s):
     return x, y, z, tx / norm, ty / norm, tz / norm
 
 
-@numba.njit(cache=True)
+@kernel()
 def normal_on_arc(pose, bend, s):
     """Return the unit normal towards the centre of curvature at arc length `s`."""
     c = math.cos(bend[0] * s)

@@ -28,9 +28,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from anatomy.kernels.compiling import kernel
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, OUTSIDE
 
 UNITS_PER_MM = 256.0
@@ -46,12 +46,12 @@ TRANSFORM_ROUNDING = 1e-4
 """Share by which distance transforms are made smaller before they are rounded down; they have less."""
 
 
-@numba.njit(cache=True, inline="always", _nrt=False)
+@kernel(inline="always", _nrt=False)
 def _squared_along(low, high, f):
     return (1.0 - f) * float(low) * float(low) + f * float(high) * float(high)
 
 
-@numba.njit(cache=True, inline="never", _nrt=False)
+@kernel(inline="never", _nrt=False)
 def interpolate_squared(field, geometry, x, y, z):
     """Return the interpolated squared distance and the variance term, in mm^2; (0, 0) off the grid."""
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
@@ -81,21 +81,21 @@ def interpolate_squared(field, geometry, x, y, z):
     return total, spread
 
 
-@numba.njit(cache=True, _nrt=False)
+@kernel(_nrt=False)
 def distance_bound(field, geometry, x, y, z):
     """Return a distance in mm that the true distance is never below; 0 outside the grid."""
     total, spread = interpolate_squared(field, geometry, x, y, z)
     return math.sqrt(max(total - spread, 0.0))
 
 
-@numba.njit(cache=True, _nrt=False)
+@kernel(_nrt=False)
 def distance_estimate(field, geometry, x, y, z):
     """Return a smooth estimate of the distance in mm, off by less than a voxel diagonal; no bound."""
     total, spread = interpolate_squared(field, geometry, x, y, z)
     return math.sqrt(max(total - 0.5 * spread, 0.0))
 
 
-@numba.njit(cache=True, _nrt=False)
+@kernel(_nrt=False)
 def most_distance(field, geometry, x, y, z):
     """Return a distance in mm that the true distance never exceeds; inf off the grid and next to its border.
 
@@ -132,7 +132,7 @@ def most_distance(field, geometry, x, y, z):
     return min(math.sqrt(max(square + total + beside, 0.0)), here + math.sqrt(beside))
 
 
-@numba.njit(cache=True, _nrt=False)
+@kernel(_nrt=False)
 def label_at(labels, geometry, x, y, z):
     """Return the label of the voxel that holds a point; OUTSIDE beyond the grid."""
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
@@ -144,7 +144,7 @@ def label_at(labels, geometry, x, y, z):
     return int(labels[np.uint64(u), np.uint64(v), np.uint64(w)])
 
 
-@numba.njit(cache=True, _nrt=False)
+@kernel(_nrt=False)
 def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
     """Search the voxels around a point for the nearest one with any of `bits`, as `geometry` takes them.
 
@@ -203,14 +203,14 @@ def exact_distance(labels, geometry, x, y, z, bits, exempt_branch, cap):
     return math.sqrt(best), nearest
 
 
-@numba.njit(cache=True)
+@kernel()
 def bounds_at(field, geometry, points, out):
     """Fill `out` (N,) with `distance_bound` at `points` (N, 3)."""
     for n in range(points.shape[0]):
         out[n] = distance_bound(field, geometry, points[n, 0], points[n, 1], points[n, 2])
 
 
-@numba.njit(cache=True)
+@kernel()
 def exact_at(labels, geometry, points, bits, exempt_branch, cap, out):
     """Fill `out` (N,) with `exact_distance` at `points` (N, 3)."""
     for n in range(points.shape[0]):
@@ -219,7 +219,7 @@ def exact_at(labels, geometry, points, bits, exempt_branch, cap, out):
         )[0]
 
 
-@numba.njit(cache=True)
+@kernel()
 def least_exact(labels, geometry, points, order, bounds, bits, exempt_branch, cap):
     """Return the least `exact_distance` of `points` (N, 3), at most `cap`.
 

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 
 MOST_STEPS = 60
 """Of a fixed point whose error falls by the norm of the gradient, 0.2 to 0.4 in a lung, with each step."""
@@ -25,7 +24,7 @@ SMALL = 1e-6
 """Taken off bounds for rounding, of which closed-form eigenvalues of size 1 have less than 1e-7."""
 
 
-@numba.njit(cache=True, inline="always")
+@kernel(inline="always")
 def cell_of(place, first, step, count):
     """Return cell and fraction in it of a coordinate; those of the border beyond it."""
     at = min(max((place - first) / step, 0.0), count - 1.0)
@@ -73,7 +72,7 @@ def gradient_at(nodes, frame, x, y, z, out):
         out[row, 0], out[row, 1], out[row, 2] = gx / frame[3], gy / frame[3], gz / frame[3]
 
 
-@numba.njit(cache=True)
+@kernel()
 def pulled_back(nodes, frame, share, qx, qy, qz, x, y, z):
     """Return the place of the masks that is at `q` in a phase, and how far from `q` it is then, mm.
 
@@ -90,7 +89,7 @@ def pulled_back(nodes, frame, share, qx, qy, qz, x, y, z):
     return x, y, z, rest
 
 
-@numba.njit(cache=True)
+@kernel()
 def displacements(nodes, frame, points, out):
     """Fill `out` (N, 3) with the displacements at `points` (N, 3)."""
     for n in range(points.shape[0]):
@@ -99,7 +98,7 @@ def displacements(nodes, frame, points, out):
         )
 
 
-@numba.njit(cache=True)
+@kernel()
 def points_pulled_back(nodes, frame, share, points, out):
     """Fill `out` (N, 3) with places of the masks; return the largest distance that is left, mm."""
     worst = 0.0
@@ -125,7 +124,7 @@ def _eigenvalue_ends(g):
     return mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0), mean + 2.0 * size * math.cos(angle)
 
 
-@numba.njit(cache=True)
+@kernel()
 def fill_cell_bounds(nodes, spacing, out):
     """Fill `out` (ni - 1, nj - 1, nk - 1, 3), see `anatomy.motion.stretch.cell_bounds`."""
     edges, mean = np.zeros((4, 3)), np.zeros((3, 3))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from anatomy.kernels.compiling import kernel
 
 NODULE_OWNER = -1
 """Nodules belong to no branch."""
 
 
-@njit(cache=True)
+@kernel()
 def paint_tree(
     labels,
     owner,

@@ -18,6 +18,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from anatomy.checksums import DamagedCacheWarning
 from anatomy.errors import AnatomyError, FileError, LungaccessError
+from anatomy.machine_code.folders import KernelsNotKeptWarning
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.commands.advise import advise
 from lungaccess.cli.commands.alternatives import alternatives
@@ -162,10 +163,10 @@ def _termination_as_interruption() -> Iterator[None]:
 
 
 def _show_damage(others: Callable[..., None]) -> Callable[..., None]:
-    """Return what shows warnings: one line for what is damaged in the cache; the rest as ever."""
+    """Return what shows warnings: one line for what caches lack, or hold damaged; the rest as ever."""
 
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-        if issubclass(category, DamagedCacheWarning):
+        if issubclass(category, DamagedCacheWarning | KernelsNotKeptWarning):
             error_console.print(str(message), soft_wrap=True)
         else:
             others(message, category, *where, **more)

@@ -6,18 +6,16 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Iterator
 from dataclasses import asdict
-from importlib import metadata, util
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from anatomy.cache import default_cache
+from anatomy.machine_code.sources import kernel_digest
 from anatomy.records import frozen_value
 
-PACKAGES = ("anatomy", "stages", "lungaccess")
 _REQUIREMENT = re.compile(r"^\s*([A-Za-z0-9._-]+)\s*([^;]*)")
-_COMPILED = re.compile(r"^@(?:\w+\.)?njit\(.*cache=True|^@(?:\w+\.)?njit$|^from \S*compil", re.MULTILINE)
 
 
 @frozen_value
@@ -31,12 +29,27 @@ class Library:
 
 @frozen_value
 class KernelCache:
-    """Compiled kernels on disk: `warm` of the modules have compiled code not older than their source."""
+    """Machine code of kernels on disk: for `warm` of the modules there is code of their present sources.
+
+    Parameters
+    ----------
+    folders : tuple of str
+        Where it is looked for: where `lungaccess-kernels` is installed, its folder first, then that in which
+        new code is kept.
+    size_bytes : int
+        Of all code for this numba and Python there, that of other sources included.
+    digest : str
+        Of all sources of kernels, as plans state it.
+    writable : bool
+        Whether new code can be kept; otherwise each process compiles anew.
+    """
 
     folders: tuple[str, ...]
     modules: int
     warm: int
     size_bytes: int
+    digest: str
+    writable: bool
 
     @property
     def state(self) -> str:
@@ -91,6 +104,9 @@ class Health:
         missing = [f"The library {each.name} is missing" for each in self.libraries if each.version is None]
         if not self.cache.writable:
             missing.append(f"The cache folder {self.cache.path} cannot be written")
+        if not self.kernels.writable:
+            place = self.kernels.folders[-1]
+            missing.append(f"Compiled kernels cannot be kept in {place}: name a folder in NUMBA_CACHE_DIR")
         if self.data is not None and not self.data.exists:
             missing.append(f"LUNGACCESS_DATA names {self.data.path}, which is no folder")
         return tuple(missing)
@@ -169,42 +185,27 @@ def _free_memory() -> int | None:
 
 
 def kernel_cache() -> KernelCache:
-    """Return where numba keeps the compiled kernels, and how many modules of them are ready."""
-    stated = os.environ.get("NUMBA_CACHE_DIR")
-    folders: set[Path] = {Path(stated)} if stated else set()
-    modules = warm = 0
-    for source in _kernel_sources():
-        modules += 1
-        home = Path(stated) if stated else source.parent / "__pycache__"
-        folders.add(home)
-        warm += any(
-            index.stat().st_mtime >= source.stat().st_mtime
-            for index in _indices(home, source, deep=stated is not None)
-        )
-    files = {file for folder in folders if folder.is_dir() for file in folder.rglob("*.nb[ic]")}
+    """Return where machine code of kernels is, and for how many modules it is that of their present sources.
+
+    numba is not imported for it, so that the answer comes at once, and also where numba is broken.
+    """
+    from anatomy.machine_code import folders
+    from anatomy.machine_code.sources import Sources, kernel_modules
+
+    sources = Sources()
+    modules = kernel_modules(sources=sources)
+    names = [folders.module_folder(each, sources.stamp(each) or "") for each in modules]
+    places = folders.code_folders()
+    files = [file for place in places for file in place.rglob("*.code")]
+    there = {file.parent.name for file in files}
     return KernelCache(
-        folders=tuple(sorted(str(folder) for folder in folders)),
-        modules=modules,
-        warm=warm,
+        folders=tuple(str(place) for place in places),
+        modules=len(names),
+        warm=len(there.intersection(names)),
         size_bytes=sum(file.stat().st_size for file in files),
+        digest=kernel_digest(),
+        writable=look_at(folders.kernels_folder()).writable,
     )
-
-
-def _indices(home: Path, source: Path, *, deep: bool) -> Iterator[Path]:
-    """Return numba's index files of the functions of a module."""
-    pattern = f"{source.stem}.*.nbi"
-    return home.rglob(pattern) if deep else home.glob(pattern)
-
-
-def _kernel_sources() -> Iterator[Path]:
-    """Return the modules of our packages that hold kernels whose compiled code is kept."""
-    for package in PACKAGES:
-        spec = util.find_spec(package)
-        for root in (spec.submodule_search_locations or ()) if spec else ():
-            for source in sorted(Path(root).rglob("*.py")):
-                kernel = "kernels" in source.parts or source.name == "kernels.py"
-                if kernel and _COMPILED.search(source.read_text(encoding="utf-8")):
-                    yield source
 
 
 def look_at(path: Path) -> Folder:

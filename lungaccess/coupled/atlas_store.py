@@ -9,6 +9,7 @@ from typing import Any, get_type_hints
 
 from anatomy.kept_records import kept_record
 from anatomy.lung import Lung
+from anatomy.machine_code.sources import kernel_digest
 from anatomy.settings import to_mapping
 from lungaccess.coupled.atlas import TIP_SPACING_MM, Atlas, build_atlas
 from lungaccess.problem.system import System
@@ -19,6 +20,11 @@ from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, shapes_
 
 FORMAT = 9
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
+
+
+def atlas_format() -> str:
+    """Return what tells atlases of this version and these kernels from all others."""
+    return f"{FORMAT}-{kernel_digest('anatomy', 'stages.scope', 'stages.tube', 'lungaccess.coupled')}"
 
 
 def open_atlas(
@@ -74,7 +80,7 @@ def open_atlas(
     in_use = () if lung.folder is None else (lung.folder,)
     return kept_record(
         "atlas",
-        FORMAT,
+        atlas_format(),
         depends_on,
         make=make,
         parts=_parts,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import arc_to_point, point_on_arc
+from anatomy.kernels.compiling import kernel
 from anatomy.kernels.field import distance_bound
 from stages.needle.kernels import exact_gap, single_arc_exceeds
 
@@ -27,7 +26,7 @@ STEP_MM = 0.5
 """Less than a voxel, so that no structure is passed over."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def look_along_arcs(obstacles, limits, positions, tangents, branches, target, found, labels):
     """Look along the single arc from each pose to the target, in steps of STEP_MM: no proof.
 

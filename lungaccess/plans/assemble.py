@@ -25,7 +25,7 @@ from lungaccess.plans.parts import (
     WallExit,
 )
 from lungaccess.plans.plan import Plan
-from lungaccess.plans.version import software_version
+from lungaccess.plans.version import software_kernels, software_version
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath
@@ -53,6 +53,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         of_needle = {"needle": needle_clearance_mm(task, candidate.path, deployment.branch)}
     return Plan(
         software_version=software_version(),
+        kernels=software_kernels(),
         patient_name=lung.name,
         lung_key=lung.key,
         sources=lung.sources,

@@ -67,6 +67,9 @@ class Plan(Record):
         "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, or without one of the
         tubes beyond the lumen (costs of the map: beyond the wall), and the cost under the objective where
         that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
+    kernels : str
+        What the planner's machine code was compiled from: `lungaccess.plans.version.software_kernels`; "" in
+        a plan that was not planned, or of an earlier version.
     needle_planner : str
         The planner of the needle that the search was told to use; "" for the method's own.
     system_choice : tuple of str
@@ -109,6 +112,7 @@ class Plan(Record):
     seed: int
     iterations: int
     timing: Mapping[str, float]
+    kernels: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
     needle_planner: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
     system_choice: tuple[str, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
     chance: Chance | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})

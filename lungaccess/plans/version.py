@@ -1,8 +1,10 @@
-"""The version of the software that plans and results state."""
+"""The version of the software that plans and results state, and what its arithmetic was compiled from."""
 
 from __future__ import annotations
 
 from functools import cache
+
+from anatomy.machine_code.sources import kernel_digest
 
 
 @cache
@@ -14,3 +16,8 @@ def software_version() -> str:
         return version("lungaccess")
     except PackageNotFoundError:
         return "unknown"
+
+
+def software_kernels() -> str:
+    """Return the digest of the kernels that run here: the same version may have others, in a checkout."""
+    return kernel_digest()

@@ -15,6 +15,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.files import require_writable_folder
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
+from anatomy.machine_code.sources import kernel_digest
 from anatomy.records import frozen_record, frozen_value
 from anatomy.typed import Bool
 from lungaccess.breathing.window import require_motion
@@ -350,7 +351,7 @@ def _key(
     lung: Lung, atlas: Atlas, spacing_mm: float, arcs: int, trees: int, phases: tuple[float, float] | None
 ) -> str:
     """Return a hash of everything that a map depends on."""
-    digest = hashlib.sha256(FORMAT)
+    digest = hashlib.sha256(FORMAT + kernel_digest().encode())
     digest.update(f"{atlas.lung.key} {system_fingerprint(atlas.system)} {atlas.with_fissures}".encode())
     digest.update(f"{spacing_mm!r} {arcs} {trees}".encode())
     if phases is not None:

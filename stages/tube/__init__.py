@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     )
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape import centreline
-    from stages.tube.shape_store import SHAPES_FORMAT, open_shapes
+    from stages.tube.shape_store import open_shapes, shapes_format
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
     from stages.tube.strain import channel_curvature_limit, straightening, transit_strain

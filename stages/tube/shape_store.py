@@ -10,12 +10,18 @@ from typing import Any
 import numpy as np
 
 from anatomy.kept_records import kept_record
+from anatomy.machine_code.sources import kernel_digest
 from anatomy.settings import to_mapping
 from stages.tube.device import Tube
 from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
 
 SHAPES_FORMAT = 2
 """Raise it when shapes change: stored ones of another format are made anew."""
+
+
+def shapes_format() -> str:
+    """Return what tells shapes of this version and these kernels from all others."""
+    return f"{SHAPES_FORMAT}-{kernel_digest('stages.tube')}"
 
 
 def open_shapes(
@@ -43,7 +49,7 @@ def open_shapes(
     }
     return kept_record(
         "shapes",
-        SHAPES_FORMAT,
+        shapes_format(),
         design,
         make=lambda: tube_shapes(tubes, limits, grid),
         parts=_parts,

@@ -11,9 +11,11 @@ import numpy as np
 
 from anatomy.build import lung_key
 from anatomy.patient import PatientImages
+from anatomy.store import folder_name
 
 SOURCES = {"airway.nii.gz": "a" * 64, "lung.nii.gz": "b" * 64}
 KEY = lung_key(SOURCES)
+FOLDER = folder_name(KEY)
 
 
 def no_reading() -> PatientImages:

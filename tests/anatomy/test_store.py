@@ -19,7 +19,7 @@ from anatomy.patient import PatientImages
 from anatomy.store import META, open_lung
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
 from tests.anatomy import toys
-from tests.anatomy.stored_toy import KEY, SOURCES, no_reading, require_same
+from tests.anatomy.stored_toy import FOLDER, KEY, SOURCES, no_reading, require_same
 from tests.anatomy.toys import toy
 
 
@@ -158,4 +158,4 @@ def test_where_the_cache_is(
 def test_the_default_cache_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("LUNGACCESS_CACHE", str(tmp_path / "deep" / "cache"))
     open_lung(SOURCES, toy)
-    assert (tmp_path / "deep" / "cache" / KEY / META).is_file()
+    assert (tmp_path / "deep" / "cache" / FOLDER / META).is_file()

@@ -23,10 +23,10 @@ from anatomy.checksums import DamagedCacheWarning
 from anatomy.errors import AnatomyError, FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
-from anatomy.store import META, open_lung
+from anatomy.store import META, folder_name, open_lung
 from anatomy.unfinished import filled_folder
 from tests.anatomy import toys
-from tests.anatomy.stored_toy import KEY, SOURCES, no_reading, require_same
+from tests.anatomy.stored_toy import FOLDER, KEY, SOURCES, no_reading, require_same
 from tests.anatomy.toys import toy
 
 
@@ -79,7 +79,7 @@ def _set_meta(**values: Any) -> Callable[[Path], None]:
 def test_damage_is_repaired(
     cache: Path, name: str, damage: Callable[[Path], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    damage(cache / KEY / name)
+    damage(cache / FOLDER / name)
     calls: list[int] = []
 
     def read() -> PatientImages:
@@ -89,7 +89,7 @@ def test_damage_is_repaired(
     lung = open_lung(SOURCES, read, cache=cache)
     assert calls == [1]
     require_same(lung, open_lung(SOURCES, no_reading, cache=cache))
-    assert [path.name for path in cache.iterdir()] == [KEY]
+    assert [path.name for path in cache.iterdir()] == [FOLDER]
 
 
 def _shift_starts(folder: Path) -> None:
@@ -116,12 +116,12 @@ def _become_another(folder: Path) -> None:
     other = {"lung.nii.gz": "f" * 64}
     open_lung(other, lambda: toy(nodules=None), cache=folder.parent)
     shutil.rmtree(folder)
-    (folder.parent / lung_key(other)).rename(folder)
+    (folder.parent / folder_name(lung_key(other))).rename(folder)
 
 
 @pytest.mark.parametrize("change", [_shift_starts, _open_way, _shift_tree, _become_another])
 def test_what_was_changed_is_made_again_with_a_warning(cache: Path, change: Callable[[Path], None]) -> None:
-    change(cache / KEY)
+    change(cache / FOLDER)
     with pytest.warns(DamagedCacheWarning, match="made again"):
         lung = open_lung(SOURCES, toy, cache=cache)
     require_same(lung, build_lung(toy(), key=KEY))
@@ -198,7 +198,7 @@ def test_a_killed_build_is_not_taken_for_a_lung(tmp_path: Path) -> None:
     assert left.name.startswith(".building-")
     assert (left / "labels.npy").is_file()
     assert open_lung(SOURCES, toy, cache=tmp_path).labels.any()
-    assert [path.name for path in tmp_path.iterdir()] == [KEY], "what was left is gone"
+    assert [path.name for path in tmp_path.iterdir()] == [FOLDER], "what was left is gone"
 
 
 def test_two_builds_at_once_end_with_one_lung(tmp_path: Path) -> None:
@@ -211,7 +211,7 @@ def test_two_builds_at_once_end_with_one_lung(tmp_path: Path) -> None:
 
     outer = open_lung(SOURCES, read, cache=tmp_path)
     require_same(outer, inner[0])
-    assert [path.name for path in tmp_path.iterdir()] == [KEY]
+    assert [path.name for path in tmp_path.iterdir()] == [FOLDER]
 
 
 def test_the_other_process_may_win_at_the_last_moment(
@@ -222,13 +222,13 @@ def test_the_other_process_may_win_at_the_last_moment(
     rename = os.replace
 
     def slow(source: Path, target: Path) -> None:
-        shutil.copytree(cache / KEY, late / KEY)
+        shutil.copytree(cache / FOLDER, late / FOLDER)
         rename(source, target)
 
     monkeypatch.setattr(store.os, "replace", slow)
     lung = open_lung(SOURCES, toy, cache=late)
     require_same(lung, open_lung(SOURCES, no_reading, cache=cache))
-    assert [path.name for path in late.iterdir()] == [KEY]
+    assert [path.name for path in late.iterdir()] == [FOLDER]
 
 
 def test_a_mapped_lung_outlives_its_folder(cache: Path) -> None:

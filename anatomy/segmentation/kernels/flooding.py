@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 
 HALF, INFINITE = np.float32(0.5), np.float32(np.inf)
 
@@ -40,7 +39,7 @@ def _pop(heap):
     return least
 
 
-@njit(cache=True)
+@kernel()
 def flood(labels, cost):
     """Give every voxel of 0 the label from which the way to it costs least, in place.
 
@@ -81,7 +80,7 @@ def flood(labels, cost):
                 _push(heap, (total, np.int64(near)))
 
 
-@njit(cache=True)
+@kernel()
 def diffuse(share, free, along_i, along_j, along_k, rounds, relaxation):
     """Bring shares nearer to their steady state by successive over-relaxation, in place.
 

@@ -7,10 +7,9 @@ or might are looked at.  `state` is uint8: FREE, LUMEN, BANNED, or the mark of a
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import merged_kernel
+from anatomy.kernels.compiling import kernel, merged_kernel
 from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.segmentation.kernels.states import BANNED, FREE, LUMEN
 
@@ -33,7 +32,7 @@ REPEATS = 8
 """How often a piece is grown anew around the leaks that were cut out of it."""
 
 
-@numba.njit(cache=True)
+@kernel()
 def touches_lumen(state, near, at):
     """Tell whether a neighbour is lumen."""
     for d in near:
@@ -42,7 +41,7 @@ def touches_lumen(state, near, at):
     return False
 
 
-@numba.njit(cache=True)
+@kernel()
 def flood(depth, state, near, start, level, mark, front_factor, front_slack, queue, parent, layer_ends):
     """Grow one piece at a level from a voxel beside the lumen.
 
@@ -93,7 +92,7 @@ def flood(depth, state, near, start, level, mark, front_factor, front_slack, que
     return tail, layer, False
 
 
-@numba.njit(cache=True)
+@kernel()
 def rings_of(state, shape, mark, queue, size):
     """Return how many rings a piece has, less the hollows in it: one less its Euler characteristic.
 
@@ -200,7 +199,7 @@ def ban_pockets(hu, state, near, size, mark, wide, rim, dark_hu, queue, parent, 
     return banned
 
 
-@numba.njit(cache=True)
+@kernel()
 def grow_airway(
     depth,
     hu,
@@ -320,7 +319,7 @@ def grow_airway(
     return count, undone
 
 
-@numba.njit(cache=True)
+@kernel()
 def join(depth, state, near, size, floor, skin_share, queue, lumen, count):
     """Make a piece lumen, with the voxels beside it that are nearly as deep; return the new count."""
     for q in range(size):

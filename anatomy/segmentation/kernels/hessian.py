@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.segmentation.kernels.eigenvalues import eigenvalues
 
 ZERO, ONE, HALF, QUARTER, TWO = (np.float64(x) for x in (0.0, 1.0, 0.5, 0.25, 2.0))
@@ -49,7 +48,7 @@ def _vesselness(low, middle, high, strength, settings):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def add_vesselness(image, first, last, n_scales, scale, factors, settings, best):
     """Raise `best` to R(x; sigma) in the planes `first <= k < last`, where more than `scale` scales apply.
 
@@ -83,7 +82,7 @@ def add_vesselness(image, first, last, n_scales, scale, factors, settings, best)
                     best[k, j, i] = max(best[k, j, i], response)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def add_large_response(
     image, hu, first, last, n_scales, scale, factors, reference, brightest, best, at_scale
 ):

@@ -6,11 +6,12 @@ neighbours.  What lies beyond the border takes no part in a minimum or maximum.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from anatomy.kernels.compiling import kernel
 
-@numba.njit(cache=True, nogil=True)
+
+@kernel(nogil=True)
 def smooth_slice(image, out):
     """Write the rounded mean of every pixel and its neighbours within the slice."""
     rows, columns = image.shape
@@ -36,7 +37,7 @@ def smooth_slice(image, out):
 def _over_neighbours(extreme):
     """Return the kernel that writes the extreme, `max` or `min`, of every pixel and its neighbours."""
 
-    @numba.njit(cache=True, nogil=True)
+    @kernel(nogil=True)
     def filter_slice(image, out):
         rows, columns = image.shape
         for r in range(rows):
@@ -58,7 +59,7 @@ dilate_slice = _over_neighbours(max)
 erode_slice = _over_neighbours(min)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def reconstruct_slice(marker, mask, queue, waiting):
     """Lower `marker` in place to its reconstruction by erosion above `mask`.
 
@@ -113,7 +114,7 @@ def reconstruct_slice(marker, mask, queue, waiting):
                     tail = tail + 1 if tail + 1 < size else 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def depth_slice(image, scale, work, queue, waiting, out):
     """Write how much higher the closing of `image` by `scale` diamonds, reconstructed, lies than `image`.
 

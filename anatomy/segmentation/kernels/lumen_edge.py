@@ -8,10 +8,9 @@ is listed once, when its state changes, so a list as long as the image has room 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import merged_kernel
+from anatomy.kernels.compiling import kernel, merged_kernel
 from anatomy.segmentation.kernels.states import LUMEN
 
 WALL = np.uint8(2)
@@ -37,7 +36,7 @@ def closing_at(hu, state, at, row):
     return least
 
 
-@numba.njit(cache=True)
+@kernel()
 def cross(n, row):
     """Return the flat step to a pixel (0) or one of its four neighbours (1 to 4) in a slice."""
     if n == 0:
@@ -49,7 +48,7 @@ def cross(n, row):
     return row if n == 3 else -row
 
 
-@numba.njit(cache=True)
+@kernel()
 def refine_edge(hu, state, faces, row, least_depth, lung_hu, lumen, count):
     """Add the voxels beside the lumen that lie on its side of the wall's inner surface.
 
@@ -102,7 +101,7 @@ def refine_edge(hu, state, faces, row, least_depth, lung_hu, lumen, count):
     return count
 
 
-@numba.njit(cache=True)
+@kernel()
 def fill_gaps(hu, state, shape, reach, dark_hu, lumen, count):
     """Add to the lumen what lies between two of its voxels along an axis and is as dark as air on average.
 
@@ -134,7 +133,7 @@ def fill_gaps(hu, state, shape, reach, dark_hu, lumen, count):
     return count
 
 
-@numba.njit(cache=True)
+@kernel()
 def join_corners(hu, state, shape, lumen, count):
     """Add the darkest voxels between voxels of the lumen that touch by an edge or corner alone.
 
@@ -188,7 +187,7 @@ def _corner_path(hu, state, here, steps, lumen, count):
     return count
 
 
-@numba.njit(cache=True)
+@kernel()
 def grow_wall(hu, state, near, lumen, count, layers, least_hu, greatest_difference, wall):
     """Mark the wall: all neighbours of the lumen, then layers of voxels like those already in it.
 

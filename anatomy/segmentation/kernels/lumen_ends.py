@@ -7,10 +7,9 @@ float64.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.segmentation.kernels.states import LUMEN
 
 BACK_MM = np.array([3.0, 6.0])
@@ -27,7 +26,7 @@ THIN_MM2 = 5.0
 """Only where the lumen has no larger section: beside wide airways lie corridors between vessels."""
 
 
-@numba.njit(cache=True)
+@kernel()
 def walk_lumen(state, near, queue, known, parent, far):
     """Walk through the lumen from the first `known` voxels of `queue`; all lists are as long as the lumen.
 
@@ -98,7 +97,7 @@ def heading_between(begin, end, heading):
     return norm > 0.0
 
 
-@numba.njit(cache=True)
+@kernel()
 def find_ends(far, lung, queue, known, count, parent, reach, spacing_mm, starts, headings, others):
     """List the ends of the lumen in the lung, and places behind them.
 

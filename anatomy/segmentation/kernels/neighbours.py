@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from anatomy.kernels.compiling import kernel
 
 
-@njit(cache=True)
+@kernel()
 def box_offsets(shape, reach):
     """Return the flat offsets of all voxels of a box of `2 reach + 1` but its middle, `(N,)` int64."""
     side = 2 * reach + 1
@@ -21,7 +22,7 @@ def box_offsets(shape, reach):
     return out
 
 
-@njit(cache=True)
+@kernel()
 def face_offsets(shape):
     """Return the flat offsets of the six voxels that share a face with a voxel, `(6,)` int64."""
     out = np.zeros(6, dtype=np.int64)
@@ -33,7 +34,7 @@ def face_offsets(shape):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def take_greatest_neighbour(values, first, last, where, raised):
     """Fill `raised` with the greatest of a voxel and its 26 neighbours in the planes `first <= k < last`.
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.segmentation.kernels.eigenvalues import eigenvalues
 from anatomy.segmentation.kernels.hessian import second_differences
 
@@ -35,7 +34,7 @@ def _eigenvector(xx, yy, zz, xy, xz, yz, value):
     return best[0] * scale, best[1] * scale, best[2] * scale
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def plate_responses(image, where, strength, normal):
     """Fill strength and normal of bright plates at the voxels of `where`.
 
@@ -69,7 +68,7 @@ def plate_responses(image, where, strength, normal):
                     normal[axis, k, j, i] = along[axis]
 
 
-@njit(cache=True)
+@kernel()
 def grow_sheets(response, normal, least, cosine, sheet, stack):
     """Number the sheets from 1 on and return their sizes in voxels, that of number 0 being 0.
 

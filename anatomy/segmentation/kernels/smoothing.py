@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 
 
 @inner_kernel
@@ -41,7 +40,7 @@ def _along_row(padded, weights, out):
             out[i] += weight * (before[i] + after[i])
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def smooth_in_planes(image, first, last, row_weights, column_weights):
     """Smooth the planes `first <= k < last` of `image` `(nk, nj, ni)` float32 along i, then along j.
 
@@ -62,7 +61,7 @@ def smooth_in_planes(image, first, last, row_weights, column_weights):
             _weighted_rows(rows, column_weights, j, image[k, j])
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def smooth_across_planes(image, first, last, weights):
     """Smooth the rows `first <= j < last` of all planes of `image` `(nk, nj, ni)` float32 along k."""
     nk, ni = image.shape[0], image.shape[2]

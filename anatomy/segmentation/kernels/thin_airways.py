@@ -7,10 +7,9 @@ float64.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.segmentation.kernels.lumen_ends import heading_between
 from anatomy.segmentation.kernels.states import LUMEN
 from anatomy.segmentation.kernels.tube_stretch import ANGLES, END_COS, NOTHING, best_stretch
@@ -104,7 +103,7 @@ def draw(path, size, state, per_mm, spacing_mm, lumen, count):
     return count
 
 
-@numba.njit(cache=True)
+@kernel()
 def follow_tubes(
     hu, state, lung, per_mm, spacing_mm, directions, radii_mm, least_contrast, least_ring_hu,
     starts, headings, others, n_starts, lumen, count,

@@ -11,10 +11,9 @@ vessels has a dark side.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.segmentation.kernels.states import BANNED, LUMEN
 
 STATIONS = 8
@@ -209,7 +208,7 @@ def best_stretch(
     return best, half, mean
 
 
-@numba.njit(cache=True)
+@kernel()
 def best_contrasts(hu, state, lung, per_mm, points, headings, directions, radii_mm, out):
     """Write the contrast of the best stretch from each point in the cone about its heading, `(N, 3)` each."""
     work = np.zeros((8, ANGLES))
@@ -221,7 +220,7 @@ def best_contrasts(hu, state, lung, per_mm, points, headings, directions, radii_
         )[0]  # fmt: skip
 
 
-@numba.njit(cache=True)
+@kernel()
 def places_beside_bright(smooth, state, lung, stride, distance, bright_hu, out):
     """List voxels of the lung that lie beside something bright, far from the lumen, `(N, 3)` int64.
 

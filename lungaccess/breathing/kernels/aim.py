@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from anatomy.kernels.compiling import kernel
 from lungaccess.breathing.kernels.rigid import rate_bounds, turned
 
 
-@numba.njit(cache=True)
+@kernel()
 def _places(rigid, target, moves, begin, end, out):
     """Fill `out` (K, 3) with the places of the target in the frame of the devices, from share to share."""
     rotation, rate = np.zeros((3, 3)), np.zeros((3, 3))
@@ -29,7 +29,7 @@ def _places(rigid, target, moves, begin, end, out):
                 out[n, a] += rotation[b, a] * lever
 
 
-@numba.njit(cache=True)
+@kernel()
 def aim_between(rigid, target, moves, begin, end, samples, aim):
     """Fill `aim` (3,) with the middle of the two farthest places; return half their distance, and the miss.
 
@@ -65,7 +65,7 @@ def aim_between(rigid, target, moves, begin, end, samples, aim):
     return 0.5 * math.sqrt(max(most, 0.0)), math.sqrt(miss)
 
 
-@numba.njit(cache=True)
+@kernel()
 def most_shares(rigid, target, moves, begin, end, samples, tolerance):
     """Return a length of shares that no end of the devices exceeds with a miss within the tolerance.
 

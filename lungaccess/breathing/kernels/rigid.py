@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.typed import Float
 
 POLAR_STEPS = 30
@@ -46,7 +45,7 @@ def inverse_transposed(m, out):
             out[r, c] /= det
 
 
-@numba.njit(cache=True)
+@kernel()
 def turned(gradient, share, rotation, rate):
     """Fill `rotation` (3, 3) with R and `rate` (3, 3) with dR / dshare."""
     f = np.zeros((3, 3))
@@ -86,7 +85,7 @@ def turned(gradient, share, rotation, rate):
         rate[r, 2] = rotation[r, 0] * wy - rotation[r, 1] * wx
 
 
-@numba.njit(cache=True)
+@kernel()
 def rate_bounds(gradient, share):
     """Return bounds of the norms of dR / dshare and of its derivative, for all shares up to `share` in size.
 
@@ -107,7 +106,7 @@ def rate_bounds(gradient, share):
     return w, w * w + change
 
 
-@numba.njit(cache=True)
+@kernel()
 def carried(rigid, share, rotation, rate, x, y, z):
     """Return where a point of the devices is, and its velocity in mm a share."""
     cx, cy, cz = rigid.centre

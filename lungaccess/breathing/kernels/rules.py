@@ -12,10 +12,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at, pulled_back, stretch_near
@@ -90,7 +89,7 @@ class Stretch(NamedTuple):
     most_change: float
 
 
-@numba.njit(cache=True)
+@kernel()
 def place(breath, rigid, stretch, point, guess):
     """Fill `guess` (3,) with the place of the masks where a point of the devices is in the middle phase.
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import merged_kernel
+from anatomy.kernels.compiling import kernel, merged_kernel
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, OUTSIDE
 from anatomy.kernels.motion import gradient_at
 from lungaccess.breathing.kernels.rigid import inverse_transposed
@@ -23,7 +22,7 @@ SWEEPS = 4
 """Of coordinate descent for the nearest point of a deformed box; the bound holds wherever it stops."""
 
 
-@numba.njit(cache=True, inline="always")
+@kernel(inline="always")
 def _across(d, fb, fc):
     """Return the value between those of four edges at fractions across them."""
     return (1.0 - fc) * ((1.0 - fb) * d[0] + fb * d[1]) + fc * ((1.0 - fb) * d[2] + fb * d[3])
@@ -50,7 +49,7 @@ def _fill_column_changes(nodes, step, i, j, k, ends, own, edges, out):
             out[2, corner] += (_across(edges[2], ends[0, u], ends[1, v]) - own[row, 2]) ** 2
 
 
-@numba.njit(cache=True, inline="always")
+@kernel(inline="always")
 def _cells_of(low, width, first, step, count):
     """Return a coordinate in cells, and the first and last cell of a stretch of `width` cells from there."""
     at = (low - first) / step

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at
@@ -188,7 +187,7 @@ def _row_of(sections, n):
     return 0
 
 
-@numba.njit(cache=True)
+@kernel()
 def refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect, done):
     """Return a point at which a stretch is not proved clear, -1 if it is, the reason, and the next `done`.
 
@@ -267,7 +266,7 @@ def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
     return best < BROKEN_MM, n
 
 
-@numba.njit(cache=True)
+@kernel()
 def divide(
     tissue,
     breath,

@@ -72,12 +72,14 @@ def clear(*, output: PatientOptions = PatientOptions()) -> ExitCode:
 
 
 def _entries(folder: Path) -> tuple[CacheEntry, ...]:
-    from anatomy.build import FORMAT
     from anatomy.cache_entries import cache_entries
-    from lungaccess.coupled.atlas_store import FORMAT as ATLAS_FORMAT
-    from stages.tube import SHAPES_FORMAT
+    from anatomy.store import stored_format
+    from lungaccess.coupled.atlas_store import atlas_format
+    from stages.tube import shapes_format
 
-    return cache_entries(folder, {"anatomy": FORMAT, "atlas": ATLAS_FORMAT, "shapes": SHAPES_FORMAT})
+    return cache_entries(
+        folder, {"anatomy": stored_format(), "atlas": atlas_format(), "shapes": shapes_format()}
+    )
 
 
 def _remove(entries: Iterable[CacheEntry], output: PatientOptions) -> ExitCode:

@@ -33,7 +33,6 @@ def doctor(*, cache: Path | None = None, output: OutputOptions = OutputOptions()
 
 def _show(health: Health) -> None:
     kernels = health.kernels
-    folders = kernels.folders[:1] if len(kernels.folders) == 1 else ("__pycache__ beside each kernel",)
     rows: list[terminal.Row] = [
         ("lungaccess", health.version),
         ("Python", health.python),
@@ -44,7 +43,8 @@ def _show(health: Health) -> None:
             "compiled kernels",
             f"{kernels.state}: {kernels.warm} of {kernels.modules} modules, {_mib(kernels.size_bytes)}",
         ),
-        ("kept in", ", ".join(folders)),
+        ("kept in", ", ".join(kernels.folders)),
+        ("digest of their sources", kernels.digest),
         ("prepared anatomies", _folder(health.cache)),
         ("data for tests", "LUNGACCESS_DATA is not set" if health.data is None else _folder(health.data)),
     ]

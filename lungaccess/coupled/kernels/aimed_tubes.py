@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from lungaccess.coupled.kernels.candidate import why_refused
 from stages.needle.kernels import cost_of_arc
 from stages.tube.kernels import (
@@ -95,7 +94,7 @@ def _aimed(constants, design, near, shape, shapes, n, base, target, outer, inner
     return ACCEPTED, rotation, shape.joints[design.lengths.shape[0] - 1], shape.joints[0]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def aim_tubes(
     tube,
     obstacles,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from lungaccess.coupled.kernels.cost_bound import bound_box
 from lungaccess.coupled.kernels.deployment_box import (
     ACROSS,
@@ -117,7 +116,7 @@ def _halve(parent, child, sides):
     return 2, side >= TIP_SIDES
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def begin_queue(environment, tubes, insertions, tips, rates, target, longest, limit, first, last, state):
     """Let boxes wait that hold all deployments whose bound may be below a limit, from tips `first` to `last`.
 
@@ -177,7 +176,7 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def divide(environment, tubes, insertions, tips, rates, target, most, limit, state):
     """Divide the box of the lowest bound, and so on.
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import most_distance
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
 
@@ -86,7 +85,7 @@ def _reduce(levels, shell):
                 above[shell, i, j] = least
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def fill_shell(field, geometry, weights, off, limit, togo, k, behind, beyond, part, parts):
     """Fill each `parts`-th row of cells of a shell of a `CostToGo`, when the shells before it are filled.
 
@@ -165,7 +164,7 @@ def fill_shell(field, geometry, weights, off, limit, togo, k, behind, beyond, pa
     return some
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def end_shell(togo, k):
     """Fill the higher levels of a shell whose cells are filled; from now on it counts."""
     _reduce(togo.levels, k)

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import distance_estimate
 from stages.needle.kernels import CLEARANCE_FLOOR_MM, blocker_on_arc, cost_of_arc, single_arc_exceeds
 
@@ -51,7 +50,7 @@ def _cost_bound(needle, begin_mm, end_mm, length):
     return max(cost, objective.least_rate * length)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def cost_bounds(needle, positions, lengths, target, bounds):
     """Fill `bounds` (N,) with the least cost of any path from `positions` (N, 3) to the target.
 
@@ -63,7 +62,7 @@ def cost_bounds(needle, positions, lengths, target, bounds):
         bounds[n] = _cost_bound(needle, begin, end, lengths[n])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, blockers, costs):
     """Evaluate the single arc from each pose to the target, and prove those whose cost is low enough.
 

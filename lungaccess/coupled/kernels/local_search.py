@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.random import uniform
 from lungaccess.coupled.kernels.candidate import INNER, OUTER, ROTATION, SCOPE_POSE, validated_cost
 from stages.tube.kernels import N_TRACE, take_member, take_over
@@ -114,7 +113,7 @@ def _vary(design, x, vias, count, start, target, state):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, state):
     """Improve a choice by a stochastic local search: vary it at random and keep what is cheaper.
 
@@ -195,7 +194,7 @@ def _draw(design, near, shapes, row, numbers, spreads, x, state):
             x[OUTER + n + m] += spreads[0] * (2.0 * uniform(state) - 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def sample_deployments(
     tube,
     needle,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numba
-
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 
 
 @inner_kernel
@@ -24,7 +22,7 @@ def _strays(one, other, square):
     return False
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def choose_separated(lines, order, separation_mm, chosen):
     """Choose lines one after the other, each separated from all chosen before.
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
-
-from anatomy.kernels.compiling import borrowing_kernel
+from anatomy.kernels.compiling import borrowing_kernel, kernel
 from anatomy.kernels.field import distance_bound
 from anatomy.typed import Float, UInt16
 
@@ -192,7 +190,7 @@ def _reach(sizes, along, off, normal, sums):
     return min(max((most + sizes.aside - off) / math.sqrt(max(across, SMALL)), -CAP), CAP)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def find_spread(around, sizes, tips, positions, tangents, exits, lengths, target, found):
     """Note what the errors do to the direct arcs from N deployments to a target.
 

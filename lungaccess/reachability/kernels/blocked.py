@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
 from lungaccess.reachability.kernels.deployment_boxes import HALF, INNER, OUTER, SPARE_MM, heading, sample_of
@@ -89,7 +88,7 @@ def _is_deep(depth, depth_geometry, not_lumen, geometry, place, needed):
     return wall == 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def deep_enough(depth, depth_geometry, not_lumen, geometry, points, needed, out):
     """Tell of points `(N, P, 3)`, LPS mm, where the lumen is so deep; `out` (N, P) bool receives it."""
     for n in range(points.shape[0]):

@@ -12,10 +12,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from lungaccess.reachability.kernels.blocked import (
     no_tip_near,
     tips_blocked,
@@ -232,14 +231,14 @@ def _measure(box):
     return product
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def measures(boxes, out):
     """Write the measure of each of N boxes to `out` (N,)."""
     for n in range(len(boxes)):
         out[n] = _measure(boxes[n])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def first_boxes(tubes, longest, wide, places, boxes):
     """Write the boxes that hold everything of a piece of the airway: up to the curved length, and beyond.
 
@@ -280,7 +279,7 @@ def first_boxes(tubes, longest, wide, places, boxes):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def divide(environment, tubes, insertions, pieces, boxes, owners, greatest, parts, part_owners):
     """Halve the boxes that are larger than `greatest`, and keep the halves that may hold a deployment.
 
@@ -332,7 +331,7 @@ def _copy(box, to):
         to[n] = box[n]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def rule_out(
     environment, tubes, insertions, limits, target, pieces, boxes, owners, rows, most, to_the_end, found
 ):

@@ -185,6 +185,7 @@ def provenance_section(plan: Plan, lung: Lung) -> str:
     """Return where a plan came from."""
     rows: list[tuple[str, object]] = [
         ("plan made with lungaccess", plan.software_version),
+        ("kernels", plan.kernels or "not stated"),
         ("digest of the plan", plan.digest),
         ("patient", plan.patient_name),
         ("lung", plan.lung_key),

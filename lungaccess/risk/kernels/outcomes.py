@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import borrowing_kernel
+from anatomy.kernels.compiling import borrowing_kernel, kernel
 from anatomy.typed import Bool, Float, UInt16
 from lungaccess.risk.kernels.chain import (
     ROTATION,
@@ -81,7 +80,7 @@ def _touched(obstacles, judging, start, pieces, n_tube, enough):
     return follow(obstacles, lumen, judging.mediastinal, start, pieces, n_tube, judging.exempt_mm, enough)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def find_successes(devices, errors, which, obstacles, judging, radius_mm, forbidden, first, done):
     """Tell which deviated plans end within a radius of the target and touch nothing forbidden.
 
@@ -111,7 +110,7 @@ def find_successes(devices, errors, which, obstacles, judging, radius_mm, forbid
             done[m] = _touched(obstacles, judging, start, pieces, devices.n_tube, forbidden) & forbidden == 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def find_outcomes(devices, errors, which, obstacles, judging, first, touched, miss_mm):
     """Note all that deviated plans touch, `(N,)` flags, and how far they miss, `(N,)` mm.
 
@@ -126,21 +125,21 @@ def find_outcomes(devices, errors, which, obstacles, judging, first, touched, mi
         touched[m] = _touched(obstacles, judging, start, pieces, devices.n_tube, 0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def find_starts(devices, errors, judging, starts):
     """Fill the starts `(N, 9)` of deviated plans, see `deviation`."""
     for n in range(starts.shape[0]):
         _set_start(devices, judging, errors, n, starts[n])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def find_pieces(devices, errors, which, pieces):
     """Fill the pieces `(N, P, 4)` of deviated plans, see `deviation`."""
     for n in range(pieces.shape[0]):
         _set_pieces(devices, errors, which, n, pieces[n])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def follow_chains(starts, pieces, n_tube, obstacles, judging, touched, ends):
     """Note what chains touch, `(N,)` flags, and where they end, `(N, 3)`; see `deviation.follow`."""
     for n in range(starts.shape[0]):

@@ -14,14 +14,12 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import any_normal, arc_to_point
-from anatomy.kernels.compiling import merged_kernel
+from anatomy.kernels.compiling import kernel, merged_kernel
 from stages.needle.kernels.limits import TINY
 
 
-@numba.njit(cache=True)
+@kernel()
 def seen_from(pose, q):
     """Return how far aside of a pose (at least 0) and how far ahead of it a point lies."""
     dx = q[0] - pose[0]
@@ -34,7 +32,7 @@ def seen_from(pose, q):
     return math.sqrt(rx * rx + ry * ry + rz * rz), h
 
 
-@numba.njit(cache=True)
+@kernel()
 def arc_and_straight(rho, h, kappa):
     """Return turn (rad, below 2 pi) and straight length of the path CS to a point, (inf, inf) if none.
 
@@ -54,7 +52,7 @@ def arc_and_straight(rho, h, kappa):
     return max(turn, 0.0), straight
 
 
-@numba.njit(cache=True)
+@kernel()
 def two_arcs(rho, h, kappa):
     """Return the turns (rad) of the shorter path CC to a point: away from it, then towards it.
 
@@ -87,7 +85,7 @@ def two_arcs(rho, h, kappa):
     return best_first, best_second
 
 
-@numba.njit(cache=True)
+@kernel()
 def shortest_path(rho, h, kappa, max_angle, max_turn):
     """Return the length of the shortest path CS or CC to a point within two turning limits, inf if none.
 
@@ -106,7 +104,7 @@ def shortest_path(rho, h, kappa, max_angle, max_turn):
     return (away + back) / kappa
 
 
-@numba.njit(cache=True)
+@kernel()
 def nearest_turn(rho, h, kappa):
     """Return the turn (rad) at which the arc of radius 1 / kappa passes a point nearest, and how near."""
     radius = 1.0 / kappa
@@ -114,7 +112,7 @@ def nearest_turn(rho, h, kappa):
     return max(turn, 0.0), abs(radius - math.hypot(radius - rho, h)) if turn >= 0.0 else math.hypot(rho, h)
 
 
-@numba.njit(cache=True)
+@kernel()
 def single_arc_exceeds(limits, bend, length, turn):
     """Tell whether an arc that is the whole path breaks a limit of curvature, length or turning."""
     return (
@@ -124,7 +122,7 @@ def single_arc_exceeds(limits, bend, length, turn):
     )
 
 
-@numba.njit(cache=True)
+@kernel()
 def least_cosine(forward, aside, turn):
     """Return the least value of `forward cos a + aside sin a` for `a` from 0 to `turn`.
 
@@ -137,7 +135,7 @@ def least_cosine(forward, aside, turn):
     return max(least, -1.0)
 
 
-@numba.njit(cache=True)
+@kernel()
 def shortest_legs(pose, q, kappa):
     """Return the shortest path from a pose to a point as two legs: bend and length of each.
 

@@ -11,11 +11,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import SMALL_ANGLE, point_on_arc
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_estimate
 from anatomy.typed import Float32
 from stages.needle.kernels.limits import TINY
@@ -54,7 +53,7 @@ class ObjectiveArrays(NamedTuple):
     cost_map: Float32
 
 
-@numba.njit(cache=True)
+@kernel()
 def inverse_clearance_on_arc(obstacles, step, pose, bend, length):
     """Estimate the integral of 1 / clearance along an arc [Kuntz2015, eq. 1] by the trapezoid rule."""
     # Fields of a tuple are taken before a loop: each access to an array counts its references.
@@ -79,7 +78,7 @@ def _coordinates(geometry, pose, bend, s):
     )
 
 
-@numba.njit(cache=True)
+@kernel()
 def _directions(geometry, x, y, z):
     """Return a direction in voxels per mm."""
     return (
@@ -143,7 +142,7 @@ def _most_voxels(geometry, bend, length):
     return int(math.ceil(faces + 3.0 * pieces)) + 1
 
 
-@numba.njit(cache=True)
+@kernel()
 def voxels_on_arc(shape, geometry, pose, bend, length):
     """Return the voxels that an arc crosses, in its order.
 
@@ -230,7 +229,7 @@ def _sort(values):
             values[at] = value
 
 
-@numba.njit(cache=True)
+@kernel()
 def map_costs_on_arc(costs, geometry, pose, bend, length, first):
     """Return the line integral of the cost map along an arc, and its sum over the voxels crossed.
 
@@ -260,7 +259,7 @@ def map_costs_on_arc(costs, geometry, pose, bend, length, first):
     return integral, total
 
 
-@numba.njit(cache=True)
+@kernel()
 def cost_of_arc(obstacles, objective, step, pose, bend, length, first):
     """Return the weighted cost of an arc; `first` tells whether its path starts with it."""
     total = objective.length * length

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, two_arcs
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 
@@ -55,7 +53,7 @@ def least_turn_into_ball(rho, h, kappa, tolerance):
     return turn if turn >= -TINY else turn + 2.0 * math.pi
 
 
-@numba.njit(cache=True)
+@kernel()
 def least_length(rho, h, limits, cosine, turn_left):
     """Return a length below which no path leads into the ball, inf if none does within the turning limits.
 
@@ -102,7 +100,7 @@ def least_length(rho, h, limits, cosine, turn_left):
     return length if least_turn_into_ball(rho, h, kappa, tolerance) <= allowed + TINY else math.inf
 
 
-@numba.njit(cache=True)
+@kernel()
 def workspace_length(rho, h, limits):
     """Return a length below which no path within all limits leads into the ball, inf outside the workspace.
 
@@ -112,7 +110,7 @@ def workspace_length(rho, h, limits):
     return length if length <= limits.max_length_mm else math.inf
 
 
-@numba.njit(cache=True)
+@kernel()
 def least_length_from(pose, goal, limits, reference, turn_left):
     """Return `least_length` for a tip on its way, inf also where its displacement would lean too far.
 
@@ -132,7 +130,7 @@ def least_length_from(pose, goal, limits, reference, turn_left):
     return least_length(rho, h, limits, cosine, turn_left)
 
 
-@numba.njit(cache=True)
+@kernel()
 def shortest_into_ball(pose, goal, limits):
     """Return the shortest path from a pose into the ball as two legs, and how far the second leads on.
 
@@ -162,7 +160,7 @@ def shortest_into_ball(pose, goal, limits):
     return first, first_length, second, second_length, ahead
 
 
-@numba.njit(cache=True)
+@kernel()
 def single_into_ball(pose, goal, limits):
     """Return the single arc towards the goal as far as the ball, bend and length.
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import distance_bound
 from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs
 from stages.needle.kernels.proof import exact_gap
@@ -32,7 +30,7 @@ def _put(found, x, y, z, inserted, distance, needed):
     found[INSERTED], found[DISTANCE], found[NEEDED] = inserted, distance, needed
 
 
-@numba.njit(cache=True)
+@kernel()
 def blocked_start(obstacles, limits, pose, inserted, longest, branch, found):
     """Look for a place ahead of a start that no path can pass: 0 if there is none, else the label there.
 
@@ -74,7 +72,7 @@ def _walk(obstacles, limits, pose, bend, length, inserted, branch, least, least_
     return least, least_label
 
 
-@numba.njit(cache=True)
+@kernel()
 def easiest_trial(obstacles, limits, pose, inserted, branch, goal, trials, state, trial, found):
     """Try the shortest path to a point and others by way of random points, without asking for clearance.
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import LUMEN
 from anatomy.typed import Float, Labels, UInt16
@@ -94,7 +93,7 @@ def kept_from_lumen(limits, inserted):
     return limits.radius_mm, 0.0
 
 
-@numba.njit(cache=True)
+@kernel()
 def exact_gap(obstacles, limits, inserted, x, y, z, branch):
     """Tell how far a needle may go on from a point where it is `inserted` mm long: the rule at the exit.
 
@@ -128,7 +127,7 @@ def exact_gap(obstacles, limits, inserted, x, y, z, branch):
     return gap, label, distance, needed
 
 
-@numba.njit(cache=True)
+@kernel()
 def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
     """Prove an arc clear of obstacles: 0 if it is, else the label of the voxel that is too near.
 

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY
 from stages.needle.kernels.connections import single_arc_exceeds
@@ -192,7 +191,7 @@ def _has_clearance(obstacles, limits, q, bits):
     return distance >= required
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def reach_by_arcs(
     obstacles, limits, starts, branches, order, mixed, points, visits, blocks, near, wanted, hints, kinds,
     found, entries

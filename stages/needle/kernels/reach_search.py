@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.reach_arcs import CLEARANCE, COST, SEARCHED, UNREACHED, least_clearance
@@ -50,7 +49,7 @@ def _record_path(obstacles, limits, nodes, parents, last, row):
     row[CLEARANCE] = least
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def reach_by_search(
     obstacles, limits, objective, starts, branches, order, points, trees, iterations, share, seeds,
     nodes, parents, picked, kinds, found, entries,

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import any_normal, arc_to_point
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
@@ -68,7 +67,7 @@ def sample_between(start, goal, limits, state):
     return (goal[0], goal[1], goal[2]), False
 
 
-@numba.njit(cache=True)
+@kernel()
 def _nearest(nodes, count, q, limits):
     """Return the node with the shortest single arc to a point, -1 if none may take it."""
     best = math.inf
@@ -111,7 +110,7 @@ def goal_from_root(obstacles, limits, objective, branch, goal, nodes, parents, c
     return count, count > 1, count > 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def grow_rrt(
     obstacles, limits, objective, branch, goal, nodes, parents, count, iterations, random_share, state, best
 ):

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import numba
-
 from anatomy.kernels.arcs import arc_to_point
+from anatomy.kernels.compiling import kernel
 from stages.needle.kernels.connections import seen_from, single_arc_exceeds
 from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.proof import blocker_on_arc
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def workspace_scan(positions, tangents, target, limits, lengths):
     """Fill `lengths` (N,) with the shortest path length from each pose to `target`, inf outside."""
     for n in range(positions.shape[0]):
@@ -21,7 +20,7 @@ def workspace_scan(positions, tangents, target, limits, lengths):
         lengths[n] = workspace_length(rho, h, limits)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def direct_arcs(obstacles, limits, positions, tangents, branches, target, blockers, costs):
     """Try the single arc from each pose to `target`.
 

@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import math
 
-import numba
-
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
 
@@ -26,7 +24,7 @@ ROUNDING_MM = 1e-6
 """Added to bounds, so that rounding excludes no pose."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def bound_bundles(positions, tangents, order, begins, bounds):
     """Fill `bounds` (B, 8); bundle `b` holds the poses `order[begins[b]:begins[b + 1]]`."""
     for b in range(bounds.shape[0]):
@@ -80,7 +78,7 @@ def _out_of_reach(bound, target, limits):
     return math.hypot(h, rho - radius) < radius - off
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def workspace_query(bounds, begins, order, positions, tangents, target, limits, found, lengths):
     """Write which poses have `target` in their workspace, and the shortest path lengths; return how many.
 

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
 from stages.needle.kernels.connections import least_cosine, seen_from
@@ -43,7 +42,7 @@ _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
 
 
-@numba.njit(cache=True)
+@kernel()
 def lay_stations(obstacles, limits, branch, start, points, arcs, stations):
     """Lay single arcs from a start through points and cut them into cells.
 
@@ -133,7 +132,7 @@ def _sine_share(share, angle):
     return share if angle < 1e-8 else math.sin(share * angle) / math.sin(angle)
 
 
-@numba.njit(cache=True)
+@kernel()
 def displacement(chord, half_turn, begin, end, offset, tilt):
     """Bound how far the shares `begin` to `end` of an arc to a fixed point move.
 
@@ -222,7 +221,7 @@ def _cell_kept(limits, branch, arcs, cell, offset, tilt, turned, miss):
     return cell[LUMEN_DISTANCE] - kept >= needed
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def largest_factor(limits, branch, arcs, stations, count, angle, offset, tilt):
     """Return the largest factor, at most 1, by which an offset and a tilt are proved together."""
     worst = np.zeros(1, dtype=np.int64)
@@ -240,7 +239,7 @@ def largest_factor(limits, branch, arcs, stations, count, angle, offset, tilt):
     return low
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def largest_tilts(limits, branch, arcs, stations, count, angle, offsets, tilts):
     """Fill `tilts` (K,) with the largest tilt in rad proved at rising `offsets` (K,); -1 where none is."""
     worst = np.zeros(1, dtype=np.int64)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import merged_kernel
+from anatomy.kernels.compiling import kernel, merged_kernel
 from anatomy.kernels.field import MIN_GAP_MM
 from stages.needle.kernels.connections import nearest_turn, seen_from, single_arc_exceeds
 from stages.needle.kernels.goal_ball import workspace_length
@@ -26,7 +25,7 @@ ROWS = ROWS_PER_STEP + 2
 _ROOT, _ONE, _TWO = np.int64(0), np.int64(1), np.int64(2)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def try_starts(
     obstacles, limits, objective, branch, positions, tangents, vias, goal, iterations, share, seed, nodes,
     parents, kinds,

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import any_normal, point_on_arc
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.needle.kernels.cost import map_costs_on_arc
 from stages.needle.kernels.limits import TINY
 from stages.needle.kernels.proof import blocker_on_arc
@@ -23,7 +22,7 @@ from stages.needle.kernels.proof import blocker_on_arc
 _FIRST = np.bool_(True)
 
 
-@numba.njit(cache=True)
+@kernel()
 def state_of(frame):
     """Return the state of a frame (4, 4)."""
     xx, yy, zz = frame[0, 0], frame[1, 1], frame[2, 2]
@@ -42,7 +41,7 @@ def state_of(frame):
     return frame[0, 3], frame[1, 3], frame[2, 3], *_unit(q)
 
 
-@numba.njit(cache=True)
+@kernel()
 def rolled(state, angle):
     """Return a state turned about its own third axis."""
     px, py, pz, x, y, z, w = state
@@ -50,13 +49,13 @@ def rolled(state, angle):
     return px, py, pz, x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s
 
 
-@numba.njit(cache=True)
+@kernel()
 def _unit(q):
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm
 
 
-@numba.njit(cache=True)
+@kernel()
 def axes(state):
     """Return the three axes of a state as tuples."""
     _px, _py, _pz, x, y, z, w = state
@@ -78,7 +77,7 @@ def inserted_at(state, origin):
     return origin[6] + straight
 
 
-@numba.njit(cache=True)
+@kernel()
 def is_allowed(obstacles, limits, state, origin, branch):
     """Tell whether a needle's tip may have a state: clear, and within length and angle as far as it shows."""
     length = inserted_at(state, origin)
@@ -99,14 +98,14 @@ def _arc_from(state, c, s, curvature):
     return pose, (curvature, c * ex[0] + s * ey[0], c * ex[1] + s * ey[1], c * ex[2] + s * ey[2])
 
 
-@numba.njit(cache=True)
+@kernel()
 def is_forbidden(costs, geometry, state, roll, curvature, length):
     """Tell whether an arc from a state meets a voxel of infinite cost, or leaves the grid."""
     pose, bend = _arc_from(state, math.cos(roll), math.sin(roll), curvature)
     return map_costs_on_arc(costs, geometry, pose, bend, length, _FIRST)[0] == math.inf
 
 
-@numba.njit(cache=True)
+@kernel()
 def proved_step(obstacles, limits, state, roll, curvature, length, origin, branch):
     """Return the state at the end of an arc, not a number where the arc is not proved clear.
 

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import least_cosine, nearest_turn, seen_from, shortest_legs
 from stages.needle.kernels.cost import cost_of_arc
@@ -27,13 +25,13 @@ ROWS_PER_STEP = 5
 """Rows that a step of any search adds at most, with one to spare."""
 
 
-@numba.njit(cache=True)
+@kernel()
 def pose_of(node):
     """Return the pose of a node."""
     return node[0], node[1], node[2], node[3], node[4], node[5]
 
 
-@numba.njit(cache=True)
+@kernel()
 def reference_of(root):
     """Return the direction from which the limit of the angle counts: the root's own unless it has another."""
     if root[BEND + 1] == 0.0 and root[BEND + 2] == 0.0 and root[BEND + 3] == 0.0:
@@ -49,7 +47,7 @@ def angle_kept(limits, reference, pose, bend, turn):
     return least_cosine(forward, aside, turn) >= math.cos(limits.max_angle_rad) - TINY
 
 
-@numba.njit(cache=True)
+@kernel()
 def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best):
     """Add an arc from node `near` as row `count`; True if it was added.
 
@@ -99,7 +97,7 @@ def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, b
     return True
 
 
-@numba.njit(cache=True)
+@kernel()
 def add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best):
     """Add the shortest path from node `near` to a point, as one or two rows; return the new `count`.
 
@@ -127,7 +125,7 @@ def add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, 
     return rows
 
 
-@numba.njit(cache=True)
+@kernel()
 def aim(pose, goal, limits, state):
     """Return the point within the goal tolerance to try next, drawn at random if there is a tolerance.
 
@@ -147,7 +145,7 @@ def aim(pose, goal, limits, state):
     return goal[0], goal[1], goal[2]
 
 
-@numba.njit(cache=True)
+@kernel()
 def within(goal, tolerance, state):
     """Return a point drawn uniformly from the ball of the goal tolerance."""
     while True:
@@ -159,7 +157,7 @@ def within(goal, tolerance, state):
             return goal[0] + scale * x, goal[1] + scale * y, goal[2] + scale * z
 
 
-@numba.njit(cache=True)
+@kernel()
 def add_goal(obstacles, limits, objective, branch, nodes, parents, count, near, goal, best, state):
     """Try to finish from node `near`: by the single arc, else by the shortest path; return the new `count`.
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import OUTSIDE
 from anatomy.typed import Float, UInt16
@@ -214,7 +213,7 @@ def nearest_setting(twist, bend, u, v, length, least_bend, most_bend):
     return found_twist, found_bend, best > abs(bend) + size
 
 
-@numba.njit(cache=True)
+@kernel()
 def motion_room(walls, radius, length, entry, states, finest, longest_step, where):
     """Return a room that is there during a whole motion; `where` (1,) becomes the state where it is BLOCKED.
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.typed import Float
 from stages.scope.kernels.body import move_along, nearest_setting, point_along, room_along, room_at, turn_room
 
@@ -191,7 +190,7 @@ def candidates(device, route, states, offsets, step, found, by_straight):
             by_straight[n * count + c] = straight
 
 
-@numba.njit(cache=True)
+@kernel()
 def grow_layer(walls, device, route, states, offsets, step, out, parents, by_straight):
     """Fill the states `(K, COLUMNS)` one step on, the cheapest that are free and differ; return how many."""
     count = states.shape[0] * offsets.shape[0]
@@ -217,7 +216,7 @@ def grow_layer(walls, device, route, states, offsets, step, out, parents, by_str
     return kept
 
 
-@numba.njit(cache=True)
+@kernel()
 def put_first(walls, device, route, state):
     """Fill in the first state of a tree, of given base frame and route point; tell whether it is free."""
     scratch = np.zeros(12)

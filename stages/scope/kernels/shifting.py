@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.scope.kernels.body import BLOCKED, move_along, room_along, turn_room
 
 
@@ -40,7 +39,7 @@ def last_slide(states):
     return -1
 
 
-@numba.njit(cache=True)
+@kernel()
 def shifted_tips(walls, device, entry, states, shifts, tips, rooms):
     """Fill tips `(K, 9)` of motions whose base stops `shifts` (K,) mm beyond that of a proved one.
 

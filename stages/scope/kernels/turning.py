@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.typed import Bool, Float, Int
 from stages.scope.kernels.body import move_along, nearest_setting, turn_room
 from stages.scope.kernels.growth import BEND, CURVATURE, ROOM, TWIST, U, V
@@ -128,7 +127,7 @@ def setting_beside(device, most_curvature, state, offset, own):
     return u, v, twist, bend, straight
 
 
-@numba.njit(cache=True)
+@kernel()
 def sort_tips(device, most_curvature, states, offsets, places, best, costs):
     """Put the cheapest tips beside states into groups `best` (G, TRIES), by rising `costs` (G, TRIES).
 
@@ -161,7 +160,7 @@ def sort_tips(device, most_curvature, states, offsets, places, best, costs):
             best[group, at] = n * offsets.shape[0] + c
 
 
-@numba.njit(cache=True)
+@kernel()
 def first_free(walls, device, most_curvature, states, offsets, best, tips, near, places):
     """Fill `tips` (G, TIP_COLUMNS) with the first proved tip of each group, and `near` with its tree point.
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.deployment import tip_of_arcs
 from stages.tube.kernels.one_shape import MAX_EXTENSION as MOST_OUT
 from stages.tube.kernels.one_shape import in_order, near_shape, take_over, whole_way
@@ -49,7 +48,7 @@ def _seen_from(base, target):
     return math.hypot(along, across), ahead, math.atan2(across, along)
 
 
-@numba.njit(cache=True)
+@kernel()
 def aim(tubes, base, target, outer, inner):
     """Return rotation, both insertions and the distance in mm by which the tip then misses a point.
 

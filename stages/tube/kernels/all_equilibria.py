@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.torsion import twist
 
 TURN = 2.0 * math.pi
@@ -66,7 +65,7 @@ def _root(design, cutting, beta, owners, nodes, steps, tip_angles, low, high, wa
     return y
 
 
-@numba.njit(cache=True)
+@kernel()
 def all_of_two(design, cutting, beta, wanted, nodes, steps, found):
     """Find all angles between the tips of two tubes for the angle `wanted` between their rear ends.
 

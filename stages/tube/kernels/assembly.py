@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import merged_kernel
+from anatomy.kernels.compiling import kernel, merged_kernel
 
 SHORTEST_PIECE_MM = 1e-9
 """Shorter pieces are rounding and are left out."""
@@ -52,7 +51,7 @@ def _breakpoints(lengths, bends, beta, found):
     return count
 
 
-@numba.njit(cache=True)
+@kernel()
 def cut(design, beta, step, pieces, moments, directions):
     """Cut the tubes ahead of the front plate into pieces; return their number and that of all steps.
 

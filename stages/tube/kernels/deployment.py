@@ -5,9 +5,7 @@
 
 from __future__ import annotations
 
-import numba
-
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels import planar
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
 from stages.tube.kernels.wall_exit import (
@@ -33,7 +31,7 @@ ENTRY_TIP = 8
 ENTRY_COLUMNS = 14
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def validate_deployment(environment, tubes, base, normal, outer, inner, trace, tip):
     """Validate one planar deployment from the scope tip pose `base`, bending towards `normal`.
 
@@ -65,7 +63,7 @@ def validate_deployment(environment, tubes, base, normal, outer, inner, trace, t
     return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
     """Validate a shape of any tubes from the scope tip pose `base`.
 
@@ -103,7 +101,7 @@ def tip_of_arcs(base, normal, arcs):
     return pose
 
 
-@numba.njit(cache=True)
+@kernel()
 def _record(entries, row, site, rotation, outer, inner, trace, pose, reasons):
     """Write an accepted deployment; return the number of rows written, 0 if it does not leave the airway."""
     if trace[PHASE] != IN_TISSUE:
@@ -132,7 +130,7 @@ def _last_row(wanted):
     return last
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def enumerate_site(environment, tubes, base, normals, site, stops, wanted, entries, reasons, work):
     """Enumerate the deployments from one site that follow their own track exactly.
 

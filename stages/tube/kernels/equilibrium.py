@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import PIECE_COLUMNS, cut
 from stages.tube.kernels.pose import lay, turned
 from stages.tube.kernels.torsion import twist
@@ -86,7 +85,7 @@ def _relative(dpsi, drate, at, beta, s, matrix):
                 matrix[i, c] += max(s, beta[i]) * drate[at, c, i] - max(s, beta[last]) * drate[at, c, last]
 
 
-@numba.njit(cache=True)
+@kernel()
 def determinant_at(dpsi, drate, at, beta, s, matrix, right):
     """Return det d psi(s) / d psi_tip at or behind node `at`; `matrix` and `right` are scratch."""
     if matrix.shape[0] == 0:
@@ -161,7 +160,7 @@ def _turns_back(dpsi, drate, beta, at, matrix, before, right):
     return trace <= 0.0
 
 
-@numba.njit(cache=True)
+@kernel()
 def least_determinant(nodes, beta):
     """Return the least determinant along the tubes; -inf where two directions turn unstable at once."""
     _s, _psi, _rate, dpsi, drate = nodes
@@ -278,7 +277,7 @@ def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, t
     return any_found
 
 
-@numba.njit(cache=True)
+@kernel()
 def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stable, tip_angles):
     """Find the equilibrium next to the guess in `tip_angles`, which gets its angles, `nodes` the rest.
 
@@ -319,7 +318,7 @@ def scratch_for(n_steps, n, columns):
     return nodes, (np.zeros(n_steps), np.zeros((n_steps, columns)), np.zeros(n_steps, np.int64))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, results):
     """Solve many configurations; `tip_angles` (M, n) holds guesses and gets the answers.
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numba
-
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.tube.kernels.planar import (
     CURVED_LENGTH,
     INNER_CURVATURE,
@@ -54,7 +52,7 @@ def insertions_exist(tubes, insertions, outer, half_outer, inner, half_inner):
     return low_inner <= longest
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def greatest_insertions(tubes, longest, spacing, insertions):
     """Find how far the inner tube may come out before it sweeps sideways too far.
 

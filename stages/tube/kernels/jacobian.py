@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, BENT_TUBE, SOFTNESS
 from stages.tube.kernels.pose import COMMUTATOR, GAUSS, step_of
 
@@ -95,7 +94,7 @@ def _twist_change(softness, moments, directions, h, dh, ends, changes, first, se
     out[5] = dh
 
 
-@numba.njit(cache=True)
+@kernel()
 def motions(cutting, nodes, steps, poses, moved):
     """Fill `moved` (columns, 6) with the tip's motion by each parameter of `torsion.twist`."""
     pieces, moments, directions, _count = cutting

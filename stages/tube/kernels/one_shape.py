@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.typed import Bool, Float, Int
 from stages.tube.kernels.assembly import SHORTEST_PIECE_MM as SAME_MM
 from stages.tube.kernels.pose import frames_at, lay
@@ -133,7 +132,7 @@ def near_shape(design, near, shape):
     return shape.number[0] > 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def whole_way(design, shape):
     """Fill `shape` at its joints by the sequence `together`; tell whether it keeps all limits of the design.
 

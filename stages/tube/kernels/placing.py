@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
 from stages.tube.kernels.wall_exit import (
     ACCEPTED,
@@ -35,7 +34,7 @@ POINT, TANGENT, NORMAL, KAPPA, STRETCH_LENGTH, BEGINS, STRETCH_COLUMNS = 0, 3, 6
 PLACED_SHAPE, PLACED_BRANCH, PLACED_EXIT, PLACED_ANGLE, PLACED_RUN, PLACED_COLUMNS = range(6)
 
 
-@numba.njit(cache=True)
+@kernel()
 def cut_at_stops(arcs, stop, stretches, ends, middles, radii):
     """Cut one shape into stretches between stops; return how many stretches there are.
 
@@ -102,7 +101,7 @@ def _off(ends, middles, one, other, place):
     return worst + 0.25 * math.sqrt(bow)
 
 
-@numba.njit(cache=True)
+@kernel()
 def grow(places, groups, ends, middles, radii, tolerance, nodes, errors, leaf):
     """Sort shapes into a tree of stretches that they share within a tolerance.
 
@@ -168,7 +167,7 @@ def _seen(base, forward, row, at):
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def place_tree(environment, tubes, frame, tree, reasons, traces, placed):
     """Follow all shapes from one scope tip with one rotation of all tubes together.
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import normal_on_arc, pose_on_arc, sine_length, versine_length
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 
 OVERLAP_CURVATURE, INNER_CURVATURE, CURVED_LENGTH, OUTER_RADIUS, INNER_RADIUS, MARGIN = range(6)
 MIN_WALL_ANGLE, MAX_SWEEP, MAX_EXTENSION, MAX_PROTRUSION, MAX_WALL_RUN, N_TUBES = range(6, 12)
@@ -21,7 +19,7 @@ SWEEP_SAMPLES = 100
 """Samples of the sweep between its two sharp peaks; it is smooth there, and they are computed exactly."""
 
 
-@numba.njit(cache=True)
+@kernel()
 def planar_point(tubes, outer, inner, s):
     """Return (aside, ahead) of the centreline at arc length `s` for given insertions, in mm.
 
@@ -41,21 +39,21 @@ def planar_point(tubes, outer, inner, s):
     return aside, ahead
 
 
-@numba.njit(cache=True)
+@kernel()
 def planar_points(tubes, outer, inner, arc_lengths, out):
     """Fill `out` (N, 2) with `planar_point` at `arc_lengths` (N,)."""
     for n in range(arc_lengths.shape[0]):
         out[n, 0], out[n, 1] = planar_point(tubes, outer, inner, arc_lengths[n])
 
 
-@numba.njit(cache=True)
+@kernel()
 def planar_points_of_many(tubes, outers, inners, arc_lengths, out):
     """Fill `out` (N, 2) with `planar_point` of N deployments, each at its own of `arc_lengths` (N,)."""
     for n in range(arc_lengths.shape[0]):
         out[n, 0], out[n, 1] = planar_point(tubes, outers[n], inners[n], arc_lengths[n])
 
 
-@numba.njit(cache=True)
+@kernel()
 def tube_pieces(tubes, outer, inner):
     """Return the four arcs of the centreline, some empty: begin and end in mm, curvature, radius."""
     straight = max(inner - tubes[CURVED_LENGTH], 0.0)
@@ -67,7 +65,7 @@ def tube_pieces(tubes, outer, inner):
     )
 
 
-@numba.njit(cache=True)
+@kernel()
 def tip_pose(tubes, base, normal, outer, inner):
     """Return the pose at the tip of the inner tube, from the scope tip `base`, bending towards `normal`."""
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])
@@ -88,7 +86,7 @@ def off_track(tubes, outer, inner, tip):
     return math.hypot(x1 - x0, z1 - z0)
 
 
-@numba.njit(cache=True)
+@kernel()
 def lateral_sweep(tubes, outer, inner):
     """Return the largest distance of a point of the body, at any step, from its final place, in mm.
 
@@ -115,7 +113,7 @@ def sampled_sweep(tubes, outer, inner, every):
     return worst
 
 
-@numba.njit(cache=True)
+@kernel()
 def turned_ends(ends, frame, normals, at, towards):
     """Turn ends of tubes in the plane of their bend to each of several directions.
 

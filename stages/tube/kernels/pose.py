@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.tube.kernels.assembly import BENT, BENT_TUBE, SOFTNESS
 
 GAUSS = 0.5 - math.sqrt(3.0) / 6.0
@@ -139,7 +138,7 @@ def step_of(cutting, nodes, steps, at, begin, end, twist, out):
     _exponential(twist, out, 0)
 
 
-@numba.njit(cache=True)
+@kernel()
 def lay(cutting, nodes, steps, poses):
     """Fill `poses` (N + 1, 12) with the Bishop frame of every node; the first is the identity."""
     twist = np.zeros(6)
@@ -151,7 +150,7 @@ def lay(cutting, nodes, steps, poses):
         _compose(poses, at, motion, poses, at + 1)
 
 
-@numba.njit(cache=True)
+@kernel()
 def frames_at(cutting, nodes, steps, poses, arc_lengths, found, angles, rates):
     """Fill poses (M, 12), psi and u (M, n) at arc lengths (M,) between front plate and tip."""
     s, psi, rate, _dpsi, _drate = nodes

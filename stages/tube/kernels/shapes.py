@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, FAR, NEAR, PIECE_COLUMNS, cut
 from stages.tube.kernels.equilibrium import TOLERANCE, least_determinant, newton, scratch_for
 from stages.tube.kernels.pose import GAUSS, curvature, frames_at, lay
@@ -233,7 +232,7 @@ def carried(pose, across, bend, direction, length):
     return after, (c * nx - s * bx, c * ny - s * by, c * nz - s * bz)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def follow_all(
     design, radii, strained, base_angles, stops, states, parents, step, tips, results, first, arcs
 ):
@@ -321,7 +320,7 @@ def follow_all(
     return first[n_states]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, arcs):
     """Lay the arcs of any joint values, reached straight from a deployment nearby.
 

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import FAR, FAR_OWNER, NEAR, NEAR_OWNER, SOFTNESS, STEPS
 
 # Nystroem's method of order 5 for y'' = f(y) [Hairer1993, sec. II.14].
@@ -160,7 +159,7 @@ def _any_stretch(owners):
     return False
 
 
-@numba.njit(cache=True)
+@kernel()
 def twist(design, cutting, tip_angles, owners, nodes, steps):
     """Integrate torsion from the tip to the front plate.
 

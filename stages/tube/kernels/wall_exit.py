@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 from anatomy.typed import Bool, Float, Labels, UInt16
@@ -73,7 +72,7 @@ class TubeEnvironment(NamedTuple):
     mediastinal: Bool
 
 
-@numba.njit(cache=True)
+@kernel()
 def _reason(label):
     """Translate the label of a voxel that is too near into a reason."""
     if label & VESSEL:
@@ -115,7 +114,7 @@ def _wall_normal(labels, geometry, x, y, z):
     return -mu / norm, -mv / norm, -mw / norm
 
 
-@numba.njit(cache=True)
+@kernel()
 def wall_angle(labels, geometry, pose):
     """Return the angle in rad between a tangent and the lumen's border at its point; pi/2 is square on."""
     nu, nv, nw = _wall_normal(labels, geometry, pose[0], pose[1], pose[2])
@@ -269,7 +268,7 @@ def _march_beyond(environment, tubes, trace, pose, bend, s0, s, end, radius, cle
         s = to
 
 
-@numba.njit(cache=True)
+@kernel()
 def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
     """Follow one arc of the tube, from `s0` mm beyond the scope tip, and validate every point of it.
 
@@ -315,7 +314,7 @@ def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
         return _march_beyond(environment, tubes, trace, pose, bend, s0, begin, length, radius, clearance)
 
 
-@numba.njit(cache=True)
+@kernel()
 def reset(trace):
     """Put a trace at the scope tip, in the lumen."""
     for m in range(trace.shape[0]):
@@ -323,7 +322,7 @@ def reset(trace):
     trace[BRANCH] = -1.0
 
 
-@numba.njit(cache=True)
+@kernel()
 def advance(environment, tubes, trace, pose, normal, kappa, s0, s1, radius, clearance):
     """March along one arc; return the reason, and pose and bending direction at its end."""
     bend = (kappa, normal[0], normal[1], normal[2])

@@ -20,7 +20,7 @@ from anatomy.motion.source import MotionSource
 from anatomy.motion.stretch import cell_bounds
 from anatomy.phantom import Phantom
 from anatomy.phantom.breathing import PhantomBreathing
-from anatomy.store import open_lung
+from anatomy.store import folder_name, open_lung
 from anatomy.structures import OUTSIDE
 from tests.anatomy.stored_toy import SOURCES
 from tests.anatomy.toys import toy
@@ -213,4 +213,4 @@ def test_a_stored_lung_breathes_as_before(tmp_path: Path) -> None:
 def test_a_lung_without_motion_is_stored_as_before(tmp_path: Path) -> None:
     lung = open_lung(SOURCES, toy, cache=tmp_path)
     assert lung.motion is None
-    assert '"motion"' not in (tmp_path / lung.key / "lung.json").read_text()
+    assert '"motion"' not in (tmp_path / folder_name(lung.key) / "lung.json").read_text()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from anatomy.machine_code import sources
 from lungaccess.cli import app as cli
 from lungaccess.cli import installation
 from lungaccess.cli.exit_code import ExitCode
@@ -51,31 +51,23 @@ def test_the_doctor_complains(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, c
         assert complaint in said
 
 
-@pytest.mark.parametrize("elsewhere", [True, False])
-def test_kernels_are_warm_if_no_older_than_their_source(
-    elsewhere: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_kernels_are_warm_where_there_is_code_of_their_present_sources(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    sources = [tmp_path / "kernels" / f"{name}.py" for name in ("a", "b")]
-    home = tmp_path / "kept" if elsewhere else sources[0].parent / "__pycache__"
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    if elsewhere:
-        monkeypatch.setenv("NUMBA_CACHE_DIR", str(home))
-    place = home / "kernels_123" if elsewhere else home
-    place.mkdir(parents=True)
-    sources[0].parent.mkdir(exist_ok=True)
-    for source in sources:
-        source.write_text("")
-        os.utime(source, (100.0, 100.0))
-    monkeypatch.setattr(installation, "_kernel_sources", lambda: iter(sources))
-    assert installation.kernel_cache().state == "cold"
-    for source, states in zip(sources, (("cold", "partly warm"), ("partly warm", "warm")), strict=True):
-        index = place / f"{source.stem}.f-12.py311.nbi"
-        index.write_bytes(b"12345")
-        for time, state in zip((99.0, 101.0), states, strict=True):
-            os.utime(index, (time, time))
-            assert installation.kernel_cache().state == state
-    assert installation.kernel_cache().size_bytes == 10
-    assert installation.kernel_cache().folders == (str(home),)
+    texts = {"a": "1", "b": "2"}
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(sources, "kernel_modules", lambda **_more: ("a", "b"))
+    monkeypatch.setattr(sources.Sources, "stamp", lambda _self, name: 64 * texts[name])
+    place = Path(installation.kernel_cache().folders[-1])
+    assert tmp_path in place.parents and installation.kernel_cache().state == "cold"
+    for name, stamp, state in (("a", "1", "partly warm"), ("b", "3", "partly warm"), ("b", "2", "warm")):
+        code = place / f"{name}-{12 * stamp}" / "f-123.code"
+        code.parent.mkdir(parents=True)
+        code.write_bytes(b"12345")
+        assert installation.kernel_cache().state == state
+    texts["a"] = "4"
+    assert installation.kernel_cache().state == "partly warm", "code of other sources does not count"
+    assert installation.kernel_cache().size_bytes == 15
 
 
 @cache

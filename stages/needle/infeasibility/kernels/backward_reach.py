@@ -18,10 +18,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 
 SHELL_MM = 1.0
@@ -108,7 +107,7 @@ def _all_blocked(obstacles, required, around, x, y, z):
     return label != 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def fill_backward_reach(obstacles, required, reach):
     """Fill the angles of a `BackwardReach`.
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 
 ONE = np.uint64(1)
 ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
@@ -21,7 +20,7 @@ def _shift(dx):
     return step, rest, np.uint64(rest), np.uint64(64 - rest)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def or_shifted(target, source, dy, dx):
     """OR a bitmap into another one, moved by whole cells; what falls off is dropped."""
     rows, words = source.shape
@@ -39,7 +38,7 @@ def or_shifted(target, source, dy, dx):
                 target[y + dy, to + 1] |= value >> high
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def and_shifted(target, source, dy, dx):
     """Keep of a bitmap what another one, moved by whole cells, holds; beyond its edge is nothing."""
     rows, words = source.shape
@@ -60,7 +59,7 @@ def and_shifted(target, source, dy, dx):
             target[y, to] &= value
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def spread(target, source, first, last, width, shift, scratch):
     """Set a row of words to another one, each bit spread by `width` cells to both sides and moved by `shift`.
 
@@ -171,7 +170,7 @@ def or_box(target, target_box, source, box):
         target_box[m + 1] = max(target_box[m + 1], box[m + 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def extent(states, out):
     """Fill `out` (8,) with the first and last direction row, column, position row and word in use."""
     nv, nu, _rows, _words = states.shape
@@ -190,7 +189,7 @@ def extent(states, out):
                     out[5 + m] = max(out[5 + m], box[m + 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def refine(coarse, halve_slopes, out):
     """Set the cells that overlap or touch a cell, twice as wide, that is set in `coarse` (V, U, Y, W).
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import exact_distance, interpolate_squared
 from anatomy.kernels.labels import LUMEN
 from stages.needle.infeasibility.kernels.bitmaps import ONE, and_shifted, find_box, or_shifted
@@ -41,7 +40,7 @@ def _probed_at(v, u, window, scale, depth):
     return y, x, abs(move_y - y) * scale[CELL], abs(move_x - x) * scale[CELL]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def mark_probed(states, window, scale, depths, probed, corners):
     """Set the bits of the cells that the tangents of a plane's states meet at some depths.
 
@@ -102,7 +101,7 @@ def _grade_of(slacks, value):
     return slacks.shape[0]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def grade_clearance(obstacles, limits, exempt_branch, inserted, origin, across, probed, slacks, grades):
     """Fill `grades` (Y, 64 W) uint8 with the first of the `slacks` that a cell's lack of clearance is within.
 
@@ -125,7 +124,7 @@ def grade_clearance(obstacles, limits, exempt_branch, inserted, origin, across, 
             grades[y, x] = _grade_of(slacks, limits.required_mm - above - SPARE)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def keep_clear(states, window, scale, depths, corners, grades, slacks):
     """Remove the states from which half a slab behind or ahead is blocked for every path.
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.needle.infeasibility.kernels.bitmaps import find_box
 
 # What `scale` holds: sides of cells in mm and as a slope, slope of the start (v, u), curvature in 1/mm, and
@@ -40,7 +39,7 @@ def steepest_sine(slope_v, slope_u, scale):
     return min(slope / math.sqrt(1.0 + slope * slope), scale[TOP_SINE])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def steepest_of(states, window, scale):
     """Return the largest sine in the cells of states."""
     box = np.zeros(4, np.int64)
@@ -69,7 +68,7 @@ def largest_slope_change(sine, scale, depth):
     return change + (depth - (top - sine) / scale[KAPPA]) * largest_second_derivative(top, scale)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def largest_aside(sine, scale, depth, low, high):
     """Return how far a path may miss the place to which the mean of both slopes leads, in mm.
 
@@ -84,7 +83,7 @@ def largest_aside(sine, scale, depth, low, high):
     return bound * depth * depth * min(0.25, 0.28868 * math.sqrt(1.0 - share * share))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def largest_reach(scale, depth, blur, window, nv, nu):
     """Return by how many cells of directions a state may change over a slab, in the directions given."""
     steepest = 0.0

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numba
-
+from anatomy.kernels.compiling import kernel
 from stages.needle.infeasibility.kernels.blocked import clearance_above
 from stages.needle.infeasibility.kernels.bounds import SPARE, TOLERANCE, TOTAL
 from stages.needle.infeasibility.kernels.reachability_pruning import place_margin
@@ -16,7 +15,7 @@ NEIGHBOURS = 26
 BEGIN, END = 0, 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def flood(
     obstacles, limits, exempt_branch, inserted, scale, ends, frame, side, corner, seen, queue, span, most
 ):  # fmt: skip

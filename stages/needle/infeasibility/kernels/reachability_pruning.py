@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.needle.infeasibility.kernels.bitmaps import ALL, find_box
 from stages.needle.infeasibility.kernels.bounds import (
     CELL,
@@ -31,7 +30,7 @@ from stages.needle.infeasibility.kernels.bounds import (
 _FIRST_BIT = np.int64(0)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def escape_depth(rho, h, radius):
     """Return how deep a point lies among the points that no needle reaches, as a number below 0, in mm.
 
@@ -83,7 +82,7 @@ def _state_margin(h, y, x, slope_v, slope_u, blur, scale, ends):
     return min(margin, back) + HALF_DIAGONAL * scale[CELL] + SPARE
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
     """Remove the states of a plane from which the goal cannot be reached, or which the start cannot reach.
 

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import merged_kernel
+from anatomy.kernels.compiling import kernel, merged_kernel
 from stages.needle.infeasibility.kernels.bitmaps import dilate, find_box, or_box, or_shifted
 from stages.needle.infeasibility.kernels.bounds import (
     CELL,
@@ -32,7 +31,7 @@ from stages.needle.infeasibility.kernels.bounds import (
 )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def table_shape(now, reach):
     """Return the shape of the table of `step_sets`: levels, directions, rows and words half-way."""
     nv, nu, rows, words = now.shape
@@ -42,7 +41,7 @@ def table_shape(now, reach):
     return levels, nv, nu, rows + nv - 1, words + (nu - 1 + 63) // 64
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_window):
     """Keep of the states of the next plane, or the one before, those that a plane's states may reach.
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import seen_from, shortest_path
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
@@ -42,7 +40,7 @@ third one is reached by the other kind of leg; above the fourth all points are m
 The values are a free choice: most variations move points, and each kind is frequent."""
 
 
-@numba.njit(cache=True)
+@kernel()
 def _choose(nodes, count, q, limits, rate, cost_bound):
     """Return the node to extend towards a point, -1 if none may take it.
 
@@ -68,7 +66,7 @@ def _choose(nodes, count, q, limits, rate, cost_bound):
     return chosen
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, count, iterations, state, best):
     """Grow a tree in state and cost by up to `iterations` samples, until it has a path cheaper than `best`.
 
@@ -132,7 +130,7 @@ def _extend(obstacles, limits, objective, branch, nodes, parents, count, near, q
     return count + 1 if added else count
 
 
-@numba.njit(cache=True)
+@kernel()
 def build(obstacles, limits, objective, branch, goal, nodes, parents, vias, count, best):
     """Lay a path from the root through via points, rows 1 onwards; return the last row, 0 if refused.
 
@@ -228,7 +226,7 @@ def _mutate(vias, trial, count, goal, limits, state):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def refine(obstacles, limits, objective, branch, goal, nodes, parents, vias, count, tries, state, best):
     """Vary the via points of a path at random and keep what is cheaper; return count, cost, improvements.
 

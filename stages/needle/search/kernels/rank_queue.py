@@ -11,10 +11,9 @@ f, (M,) float64, and its entries, (M,) int32; `ranks`, (K, 2) int32, with the fi
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 
 LOOK_AHEAD = 3
 
@@ -70,7 +69,7 @@ def _off_heap(heap_f, heap, state):
     return top
 
 
-@numba.njit(cache=True)
+@kernel()
 def push(queue, state, f, first, second, rank):
     """Add an entry; the caller sees to it that one is free, WAITING < M."""
     entry_f, entries, heap_f, heap, ranks = queue
@@ -93,7 +92,7 @@ def push(queue, state, f, first, second, rank):
         ranks[rank, HEAD] = entry
 
 
-@numba.njit(cache=True)
+@kernel()
 def pop(queue, state):
     """Take the next entry, of which there is one: return its f, its two numbers and its rank."""
     entry_f, entries, heap_f, heap, ranks = queue

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import pose_on_arc
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.goal_ball import least_length_from, shortest_into_ball, single_into_ball
@@ -225,7 +223,7 @@ def _connect(obstacles, limits, objective, rates, branch, goal, reference, nodes
     return cost
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def search_words(
     obstacles, limits, objective, rates, branch, goal, reference, words, merge, store, queue, state, counts,
     best, cost, pops,

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 
 ROUNDING = 1e-9
 """Share of the best cost by which a path must be cheaper to be looked for."""
@@ -38,7 +37,7 @@ def node_pose(nodes, at):
     return nodes[at, 0], nodes[at, 1], nodes[at, 2], nodes[at, 3], nodes[at, 4], nodes[at, 5]
 
 
-@numba.njit(cache=True)
+@kernel()
 def bend_of(nodes, rolls, kappa, at, direction):
     """Return the bend of a primitive from a node; the direction after the last is straight."""
     tx, ty, tz = nodes[at, 3], nodes[at, 4], nodes[at, 5]
@@ -168,7 +167,7 @@ def _in_chain(nodes, seen, merge, n_rolls, row, slot):
     return slot, False
 
 
-@numba.njit(cache=True)
+@kernel()
 def find_duplicate(nodes, seen, merge, n_rolls, row):
     """Return the slot of a row in the hash table, and whether a node there makes the row superfluous.
 
@@ -186,7 +185,7 @@ def find_duplicate(nodes, seen, merge, n_rolls, row):
     return slot, duplicate
 
 
-@numba.njit(cache=True)
+@kernel()
 def rehash(nodes, merge, seen, larger):
     """Move the nodes in the hash table `seen` to a larger one, whose size is a power of two, all 0."""
     last = larger.shape[0] - 1

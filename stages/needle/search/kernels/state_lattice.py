@@ -15,10 +15,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-
 from anatomy.kernels.arcs import arc_to_point
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.proof import blocker_on_arc
 
@@ -138,7 +136,7 @@ def _sort_by_cost(order, costs, begin, end):
             order[at] = state
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def explore(
     obstacles, limits, objective, branch, base, axes, goal_cells, kappa, reach, inserted, bound,
     begins, states, before, costs, table, order,
@@ -248,7 +246,7 @@ def _follow(
     return count, tried
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def cheapest_guide_path(base, axes, goal_cells, begins, states, before, costs, controls):
     """Write the cheapest path to the goal; return its cost, infinite if there is none.
 

@@ -13,11 +13,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from anatomy.kernels.arcs import sine_length, versine_length
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import inlined_kernel, kernel
 
 STATE = 14
 
@@ -102,7 +101,7 @@ def joints_of(state, link, links, alpha, beta, out):
         c, s = ct * c - st * s, st * c + ct * s
 
 
-@numba.njit(cache=True)
+@kernel()
 def bodies(states, link, links, joints, frames):
     """Fill `joints` (M, links + 1, 3) and tool frames (M, 4, 4), zeros before, of states (M, 14)."""
     for m in range(states.shape[0]):
@@ -121,7 +120,7 @@ def bodies(states, link, links, joints, frames):
         frames[m, 3, 3] = 1.0
 
 
-@numba.njit(cache=True)
+@kernel()
 def advance(state, link, links, distance, alpha, beta):
     """Algorithm 1: return the state advanced by `distance` mm with a new twist and bend."""
     out = np.zeros(STATE)

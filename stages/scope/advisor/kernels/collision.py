@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel
+from anatomy.kernels.compiling import inlined_kernel, kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import OUTSIDE
 from anatomy.typed import Float, Int32, Labels
@@ -166,7 +165,7 @@ def body_fits(lumen, scope, state, alpha, beta, joints):
     return passes_printed_rule(lumen, scope, joints)
 
 
-@numba.njit(cache=True)
+@kernel()
 def measure(lumen, scope, states, fits, clearances):
     """Fill for states (M, 14): whether the links fit, and the sum of clearances of Section IV-D.
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inlined_kernel, inner_kernel
+from anatomy.kernels.compiling import inlined_kernel, inner_kernel, kernel
 from anatomy.kernels.random import uniform
 from stages.scope.advisor.kernels.chain import circle_curvature, move_base, tip_of
 from stages.scope.advisor.kernels.collision import base_fits, body_fits, distance_to, voxel_of
@@ -178,7 +177,7 @@ def evaluate_candidates(lumen, scope, state, look_ahead, weights, offsets, table
     return best_of(table, CANDIDATES)
 
 
-@numba.njit(cache=True)
+@kernel()
 def best_motion(lumen, scope, state, look_ahead, weights, offsets, table):
     """Call `evaluate_candidates` from Python."""
     scratch = np.zeros(14)
@@ -210,7 +209,7 @@ def take_sub_step(lumen, scope, state, look_ahead, step, row, looks, out, joints
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def compute_path(lumen, scope, weights, goal, steps, randomness, looks, states, info):
     """Algorithm 2: follow the best motions from `states[0]`; return the number of states and the end.
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from anatomy.kernels.compiling import kernel
 from anatomy.kernels.field import MIN_GAP_MM
 from stages.scope.advisor.kernels.chain import tip_of
 from stages.scope.advisor.kernels.collision import body_fits, clearance_beyond
 
 
-@numba.njit(cache=True)
+@kernel()
 def pointable(lumen, scope, bases, tips, shaft, twists, bends, fits):
     """Fill `fits` (A, B): whether some body with the tip at one of `tips` (T, 3) has a twist and a bend.
 

@@ -6,14 +6,15 @@ before and after along i, j and k, -1 for wall.  `steps` is `(3,)` float64: what
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from anatomy.kernels.compiling import kernel
 
 WALL = -1
 UNSEEN = -2
 
 
-@numba.njit(cache=True)
+@kernel()
 def number_component(inside, seed, stack, index):
     """Number the voxels of `inside` (bool) that hang together with voxel `seed` by their faces.
 
@@ -63,7 +64,7 @@ def number_component(inside, seed, stack, index):
     return voxels, neighbours
 
 
-@numba.njit(cache=True)
+@kernel()
 def clearance_l1(neighbours, steps, out):
     """Fill `out` (N,) with the L1 distance to the nearest voxel of wall.
 
@@ -88,7 +89,7 @@ def clearance_l1(neighbours, steps, out):
         out[n] = best
 
 
-@numba.njit(cache=True)
+@kernel()
 def shortest_paths(neighbours, steps, weights, extremes, goal, out):
     """Fill `out` (N,) with the cost of the shortest path from voxel `goal`, infinity where there is none.
 
@@ -151,7 +152,7 @@ def shortest_paths(neighbours, steps, weights, extremes, goal, out):
             waiting += 1
 
 
-@numba.njit(cache=True)
+@kernel()
 def widest_paths(neighbours, depth, start, out):
     """Fill `out` (N,) int64 with the narrowest depth on the widest path from voxel `start`, -1 if none.
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 
 NOWHERE = -1.0e30
 """Depth of a point in no listed cone: below that of any point."""
@@ -112,7 +111,7 @@ def _cell_range(cones, index, e, axis):
     return range(first, min(int(math.floor((high - index[axis]) / index[3])), last) + 1)
 
 
-@numba.njit(cache=True)
+@kernel()
 def list_cells(cones, index):
     """Return, as two arrays of a compressed list, the cones whose box touches each cell."""
     n_cells = int(index[4] * index[5] * index[6])
@@ -136,7 +135,7 @@ def list_cells(cones, index):
     return start, listed
 
 
-@numba.njit(cache=True)
+@kernel()
 def depths_at(cones, index, cell_start, cell_cones, points, out):
     """Fill `out` (N,) with the depths of `points` (N, 3) in the lumen; outside, negative, by all cones."""
     for n in range(points.shape[0]):

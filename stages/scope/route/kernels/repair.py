@@ -16,10 +16,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.scope.route.kernels.lagrangian import lagrangian, normal_equations
 
 BAND = 12
@@ -101,7 +100,7 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
     return steps
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def repair(control, program, rounds, steps, tolerance):
     """Move the free control points to the solution of the program.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from anatomy.kernels.compiling import kernel
 
-@numba.njit(cache=True)
+
+@kernel()
 def breadth_first(start, links, source, goal):
     """Return the nodes from `source` to `goal` with the fewest hops, empty if there is none.
 

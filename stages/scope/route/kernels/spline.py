@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.scope.route.kernels.lumen import depth_at
 
 DEEPEST = 10
@@ -188,7 +187,7 @@ def prove_span(control, knots, first, cones, index, cell_start, cell_cones, limi
     return PROVED
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def prove_spans(
     control, knots, cones, index, cell_start, cell_cones, limit, needed, verdicts, points, bounds
 ):
@@ -226,7 +225,7 @@ def basis_rows(knots, first, u, rows):
         rows[2, c] = 6.0 * (s0 + (u - k3) / (k4 - k3) * (s1 - s0))
 
 
-@numba.njit(cache=True)
+@kernel()
 def evaluate(control, knots, parameters, out):
     """Fill `out` (3, S, 3) with points, first and second derivatives at sorted `parameters` (S,)."""
     rows = np.zeros((3, 4))
@@ -244,7 +243,7 @@ def evaluate(control, knots, parameters, out):
                 out[d, s, axis] = total
 
 
-@numba.njit(cache=True)
+@kernel()
 def take_samples(control, knots, begin, end, per_span, along, guide, first, rows, samples):
     """Prepare the samples of the spans `begin` to `end - 1` for `repair`.
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 
 
 @inner_kernel
@@ -109,7 +108,7 @@ def _side(parent, resistance, side, which, vertex_of, lesion, count, on_n, on_r,
     return merged
 
 
-@numba.njit(cache=True)
+@kernel()
 def all_resistances(parent, resistance, side, exit_vertex, exit_resistance, first, printed, reduced):
     """Fill `printed` (C,) and `reduced` (C,) for all combinations of exits.
 

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 
 
 @inner_kernel
@@ -75,7 +74,7 @@ def _parts(union, above, a, b):
     return closing, keep, _spread(union, a & b), _spread(union, a & ~b)
 
 
-@numba.njit(cache=True)
+@kernel()
 def solve(left, right, lift, cost, below, open_sets, offset, closed_tour, best, split, chosen):
     """Return the least cost, and mark the chosen exits.
 

@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help demo test first-contact lint format docs publish-docs dist try bench results results-quick clean
+.PHONY: help demo kernel-calls test first-contact lint format docs publish-docs dist try bench results results-quick clean
 
 help:
 	@echo "make demo    plan on a synthetic patient, results in demo-output/"
@@ -21,6 +21,7 @@ help:
 	@echo "make docs    build the documentation into site/"
 	@echo "make publish-docs PUBLISHED=FOLDER  the pages of this version beside those of others"
 	@echo "make dist    build wheel and sdist into dist/, and check what is in them"
+	@echo "make kernel-calls  write down which kernels each command calls (a quarter of an hour)"
 	@echo "make try     the wheel in new environments, on all versions of Python at hand (half an hour)"
 	@echo "make bench   run the benchmarks"
 	@echo "make results-quick  all studies in the quick setting, and RESULTS.md"
@@ -31,8 +32,10 @@ $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer was not found; name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
+# The kernels of the demonstration need numpy and numba alone: they are compiled while the rest is installed.
 $(VENV)/.installed-run: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) -e .
+	$(PIP) numpy numba
+	$(BIN)/python -m anatomy.machine_code demo & compiling=$$!; $(PIP) -e . && wait $$compiling
 	@touch $@
 
 $(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/python
@@ -41,6 +44,9 @@ $(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/python
 
 demo: $(VENV)/.installed-run
 	$(BIN)/lungaccess demo --out demo-output
+
+kernel-calls: $(VENV)/.installed-test
+	$(BIN)/python packaging/kernel_calls.py
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """Build a release and try it: `make dist`, `make try`.
 
-    python packaging/release.py dist       wheel and sdist in dist/, with their contents checked
+    python packaging/release.py dist       wheel and sdist in dist/, with their contents checked, and the
+                                           wheel of compiled kernels for this platform
     python packaging/release.py try        the wheel in every environment of matrix.toml at hand
     python packaging/release.py try --python 3.12 --dependencies newest
     python packaging/release.py matrix     the environments as one line of JSON
@@ -25,6 +26,8 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+from kernels_wheel import build_kernels_wheel
 
 ROOT = Path(__file__).resolve().parents[1]
 MATRIX = tomllib.loads((ROOT / "packaging" / "matrix.toml").read_text(encoding="utf-8"))
@@ -212,7 +215,10 @@ def main() -> int:
     except ReleaseError as error:
         print(error, file=sys.stderr)
         return 1
-    return 0 if asked.what == "dist" else try_all(wheel, wanted)
+    if asked.what == "dist":
+        build_kernels_wheel(asked.out.resolve())
+        return 0
+    return try_all(wheel, wanted)
 
 
 if __name__ == "__main__":

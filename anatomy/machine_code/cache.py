@@ -20,6 +20,7 @@ from typing import Any
 
 from numba.core import caching, compiler, serialize
 
+from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import code_folders, kernels_folder, module_folder, say_once
 from anatomy.machine_code.sources import running
 
@@ -69,11 +70,22 @@ class KernelCache(caching._Cache):  # type: ignore[misc]
         if not self._enabled:
             return None
         key = self._key(sig, target_context.codegen())
-        for folder in code_folders():
-            stored = _stored(folder / self._folder / self._file(key), key)
-            if stored is not None:
-                return compiler.CompileResult._rebuild(target_context, *stored)
-        return None
+        stored = self._stored(key)
+        if stored is None and first_compilation.prepare():
+            stored = self._stored(key)
+        return None if stored is None else compiler.CompileResult._rebuild(target_context, *stored)
+
+    def code_file(self, sig: Any, target_context: Any) -> Path | None:
+        """Return the file of the code for these kinds of arguments, None if there is none."""
+        target_context.refresh()
+        name = self._file(self._key(sig, target_context.codegen()))
+        paths = (folder / self._folder / name for folder in code_folders())
+        return next((path for path in paths if path.is_file()), None)
+
+    def _stored(self, key: tuple[Any, ...]) -> Any:
+        name = self._file(key)
+        found = (_stored(folder / self._folder / name, key) for folder in code_folders())
+        return next((each for each in found if each is not None), None)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled function; where nothing can be written it serves this process alone."""

@@ -14,7 +14,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator
 from functools import cache
-from importlib import metadata, util
+from importlib import util
 from pathlib import Path
 
 PACKAGES = ("anatomy", "stages", "lungaccess")
@@ -133,6 +133,8 @@ def _modules_beside_kernels(package: str) -> Iterator[str]:
 @cache
 def version_of(distribution: str) -> str:
     """Return the installed version of a distribution, and an empty text where there is none."""
+    from importlib import metadata  # Not before it is asked for: it takes as long as all else here.
+
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:

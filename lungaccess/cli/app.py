@@ -18,6 +18,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from anatomy.checksums import DamagedCacheWarning
 from anatomy.errors import AnatomyError, FileError, LungaccessError
+from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import KernelsNotKeptWarning
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.commands.advise import advise
@@ -180,6 +181,7 @@ def _answer(words: list[str]) -> int:
         terminal.console.file.write(START_PAGE)
         return ExitCode.OK
     as_json = asks_json(words)
+    first_compilation.command = words[0]
     try:
         code = app.meta(with_nodule_number(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:

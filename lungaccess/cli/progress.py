@@ -71,10 +71,12 @@ class _Shown:
 
     def __enter__(self) -> Self:
         from anatomy.kernel_clock import watching_compilations
+        from anatomy.machine_code.ahead import first_compilation
 
         self._interrupted_words: str | None = None
         self._compilations = watching_compilations(self._compiling)
         self._compilations.__enter__()
+        first_compilation.tell = self._compiling
         self._progress.start()
         return self
 
@@ -85,7 +87,7 @@ class _Shown:
         self._compilations.__exit__(kind, error, trace)
 
     def _compiling(self, kernel: str | None) -> None:
-        """Show that a kernel is compiled, or with None what was shown before."""
+        """Show which kernel is compiled, or how many are; with None what was shown before."""
         if not _Shown._announced:
             _Shown._announced = True
             self._progress.console.print(COMPILING_ONCE, highlight=False)

@@ -7,6 +7,7 @@ from dataclasses import field
 from typing import Any
 
 from anatomy.records import frozen_value
+from lungaccess.plans.version import software_kernels
 
 PLAN, PATH, NO_PLAN = "plan", "path", "no plan"
 """Outcomes of runs; another one is the class of the error that ended the run."""
@@ -49,6 +50,8 @@ class Answer:
         `PLAN`, `PATH`, `NO_PLAN`, or the class of the error that ended the run.
     status : int
         Number of OMPL's word for it in `STATUS`.
+    kernels : str
+        Digest of the kernels of the process that made the run.
     failed : bool
         Whether the run could not be made: a file was missing, the machine had no memory, a worker was lost.
         Such a run is made again when the study is started the next time.
@@ -77,6 +80,7 @@ class Answer:
     key: str
     outcome: str
     status: int
+    kernels: str = field(default_factory=software_kernels)
     failed: bool = False
     message: str = ""
     advice: str = ""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anatomy.records import frozen_value
+from lungaccess.plans.version import software_kernels
 from lungaccess.study.answers import CRASH, UNKNOWN, Answer
 from lungaccess.study.cluster import Backlog, connect, interruptions_noted, require_dask
 from lungaccess.study.results import ResultsFile
@@ -29,11 +30,13 @@ class StudyDone:
 
     The study has `runs`, of which the file had `stored_before`.  The start `added` some: fewer than the rest
     if another process stored some meanwhile.  Those that `failed` could not be made; the next start makes
-    them again.
+    them again.  Of what was stored before, `other_kernels` runs were made with other kernels than those here,
+    or do not say with which: their figures may differ from what would be found now.
     """
 
     runs: int
     stored_before: int
+    other_kernels: int
     added: int
     failed: int
     wall_s: float
@@ -79,6 +82,8 @@ def run_study(
         runs = list(runs_of(study, cache=cache, progress=lambda words: say(words, None)))
         stored = results.finished_keys()
         missing = [run for run in runs if run.key not in stored]
+        there = {run.key for run in runs} & stored
+        others = results.made_with_other_kernels(there, software_kernels())
         added = failed = 0
         if missing:
             say("starting workers", None)
@@ -93,6 +98,7 @@ def run_study(
     return StudyDone(
         runs=len(runs),
         stored_before=len(runs) - len(missing),
+        other_kernels=others,
         added=added,
         failed=failed,
         wall_s=time.perf_counter() - began,

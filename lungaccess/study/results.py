@@ -16,7 +16,7 @@ from lungaccess.study.answers import Answer
 from lungaccess.study.file_errors import BUSY_S, damaged, file_errors
 from lungaccess.study.rows import add_rest, experiment_row, problem_row, run_row
 from lungaccess.study.runs import Problem, Run
-from lungaccess.study.schema import APPLICATION_ID, FORMAT, statements
+from lungaccess.study.schema import APPLICATION_ID, FORMAT, KERNELS_TABLE, statements
 
 BATCH = 1000
 """Rows that are read at once: a few of them take no time, and all of them would fill the memory."""
@@ -133,6 +133,12 @@ class ResultsFile:
         query = "SELECT key FROM runs JOIN outcomes ON runid = id WHERE NOT failed"
         return {key for (key,) in self.rows(query)}
 
+    def made_with_other_kernels(self, keys: set[str], kernels: str) -> int:
+        """Return how many of the runs with these keys other kernels made, or none that are stated."""
+        stated = "SELECT key FROM runs JOIN made_with ON runid = id WHERE kernels = ?"
+        known = self._connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'made_with'").fetchone()
+        return len(keys - {key for (key,) in self.rows(stated, (kernels,))} if known else keys)
+
     def add(self, run: Run, answer: Answer) -> bool:
         """Store what a run ended with, all of it or nothing; return whether it was new.
 
@@ -152,6 +158,7 @@ class ResultsFile:
             made = connection.execute(*run_row(run, answer, experiment, planner))
             if made.rowcount == 0:
                 return False
+            connection.execute(KERNELS_TABLE)
             add_rest(connection, int(made.lastrowid or 0), answer)
             connection.execute(
                 "UPDATE experiments SET totaltime = totaltime + ?, runcount = (SELECT max(n) FROM "

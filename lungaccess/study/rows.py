@@ -94,6 +94,7 @@ def add_rest(connection: sqlite3.Connection, run: int, answer: Answer) -> None:
     """Store what a run ended with besides its row: outcome, plan, progress, findings and rejections."""
     outcome = (run, answer.outcome, answer.failed, answer.message, answer.advice)
     connection.execute("INSERT INTO outcomes VALUES (?, ?, ?, ?, ?)", outcome)
+    connection.execute("INSERT INTO made_with VALUES (?, ?)", (run, answer.kernels))
     if answer.plan:
         connection.execute("INSERT INTO plans VALUES (?, ?, ?)", (run, answer.digest, answer.plan))
     points = [(run, each.time_s, each.cost, each.iteration) for each in answer.improvements]

@@ -56,13 +56,17 @@ CREATE TABLE rejections (
 CREATE INDEX runs_of_experiment ON runs (experimentid);
 """
 
+KERNELS_TABLE = """CREATE TABLE IF NOT EXISTS made_with (
+    runid INTEGER PRIMARY KEY REFERENCES runs(id) ON DELETE CASCADE, kernels TEXT NOT NULL)"""
+"""The kernels that made a run; a file may lack the table, or a run its row."""
+
 
 def statements() -> str:
     """Return what makes an empty results file, as one transaction."""
     words = ", ".join(f"('status', {number}, '{word}')" for number, word in enumerate(STATUS))
     return f"""
 BEGIN IMMEDIATE;
-{OMPL_TABLES}{OUR_TABLES}
+{OMPL_TABLES}{OUR_TABLES}{KERNELS_TABLE};
 INSERT INTO enums VALUES {words};
 PRAGMA application_id = {APPLICATION_ID};
 PRAGMA user_version = {FORMAT};

@@ -53,6 +53,7 @@ def run(
     workers : int
         How many processes on this machine; as many as it has cores if not given.
     """
+    from lungaccess.plans.version import software_kernels
     from lungaccess.study.driver import run_study
     from lungaccess.study.settings import read_study
     from lungaccess.study.summary import summarise
@@ -78,6 +79,12 @@ def run(
         f"{done.runs} runs: {done.stored_before} were stored, {done.added} added in {done.wall_s:.1f} s. "
         f"Written to {out}"
     )
+    if done.other_kernels:
+        terminal.console.print(
+            f"{done.other_kernels} of the stored runs were made with other kernels than those here, "
+            f"{software_kernels()}, or do not say with which. For runs of one kind, write to another file.",
+            style="yellow",
+        )
     if done.failed:
         terminal.console.print(f"{done.failed} could not be made; start the study again.", style="bold red")
     return ExitCode.of(not done.failed)

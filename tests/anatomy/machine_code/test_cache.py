@@ -62,13 +62,15 @@ class Tree:
 
     def call(self, *arguments: float, **environment: str) -> Any:
         """Return the values of `outer`, what was compiled for them, and what was said, in a new process."""
-        path = os.pathsep.join([str(self.place), str(self.place / "site")])
-        known = {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(self.kept)}
-        ended = subprocess.run(
-            [sys.executable, "-c", PROGRAM, json.dumps(arguments)],
-            env=os.environ | known | environment, cwd=self.place, capture_output=True, text=True, check=True,
-        )  # fmt: skip
+        words = [sys.executable, "-c", PROGRAM, json.dumps(arguments)]
+        around = self.environment() | environment
+        ended = subprocess.run(words, env=around, cwd=self.place, capture_output=True, text=True, check=True)
         return json.loads(ended.stdout)
+
+    def environment(self) -> dict[str, str]:
+        """Return the environment of a process that uses this copy and its cache."""
+        path = os.pathsep.join([str(self.place), str(self.place / "site")])
+        return os.environ | {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(self.kept)}
 
     def files(self) -> dict[Path, int]:
         """Return the files of code, and when each was written."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +66,7 @@ def test_a_study_goes_on_from_what_is_stored(
 ) -> None:
     path, told = tmp_path / "r.db", list[tuple[str, float | None]]()
     with ResultsFile(path, create=True) as results:
-        results.add(runs[1], toy_answer(runs[1]))
+        results.add(runs[1], replace(toy_answer(runs[1]), kernels="others"))
 
     def start(study: Study) -> StudyDone:
         return run_study(
@@ -78,9 +80,14 @@ def test_a_study_goes_on_from_what_is_stored(
     assert sorted(keys) == sorted({run.key for run in runs} - {runs[1].key})
     again = start(study_of(content()))
     assert (again.runs, again.stored_before, again.added) == (4, 4, 0)
+    assert (done.other_kernels, again.other_kernels) == (1, 1)
     assert made.read_text().split() == keys
     more = start(study_of(content(seeds=[0, 1, 2])))
     assert (more.runs, more.stored_before, more.added) == (6, 4, 2)
+    with sqlite3.connect(path) as connection:
+        connection.execute("DROP TABLE made_with")
+    earlier = start(study_of(content()))
+    assert (earlier.stored_before, earlier.other_kernels) == (4, 4), "an earlier version did not state them"
 
 
 def test_a_run_that_cannot_be_made_is_stored_and_made_again(

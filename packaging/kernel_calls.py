@@ -1,0 +1,120 @@
+"""Write down which kernels each command calls, with which kinds of arguments: `make kernel-calls`.
+
+The commands are those of tests/first_contact/tasks.toml and of WORKLOADS, done in a new folder by this
+checkout.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TASKS = ROOT / "tests" / "first_contact" / "tasks.toml"
+CALLS_FILE = ROOT / "anatomy" / "machine_code" / "kernel_calls.json"
+WORKLOADS = (
+    "lungaccess phantom --seed 3 --breathing --out BREATHING",
+    "lungaccess plan BREATHING --nodule --iterations 20 --out breathing",
+)
+"""Commands beside the tasks, in this order after them."""
+RECORDER = """
+import json, sys
+
+from anatomy.machine_code import cache, signatures
+
+noted = {}
+load = cache.KernelCache.load_overload
+
+def note(self, sig, target_context):
+    try:
+        kinds = [signatures.encoded(each) for each in sig]
+    except TypeError:
+        kinds = None
+    if kinds is not None and "<" not in self._function.__qualname__:
+        file = self._file(self._key(sig, target_context.codegen()))
+        where = str(self._kept_in() / file)
+        noted[json.dumps([self._function.__module__, self._function.__qualname__, kinds])] = where
+    return load(self, sig, target_context)
+
+cache.KernelCache.load_overload = note
+out, sys.argv = sys.argv[1], ["lungaccess", *sys.argv[2:]]
+code = 1
+try:
+    if sys.argv[1:2] == ["-c"]:
+        exec(sys.argv[2], {"__name__": "__main__"})
+        code = 0
+    else:
+        from lungaccess.cli.app import main
+
+        code = main()
+finally:
+    with open(out, "w", encoding="ascii") as stream:
+        json.dump(noted, stream)
+sys.exit(code)
+"""
+
+
+def main() -> int:
+    """Do the work of each command, and write down the kernels that it called."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    options.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        calls = recorded(Path(temporary))
+    CALLS_FILE.write_text(as_json(calls), encoding="ascii")
+    print(f"{len(calls)} calls of kernels, written to {CALLS_FILE.relative_to(ROOT)}")
+    return 0
+
+
+def recorded(folder: Path) -> dict[str, tuple[set[str], int]]:
+    """Return the commands that make each call, and the size of its code."""
+    calls: dict[str, tuple[set[str], int]] = {}
+    # From nothing: a kernel that is found on disk does not tell which others it calls.
+    environment = {"NUMBA_CACHE_DIR": str(folder / "code")} | os.environ | {"PYTHONPATH": str(ROOT)}
+    for number, words in enumerate(steps()):
+        note = folder / f"{number}.json"
+        done = subprocess.run(
+            [sys.executable, "-c", RECORDER, str(note), *words],
+            cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        noted: dict[str, str] = json.loads(note.read_text(encoding="ascii")) if note.is_file() else {}
+        print(f"{done.returncode} {len(noted):4} kernels: {' '.join(words)[:80]!r}", flush=True)
+        for call, file in noted.items():
+            size = os.path.getsize(file) if os.path.exists(file) else 0
+            calls.setdefault(call, (set(), size))[0].add("python" if words[0] == "-c" else words[0])
+    return calls
+
+
+def steps() -> list[list[str]]:
+    """Return the words of each step: a command of lungaccess, or -c and a script."""
+    tasks = tomllib.loads(TASKS.read_text(encoding="utf-8"))["task"]
+    found = [step for task in tasks if task.get("needs") != "data" for step in task["step"]]
+    words = [shlex.split(step["run"])[1:] if "run" in step else ["-c", step["python"]] for step in found]
+    return [each for each in words if each] + [shlex.split(line)[1:] for line in WORKLOADS]
+
+
+def as_json(calls: dict[str, tuple[set[str], int]]) -> str:
+    """Return the calls as JSON, a line each; kinds of arguments and commands stand there once each."""
+    given = {call: [json.dumps(kind) for kind in json.loads(call)[2]] for call in calls}
+    kinds = sorted({kind for each in given.values() for kind in each})
+    commands = sorted({name for users, _size in calls.values() for name in users})
+    lines = []
+    for call, (users, size) in sorted(calls.items()):
+        module, function, _kinds = json.loads(call)
+        row = [module, function, [kinds.index(kind) for kind in given[call]]]
+        row += [[n for n, name in enumerate(commands) if name in users], size]
+        lines.append(json.dumps(row, separators=(",", ":")))
+    return (
+        '{"commands": ' + json.dumps(commands) + ',\n"kinds": [\n' + ",\n".join(kinds)
+        + '\n],\n"calls": [\n' + ",\n".join(lines) + "\n]}\n"
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -60,8 +60,7 @@ def kept_record(
     SettingsError
         If the limit of the cache is no size.
     """
-    text = json.dumps({"format": version, **depends_on}, sort_keys=True, default=list)
-    path = Path(cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
+    path = record_path(kind, version, depends_on, cache)
     stored = _stored(path, rebuilt) if path.exists() else None
     if stored is not None:
         note_use(path)
@@ -71,6 +70,14 @@ def kept_record(
     _save(kind, {"format": version, "name": name, **parts(made)}, path)
     make_room(path.parent, most_bytes, {kind: version}, keep=(path, *in_use))
     return made
+
+
+def record_path(
+    kind: str, version: int, depends_on: Mapping[str, Any], cache: str | os.PathLike[str] | None = None
+) -> Path:
+    """Return the file in which `kept_record` keeps a record, whether or not there is one."""
+    text = json.dumps({"format": version, **depends_on}, sort_keys=True, default=list)
+    return Path(cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
 
 
 def _stored(path: Path, rebuilt: Callable[[dict[str, Any]], T]) -> T | None:

@@ -31,7 +31,7 @@ def explain_and_report(
     Parameters
     ----------
     time_s : float or None
-        Time for the explanation; the default of `explain_no_plan` if None.
+        Processor time for the explanation; the default of `explain_no_plan` if None.
     """
     from lungaccess.explanation import explanation_record, save_explanation
 
@@ -51,24 +51,30 @@ def explain_and_report(
 
 
 def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float | None) -> Explanation:
-    from lungaccess.coupled import open_atlas
+    from lungaccess.coupled import atlas_is_kept, open_atlas
     from lungaccess.explanation import DEFAULT_TIME_S, explain_no_plan
 
-    def atlas_of(system: System, on_share: Callable[[float], None]) -> Atlas:
-        return open_atlas(lung, system, cache=request.output.cache, progress=on_share)
+    system, cache = request.systems[0], request.output.cache
 
-    system = request.systems[0]
+    def atlas_of(other: System, on_share: Callable[[float], None]) -> Atlas:
+        def tell(share: float) -> None:
+            on_share(share)
+            shown.step(f"atlas of {other.name}", share)
+
+        return open_atlas(lung, other, cache=cache, progress=tell)
+
     with progress("no plan: looking for what would help") as shown:
         return explain_no_plan(
             lung,
             system,
             request.target.resolve(lung),
             failure,
-            atlas=atlas_of(system, shown.share),
+            atlas=open_atlas(lung, system, cache=cache, progress=shown.share),
             objective=request.search.objective,
             seed=request.search.seed,
             time_s=DEFAULT_TIME_S if time_s is None else time_s,
             atlas_of=atlas_of,
+            is_kept=lambda other: atlas_is_kept(lung, other, cache=cache),
             on_part=shown.step,
         )
 

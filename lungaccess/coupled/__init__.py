@@ -9,7 +9,7 @@ from anatomy.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.coupled.atlas import Atlas, atlas_part, build_atlas
     from lungaccess.coupled.atlas_measures import tip_clearances_mm, tube_stability
-    from lungaccess.coupled.atlas_store import open_atlas
+    from lungaccess.coupled.atlas_store import atlas_is_kept, open_atlas
     from lungaccess.coupled.counterfactuals import (
         Counterfactual,
         find_counterfactuals,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any, get_type_hints
 
-from anatomy.kept_records import kept_record
+from anatomy.kept_records import kept_record, record_path
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.settings import to_mapping
@@ -43,17 +43,7 @@ def open_atlas(
     `lungaccess.coupled.atlas.build_atlas` and, for the cache, of `anatomy.kept_records.kept_record`.
     """
     prover_of(lung, system.scope)  # Here: the first plan does not wait for it.
-    depends_on = {
-        "lung": lung.key,
-        "scope": to_mapping(system.scope),
-        "tubes": to_mapping(system.tubes),
-        "margins": to_mapping(system.margins),
-        "shapes": shapes_digest(system.tubes),
-        "with_fissures": fissures_are_obstacles(lung, system),
-        "rotations": rotations,
-        "stop_mm": stop_spacing_mm,
-        "site_mm": site_spacing_mm,
-    }
+    depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
 
     def make() -> Atlas:
         return build_atlas(
@@ -89,6 +79,41 @@ def open_atlas(
         name=lung.name,
         in_use=in_use,
     )
+
+
+def atlas_is_kept(
+    lung: Lung,
+    system: System,
+    *,
+    rotations: int = DEFAULT_ROTATIONS,
+    stop_spacing_mm: float = DEFAULT_STOP_MM,
+    site_spacing_mm: float = TIP_SPACING_MM,
+    cache: str | os.PathLike[str] | None = None,
+) -> bool:
+    """Tell whether `open_atlas` finds an atlas in the cache; the file is not read, so it may be damaged.
+
+    Tubes that are not planar count as not kept: their file is named by shapes that take long to compute.
+    """
+    if not system.tubes.planar:
+        return False
+    depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
+    return record_path("atlas", FORMAT, depends_on, cache).is_file()
+
+
+def _depends_on(
+    lung: Lung, system: System, rotations: int, stop_spacing_mm: float, site_spacing_mm: float
+) -> dict[str, Any]:
+    return {
+        "lung": lung.key,
+        "scope": to_mapping(system.scope),
+        "tubes": to_mapping(system.tubes),
+        "margins": to_mapping(system.margins),
+        "shapes": shapes_digest(system.tubes),
+        "with_fissures": fissures_are_obstacles(lung, system),
+        "rotations": rotations,
+        "stop_mm": stop_spacing_mm,
+        "site_mm": site_spacing_mm,
+    }
 
 
 def _parts(atlas: Atlas) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 from anatomy.errors import SettingsError
+from anatomy.kernel_clock import working_s
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from lungaccess.checking import Checker, CheckReport
@@ -80,8 +80,8 @@ def plan_with_presets(
     systems : sequence of System
         In any order; the presets that ship with the package if empty.
     time_s : float, optional
-        Planning time in all, without that of the atlases.  A system without a plan gets an equal share of
-        what is left, so that each one is tried.
+        Planning time in all, without that of the atlases and of getting kernels.  A system without a plan
+        gets an equal share of what is left, so that each one is tried.
     atlas_of : callable, optional
         Returns the deployment atlas of a system; `build_atlas` if None.
     on_attempt : callable, optional
@@ -112,7 +112,7 @@ def plan_with_presets(
         if on_attempt:
             on_attempt(system)
         atlas = atlas_of(system) if atlas_of else build_atlas(lung, system)
-        began = time.perf_counter()
+        began = working_s()
         plans = plan(
             lung,
             system,
@@ -130,7 +130,7 @@ def plan_with_presets(
             yield from (replace(better, system_choice=choice) for better in plans)
             return
         failed.append(attempt)
-        left_s = max(left_s - (time.perf_counter() - began), 0.0)
+        left_s = max(left_s - (working_s() - began), 0.0)
     raise none_reaches(failed)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any, cast
 
+from anatomy.kernel_clock import working_cpu_s
 from anatomy.lung import Lung
 from lungaccess.appraisal import DRAWS, SEED
 from lungaccess.checking import Checker
@@ -46,7 +46,11 @@ PROOF_BOXES = 2_000_000
 TIME_IS_UP = "the time was up"
 NO_NEEDLE = "the system has no needle"
 
+SHARED, KEPT, TO_BE_MADE = range(3)
+"""What the atlas of a preset costs: nothing, as it is the system's own; a file to read; many seconds."""
+
 AtlasOf = Callable[[System, Callable[[float], None]], Atlas]
+IsKept = Callable[[System], bool]
 
 
 class OutOfTime(Exception):  # noqa: N818
@@ -64,6 +68,7 @@ def explain_no_plan(
     seed: int = 0,
     time_s: float | None = DEFAULT_TIME_S,
     atlas_of: AtlasOf | None = None,
+    is_kept: IsKept | None = None,
     on_part: Callable[[str], None] | None = None,
 ) -> Explanation:
     """Return what can be learned from a search that found no plan.
@@ -80,15 +85,22 @@ def explain_no_plan(
     objective, seed
         As for `lungaccess.coupled.planner.plan`.
     time_s : float, optional
-        No part begins after so many seconds, and long ones end; None for no limit.
+        No part begins after so many seconds of processor time, and long ones end; None for no limit.  Getting
+        kernels does not count, and one preset is tried even if no time is left.
     atlas_of : callable, optional
         Returns the atlas of a system, and tells a function the share of it made; `build_atlas` if None.
+    is_kept : callable, optional
+        Tells whether `atlas_of` need not make the atlas of a system, as `lungaccess.coupled.atlas_is_kept`
+        does: such presets are tried first.  None is taken to be kept if it is not given.
     on_part : callable, optional
         Told the name of each part as it begins.
     """
     own = atlas or build_atlas(lung, system)
     task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective), seed=seed)
-    made = Explainer(task, own, time_s, atlas_of or _built(lung), on_part or (lambda _name: None))
+    made = Explainer(
+        task, own, time_s, atlas_of or _built(lung), is_kept or (lambda _system: False),
+        on_part or (lambda _name: None),
+    )  # fmt: skip
     return made.explanation(failure)
 
 
@@ -111,13 +123,15 @@ class Explainer:
         atlas: Atlas,
         time_s: float | None,
         atlas_of: AtlasOf,
+        is_kept: IsKept,
         on_part: Callable[[str], None],
     ) -> None:
+        self._began = working_cpu_s()
         self._task, self._atlas, self._time_s = task, atlas, time_s
-        self._atlas_of, self._on_part = atlas_of, on_part
+        self._atlas_of, self._is_kept, self._on_part = atlas_of, is_kept, on_part
+        self._at_any_time = False
         self._direct = direct_candidates(task, atlas)
         self._checker = Checker(task.lung)
-        self._began = time.perf_counter()
         self._parts: list[Part] = []
         self._found: dict[str, Any] = {}
 
@@ -131,13 +145,15 @@ class Explainer:
         if self._task.with_fissures:
             self._part_of_needle("crossing a fissure", self._through_fissures)
         self._part("nearest point that is reached", self._neighbour)
-        for shares_atlas in (True, False):
-            for system in untried:
-                if self._shares_atlas(system) == shares_atlas:
-                    self._part(f"preset {system.name}", partial(self._attempt, system, tried))
-            if shares_atlas:
+        costs = {each.name: self._atlas_cost(each) for each in untried}
+        for cost in (SHARED, KEPT, TO_BE_MADE):
+            if cost == TO_BE_MADE:
                 self._part_of_needle("change of the needle", self._needle_changes)
                 self._part("share of the surroundings that is reached", self._shares)
+            for system in untried:
+                if costs[system.name] == cost:
+                    attempt = partial(self._attempt, system, tried)
+                    self._part(f"preset {system.name}", attempt, at_any_time=not tried)
         self._part("change of the bronchoscope", self._scope_changes)
         self._part_of_needle("proof that the target is unreachable", self._proof)
         done = {attempt.system.name for attempt in tried}
@@ -156,7 +172,7 @@ class Explainer:
             **self._found,
         )
         chances = {name: self._chance(each) for name, each in made.plans.items()}
-        return replace(made, chances=chances, time_s=time.perf_counter() - self._began)
+        return replace(made, chances=chances, time_s=working_cpu_s() - self._began)
 
     def _chance(self, plan: Plan) -> Share:
         return assess(plan, self._task.lung, samples=DRAWS, seed=SEED).succeeds
@@ -165,9 +181,10 @@ class Explainer:
         """Return the rule about fissures that the presets take over: only if it is not their own."""
         return True if self._task.system.fissures_allowed else None
 
-    def _part(self, name: str, do: Callable[[], None]) -> None:
-        """Do a part, unless the time is up before or during it."""
+    def _part(self, name: str, do: Callable[[], None], *, at_any_time: bool = False) -> None:
+        """Do a part, unless the time is up before or during it and it is not one for any time."""
         self._on_part(name)
+        self._at_any_time = at_any_time
         try:
             self._alive()
             do()
@@ -191,7 +208,9 @@ class Explainer:
         return cast(DirectArcs, self._direct)
 
     def _alive(self) -> None:
-        if self._time_s is not None and time.perf_counter() - self._began > self._time_s:
+        if self._at_any_time or self._time_s is None:
+            return
+        if working_cpu_s() - self._began > self._time_s:
             raise OutOfTime
 
     def _alive_share(self, _share: float) -> None:
@@ -229,6 +248,11 @@ class Explainer:
         return (system.scope, system.tubes, system.margins, system.fissures_allowed) == (
             own.scope, own.tubes, own.margins, own.fissures_allowed
         )  # fmt: skip
+
+    def _atlas_cost(self, system: System) -> int:
+        if self._shares_atlas(system):
+            return SHARED
+        return KEPT if self._is_kept(system) else TO_BE_MADE
 
     def _attempt(self, system: System, tried: list[Attempt]) -> None:
         task = self._task

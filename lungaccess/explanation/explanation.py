@@ -12,6 +12,7 @@ from lungaccess.explanation.neighbours import Neighbour, ReachedShare
 from lungaccess.explanation.starts import StartMap
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.preset_order import presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.reachability import ReachVerdict
@@ -78,7 +79,7 @@ class Explanation:
     parts : tuple of Part
         What was done and what was not, in the order of doing.
     time_s : float
-        Seconds that it took.
+        Seconds of processor time that it took, without getting kernels.
     """
 
     patient_name: str
@@ -138,17 +139,29 @@ class Explanation:
 
     @property
     def _way_on(self) -> str:
-        names = [attempt.system.name for attempt in self.attempts if attempt.succeeded]
-        if names:
-            return f"{names[0]} would reach it"
+        names = list(self.presets)
+        reach = next((name for name, each in self.presets.items() if each and each.succeeded), "")
+        less = {name for name in self.untried if reach and names.index(name) < names.index(reach)}
+        untried = ", ".join(f"{name} (less invasive)" if name in less else name for name in self.untried)
+        tried = f"{len(self.attempts)} of {len(names)} other presets tried"
+        tried += f"; not tried: {untried}" if untried else ""
+        if reach:
+            least = "" if less else ", the least invasive other preset with a plan"
+            return f"{reach} would reach it{least} ({tried})"
         if self.verdict is not None and self.verdict.proved:
             return "this system is proved not to reach it"
-        if self._change and not self.untried:
-            return f"with no other preset was a plan found, but {self._change} would reach it"
-        if self.untried:
-            tried = ", ".join(f"no plan with {each.system.name}" for each in self.attempts)
-            return f"{tried + ', ' if tried else ''}{', '.join(self.untried)} not tried"
-        return "with no other preset was a plan found"
+        change = f", but {self._change} would reach it" if self._change else ""
+        if not self.untried:
+            return f"with no other preset was a plan found ({tried}){change}"
+        failed = ", ".join(f"no plan with {each.system.name}" for each in self.attempts)
+        return f"{failed} ({tried}){change}" if failed else f"{tried}{change}"
+
+    @property
+    def presets(self) -> Mapping[str, Attempt | None]:
+        """The other presets, the least invasive first, and what became of each; None if it was not tried."""
+        tried = {attempt.system.name: attempt for attempt in self.attempts}
+        names = (each.name for each in presets_by_invasiveness())
+        return {name: tried.get(name) for name in names if name in tried or name in self.untried}
 
     @property
     def plans(self) -> Mapping[str, Plan]:

@@ -56,8 +56,8 @@ def explanation_record(explanation: Explanation) -> Record:
             "nearest_point_reached": _neighbour(e),
         },
         "presets": [
-            *(_attempt(e, each) for each in e.attempts),
-            *({"system": name, "tried": False} for name in e.untried),
+            {"system": name, "tried": False} if attempt is None else _attempt(e, attempt)
+            for name, attempt in e.presets.items()
         ],
         "changes": [_change(e, each) for each in e.changes],
         "through_fissures": e.through_fissures,
@@ -66,7 +66,7 @@ def explanation_record(explanation: Explanation) -> Record:
         "parts": [{"part": part.name, "outcome": part.outcome, "why": part.why} for part in e.parts],
         "chances_under_default_errors": {name: _chance(share) for name, share in e.chances.items()},
         "files": list(e.plans),
-        "explain_s": e.time_s,
+        "explain_cpu_s": e.time_s,
     }
 
 

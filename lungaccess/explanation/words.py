@@ -33,7 +33,7 @@ def sections(explanation: Explanation) -> tuple[Section, ...]:
             rows=tuple(_blocks(e)),
         ),
         Section(
-            title="Other presets, the least invasive first",
+            title=f"Other presets, the least invasive first: {len(e.attempts)} of {len(e.presets)} tried",
             headings=("preset", "outcome", "plan"),
             rows=tuple(_presets(e)),
         ),
@@ -113,10 +113,8 @@ def _blocks(e: Explanation) -> Iterator[Row]:
 
 
 def _presets(e: Explanation) -> Iterator[Row]:
-    for attempt in e.attempts:
-        yield attempt.system.name, attempt.why, _file(e, attempt.plan)
-    for name in e.untried:
-        yield name, "not tried", ""
+    for name, attempt in e.presets.items():
+        yield (name, "not tried", "") if attempt is None else (name, attempt.why, _file(e, attempt.plan))
 
 
 def _proof(e: Explanation) -> Iterator[Row]:

@@ -16,7 +16,7 @@ from anatomy.lung import Lung
 from anatomy.settings_file import settings_toml
 from anatomy.typed import Float, Int
 from lungaccess.breathing.window import with_window
-from lungaccess.coupled import Atlas, ProgressEvent, feasible_exits, open_atlas, plan
+from lungaccess.coupled import Atlas, ProgressEvent, atlas_is_kept, feasible_exits, open_atlas, plan
 from lungaccess.explorer import questions as ask
 from lungaccess.explorer.changed_system import plan_command, system_of
 from lungaccess.explorer.chosen_place import ChosenPlace
@@ -279,7 +279,10 @@ class Answers:
         def atlas_of(other: System, progress: Callable[[float], None]) -> Atlas:
             return open_atlas(self.lung, other, cache=self._source.cache, progress=progress)
 
-        yield explanation_part(self.lung, system, target, asked.question, own, atlas_of, turn)
+        def is_kept(other: System) -> bool:
+            return atlas_is_kept(self.lung, other, cache=self._source.cache)
+
+        yield explanation_part(self.lung, system, target, asked.question, own, atlas_of, is_kept, turn)
 
     def _export(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         from lungaccess.explorer.exports import export_file

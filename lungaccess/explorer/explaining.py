@@ -23,6 +23,7 @@ def explanation_part(
     question: ExplainQuestion,
     atlas: Atlas,
     atlas_of: Callable[[System, Callable[[float], None]], Atlas],
+    is_kept: Callable[[System], bool],
     turn: Turn,
 ) -> Part:
     """Return headline and sections of an explanation.
@@ -47,7 +48,7 @@ def explanation_part(
     except NoPlan as failure:
         made = explain_no_plan(
             lung, system, target, failure, atlas=atlas, objective=question.objective, seed=question.seed,
-            time_s=DEFAULT_TIME_S, atlas_of=atlas_of, on_part=on_part,
+            time_s=DEFAULT_TIME_S, atlas_of=atlas_of, is_kept=is_kept, on_part=on_part,
         )  # fmt: skip
     else:
         raise SettingsError("There is a plan to this target", remedy="Ask for it")

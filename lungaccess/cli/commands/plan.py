@@ -52,8 +52,9 @@ def plan(
     explain_time: Annotated[
         NotNegative | None,
         Parameter(
-            help="Seconds for what is learned where there is no plan: the nearest miss, what blocks, which "
-            "preset or change of device would do, what is proved; 10 if not given, 0 to leave it out."
+            help="Seconds of processor time, compiling kernels not counted, for what is learned where there "
+            "is no plan: the nearest miss, what blocks, which preset or change of device would do, what is "
+            "proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is."
         ),
     ] = None,
     output: PatientOptions = PatientOptions(),

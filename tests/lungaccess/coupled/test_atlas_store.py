@@ -14,7 +14,7 @@ from anatomy.errors import FileError
 from anatomy.lung import Lung
 from lungaccess.coupled import atlas_store
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.atlas_store import open_atlas
+from lungaccess.coupled.atlas_store import atlas_is_kept, open_atlas
 
 SYSTEM = la.load_system("ultrathin")
 COARSE: dict[str, Any] = {"rotations": 4, "stop_spacing_mm": 10.0, "site_spacing_mm": 4.0}
@@ -71,6 +71,19 @@ def test_what_matters_is_made_anew(small_lung: Lung, tmp_path: Path, made: list[
     open_atlas(replace(small_lung, key="another"), SYSTEM, cache=tmp_path, **COARSE)
     open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE | {"rotations": 5})
     assert len(made) == len(changes) + 3
+
+
+def test_what_is_kept_is_known_without_reading_it(small_lung: Lung, tmp_path: Path, made: list[str]) -> None:
+    assert not atlas_is_kept(small_lung, SYSTEM, cache=tmp_path / "none", **COARSE)
+    open_atlas(small_lung, SYSTEM, cache=tmp_path, **COARSE)
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(b"")
+    other_needle = replace(SYSTEM, name="other", needle=None)
+    assert all(atlas_is_kept(small_lung, each, cache=tmp_path, **COARSE) for each in (SYSTEM, other_needle))
+    other_scope = replace(SYSTEM, scope=replace(SYSTEM.scope, outer_diameter_mm=3.2))
+    assert not atlas_is_kept(small_lung, other_scope, cache=tmp_path, **COARSE)
+    assert not atlas_is_kept(small_lung, SYSTEM, cache=tmp_path), "on another grid"
+    assert made == [SYSTEM.name] and path.read_bytes() == b""
 
 
 @pytest.mark.parametrize("keep", [0, 100, 5000])

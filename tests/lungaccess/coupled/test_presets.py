@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from html import escape
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from numba.core.compiler_lock import global_compiler_lock
 
 import lungaccess as la
+from anatomy import kernel_clock
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.checking import Checker
@@ -83,3 +86,24 @@ def test_none_does(small_lung: Lung, atlas_of: Any) -> None:
 def test_systems_of_one_name_are_refused(small_lung: Lung) -> None:
     with pytest.raises(SettingsError, match="same name"):
         planned(small_lung, [SYSTEM, replace(MORE, name="does")])
+
+
+def test_getting_kernels_takes_nothing_from_the_time_of_the_next_system(
+    small_lung: Lung, atlas_of: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, given = {"s": 0.0}, []
+    fake = SimpleNamespace(perf_counter=lambda: clock["s"], process_time=lambda: 0.0)
+    monkeypatch.setattr(kernel_clock, "time", fake)
+
+    def plan(*_: Any, time_s: float, **__: Any) -> Iterator[la.Plan]:
+        given.append(time_s)
+        with global_compiler_lock:
+            clock["s"] += 1000.0
+        clock["s"] += 2.0
+        raise la.NoPlan("No", reasons={})
+        yield
+
+    monkeypatch.setattr(presets, "plan", plan)
+    with pytest.raises(la.NoPlan):
+        planned(small_lung, [SHORT, SYSTEM, MORE], atlas_of=atlas_of, time_s=10.0)
+    assert given == pytest.approx([10.0, 8.0, 6.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -124,10 +125,15 @@ def test_the_command_leaves_what_it_learned_and_exits_1(
     as_json: bool, small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
-    """Without any time for it the answer is honest: everything is listed as not tried."""
+    """Without any time one preset is tried, the one whose atlas is kept; the rest is listed as not tried."""
     load_with(monkeypatch, lambda *_, **__: small_lung)
     atlas = la.build_atlas(small_lung, SYSTEM, rotations=4, stop_spacing_mm=10.0, site_spacing_mm=5.0)
-    monkeypatch.setattr("lungaccess.coupled.open_atlas", lambda *_, **__: atlas)
+    monkeypatch.setattr(
+        "lungaccess.coupled.open_atlas", lambda _lung, system, **_: replace(atlas, system=system)
+    )
+    monkeypatch.setattr(
+        "lungaccess.coupled.atlas_is_kept", lambda _lung, system, **_: system.name == "stylet-needle"
+    )
     (tmp_path / "plan.json").write_text("{}")
     words = [
         "plan", "toy", "--target", FAR_TARGET, "--system", "ultrathin", "--iterations", "3", "--no-pictures",
@@ -136,8 +142,10 @@ def test_the_command_leaves_what_it_learned_and_exits_1(
     assert cli.main(words) == ExitCode.NEGATIVE
     said = capsys.readouterr().out
     stored = json.loads((tmp_path / "no_plan.json").read_text())
-    assert all(part["outcome"] == "not tried" for part in stored["parts"]) and stored["parts"]
-    assert [each["tried"] for each in stored["presets"]] == [False] * 5
+    done = [part["part"] for part in stored["parts"] if part["outcome"] == "done"]
+    assert done == ["preset stylet-needle"] and len(stored["parts"]) > 5
+    assert [each["system"] for each in stored["presets"] if each["tried"]] == ["stylet-needle"]
+    assert stored["headline"].count("not tried: tubes-only, lung-default") == 1
     if as_json:
         record = json.loads(said)
         assert record["headline"] == stored["headline"] and record["files"] == ["no_plan.json"]

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from lungaccess.problem.system import System
 
 PICTURE, PAGE = "no_plan.png", "no_plan.html"
+MORE_TIME = (
+    "The explanation took {:.1f} s of processor time, without compiling kernels; "
+    "a longer --explain-time tries the rest."
+)
 STALE = "plan.json in this folder is from another run: it is no answer to this one"
 
 
@@ -99,3 +103,5 @@ def show_explanation(explanation: Explanation) -> None:
     )
     terminal.show(terminal.table(each.title, each.headings, each.rows) for each in sections(explanation))
     terminal.show_reasons(explanation.failure)
+    if explanation.ran_out_of_time:
+        terminal.say(MORE_TIME.format(explanation.time_s))

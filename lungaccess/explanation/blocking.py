@@ -136,7 +136,7 @@ class ArcBeyondLimits:
              f"at most {self.most_turn_deg:.0f}°", "°"),
         ]  # fmt: skip
         words = " and ".join(
-            f"{what} of {value:.0f}{'' if unit == '°' else ' '}{unit} ({limit})"
+            f"{what} of {value:.0f}{'' if unit == '°' else ' '}{unit} (the needle allows {limit})"
             for exceeded, what, value, limit, unit in needs
             if exceeded
         )

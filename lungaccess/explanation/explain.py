@@ -24,7 +24,7 @@ from lungaccess.coupled import (
     scope_changes,
 )
 from lungaccess.explanation.blocking import arc_beyond_limits, look_along
-from lungaccess.explanation.explanation import DONE, NOT_TRIED, Change, Explanation, Part
+from lungaccess.explanation.explanation import DONE, NOT_TRIED, TIME_IS_UP, Change, Explanation, Part
 from lungaccess.explanation.neighbours import Surroundings
 from lungaccess.explanation.starts import map_starts
 from lungaccess.plans.no_plan import NoPlan
@@ -43,7 +43,6 @@ ITERATIONS = 20
 """Of the search with each preset: those that reach the target mostly do so with a direct arc."""
 PROOF_BOXES = 2_000_000
 """Boxes for the proof: a tenth of what `certify` looks at, which can take half a minute."""
-TIME_IS_UP = "the time was up"
 NO_NEEDLE = "the system has no needle"
 
 SHARED, KEPT, TO_BE_MADE = range(3)

@@ -19,6 +19,7 @@ from lungaccess.reachability import ReachVerdict
 from lungaccess.risk import Share
 
 DONE, NOT_TRIED = "done", "not tried"
+TIME_IS_UP = "the time was up"
 
 
 @frozen_value
@@ -193,6 +194,11 @@ class Explanation:
     def not_tried(self) -> tuple[Part, ...]:
         """The parts that were not done: nothing follows from them."""
         return tuple(part for part in self.parts if part.outcome == NOT_TRIED)
+
+    @property
+    def ran_out_of_time(self) -> bool:
+        """Whether more time would have let something be tried."""
+        return any(part.why == TIME_IS_UP for part in self.parts)
 
 
 def _file_stem(name: str) -> str:

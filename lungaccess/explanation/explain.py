@@ -137,7 +137,8 @@ class Explainer:
     def explanation(self, failure: NoPlan) -> Explanation:
         """Do all parts for which there is time, the most useful first."""
         others = presets_by_invasiveness(fissures_allowed=self._fissures_allowed())
-        untried = [each for each in others if each.name != self._task.system.name]
+        known = {self._task.system.name, *failure.attempts}
+        untried = [each for each in others if each.name not in known]
         tried: list[Attempt] = []
         self._part_of_needle("what blocks the direct arcs", self._what_blocks)
         self._part_of_needle("map of the starts", self._starts)

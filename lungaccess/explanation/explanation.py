@@ -115,8 +115,9 @@ class Explanation:
 
     @property
     def _change(self) -> str:
-        """The smallest change of the device whose plan the check accepts."""
-        return next((str(each.change) for each in self.changes if each.accepted), "")
+        """The smallest change of the device whose plan the check accepts, and how often that plan succeeds."""
+        accepted = (each.change for each in self.changes if each.accepted)
+        return next((f"{change}{self._how_often(change.plan)}" for change in accepted), "")
 
     @property
     def advice(self) -> str:
@@ -148,7 +149,8 @@ class Explanation:
         tried += f"; not tried: {untried}" if untried else ""
         if reach:
             least = "" if less else ", the least invasive other preset with a plan"
-            return f"{reach} would reach it{least} ({tried})"
+            plan = next(each.plan for each in self.attempts if each.system.name == reach)
+            return f"{reach} would reach it{self._how_often(plan)}{least} ({tried})"
         if self.verdict is not None and self.verdict.proved:
             return "this system is proved not to reach it"
         change = f", but {self._change} would reach it" if self._change else ""

@@ -248,7 +248,7 @@ def test_a_headline_names_the_least_invasive_preset_that_does(far: Explanation) 
         else Attempt(system=each.system, failure=la.NoPlan("No", reasons={}, main_reason="it is too thick"))
         for each in far.attempts
     )
-    headline = replace(far, attempts=done).headline
+    headline = replace(far, attempts=done, chances={}).headline
     assert headline.startswith("No plan found with ultrathin: ")
     least = "flexure-needle would reach it, the least invasive other preset with a plan"
     assert headline.endswith(f"; {least} (5 of 5 other presets tried)")

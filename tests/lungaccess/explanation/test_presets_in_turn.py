@@ -75,6 +75,7 @@ def explained(small_lung: Lung, clock: FakeTime, monkeypatch: pytest.MonkeyPatch
         time_s: float | None = None,
         compiling_s: float = 0.0,
         tried: list[str] | None = None,
+        failure: la.NoPlan = FAILURE,
     ) -> Explanation:
         def first_attempt(_plans: Any, system: System, _checker: Any) -> Attempt:
             if tried is not None:
@@ -92,7 +93,7 @@ def explained(small_lung: Lung, clock: FakeTime, monkeypatch: pytest.MonkeyPatch
 
         monkeypatch.setattr(explain, "first_attempt", first_attempt)
         return explain_no_plan(
-            small_lung, own, la.resolve_target(small_lung, FAR_TARGET), FAILURE, atlas=FakeAtlas(own),  # type: ignore[arg-type]
+            small_lung, own, la.resolve_target(small_lung, FAR_TARGET), failure, atlas=FakeAtlas(own),  # type: ignore[arg-type]
             time_s=time_s, atlas_of=atlas_of, is_kept=lambda system: system.name in kept,
         )  # fmt: skip
 
@@ -181,3 +182,11 @@ def test_where_none_reaches_it_the_untried_ones_are_named(explained: Explained) 
     assert table.title == "Other presets, the least invasive first: 1 of 5 tried"
     assert [row[0] for row in table.rows] == OTHERS
     assert [each["tried"] for each in explanation_record(made)["presets"]] == [True] + 4 * [False]
+
+
+def test_what_failed_when_a_system_was_chosen_is_not_tried_again(explained: Explained) -> None:
+    tried: list[str] = []
+    failure = la.NoPlan("None", reasons={}, attempts=dict.fromkeys(PRESETS[:4], "no plan: it is too thick"))
+    made = explained(own=la.load_system(PRESETS[0]), failure=failure, tried=tried)
+    assert tried == PRESETS[4:] == list(made.presets)
+    assert made.headline == f"No plan found with any of 4 systems; with {PRESETS[0]}: it is too thick"

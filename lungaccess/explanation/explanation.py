@@ -115,7 +115,7 @@ class Explanation:
 
     @property
     def _change(self) -> str:
-        """The smallest change of the device whose plan the check accepts, and how often that plan succeeds."""
+        """The smallest change of the device whose plan the check accepts, and how often it succeeds."""
         accepted = (each.change for each in self.changes if each.accepted)
         return next((f"{change}{self._how_often(change.plan)}" for change in accepted), "")
 

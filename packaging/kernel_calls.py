@@ -29,21 +29,34 @@ import json, sys
 
 from anatomy.machine_code import cache, signatures
 
-noted = {}
-load = cache.KernelCache.load_overload
+noted, inner, calls = {}, {}, {}
+load, save = cache.KernelCache.load_overload, cache.KernelCache.save_overload
 
-def note(self, sig, target_context):
+def note(self, sig, codegen, library=None):
     try:
         kinds = [signatures.encoded(each) for each in sig]
     except TypeError:
-        kinds = None
-    if kinds is not None and "<" not in self._function.__qualname__:
-        file = self._file(self._key(sig, target_context.codegen()))
-        where = str(self._kept_in() / file)
-        noted[json.dumps([self._function.__module__, self._function.__qualname__, kinds])] = where
-    return load(self, sig, target_context)
+        return None
+    if "<" in self._function.__qualname__:
+        return None
+    call = json.dumps([self._function.__module__, self._function.__qualname__, kinds])
+    noted[call] = str(self._kept_in() / self._file(self._key(sig, codegen)))
+    if library is not None:
+        calls[id(library)] = call, library
+    return call
 
-cache.KernelCache.load_overload = note
+def load_and_note(self, sig, target_context):
+    found = load(self, sig, target_context)
+    note(self, sig, target_context.codegen(), found and found.library)
+    return found
+
+def save_and_note(self, sig, data):
+    call = note(self, sig, data.codegen, data.library)
+    linked = [calls[id(each)][0] for each in data.library._linking_libraries if id(each) in calls]
+    inner[call] = sorted({each for each in linked if each != call})
+    save(self, sig, data)
+
+cache.KernelCache.load_overload, cache.KernelCache.save_overload = load_and_note, save_and_note
 out, sys.argv = sys.argv[1], ["lungaccess", *sys.argv[2:]]
 code = 1
 try:
@@ -56,7 +69,7 @@ try:
         code = main()
 finally:
     with open(out, "w", encoding="ascii") as stream:
-        json.dump(noted, stream)
+        json.dump({"files": noted, "inner": inner}, stream)
 sys.exit(code)
 """
 
@@ -74,21 +87,33 @@ def main() -> int:
 
 def recorded(folder: Path) -> dict[str, tuple[set[str], int]]:
     """Return the commands that make each call, and the size of its code."""
-    calls: dict[str, tuple[set[str], int]] = {}
-    # From nothing: a kernel that is found on disk does not tell which others it calls.
-    environment = {"NUMBA_CACHE_DIR": str(folder / "code")} | os.environ | {"PYTHONPATH": str(ROOT)}
+    users: dict[str, set[str]] = {}
+    inner: dict[str, list[str]] = {}
+    sizes: dict[str, int] = {}
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    here = {"PYTHONPATH": str(ROOT), "PATH": path}
+    # From nothing: what a kernel calls is seen while it is compiled.
+    environment = {"NUMBA_CACHE_DIR": str(folder / "code")} | os.environ | here
     for number, words in enumerate(steps()):
         note = folder / f"{number}.json"
         done = subprocess.run(
             [sys.executable, "-c", RECORDER, str(note), *words],
             cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
-        noted: dict[str, str] = json.loads(note.read_text(encoding="ascii")) if note.is_file() else {}
-        print(f"{done.returncode} {len(noted):4} kernels: {' '.join(words)[:80]!r}", flush=True)
-        for call, file in noted.items():
-            size = os.path.getsize(file) if os.path.exists(file) else 0
-            calls.setdefault(call, (set(), size))[0].add("python" if words[0] == "-c" else words[0])
-    return calls
+        noted = json.loads(note.read_text(encoding="ascii")) if note.is_file() else {"files": {}, "inner": {}}
+        print(f"{done.returncode} {len(noted['files']):4} kernels: {' '.join(words)[:80]!r}", flush=True)
+        inner |= noted["inner"]
+        ahead = list(noted["files"])
+        command = "python" if words[0] == "-c" else words[0]
+        while ahead:
+            call = ahead.pop()
+            if command not in users.setdefault(call, set()):
+                users[call].add(command)
+                ahead += inner.get(call, [])
+        sizes |= {
+            call: os.path.getsize(file) for call, file in noted["files"].items() if os.path.exists(file)
+        }
+    return {call: (users[call], sizes.get(call, 0)) for call in users}
 
 
 def steps() -> list[list[str]]:

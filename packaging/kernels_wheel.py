@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FILES_OF_CALLS = """
 from anatomy.machine_code.ahead import code_files, compile_ahead
 
-compile_ahead([], fewest=1)
+compile_ahead([])
 print("\\n".join(map(str, code_files())))
 """
 

@@ -27,8 +27,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from kernels_wheel import build_kernels_wheel
-
 ROOT = Path(__file__).resolve().parents[1]
 MATRIX = tomllib.loads((ROOT / "packaging" / "matrix.toml").read_text(encoding="utf-8"))
 PACKAGES = ("anatomy", "stages", "lungaccess")
@@ -216,6 +214,8 @@ def main() -> int:
         print(error, file=sys.stderr)
         return 1
     if asked.what == "dist":
+        from kernels_wheel import build_kernels_wheel
+
         build_kernels_wheel(asked.out.resolve())
         return 0
     return try_all(wheel, wanted)

@@ -7,4 +7,6 @@ import sys
 from anatomy.machine_code.ahead import compile_ahead
 
 if __name__ == "__main__":
-    compile_ahead(sys.argv[1:], fewest=1, tell=lambda words: sys.stderr.write(f"\rkernels: {words} "))
+    shown = sys.stderr.write if sys.stderr.isatty() else len
+    done = compile_ahead(sys.argv[1:], tell=lambda words: shown(f"\rkernels: {words} "))
+    sys.stderr.write(f"\r{done} kernels compiled\n" if done else "")

@@ -39,7 +39,7 @@ class FirstCompilation:
     def prepare(self) -> bool:
         """Compile what the command will call; return whether anything was compiled."""
         command, self.command = self.command, ""
-        return bool(command) and compile_ahead([command], tell=self.tell) > 0
+        return bool(command) and compile_ahead([command], fewest=FEWEST, tell=self.tell) > 0
 
 
 first_compilation = FirstCompilation()
@@ -49,7 +49,7 @@ def compile_ahead(
     commands: list[str],
     *,
     processes: int | None = None,
-    fewest: int = FEWEST,
+    fewest: int = 1,
     tell: Callable[[str], None] = lambda words: None,
 ) -> int:
     """Compile kernels that commands call and that are not on disk; return how many were compiled.
@@ -63,7 +63,7 @@ def compile_ahead(
     fewest : int
         Fewer missing kernels are left to be compiled when they are called.
     """
-    missing = {n: call for n, call in enumerate(_calls()) if _is_missing(call, commands)}
+    missing = {n: call for n, call in _called(commands).items() if _code_file(call) is None}
     if len(missing) < fewest:
         return 0
     done = 0
@@ -100,10 +100,12 @@ def _calls() -> tuple[Mapping[str, Any], ...]:
     )
 
 
-def _is_missing(call: Mapping[str, Any], commands: list[str]) -> bool:
-    """Tell whether commands call a kernel without code on disk; one that is gone counts as not called."""
-    wanted = not commands or bool(call["commands"].intersection(commands))
-    return wanted and _dispatcher(call) is not None and _code_file(call) is None
+def _called(commands: list[str]) -> dict[int, Mapping[str, Any]]:
+    """Return the calls that commands make; kernels that are gone are left out."""
+    wanted = {
+        n: call for n, call in enumerate(_calls()) if not commands or call["commands"].intersection(commands)
+    }
+    return {n: call for n, call in wanted.items() if _dispatcher(call) is not None}
 
 
 def _code_file(call: Mapping[str, Any]) -> Path | None:

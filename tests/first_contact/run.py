@@ -7,8 +7,9 @@
 tasks of a first look, as packaging/release.py asks for each version of Python.
 
 The package is built and installed as a user would get it, so that a file that was forgotten is missed.
-Without --fresh, what the checkout has compiled is copied, modules and kernels, and the libraries are those of
-the Python that runs this: a user's first minute of compiling is then not part of it.
+Without --fresh, what the checkout has compiled of modules is copied, and the libraries are those of the Python
+that runs this.  With --kernels, the wheel of compiled kernels is installed too: then the tasks must compile no
+kernel.  Without it they use those that this user has compiled.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from anatomy.cache import user_cache
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
@@ -52,6 +55,7 @@ def main() -> int:
     )
     options.add_argument("--first", action="store_true", help="only the tasks that are marked as first")
     options.add_argument("--wheel", default=str(ROOT), help="what is installed; the checkout if not stated")
+    options.add_argument("--kernels", help="a wheel lungaccess-kernels that is installed as well")
     options.add_argument("--python", default=sys.executable, help="with --fresh: this one if not stated")
     options.add_argument(
         "--constraints", default="constraints.txt", help="with --fresh: of the checkout; '' for none"
@@ -66,7 +70,7 @@ def main() -> int:
         if asked.fresh:
             place = fresh_place(home, asked.wheel, asked.python, asked.constraints)
         else:
-            place = place_with_these_libraries(home, asked.wheel)
+            place = place_with_these_libraries(home, asked.wheel, asked.kernels)
         beside = [task for task in tasks if task.get("beside")]
         others = [task for task in tasks if not task.get("beside")]
         alone = next((n for n, task in enumerate(others) if task.get("together")), len(others))
@@ -77,6 +81,8 @@ def main() -> int:
             begun += [pool.submit(do_task, task, place) for task in others[alone:]]
             for each in begun:
                 faults += each.result()
+        if asked.kernels:
+            faults += compiled_kernels(home / "home")
     print(f"{len(tasks)} tasks, {len(faults)} faults", flush=True)
     return 1 if faults else 0
 
@@ -102,21 +108,33 @@ def fresh_place(home: Path, package: str, python: str, constraints: str) -> Plac
     return _place(home, inside, {})
 
 
-def place_with_these_libraries(home: Path, package: str) -> Place:
-    """Install a wheel or a checkout alone, beside these libraries, with what the checkout has compiled."""
+def compiled_kernels(home: Path) -> list[str]:
+    """Return a fault if the tasks compiled kernels that the wheel of kernels lacks."""
+    made = sorted(f"{each.parent.name.rpartition('-')[0]}:{each.stem}" for each in home.rglob("*.code"))
+    said = [f"the wheel of kernels lacks {len(made)}: run `make kernel-calls`", *made] if made else []
+    print("\n".join(said), end="\n" if said else "", flush=True)
+    return said[:1]
+
+
+def place_with_these_libraries(home: Path, package: str, kernels: str | None) -> Place:
+    """Install wheels or a checkout alone, beside these libraries."""
     site = home / "site"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    subprocess.run([*pip, "--no-compile", "--target", str(site), package], check=True)
+    packages = [package, *([kernels] if kernels else [])]
+    subprocess.run([*pip, "--no-compile", "--target", str(site), *packages], check=True)
     for top in PACKAGES:
         for source in (ROOT / top).rglob("*.py"):
             installed = site / source.relative_to(ROOT)
             if installed.is_file() and installed.read_bytes() == source.read_bytes():
                 shutil.copystat(source, installed)
-        for compiled in (ROOT / top).rglob("__pycache__/*"):
+        for compiled in (ROOT / top).rglob("__pycache__/*.pyc"):
             target = site / compiled.relative_to(ROOT)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(compiled, target)
-    return _place(home, Path(sys.executable), {"PYTHONPATH": str(site)}, site / "bin")
+    more = {"PYTHONPATH": str(site)}
+    if not kernels:
+        more["NUMBA_CACHE_DIR"] = os.environ.get("NUMBA_CACHE_DIR", str(user_cache()))
+    return _place(home, Path(sys.executable), more, site / "bin")
 
 
 def _place(home: Path, python: Path, more: dict[str, str], *bins: Path) -> Place:

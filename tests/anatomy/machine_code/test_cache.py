@@ -11,10 +11,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 
 import anatomy
 from anatomy.machine_code.folders import generation
+from tests.test_release import load
 
 CALLEE = """from anatomy.kernels.compiling import kernel
 
@@ -136,6 +138,40 @@ def test_processes_that_begin_at_once_do_not_disturb_each_other(tree: Tree) -> N
     assert [each[0] for each in found] == [[3.0, 3.0 + 2 * (number % 2)] for number in range(4)]
     assert tree.call(1.0, 2)[1] == []
     assert {each.suffix for each in tree.kept.rglob("*") if each.is_file()} == {".code"}
+
+
+def test_an_upgrade_compiles_anew(tree: Tree, tmp_path: Path) -> None:
+    """pip leaves what it did not install, so an upgraded package finds the code of the old one."""
+    place = tmp_path / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place)], check=True)
+    python = place / ("Scripts" if os.name == "nt" else "bin") / "python"
+    said = []
+    for number, text in ((1, CALLEE), (2, CALLEE.replace("2.0", "5.0")), (1, CALLEE)):
+        tree.callee.write_text(text)
+        files = {
+            each.relative_to(tree.place).as_posix(): each.read_bytes()
+            for each in (tree.place / "anatomy").rglob("*.py*")
+            if each.suffix in (".py", ".json")
+        }
+        wheel = tmp_path / f"upgraded-{number}-py3-none-any.whl"
+        about = f"upgraded-{number}.dist-info"
+        files[f"{about}/METADATA"] = f"Metadata-Version: 2.1\nName: upgraded\nVersion: {number}\n".encode()
+        files[f"{about}/WHEEL"] = b"Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+        load("kernels_wheel").write_wheel(wheel, files, f"{about}/RECORD")
+        pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-index"]
+        subprocess.run([*pip, "--no-deps", "--upgrade", str(wheel)], check=True)
+        libraries = {"PYTHONPATH": str(Path(numba.__file__).parents[1]), "NUMBA_CACHE_DIR": str(tree.kept)}
+        words = [str(python), "-c", PROGRAM, "[3.0]"]
+        ended = subprocess.run(
+            words,
+            env=os.environ | libraries,
+            cwd=tmp_path / "venv",
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        said.append(json.loads(ended.stdout))
+    assert said == [[[7.0], COMPILED, []], [[16.0], COMPILED, []], [[7.0], [], []]]
 
 
 def made_before(tree: Tree, folder: str) -> Path:

@@ -23,7 +23,7 @@ from anatomy.cache import BUILDING, LUNG_FILE, REMOVED
 from anatomy.errors import FileError
 from anatomy.io.files import DAMAGE
 from anatomy.records import frozen_value
-from anatomy.unfinished import SECONDS_PER_DAY, is_abandoned, locked
+from anatomy.unfinished import SECONDS_PER_DAY, clear_abandoned, is_abandoned
 
 ARRAYS_PATTERN = re.compile(r"(atlas|shapes)-[0-9a-f]{64}\.npz")
 """Files of arrays: deployment atlases, and the shapes of tubes."""
@@ -119,7 +119,8 @@ def _header(path: Path) -> dict[str, Any]:
 def _made(path: Path, kind: str, stated: Any, last_used: float, formats: Mapping[str, str]) -> CacheEntry:
     """Return an entry with its size; `stated` is what it says of itself."""
     facts = stated if isinstance(stated, dict) else {}
-    sizes = {each.name: each.stat().st_size for each in ([path] if path.is_file() else path.iterdir())}
+    files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
+    sizes = {each.name: each.stat().st_size for each in files}
     pictures = sum(size for name, size in sizes.items() if name.endswith(".json") and name != LUNG_FILE)
     return CacheEntry(
         path=path,
@@ -147,10 +148,11 @@ def remove_entry(entry: CacheEntry) -> None:
         If it may not be removed.
     """
     try:
-        if entry.path.is_dir():
+        if entry.kind == "unfinished" and entry.path.is_dir():
+            clear_abandoned(entry.path)
+        elif entry.path.is_dir():
             doomed = entry.path.with_name(f"{REMOVED}{uuid.uuid4().hex}")
-            with locked(entry.path):
-                os.replace(entry.path, doomed)
+            os.replace(entry.path, doomed)
             shutil.rmtree(doomed, ignore_errors=True)
         else:
             entry.path.unlink(missing_ok=True)
@@ -159,7 +161,7 @@ def remove_entry(entry: CacheEntry) -> None:
     except OSError as error:
         raise FileError(
             f"{entry.path} cannot be removed: {error.strerror or error}",
-            remedy="Change the permissions of the cache folder, or choose another one",
+            remedy="End what uses it, change the permissions of the cache folder, or choose another one",
         ) from error
 
 

@@ -50,6 +50,10 @@ class SettingsError(LungaccessError):
     """A device or planning setting is unknown, not finite or physically impossible."""
 
 
+class MissingLibraryError(SettingsError, ImportError):
+    """A setting asks for a library that is not installed, or that does not exist for this platform."""
+
+
 class TargetError(LungaccessError):
     """The target is not where a target can be: outside the lung, or inside an obstacle."""
 

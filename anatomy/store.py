@@ -98,11 +98,11 @@ def _build_into(
             np.save(work / f"{name}.npy", array)
             return _mapped(work, name)
 
-        built = build_lung(images, key=key, keep=keep, progress=progress)
-        _save_rest(built, work)
+        # Nothing stays mapped: Windows renames no folder in which a file is open.
+        _save_rest(build_lung(images, key=key, keep=keep, progress=progress), work)
     lung = _load(folder)
     if lung is None and not folder.exists():
-        return built  # Another process made room; what is mapped stays readable.
+        return build_lung(images, key=key)  # Another process made room; this lung is in memory alone.
     if lung is None:
         raise FileError(
             f"The cached lung in {folder} cannot be read back",

@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
 import shutil
 import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+from filelock import FileLock, SoftFileLock, Timeout
+
 from anatomy.cache import BUILDING
 
 ABANDONED_AFTER_DAYS = 1.0
 """No anatomy takes so long to prepare: what is older and bears no lock was left behind."""
 SECONDS_PER_DAY = 24 * 3600.0
+LOCK, CONTENT = "lock", "content"
+"""What is filled lies beside its lock: Windows renames no folder in which a file is open."""
 
 
 @contextlib.contextmanager
 def filled_folder(parent: Path) -> Iterator[Path]:
-    """Make a folder and hold its lock, which the system takes back when this process ends, however it ends.
+    """Make a folder under a lock, which the system takes back when this process ends, however it ends.
 
     What is left of the folder at the end of the block is removed.
 
@@ -36,7 +38,7 @@ def filled_folder(parent: Path) -> Iterator[Path]:
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
             folder.mkdir(mode=0o700)
             if _is_taken(folder, stack):
-                yield folder
+                yield folder / CONTENT
                 return
 
 
@@ -44,7 +46,8 @@ def _is_taken(folder: Path, stack: contextlib.ExitStack) -> bool:
     """Lock a new folder, unless another process removes it meanwhile as one that nobody fills."""
     with contextlib.suppress(FileNotFoundError, BlockingIOError):
         stack.enter_context(locked(folder))
-        return folder.is_dir()
+        (folder / CONTENT).mkdir(mode=0o700)
+        return True
     return False
 
 
@@ -59,17 +62,20 @@ def locked(folder: Path) -> Iterator[bool]:
     FileNotFoundError
         If there is no such folder.
     """
-    handle, there = os.open(folder, os.O_RDONLY), True
+    lock, there = FileLock(folder / LOCK), True
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise
-        except OSError:
-            there = False
+        lock.acquire(blocking=False)
+    except FileNotFoundError:
+        raise
+    except (OSError, NotImplementedError) as error:
+        there = isinstance(error, Timeout)
+    there = there and not isinstance(lock, SoftFileLock)
+    if there and not lock.is_locked:
+        raise BlockingIOError(f"Another process fills {folder}")
+    try:
         yield there
     finally:
-        os.close(handle)
+        lock.release()
 
 
 def is_abandoned(path: Path) -> bool:
@@ -80,11 +86,21 @@ def is_abandoned(path: Path) -> bool:
     aged = time.time() - path.stat().st_mtime > ABANDONED_AFTER_DAYS * SECONDS_PER_DAY
     if not path.is_dir():
         return aged
+    if not (path / LOCK).exists():
+        return True
     try:
         with locked(path) as there:
             return there or aged
     except BlockingIOError:
         return False
+
+
+def clear_abandoned(folder: Path) -> None:
+    """Remove a folder that nobody fills; see `locked` for what is raised."""
+    with locked(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+    # Windows removes no file that is open, as the lock was.
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def clear_place(path: Path) -> None:

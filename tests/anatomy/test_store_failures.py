@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from anatomy import store, unfinished
 from anatomy.build import build_lung, lung_key
@@ -24,7 +25,7 @@ from anatomy.errors import AnatomyError, FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.store import META, folder_name, open_lung
-from anatomy.unfinished import filled_folder
+from anatomy.unfinished import CONTENT, LOCK, filled_folder, is_abandoned, locked
 from tests.anatomy import toys
 from tests.anatomy.stored_toy import FOLDER, KEY, SOURCES, no_reading, require_same
 from tests.anatomy.toys import toy
@@ -196,7 +197,7 @@ def test_a_killed_build_is_not_taken_for_a_lung(tmp_path: Path) -> None:
     assert done.returncode == -9
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".building-")
-    assert (left / "labels.npy").is_file()
+    assert (left / CONTENT / "labels.npy").is_file()
     assert open_lung(SOURCES, toy, cache=tmp_path).labels.any()
     assert [path.name for path in tmp_path.iterdir()] == [FOLDER], "what was left is gone"
 
@@ -264,7 +265,7 @@ def test_what_killed_builds_left_is_removed_and_what_is_being_built_stays(tmp_pa
     (left / "labels.npy").write_bytes(b"half")
     with filled_folder(tmp_path) as alive:
         long_ago = time.time() - 2 * 24 * 3600
-        os.utime(alive, (long_ago, long_ago))
+        os.utime(alive.parent, (long_ago, long_ago))
         open_lung(SOURCES, toy, cache=tmp_path)
         assert not left.exists() and alive.exists()
         assert not any(entry.abandoned for entry in cache_entries(tmp_path, {}))
@@ -284,4 +285,48 @@ def test_a_folder_lost_before_its_lock_is_made_again(tmp_path: Path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(unfinished, "locked", late)
         with filled_folder(tmp_path) as folder:
-            assert lost and folder != lost[0] and [*tmp_path.iterdir()] == [folder]
+            assert lost and folder.is_dir() and [*tmp_path.iterdir()] == [folder.parent]
+
+
+def test_one_process_alone_holds_the_lock_of_a_folder(tmp_path: Path) -> None:
+    with filled_folder(tmp_path) as folder:
+        with pytest.raises(BlockingIOError), locked(folder.parent):
+            pass
+        (folder / "labels.npy").write_bytes(b"half")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_locks_the_age_of_a_folder_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some file systems of networks have none."""
+
+    def refuse(_lock: FileLock) -> None:
+        raise OSError(errno.ENOTSUP, "Operation not supported")
+
+    monkeypatch.setattr(FileLock, "_acquire", refuse)
+    with filled_folder(tmp_path) as folder:
+        (folder.parent / LOCK).touch()
+        assert not is_abandoned(folder.parent)
+        long_ago = time.time() - 2 * 24 * 3600
+        os.utime(folder.parent, (long_ago, long_ago))
+        assert is_abandoned(folder.parent)
+
+
+def test_no_file_of_a_folder_is_open_when_it_is_renamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows would refuse; what this process maps and has open is asked of the system where it tells."""
+    told = [Path(f"/proc/self/{name}") for name in ("maps", "fd")]
+    if not all(each.exists() for each in told):
+        pytest.skip("the system does not tell which files are open")
+    rename, seen = os.replace, []
+
+    def looking(source: Path, target: Path) -> None:
+        seen.append(source)
+        assert str(source) not in told[0].read_text()
+        opened = [os.readlink(each) for each in told[1].iterdir() if each.is_symlink()]
+        assert not any(each.startswith(f"{source}{os.sep}") for each in opened)
+        rename(source, target)
+
+    monkeypatch.setattr(store.os, "replace", looking)
+    open_lung(SOURCES, toy, cache=tmp_path)
+    assert len(seen) == 1

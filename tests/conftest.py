@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from stages.needle import has_ompl
 
 if TYPE_CHECKING:
     import lungaccess as la
@@ -16,6 +19,44 @@ if TYPE_CHECKING:
     from anatomy.phantom import Phantom
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+OMPL_ALONE = _CHECKOUT / "tests" / "stages" / "needle" / "ompl"
+"""All tests in this folder need OMPL, as do others with the mark `ompl`."""
+WITHOUT_OMPL = "OMPL is not installed, or kept away by --without-ompl"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let tests be run as on a platform for which OMPL has no wheels."""
+    parser.addoption("--without-ompl", action="store_true", help="run the tests as if OMPL were not there")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Put a module that cannot be imported before OMPL, in this process and in those that it starts."""
+    if config.getoption("--without-ompl"):
+        blocked = str(_CHECKOUT / "tests" / "without_ompl")
+        sys.path.insert(0, blocked)
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [blocked, os.environ.get("PYTHONPATH")]))
+
+
+class _Skipped(pytest.Module):
+    """A module of tests that is not even imported."""
+
+    def collect(self) -> list[pytest.Item | pytest.Collector]:
+        pytest.skip(WITHOUT_OMPL, allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module | None:
+    """Skip what needs OMPL to be imported, where it is missing."""
+    if OMPL_ALONE in module_path.parents and not has_ompl():
+        return _Skipped.from_parent(parent, path=module_path)
+    return None
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what needs OMPL to run, where it is missing."""
+    if item.get_closest_marker("ompl") and not has_ompl():
+        pytest.skip(WITHOUT_OMPL)
 
 
 # No test may depend on the speed of the machine.

@@ -32,6 +32,8 @@ INSTEAD = {"--budget": "2", "--samples": "500", "--spacing": "15", "--iterations
 """How long the reader wants to wait, and how exact the answer has to be: less than on the pages."""
 QUICK = ("docs/explanation/replanning.md", "docs/explanation/ompl.md")
 """Pages that need no patient and run within seconds; all others are slow."""
+OF_OMPL = ("docs/explanation/planning.md", "docs/explanation/ompl.md")
+"""Pages that use OMPL's own planners."""
 STUDY = """
 name = "nodules"
 budget = {iterations = 1}
@@ -127,10 +129,16 @@ def run_block(block: Block, names: dict[str, object], page: Path) -> None:
             run_command(words)
 
 
+def marks(page: Path) -> list[pytest.MarkDecorator]:
+    """Return what the tests of a page are: slow, or of OMPL."""
+    name = name_of(page)
+    return [pytest.mark.slow] * (name not in QUICK) + [pytest.mark.ompl] * (name in OF_OMPL)
+
+
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, id=name_of(page), marks=() if name_of(page) in QUICK else pytest.mark.slow)
+        pytest.param(page, id=name_of(page), marks=marks(page))
         for page in PAGES
         if any(block.kind in RUN and block.not_run is None for block in blocks(page))
     ],

@@ -15,6 +15,7 @@ from lungaccess.study.cluster import Backlog, connect, interruptions_noted, requ
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.runs import Problem, Run, runs_of
 from lungaccess.study.settings import Study, StudyError
+from stages.needle import require_planner
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -84,6 +85,8 @@ def run_study(
         missing = [run for run in runs if run.key not in stored]
         there = {run.key for run in runs} & stored
         others = results.made_with_other_kernels(there, software_kernels())
+        for name in {run.planner.of_the_needle for run in missing if run.planner.is_of_ompl}:
+            require_planner(name)
         added = failed = 0
         if missing:
             say("starting workers", None)

@@ -221,7 +221,7 @@ def _atlas(patient: Patient, system: System, spacing: tuple[int, float, float], 
 def _in_own_process(run: Run, cache: Path | None) -> Answer:
     """Make a run in a fresh process, as a library with one seed a process needs."""
     words = [sys.executable, "-m", "lungaccess.study.one_run", *([str(cache)] if cache else [])]
-    done = subprocess.run(words, input=run.to_json(), capture_output=True, text=True, check=False)
+    done = subprocess.run(words, input=run.to_json(), capture_output=True, encoding="utf-8", errors="replace")
     if done.returncode != 0:
         raise StudyError(
             f"The process of a run ended with code {done.returncode}: {done.stderr.strip()[-500:]}",

@@ -137,9 +137,14 @@ class PlannerChoice:
             raise impossible("needle_planner", self.needle_planner, expected)
 
     @property
+    def of_the_needle(self) -> str:
+        """The planner of the needle that it names; empty for the method's own."""
+        return self.method if self.kind == "needle" else self.needle_planner
+
+    @property
     def is_of_ompl(self) -> bool:
         """Whether it is a planner of OMPL, whose random numbers can be seeded once in a process."""
-        return (self.method if self.kind == "needle" else self.needle_planner) in OMPL_PLANNERS
+        return self.of_the_needle in OMPL_PLANNERS
 
     @property
     def needs_a_needle(self) -> bool:

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         OMPL_PLANNERS,
         OMPL_TOLERANCE_MM,
         OUR_PLANNERS,
+        has_ompl,
         require_planner,
     )
     from stages.needle.query import Query
@@ -80,7 +81,7 @@ if TYPE_CHECKING:
         ReplanSettings,
         with_reserve,
     )
-    from stages.needle.search.base import RestartingRRT, Search
+    from stages.needle.search.base import RestartingRRT, Search, first_path
     from stages.needle.search.decision import Decision
     from stages.needle.search.optimal import OptimalSearch
     from stages.needle.search.planners import PLANNERS, MakeSearch

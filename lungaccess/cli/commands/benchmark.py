@@ -161,9 +161,12 @@ def _posing(
 
 
 def _planners(text: str) -> tuple[str, ...]:
-    from stages.needle import NEEDLE_PLANNERS, require_planner
+    from stages.needle import NEEDLE_PLANNERS, OMPL_PLANNERS, has_ompl, require_planner
 
     names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if text == DEFAULT_PLANNERS and not has_ompl():
+        names = tuple(name for name in names if name not in OMPL_PLANNERS)
+        terminal.progress_console.print("The planners of OMPL are left out: OMPL is not installed.")
     for name in names:
         require_planner(name)
     if not names:

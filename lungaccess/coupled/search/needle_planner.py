@@ -1,4 +1,4 @@
-"""A needle planner by its name in the coupled search: ours or one of OMPL, as one problem of OMPL."""
+"""A needle planner by its name in the coupled search: ours or one of OMPL, as one problem of OMPL where that is there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from anatomy.typed import Float
 from lungaccess.plans.evaluator import CandidateEvaluator
-from stages.needle import OMPL_PLANNERS, ArcPath
+from stages.needle import OMPL_PLANNERS, PLANNERS, ArcPath, first_path, has_ompl
 from stages.tube import Deployment
 
 if TYPE_CHECKING:
@@ -51,6 +51,11 @@ class NamedNeedlePlanner:
         The planners of OMPL look at no objective and at no seed; what they find may cost more.
         """
         query = self._evaluator.query(deployment, end)
+        if self._name not in OMPL_PLANNERS and not has_ompl():
+            search = PLANNERS[self._name](
+                self._evaluator.environment, query, seed, self._evaluator.objective
+            )
+            return first_path(search, iterations, cost_limit)
         return self._problem.plan(
             query, seed=seed, iterations=iterations, method=self._name, cost_limit=cost_limit
         )

@@ -4,6 +4,18 @@ The only package that imports OMPL; docs/explanation/ompl.md tells how it is use
 What OMPL's own planners propagate is proved clear step by step; what they find is proved once more as arcs.
 """
 
+from anatomy.errors import MissingLibraryError
+
+try:
+    import ompl.base
+    import ompl.control
+except ImportError as error:
+    raise MissingLibraryError(
+        f"OMPL cannot be imported ({error}), and its planners run in it",
+        expected="the library ompl, which has no wheels for Windows, Linux on ARM, Python 3.14 and macOS 14",
+        remedy="Choose a planner of our own, such as rrt or optimal, or install ompl where it exists",
+    ) from error
+
 from stages.needle.ompl.benchmark import benchmark
 from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question
 from stages.needle.ompl.problem import Allocator, NeedleProblem, SearchFactory, seed_ompl

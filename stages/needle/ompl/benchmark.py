@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -114,5 +113,7 @@ def benchmark(
 
 
 def _peak_memory_mb() -> float:
+    import resource  # Here: Windows has none, nor has it OMPL.
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10

@@ -19,13 +19,11 @@ from stages.needle.kernels import states, tree
 from stages.needle.ompl.states import numbers_of, put_numbers, write_state
 from stages.needle.path import ArcPath, arc_transform
 from stages.needle.query import Query
-from stages.needle.search.base import Search, TreeSearch
+from stages.needle.search.base import Search, TreeSearch, in_slices
 from stages.needle.violations import SAME_MM
 
 ROUNDING_MM = 1e-6
 """What every goal tolerance is larger for OMPL, whose states are rounded."""
-SLICE_ITERATIONS = 200
-"""Iterations between two looks at OMPL's termination condition, a few milliseconds."""
 NO_LIMIT = 2**62
 
 
@@ -131,16 +129,13 @@ class NeedlePlanner(base.Planner):
         self.search = search = self._make_search(query, self.seed)
         search.cost = self.cost_limit
         status = base.PlannerStatus.TIMEOUT
-        while not (termination() or search.finished):
-            portion = min(SLICE_ITERATIONS, self.iterations - self.iterations_used)
-            self.iterations_used += portion
-            if search.advance(portion) and search.path is not None:
-                self.path = search.path
-                status = self._hand_over(search.path)
+        for used, better in in_slices(search, self.iterations, termination):
+            self.iterations_used = used
+            if better is not None:
+                self.path = better
+                status = self._hand_over(better)
                 if not self.anytime:
                     break
-            if self.iterations_used >= self.iterations:
-                break
         return base.PlannerStatus(status)
 
     def _hand_over(self, path: ArcPath) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +20,8 @@ MAX_NODES = 20_000
 """Rows of a tree, 2 MB; a tree that has more begins anew."""
 RANDOM_SHARE = 0.5
 """Share of the iterations that extend a random node by a random arc; a free choice."""
+SLICE_ITERATIONS = 200
+"""Iterations of a slice, a few milliseconds."""
 RESTART_ITERATIONS = 200
 """Unit of the restart schedule: trees that are lucky are so early."""
 
@@ -55,6 +58,33 @@ def root_of(query: Query) -> Float:
     if query.reference is not None:
         root[tree.BEND + 1 : tree.BEND + 4] = query.reference
     return root
+
+
+def in_slices(
+    search: Search, iterations: int, ended: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[int, ArcPath | None]]:
+    """Advance a search; yield after each slice the iterations spent, and the path if it is a better one.
+
+    Parameters
+    ----------
+    iterations : int
+        Most to be spent.  One slice is begun in any case.
+    ended : callable, optional
+        Asked before each slice whether that is enough.
+    """
+    used = 0
+    while not (ended() or search.finished):
+        portion = min(SLICE_ITERATIONS, iterations - used)
+        used += portion
+        yield used, search.path if search.advance(portion) else None
+        if used >= iterations:
+            return
+
+
+def first_path(search: Search, iterations: int, cost_limit: float = math.inf) -> ArcPath | None:
+    """Return the first path that costs less than a limit, None if so many iterations find none."""
+    search.cost = cost_limit
+    return next((path for _used, path in in_slices(search, iterations) if path is not None), None)
 
 
 class TreeSearch:

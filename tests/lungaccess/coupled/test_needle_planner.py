@@ -16,8 +16,8 @@ from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import preset_names
 from lungaccess.problem.target import Target
-from stages.needle import OUR_PLANNERS
-from tests.lungaccess.coupled.planning import KUNTZ_TARGET, SYSTEM, mapped, plans_of
+from stages.needle import OUR_PLANNERS, has_ompl
+from tests.lungaccess.coupled.planning import KUNTZ_TARGET, SYSTEM, TARGET, mapped, plans_of, same_run
 
 
 class TestNeedlePlanner:
@@ -58,6 +58,19 @@ class TestNeedlePlanner:
         with pytest.raises(SettingsError, match=f"with {len(preset_names())} systems"):
             next(la.plan_with_presets(small_lung, target, needle_planner="control.EST"))
 
+    @pytest.mark.parametrize("method", ["atlas", "kuntz2015"])
+    def test_without_ompl_the_plans_are_the_same_bit_for_bit(
+        self, small_lung: Lung, atlas: la.Atlas, method: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        target = la.resolve_target(small_lung, KUNTZ_TARGET if method == "kuntz2015" else TARGET)
+        found = []
+        for there in (has_ompl(), False):
+            monkeypatch.setattr("lungaccess.coupled.search.needle_planner.has_ompl", lambda there=there: there)
+            plans = plans_of(small_lung, target, atlas, iterations=2000, method=method, seed=1)
+            found.append(same_run(plans))
+        assert found[0] == found[1] and found[0]
+
+    @pytest.mark.ompl
     @pytest.mark.slow
     def test_planners_of_ompl_repeat_in_processes_of_their_own(self) -> None:
         first, again = (

@@ -77,6 +77,7 @@ def test_a_run_that_cannot_be_stored_leaves_nothing(path: Path, runs: list[Run])
     assert counts(path)["experiments"] == 2
 
 
+@pytest.mark.ompl
 def test_the_tables_are_those_of_ompl(path: Path, runs: list[Run], tmp_path: Path) -> None:
     """Every column that OMPL's own reader makes is there, and its views can be made."""
     from ompl import tools

@@ -241,6 +241,7 @@ except SettingsError as error:
 """
 
 
+@pytest.mark.ompl
 @pytest.mark.slow
 def test_planners_of_ompl_repeat_in_processes_of_their_own(runs: list[Run], cache: Path) -> None:
     tip = Plan.from_json(answer(runs[0], cache).plan).tube.lps_from_tip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,11 +14,13 @@ from anatomy.margins import Margins
 from anatomy.structures import OUTSIDE, VESSEL
 from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment, needle_environment
-from stages.needle.ompl import NeedleProblem
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
 from stages.needle.search.base import Search
 from tests.stages.scenes import Canvas
+
+if TYPE_CHECKING:
+    from stages.needle.ompl import NeedleProblem
 
 GOAL = np.array([0.0, 0.0, 28.0])
 NEAR = np.array([8.0, 0.0, -4.0])

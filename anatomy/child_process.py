@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -25,6 +26,10 @@ def end_with_parent() -> None:
 
 
 def _watch(parent: int) -> None:
+    forked = multiprocessing.parent_process()
+    if sys.platform == "win32" and forked is not None:
+        forked.join()  # A number of a process says nothing there: it stays, and may become that of another.
+        os._exit(1)
     while os.getppid() == parent:
         time.sleep(LOOK_EVERY_S)
     os._exit(1)

@@ -189,7 +189,7 @@ def _save_rest(lung: Lung, folder: Path) -> None:
     meta["files"] = file_states(folder, sorted(path.name for path in folder.iterdir()))
     meta = json.loads(json.dumps(meta))
     meta["checksum"] = values_checksum(meta)
-    (folder / META).write_text(json.dumps(meta, indent=1))
+    (folder / META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
 
 
 def _load(folder: Path, *, warn: bool = False) -> Lung | None:
@@ -197,7 +197,7 @@ def _load(folder: Path, *, warn: bool = False) -> Lung | None:
     if not folder.exists():
         return None
     try:
-        meta = json.loads((folder / META).read_text())
+        meta = json.loads((folder / META).read_text(encoding="utf-8"))
         if meta["format"] != stored_format():
             return None
         stated = meta.pop("checksum")

@@ -136,6 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The words after the name of the program; those of this process if None.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    terminal.accept_every_character()
     try:
         with warnings.catch_warnings(), _termination_as_interruption():
             warnings.showwarning = _show_damage(warnings.showwarning)

@@ -15,7 +15,6 @@ from anatomy.cache import default_cache
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.records import frozen_value
 
-_REQUIREMENT = re.compile(r"^\s*([A-Za-z0-9._-]+)\s*([^;]*)")
 
 
 @frozen_value
@@ -148,16 +147,17 @@ def _version(name: str) -> str | None:
 
 
 def _libraries() -> tuple[Library, ...]:
-    """Return the libraries that the installed package requires."""
+    """Return the libraries that the installed package requires on this platform."""
+    from packaging.requirements import Requirement
+
     try:
         lines = metadata.requires("lungaccess") or []
     except metadata.PackageNotFoundError:
         lines = []
     found = []
-    for line in lines:
-        match = _REQUIREMENT.match(line)
-        if match is not None and "extra ==" not in line:
-            name, required = match[1], match[2].strip()
+    for each in map(Requirement, lines):
+        if each.marker is None or each.marker.evaluate({"extra": ""}):
+            name, required = each.name, str(each.specifier)
             found.append(Library(name=name, required=required, version=_version(name)))
     return tuple(found)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import io
 import json
 import math
 import os
@@ -51,6 +53,31 @@ progress_console = _Console(stderr=True)
 help_console = _Console()
 
 Row = tuple[str, ...]
+
+
+PLAIN = {
+    "\N{DEGREE SIGN}": " deg", "\N{EN DASH}": "-", "\N{GREATER-THAN OR EQUAL TO}": ">=", "\N{CHECK MARK}": "+",
+    "\N{LESS-THAN OR EQUAL TO}": "<=", "\N{BALLOT X}": "x", "\N{HORIZONTAL ELLIPSIS}": "...",
+}  # fmt: skip
+"""How our own characters are written where the encoding of the output has none for them."""
+
+
+def _plain(error: UnicodeError) -> tuple[str | bytes, int]:
+    """Write one character of `PLAIN` as there, others as escapes."""
+    if isinstance(error, UnicodeEncodeError) and error.object[error.start] in PLAIN:
+        return PLAIN[error.object[error.start]], error.start + 1
+    return codecs.backslashreplace_errors(error)
+
+
+codecs.register_error("lungaccess-plain", _plain)
+
+
+def accept_every_character() -> None:
+    """Let standard output and error write what their encoding lacks in other words."""
+    for stream in (sys.stdout, sys.stderr):
+        # Such as code page 1252 of Windows, which files get when output is redirected.
+        if isinstance(stream, io.TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
+            stream.reconfigure(errors="lungaccess-plain")
 
 
 def set_quiet(quiet: bool) -> None:

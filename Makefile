@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST_ARGS ?=
 BENCH_ARGS ?=
 
-.PHONY: help demo kernel-calls test first-contact lint format docs publish-docs dist try bench results results-quick clean
+.PHONY: help demo kernel-calls test first-contact lint format docs publish-docs dist try resolve bench results results-quick clean
 
 help:
 	@echo "make demo    plan on a synthetic patient, results in demo-output/"
@@ -23,6 +23,7 @@ help:
 	@echo "make dist    build wheel and sdist into dist/, and check what is in them"
 	@echo "make kernel-calls  write down which kernels each command calls (a quarter of an hour)"
 	@echo "make try     the wheel in new environments, on all versions of Python at hand (half an hour)"
+	@echo "make resolve the package registry asked whether every stated platform can install"
 	@echo "make bench   run the benchmarks"
 	@echo "make results-quick  all studies in the quick setting, and RESULTS.md"
 	@echo "make results        all studies in the full setting (hours), and RESULTS.md"
@@ -78,6 +79,10 @@ dist: $(VENV)/.installed-test
 # TRY_ARGS="--python 3.12 --dependencies newest" tries one environment of packaging/matrix.toml.
 try: $(VENV)/.installed-test
 	$(BIN)/python packaging/release.py try $(TRY_ARGS)
+
+# RESOLVE_ARGS="--platform Windows --python 3.12" asks about one cell of packaging/matrix.toml.
+resolve: $(VENV)/.installed-test
+	$(BIN)/python packaging/resolve.py $(RESOLVE_ARGS)
 
 bench: $(VENV)/.installed-dev
 	cd benchmarks && export ASV_PYTHONPATH="$(CURDIR)" && ../$(BIN)/asv machine --yes && ../$(BIN)/asv run -E existing:same --show-stderr $(BENCH_ARGS)

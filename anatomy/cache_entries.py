@@ -29,7 +29,7 @@ ARRAYS_PATTERN = re.compile(r"(atlas|shapes)-[0-9a-f]{64}\.npz")
 """Files of arrays: deployment atlases, and the shapes of tubes."""
 KEY_PATTERN = re.compile(r"[0-9a-f]{24}")
 UNFINISHED_PATTERN = re.compile(
-    rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}-{ARRAYS_PATTERN.pattern}"
+    rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}\.npz"
 )
 
 

@@ -8,6 +8,8 @@ import json
 import os
 import secrets
 import struct
+import sys
+import time
 import tomllib
 import zlib
 from collections.abc import Iterator
@@ -23,6 +25,8 @@ DAMAGE = (
     SyntaxError, TypeError, ValueError, BadZipFile, struct.error, zlib.error,
 )  # fmt: skip
 """What code raises that reads a damaged file."""
+REPLACE_TRIES = 20 if sys.platform == "win32" else 1
+"""For a second: readers and scanners of viruses have a file open no longer."""
 MOST_REASON = 300
 """Letters of a reason that are shown: a damaged file can be quoted without end."""
 
@@ -180,14 +184,26 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     '{}'
     """
     path = Path(path)
-    temporary = path.with_name(f".{secrets.token_hex(6)}-{path.name}")
+    # Short: Windows limits a whole path to 260 characters.
+    temporary = path.with_name(f".{secrets.token_hex(6)}{''.join(path.suffixes[-2:])}")
     try:
         yield temporary
-        os.replace(temporary, path)
+        _replace(temporary, path)
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
         temporary.unlink(missing_ok=True) if path.parent.is_dir() else None
+
+
+def _replace(source: Path, target: Path) -> None:
+    """Give a file the name of another; on Windows that waits a moment for those who have the other open."""
+    for left in reversed(range(REPLACE_TRIES)):
+        try:
+            return os.replace(source, target)
+        except PermissionError:
+            if not left:
+                raise
+            time.sleep(0.05)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -215,8 +231,9 @@ def write_json(path: str | Path, value: object) -> None:
 
 def _unwritable(path: Path, error: OSError) -> FileError:
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    change = "Close what has it open, change its permissions" if path.is_file() else "Change its permissions"
     return FileError(
         f"{path} cannot be written: {error.strerror or error}",
         expected="an existing folder that may be written to, with room on the disk",
-        remedy=f"{'Make room on the disk' if full else 'Change its permissions'}, or choose another folder",
+        remedy=f"{'Make room on the disk' if full else change}, or choose another folder",
     )

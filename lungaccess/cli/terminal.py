@@ -56,8 +56,9 @@ Row = tuple[str, ...]
 
 
 PLAIN = {
-    "\N{DEGREE SIGN}": " deg", "\N{EN DASH}": "-", "\N{GREATER-THAN OR EQUAL TO}": ">=", "\N{CHECK MARK}": "+",
-    "\N{LESS-THAN OR EQUAL TO}": "<=", "\N{BALLOT X}": "x", "\N{HORIZONTAL ELLIPSIS}": "...",
+    "\N{DEGREE SIGN}": " deg", "\N{EN DASH}": "-", "\N{GREATER-THAN OR EQUAL TO}": ">=",
+    "\N{CHECK MARK}": "+", "\N{LESS-THAN OR EQUAL TO}": "<=", "\N{BALLOT X}": "x",
+    "\N{HORIZONTAL ELLIPSIS}": "...",
 }  # fmt: skip
 """How our own characters are written where the encoding of the output has none for them."""
 

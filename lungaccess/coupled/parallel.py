@@ -32,8 +32,8 @@ def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
     if processes < 2 or "fork" not in multiprocessing.get_all_start_methods():
         raise SettingsError(
             f"{processes} processes are asked for",
-            expected="at least 2, on a system that can fork processes",
-            remedy="Search in one process",
+            expected="at least 2, on a system that can fork processes: not Windows",
+            remedy="Leave out --processes; studies use several processes on every system",
         )
     yield from search.direct_steps()
     context = multiprocessing.get_context("fork")

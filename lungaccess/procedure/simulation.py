@@ -77,7 +77,7 @@ def simulate_procedure(
     radius_mm : float, optional
         Radius of the goal; see `RiskAssessor`.
     processes : int
-        How many processes share the work.
+        How many processes share the work; one does all where the system cannot fork, as on Windows.
 
     Raises
     ------

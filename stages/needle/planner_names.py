@@ -27,7 +27,7 @@ def has_ompl() -> bool:
 
 
 def require_planner(name: str) -> None:
-    """Raise SettingsError unless a name is one of NEEDLE_PLANNERS, and OMPL is there if it is one of its own."""
+    """Raise SettingsError unless a name is one of NEEDLE_PLANNERS, and OMPL is there for its own."""
     if name in OMPL_PLANNERS:
         import stages.needle.ompl  # noqa: F401  # Raises where OMPL is missing.
     if name not in NEEDLE_PLANNERS:

@@ -94,7 +94,7 @@ def test_old_formats_and_what_is_too_old_go(cache: Path) -> None:
 
 
 def test_what_is_being_written_stays_and_what_was_left_behind_goes(cache: Path) -> None:
-    names = (f"{BUILDING}{'0' * 32}", f"{REMOVED}{'1' * 32}", f".{'a' * 12}-atlas-{'b' * 64}.npz")
+    names = (f"{BUILDING}{'0' * 32}", f"{REMOVED}{'1' * 32}", f".{'a' * 12}.npz")
     for name in names:
         (cache / name).write_bytes(b"half")
     listed = [entry for entry in cache_entries(cache, FORMATS) if entry.kind == "unfinished"]

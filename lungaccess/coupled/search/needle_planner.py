@@ -1,4 +1,4 @@
-"""A needle planner by its name in the coupled search: ours or one of OMPL, as one problem of OMPL where that is there."""
+"""A needle planner by its name in the coupled search: ours, or one of OMPL; driven by OMPL if it is there."""
 
 from __future__ import annotations
 
@@ -52,9 +52,7 @@ class NamedNeedlePlanner:
         """
         query = self._evaluator.query(deployment, end)
         if self._name not in OMPL_PLANNERS and not has_ompl():
-            search = PLANNERS[self._name](
-                self._evaluator.environment, query, seed, self._evaluator.objective
-            )
+            search = PLANNERS[self._name](self._evaluator.environment, query, seed, self._evaluator.objective)
             return first_path(search, iterations, cost_limit)
         return self._problem.plan(
             query, seed=seed, iterations=iterations, method=self._name, cost_limit=cost_limit

@@ -13,6 +13,7 @@ import pytest
 import lungaccess as la
 from anatomy.errors import SettingsError
 from anatomy.lung import Lung
+from lungaccess.coupled.search import needle_planner
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import preset_names
 from lungaccess.problem.target import Target
@@ -65,7 +66,7 @@ class TestNeedlePlanner:
         target = la.resolve_target(small_lung, KUNTZ_TARGET if method == "kuntz2015" else TARGET)
         found = []
         for there in (has_ompl(), False):
-            monkeypatch.setattr("lungaccess.coupled.search.needle_planner.has_ompl", lambda there=there: there)
+            monkeypatch.setattr(needle_planner, "has_ompl", lambda there=there: there)
             plans = plans_of(small_lung, target, atlas, iterations=2000, method=method, seed=1)
             found.append(same_run(plans))
         assert found[0] == found[1] and found[0]

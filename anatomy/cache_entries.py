@@ -28,9 +28,7 @@ from anatomy.unfinished import SECONDS_PER_DAY, clear_abandoned, is_abandoned
 ARRAYS_PATTERN = re.compile(r"(atlas|shapes)-[0-9a-f]{64}\.npz")
 """Files of arrays: deployment atlases, and the shapes of tubes."""
 KEY_PATTERN = re.compile(r"[0-9a-f]{24}")
-UNFINISHED_PATTERN = re.compile(
-    rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}\.npz"
-)
+UNFINISHED_PATTERN = re.compile(rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}\.npz")
 
 
 @frozen_value

@@ -333,7 +333,7 @@ class SearchOptions(BudgetOptions):
         ),
     ] = None
     processes: Annotated[
-        Processes, Parameter(help="How many processes refine the plan at the same time.")
+        Processes, Parameter(help="How many processes refine the plan at the same time; not on Windows.")
     ] = 1
     gap: Annotated[
         NotNegative | None,

@@ -10,7 +10,7 @@ import shutil
 import signal
 import tempfile
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from importlib import resources
 from pathlib import Path
 
@@ -158,17 +158,12 @@ class Explorer:
     async def serve(self, started: Callable[[Address], None]) -> None:
         """Serve until SIGINT or SIGTERM comes; `started` is told the address."""
         ended = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        with _signalled(asyncio.get_running_loop(), ended):
             try:
-                loop.add_signal_handler(number, ended.set)
-            except NotImplementedError:  # Windows
-                signal.signal(number, lambda *_: loop.call_soon_threadsafe(ended.set))
-        try:
-            started(await self.start())
-            await ended.wait()
-        finally:
-            await self.stop()
+                started(await self.start())
+                await ended.wait()
+            finally:
+                await self.stop()
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -312,6 +307,21 @@ class Explorer:
             _ticket, old = self._files.popitem(last=False)
             shutil.rmtree(old.parent, ignore_errors=True)
         return ticket
+
+
+@contextlib.contextmanager
+def _signalled(loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> Iterator[None]:
+    """Let SIGINT and SIGTERM set an event; loops have handlers of their own for that, but not on Windows."""
+
+    def end(*_signal: object) -> None:
+        loop.call_soon_threadsafe(ended.set)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _same(given: str, token: str) -> bool:

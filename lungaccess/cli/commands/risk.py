@@ -38,7 +38,9 @@ def risk(
         Probability, Parameter(help="Probability of success that the tolerances keep.")
     ] = 0.95,
     seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
-    processes: Annotated[Processes, Parameter(help="How many processes share procedures that measure.")] = 1,
+    processes: Annotated[
+        Processes, Parameter(help="How many processes share procedures that measure; one on Windows.")
+    ] = 1,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it."""

@@ -88,7 +88,7 @@ def table(found: dict[tuple[str, str], str]) -> str:
     lines = ["| platform | " + " | ".join(pythons) + " |", "|---" * (1 + len(pythons)) + "|"]
     for platform in dict.fromkeys(name for name, _python in found):
         cells = [found.get((platform, python)) for python in pythons]
-        words = [{None: "not stated", "": "yes"}.get(cell, "NO") for cell in cells]
+        words = [{None: "-", "": "yes"}.get(cell, "NO") for cell in cells]
         lines.append(f"| {platform} | " + " | ".join(words) + " |")
     reasons = [f"{platform}, Python {python}: {why}" for (platform, python), why in found.items() if why]
     return "\n".join(lines + reasons)

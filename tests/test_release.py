@@ -27,7 +27,7 @@ def load(name: str) -> ModuleType:
     return module
 
 
-release, publish_docs = load("release"), load("publish_docs")
+release, publish_docs, resolve = load("release"), load("publish_docs"), load("resolve")
 
 
 def bounds(*extras: str) -> dict[str, str]:
@@ -54,7 +54,8 @@ def test_the_matrix_has_every_version_of_python_that_the_project_states() -> Non
     classified = [each.rsplit(" ", 1)[1] for each in PROJECT["classifiers"] if ":: 3." in each]
     tried = {each["python"] for each in release.MATRIX["environment"]}
     assert sorted(tried) == stated == classified
-    assert all(each["python"] == stated for each in release.MATRIX["platform"])
+    assert all(set(each["python"]) <= set(stated) for each in release.MATRIX["platform"])
+    assert set().union(*(each["python"] for each in release.MATRIX["platform"])) == set(stated)
     extremes = {each["dependencies"] for each in release.MATRIX["environment"]}
     assert extremes == {"lowest", "tested", "newest"} == set(release.MATRIX["constraints"])
     assert {"python": stated[0], "dependencies": "lowest"} in release.MATRIX["environment"]
@@ -172,3 +173,47 @@ def test_the_paper_cites_what_its_bibliography_has_and_links_lead_somewhere() ->
     assert links and all((ROOT / "paper" / link).exists() for link in links)
     for section in ("Summary", "Statement of need", "State of the field", "Figures"):
         assert f"# {section}\n" in text
+
+
+def test_ompl_is_required_where_it_has_wheels_alone() -> None:
+    required = {
+        (platform["name"], python)
+        for platform in release.MATRIX["platform"]
+        for python in platform["python"]
+        if any(
+            line.startswith("ompl")
+            for line in resolve.applying(PROJECT["dependencies"], resolve.environment(platform, python))
+        )
+    }
+    having = ("Linux x86-64", "macOS 15 arm64", "macOS 15 x86-64")
+    assert required == {(name, python) for name in having for python in ("3.11", "3.12", "3.13")}
+
+
+def test_indirect_requirements_of_another_platform_are_resolved_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A library that a requirement needs on Windows alone is asked for there; what pip refuses is told."""
+    asked: list[list[str]] = []
+
+    def pip(wanted: list[str], _tags: list[str], _python: str) -> tuple[list[object] | None, str]:
+        asked.append(wanted)
+        if any(line.startswith("nowhere") for line in wanted):
+            return None, "No matching distribution found for nowhere"
+        needs = ["colorama; sys_platform == 'win32'", "nowhere; sys_platform == 'darwin'"]
+        names = [re.split("[<>=]", line)[0] for line in wanted]
+        return [{"metadata": {"name": name, "requires_dist": needs}} for name in names], ""
+
+    monkeypatch.setattr(resolve, "pip_report", pip)
+    windows, mac = (
+        next(p for p in release.MATRIX["platform"] if name in p["name"]) for name in ("Win", "mac")
+    )
+    assert resolve.resolve(windows, "3.12") == "" and "colorama" in asked[-1]
+    assert "nowhere" in resolve.resolve(mac, "3.12")
+    told = resolve.table({("Windows", "3.12"): "", ("macOS", "3.12"): "no wheel"})
+    assert "| macOS | NO |" in told and told.endswith("macOS, Python 3.12: no wheel")
+
+
+def test_without_a_registry_nothing_fails(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(resolve, "pip_report", lambda *_: (None, "no connection"))
+    monkeypatch.setattr("sys.argv", ["resolve.py"])
+    assert resolve.main() == 0 and "No package registry" in capsys.readouterr().out

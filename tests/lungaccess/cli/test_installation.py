@@ -40,6 +40,16 @@ def test_the_doctor_sees_every_library(tmp_path: Path, capsys: pytest.CaptureFix
     assert "compiled kernels" in capsys.readouterr().out
 
 
+def test_the_doctor_misses_nothing_that_this_platform_does_not_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [
+        "numpy>=2.0", "no-such-a>=1; sys_platform == 'another'", "no-such-b; extra == 'view'",
+        "no-such-c>=1; python_version >= '3.9' and (sys_platform != 'another' or extra == 'view')",
+    ]  # fmt: skip
+    monkeypatch.setattr(installation.metadata, "requires", lambda _name: lines)
+    found = {each.name: each.version for each in installation._libraries()}
+    assert list(found) == ["numpy", "no-such-c"] and found["numpy"] and found["no-such-c"] is None
+
+
 def test_the_doctor_complains(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
     missing = installation.Library(name="numba", required=">=0.60", version=None)
     monkeypatch.setattr(installation, "_libraries", lambda: (missing,))

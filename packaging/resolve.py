@@ -111,6 +111,9 @@ def main() -> int:
             if asked.python in (None, python):
                 found[platform["name"], python] = why = resolve(platform, python)
                 print(f"{platform['name']}, Python {python}: {why or 'resolves'}", flush=True)
+                if why and not is_reachable():
+                    print("The package registry can no longer be reached: the rest was not resolved")
+                    return 0
     print(table(found))
     return 1 if any(found.values()) else 0
 

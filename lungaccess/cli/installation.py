@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import sys
 from dataclasses import asdict
 from importlib import metadata
@@ -14,7 +13,6 @@ from typing import Any
 from anatomy.cache import default_cache
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.records import frozen_value
-
 
 
 @frozen_value

@@ -7,9 +7,9 @@
 tasks of a first look, as packaging/release.py asks for each version of Python.
 
 The package is built and installed as a user would get it, so that a file that was forgotten is missed.
-Without --fresh, what the checkout has compiled of modules is copied, and the libraries are those of the Python
-that runs this.  With --kernels, the wheel of compiled kernels is installed too: then the tasks must compile no
-kernel.  Without it they use those that this user has compiled.
+Without --fresh, what the checkout has compiled of modules is copied, and the libraries are those of the
+Python that runs this.  With --kernels, the wheel of compiled kernels is installed too: then the tasks must
+compile no kernel.  Without it they use those that this user has compiled.
 """
 
 from __future__ import annotations

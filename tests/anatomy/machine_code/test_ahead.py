@@ -24,7 +24,7 @@ READ_ONLY.setflags(write=False)
 @pytest.mark.parametrize(
     "kind",
     [
-        *map(numba.typeof, (1, 2.0, True, None, np.uint16(3), READ_ONLY, READ_ONLY[:, ::2], (1, 2), (1, 2.0))),
+        *map(numba.typeof, (1, 2.0, True, None, np.uint16(3), READ_ONLY, READ_ONLY[:, ::2], (1, 2.0))),
         types.literal(3), types.Omitted(0.5), types.Optional(types.float64),
     ],
 )  # fmt: skip

@@ -1,0 +1,125 @@
+"""Tiny lungs drawn voxel by voxel, and distances to their voxels without any of the kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy import poses
+from anatomy.airway_tree import AirwayTree
+from anatomy.fields import distance_field
+from anatomy.grid import Grid
+from anatomy.lung import Lung
+from anatomy.records import frozen_record
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, FIELD_BITS, LUMEN, OUTSIDE, close_border
+from anatomy.typed import Float, Labels, Mask
+
+Random = np.random.Generator
+ROUNDING_MM = 1e-7
+"""Distances of kernels and of numpy differ by less."""
+
+
+@frozen_record
+class Case:
+    """One drawn case of a proof.
+
+    Parameters
+    ----------
+    answers : (N,) float64
+        What the kernels answered.
+    contradiction : callable
+        Compares the answers with the truth; returns "" or what contradicts it, with both numbers.
+    """
+
+    answers: Float
+    contradiction: Callable[[], str]
+
+
+def empty_labels(low: ArrayLike, high: ArrayLike, spacing_mm: ArrayLike) -> tuple[Labels, Grid]:
+    """Return free tissue whose faces lie at `low` and about at `high`, LPS mm."""
+    spacing = np.broadcast_to(np.asarray(spacing_mm, dtype=np.float64), 3)
+    shape = tuple(int(n) for n in np.rint((np.asarray(high) - np.asarray(low)) / spacing))
+    grid = Grid.from_spacing(shape, spacing, np.asarray(low) + 0.5 * spacing)
+    return np.zeros(shape, dtype=np.uint16, order="F"), grid
+
+
+def near_segment(grid: Grid, a: ArrayLike, b: ArrayLike, radius_mm: float) -> Mask:
+    """Tell which voxel centres lie within a radius of a segment, or of a point if both ends are one."""
+    points = grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1))
+    begin, way = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64) - a
+    share = np.clip(((points - begin) @ way) / max(float(way @ way), 1e-300), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(points - begin - share[..., None] * way, axis=-1) <= radius_mm)
+
+
+def draw_airway(labels: Labels, grid: Grid, a: ArrayLike, b: ArrayLike, radius_mm: float) -> None:
+    """Draw an airway, branch 0, with a wall of 1 mm."""
+    code = AIRWAY | (1 << BRANCH_SHIFT)
+    labels[near_segment(grid, a, b, radius_mm + 1.0)] = code
+    labels[near_segment(grid, a, b, radius_mm)] = code | LUMEN
+
+
+def line_tree(a: ArrayLike, b: ArrayLike, radius_mm: float) -> AirwayTree:
+    """Return a tree of one straight branch with points about 1 mm apart."""
+    begin, way = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64) - a
+    length = float(np.linalg.norm(way))
+    count = max(round(length), 1) + 1
+    share = np.linspace(0.0, 1.0, count)
+    return AirwayTree(
+        points_lps=begin + share[:, None] * way,
+        radius_mm=np.full(count, radius_mm),
+        parent_point=np.arange(count) - 1,
+        branch_of_point=np.zeros(count, dtype=np.int64),
+        branch_start=np.array([0, count]),
+        branch_parent=np.array([-1]),
+        generation=np.array([0]),
+        distance_from_root_mm=share * length,
+        tangents=np.tile(way / length, (count, 1)),
+    )
+
+
+def lung_of(labels: Labels, grid: Grid, tree: AirwayTree) -> Lung:
+    """Return a lung of labels, whose outermost voxels become OUTSIDE."""
+    close_border(labels)
+    fields = {name: distance_field(name, (labels & bits) != 0, grid) for name, bits in FIELD_BITS.items()}
+    return Lung(
+        name="selftest", kind="masks", key="", grid=grid, labels=labels, nodules=None, cost=None, starts=(),
+        fields={name: field for name, field in fields.items() if "fissure" not in name},
+        targets_lps=(), breath_hold=None, sources={}, warnings=(), tree=tree,
+        lumen_depth=distance_field("lumen_depth", (labels & LUMEN) == 0, grid),
+    )  # fmt: skip
+
+
+def true_distances(labels: Labels, grid: Grid, points: Float, bits: int, exempt: int = -1) -> Float:
+    """Return the distances `(N,)` of points to the nearest voxel box with any of `bits`; inf without one.
+
+    Voxels of the branch `exempt` that are airway alone, of these structures, are passed over.  All beyond
+    the grid is OUTSIDE.
+    """
+    hit = labels & bits
+    chosen = hit != 0
+    if exempt >= 0:
+        chosen &= ~((hit == AIRWAY) & ((labels >> BRANCH_SHIFT).astype(np.int64) - 1 == exempt))
+    local, centres = grid.ijk(points), np.argwhere(chosen)
+    out = np.full(len(points), np.inf)
+    for n, place in enumerate(local):
+        gaps = np.maximum(np.abs(centres - place) - 0.5, 0.0) * grid.spacing_mm
+        out[n] = math.sqrt((gaps**2).sum(axis=1).min(initial=np.inf))
+    if bits & OUTSIDE:
+        faces = np.hstack([local + 0.5, np.array(grid.shape) - 0.5 - local]) * np.tile(grid.spacing_mm, 2)
+        out = np.minimum(out, np.maximum(faces.min(axis=1), 0.0))
+    return out
+
+
+def unit(rng: Random) -> Float:
+    """Return a random direction `(3,)`."""
+    direction = rng.normal(size=3)
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def tilted(frame: Float, moved: Float, tilt_rad: float, around_rad: float) -> Float:
+    """Return a pose moved by a vector, its direction tilted."""
+    aside = math.cos(around_rad) * frame[:3, 0] + math.sin(around_rad) * frame[:3, 1]
+    return poses.pose(frame[:3, 3] + moved, math.cos(tilt_rad) * frame[:3, 2] + math.sin(tilt_rad) * aside)

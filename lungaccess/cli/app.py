@@ -41,6 +41,7 @@ from lungaccess.cli.commands.report import report
 from lungaccess.cli.commands.risk import risk
 from lungaccess.cli.commands.route import route
 from lungaccess.cli.commands.segment import segment
+from lungaccess.cli.commands.selftest import selftest
 from lungaccess.cli.commands.shapes import shapes
 from lungaccess.cli.commands.start_region import start_region
 from lungaccess.cli.commands.steps import steps
@@ -98,7 +99,7 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 for _command in (
     plan, needle, replan, stream, certify, check, info, presets, template, phantom, demo, advise,
     alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report,
-    view, export, insert, doctor, completion,
+    view, export, insert, doctor, selftest, completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 app.command(study)

@@ -57,6 +57,7 @@ EXAMPLES = MappingProxyType(
         "cache prune": "lungaccess cache prune --older-than 30 --max-size 5GB",
         "cache clear": "lungaccess cache clear --cache CACHE",
         "doctor": "lungaccess doctor",
+        "selftest": "lungaccess selftest",
         "completion": "lungaccess completion bash",
     }
 )

@@ -9,7 +9,7 @@ import numpy as np
 from anatomy.fields import corner_geometry, distance_field
 from anatomy.kernels.field import MIN_GAP_MM, UNITS_PER_MM, exact_at
 from anatomy.poses import pose
-from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OBSTACLES, VESSEL
+from anatomy.structures import LUMEN, OBSTACLES, VESSEL
 from anatomy.typed import Float
 from lungaccess.selftest.scenes import (
     ROUNDING_MM,
@@ -30,7 +30,6 @@ from stages.needle import (
     Query,
     StartRegion,
     TriedStarts,
-    arc_transform,
     blocker_on_path,
     direct_path,
     environment_of_labels,
@@ -95,11 +94,15 @@ def arcs(rng: Random) -> Case:
     """Draw paths of one and two arcs; a clear one is clear in all samples, another is not."""
     environment, paths = tissue(rng, 5), []
     for _ in range(6):
-        pieces = np.column_stack([rng.uniform(3.0, 8.0, 2), rng.uniform(-3.0, 3.0, 2), rng.uniform(0, 0.05, 2)])
+        pieces = np.column_stack(
+            [rng.uniform(3.0, 8.0, 2), rng.uniform(-3.0, 3.0, 2), rng.uniform(0, 0.05, 2)]
+        )
         frame = tilted(START, 0.3 * unit(rng), rng.uniform(0.0, 0.3), rng.uniform(0.0, 6.0))
         paths.append(ArcPath(lps_from_start=frame, arcs=pieces[: int(rng.integers(1, 3))]))
     branches = rng.integers(-1, 1, len(paths)).tolist()
-    labels = [blocker_on_path(environment, path, branch) for path, branch in zip(paths, branches, strict=True)]
+    labels = [
+        blocker_on_path(environment, path, branch) for path, branch in zip(paths, branches, strict=True)
+    ]
 
     def contradiction() -> str:
         for path, branch, label in zip(paths, branches, labels, strict=True):
@@ -121,8 +124,8 @@ def start_region(rng: Random) -> Case:
         lps_from_start=START, target=target, radius_mm=0.0, proved=proved, tried=NOTHING_TRIED,
         max_curvature_per_mm=environment.limits.kappa,
     )  # fmt: skip
-    aside = np.array([1.0, 0.0, 0.0])
-    drawn = [(0.0, aside), (math.pi, aside), (rng.uniform(0.0, 6.3), unit(rng))]
+    aside, around = np.array([1.0, 0.0, 0.0]), math.atan2(START[0, 1], START[0, 0])
+    drawn = [(around, aside), (around + math.pi, aside), (rng.uniform(0.0, 6.3), unit(rng))]
 
     def contradiction() -> str:
         for n in range(0, len(proved.offsets_mm), 3):

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from anatomy import poses
 from anatomy.airway_tree import AirwayTree
@@ -15,9 +16,11 @@ from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FIELD_BITS, LUMEN, OUTSIDE, close_border
-from anatomy.typed import Float, Labels, Mask
+from anatomy.typed import Float, Int, Labels, Mask
 
 Random = np.random.Generator
+NEAREST = 16
+"""Voxels whose centres are looked at first for the nearest box."""
 ROUNDING_MM = 1e-7
 """Distances of kernels and of numpy differ by less."""
 
@@ -102,15 +105,24 @@ def true_distances(labels: Labels, grid: Grid, points: Float, bits: int, exempt:
     chosen = hit != 0
     if exempt >= 0:
         chosen &= ~((hit == AIRWAY) & ((labels >> BRANCH_SHIFT).astype(np.int64) - 1 == exempt))
-    local, centres = grid.ijk(points), np.argwhere(chosen)
+    local, centres, spacing = grid.ijk(points), np.argwhere(chosen), grid.spacing_mm
     out = np.full(len(points), np.inf)
-    for n, place in enumerate(local):
-        gaps = np.maximum(np.abs(centres - place) - 0.5, 0.0) * grid.spacing_mm
-        out[n] = math.sqrt((gaps**2).sum(axis=1).min(initial=np.inf))
+    if len(centres) and len(points):
+        some = [*range(1, min(NEAREST, len(centres)) + 1)]
+        away, voxels = cKDTree(centres * spacing).query(local * spacing, k=some)
+        out = _to_boxes(local[:, None], centres[voxels], spacing)
+        # A box whose centre is farther than these may yet be nearer.
+        for n in np.flatnonzero(away[:, -1] - 0.5 * np.linalg.norm(spacing) < out):
+            out[n] = _to_boxes(local[n], centres, spacing)
     if bits & OUTSIDE:
-        faces = np.hstack([local + 0.5, np.array(grid.shape) - 0.5 - local]) * np.tile(grid.spacing_mm, 2)
+        faces = np.hstack([local + 0.5, np.array(grid.shape) - 0.5 - local]) * np.tile(spacing, 2)
         out = np.minimum(out, np.maximum(faces.min(axis=1), 0.0))
     return out
+
+
+def _to_boxes(places: Float, centres: Int, spacing: Float) -> Float:
+    gaps = np.maximum(np.abs(centres - places) - 0.5, 0.0) * spacing
+    return np.asarray(np.sqrt((gaps**2).sum(axis=-1)).min(axis=-1))
 
 
 def unit(rng: Random) -> Float:

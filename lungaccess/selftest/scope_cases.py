@@ -6,15 +6,24 @@ import math
 
 import numpy as np
 
-from anatomy.poses import poses_on_arc
+from anatomy.poses import pose, poses_on_arc
 from anatomy.structures import AIRWAY, LUMEN
 from anatomy.typed import Float
-from lungaccess.selftest.scenes import Case, Random, draw_airway, empty_labels, line_tree, lung_of, tilted
-from lungaccess.selftest.scenes import ROUNDING_MM, true_distances, unit
+from lungaccess.selftest.scenes import (
+    ROUNDING_MM,
+    Case,
+    Random,
+    draw_airway,
+    empty_labels,
+    line_tree,
+    lung_of,
+    tilted,
+    true_distances,
+    unit,
+)
 from stages.scope import Bronchoscope, MotionProver, ScopeMotion
 from stages.scope.kernels.body import motion_room
 from stages.scope.lumen_walls import walls_of
-from anatomy.poses import pose
 
 SCOPE = Bronchoscope(
     name="selftest", outer_diameter_mm=2.0, channel_diameter_mm=1.0, lumen_margin_mm=0.1, bend_up_deg=180.0,
@@ -43,9 +52,7 @@ def motions(rng: Random) -> Case:
         states[:, 1:] = rng.uniform((-0.4, 0.65), (0.4, 0.85), (4, 2))
         states[:, 2] *= rng.choice((-1.0, 1.0), 4)
         states[2, 1:] = states[1, 1:]
-        motion = ScopeMotion(
-            lps_from_entry=entry, states=states, bending_length_mm=SCOPE.bending_length_mm
-        )
+        motion = ScopeMotion(lps_from_entry=entry, states=states, bending_length_mm=SCOPE.bending_length_mm)
         margin = prover.prove(motion)
         # With the longest steps the bounds between places and states carry the whole proof.
         room = motion_room(

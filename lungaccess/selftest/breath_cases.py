@@ -7,7 +7,7 @@ import numpy as np
 from anatomy.grid import Grid
 from anatomy.motion.motion import LEFT, Motion
 from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, VESSEL
-from anatomy.typed import Float
+from anatomy.typed import Float, Labels
 from lungaccess.breathing.kernels import rules
 from lungaccess.breathing.kernels.rigid import Rigid
 from lungaccess.breathing.kernels.window import MOST_LEAVES, divide
@@ -72,7 +72,8 @@ def windows(rng: Random) -> Case:
             for phase in begin + SHARES * (end - begin):
                 spare = spare_mm(lung.labels, grid, motion, rigid, points, target, float(phase) - MASKS_PHASE)
                 if spare < -1e-3 if state == rules.CLEAR else state == rules.BLOCKED and spare > FOUND_MM:
-                    return f"state {state:.0f} from {begin:.4f} to {end:.4f}; at {phase:.4f} {spare:.4f} mm spare"
+                    said = f"phases {begin:.4f} to {end:.4f} in state {state:.0f}"
+                    return f"{said}; {spare:.4f} mm spare at {phase:.4f}"
         return ""
 
     return Case(answers=leaves.ravel(), contradiction=contradiction)
@@ -106,7 +107,7 @@ def displaced(motion: Motion, points: Float) -> Float:
 
 
 def spare_mm(
-    labels: Float, grid: Grid, motion: Motion, rigid: Rigid, points: Float, target: Float, share: float
+    labels: Labels, grid: Grid, motion: Motion, rigid: Rigid, points: Float, target: Float, share: float
 ) -> float:
     """Return by how much all rules are kept in a phase, by samples of the moved voxels."""
     from scipy.linalg import polar

@@ -108,7 +108,7 @@ def drawn_tubes(rng: Random, environment: TubeEnvironment) -> tuple[Float, Float
 
 
 def tubes(rng: Random) -> Case:
-    """Draw deployments; beyond the wall an accepted one keeps clear, in all samples, of all but its branch."""
+    """Draw deployments; samples of an accepted one, beyond the wall, are clear of all but its branch."""
     lung = drawn_lung(rng)
     environment = tube_environment(lung, with_fissures=False)
     drawn = [drawn_tubes(rng, environment) for _ in range(12)]
@@ -218,7 +218,7 @@ def not_reached(rng: Random) -> Case:
 
 
 def _proof_environment(case: Reaching) -> ProofEnvironment:
-    """Return what the proof looks at; that tips may be in all of the lumen, and needles everywhere, is no less."""
+    """Return what the proof looks at, with tips of the scope wherever there is lumen."""
     lung, spacing = case.lung, case.lung.grid.spacing_mm
     lumen, hazards = (lung.labels & LUMEN) != 0, (lung.labels & (VESSEL | OUTSIDE)) != 0
     to_lumen = distance_corners(lumen, spacing)
@@ -285,5 +285,6 @@ def _bound_environment(case: Reaching, limit: float) -> BoundEnvironment:
             mediastinal=tubes.mediastinal,
         ),
         max_length_mm=limits.max_length_mm, goal_tolerance_mm=limits.goal_tolerance_mm,
-        per_clearance=WEIGHTS[0], per_mm=WEIGHTS[1], required_mm=limits.required_mm, exempt_mm=limits.exempt_mm,
+        per_clearance=WEIGHTS[0], per_mm=WEIGHTS[1], required_mm=limits.required_mm,
+        exempt_mm=limits.exempt_mm,
     )  # fmt: skip

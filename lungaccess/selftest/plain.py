@@ -15,7 +15,7 @@ from lungaccess.selftest.kinds import KINDS
 
 
 def main(names: list[str]) -> None:
-    """Answer the cases of some kinds and print the answers: by kind and seed, numbers or an error in words."""
+    """Answer the cases of some kinds; print, by kind and seed, the numbers or an error in words."""
     end_with_parent()
     found: dict[str, dict[str, Any]] = {}
     for name in names:

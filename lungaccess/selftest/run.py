@@ -1,4 +1,4 @@
-"""Compares the answers of compiled kernels with those of their sources in plain Python, and with the truth."""
+"""Compares answers of compiled kernels with those of their sources in plain Python, and with the truth."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from anatomy.records import frozen_value
 from lungaccess.selftest.kinds import KINDS
 
 TOLERANCE = 1e-9
-"""Relative, or in mm and rad.  Arithmetic is done in the same order, but functions such as `hypot` and `sin` of
-the compiled code and of Python may differ in their last digit, and a proof goes on from what it has computed."""
+"""Relative, or in mm and rad.  Arithmetic is done in the same order, but `hypot` and others may differ in
+their last digit, and a proof goes on from what it has computed."""
 PACKAGES = Path(__file__).resolve().parents[2]
 
 
@@ -107,7 +107,8 @@ def _told(progress: Callable[[str], None]) -> Callable[[str], str]:
 
 def _answered(name: str) -> tuple[Answers, tuple[Failure, ...], float]:
     """Return the compiled answers, what contradicts the truth, and the time for both."""
-    begun, answers, contradictions = time.perf_counter(), {}, []
+    begun, contradictions = time.perf_counter(), []
+    answers: Answers = {}
     for seed in KINDS[name].seeds:
         try:
             case = KINDS[name].case(seed)

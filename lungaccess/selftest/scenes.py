@@ -52,7 +52,8 @@ def empty_labels(low: ArrayLike, high: ArrayLike, spacing_mm: ArrayLike) -> tupl
 def near_segment(grid: Grid, a: ArrayLike, b: ArrayLike, radius_mm: float) -> Mask:
     """Tell which voxel centres lie within a radius of a segment, or of a point if both ends are one."""
     points = grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1))
-    begin, way = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64) - a
+    begin = np.asarray(a, dtype=np.float64)
+    way = np.asarray(b, dtype=np.float64) - begin
     share = np.clip(((points - begin) @ way) / max(float(way @ way), 1e-300), 0.0, 1.0)
     return np.asarray(np.linalg.norm(points - begin - share[..., None] * way, axis=-1) <= radius_mm)
 
@@ -66,7 +67,8 @@ def draw_airway(labels: Labels, grid: Grid, a: ArrayLike, b: ArrayLike, radius_m
 
 def line_tree(a: ArrayLike, b: ArrayLike, radius_mm: float) -> AirwayTree:
     """Return a tree of one straight branch with points about 1 mm apart."""
-    begin, way = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64) - a
+    begin = np.asarray(a, dtype=np.float64)
+    way = np.asarray(b, dtype=np.float64) - begin
     length = float(np.linalg.norm(way))
     count = max(round(length), 1) + 1
     share = np.linspace(0.0, 1.0, count)

@@ -50,12 +50,20 @@ class MotionProver:
         self._scope, self._walls = scope, walls_of(lung)
         self._device, self._tree = kernel_device(scope, math.inf), lung.tree
 
-    def prove(self, motion: ScopeMotion) -> float | str:
+    def prove(
+        self, motion: ScopeMotion, *, turn_mm: float = PROOF_TURN_MM, step_mm: float = PROOF_STEP_MM
+    ) -> float | str:
         """Prove a motion: return its margin in mm, or say in words why there is no proof.
 
         The margin is a lower bound on the distance between the scope's surface and the wall of the lumen,
         beyond the gap that the scope keeps, over all places of the body during the whole motion.  Near
         the wall the bound is about 0.1 mm too low at most.
+
+        Parameters
+        ----------
+        motion : ScopeMotion
+        turn_mm, step_mm : float
+            Longest parts of changes in place and longest steps along the body: longer ones prove less.
         """
         wrong = broken_limit(self._scope, motion)
         if wrong:
@@ -68,8 +76,8 @@ class MotionProver:
             self._scope.bending_length_mm,
             entry,
             motion.states,
-            PROOF_TURN_MM,
-            PROOF_STEP_MM,
+            turn_mm,
+            step_mm,
             where,
         )
         if room < 0.0:

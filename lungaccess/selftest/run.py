@@ -85,9 +85,9 @@ def self_test(
         if name not in KINDS:
             raise SettingsError(f"There is no kind of proof named {name!r}", expected=", ".join(KINDS))
     if numba.config.DISABLE_JIT:
-        return tuple(_outcome(name, *_answered(name), None) for name in map(_told(progress), names))
+        return tuple(_outcome(name, *_answered(name), None) for name in map(_reported(progress), names))
     with _plain(names) as plain:
-        found = {name: _answered(name) for name in map(_told(progress), names)}
+        found = {name: _answered(name) for name in map(_reported(progress), names)}
         progress("the same in plain Python")
         answers = plain()
     return tuple(_outcome(name, *found[name], answers[name]) for name in names)
@@ -97,7 +97,7 @@ Answers = dict[int, Any]
 """By the seed: numbers, or an error in words."""
 
 
-def _told(progress: Callable[[str], None]) -> Callable[[str], str]:
+def _reported(progress: Callable[[str], None]) -> Callable[[str], str]:
     def tell(name: str) -> str:
         progress(name)
         return name
@@ -169,7 +169,7 @@ def _difference(compiled: Any, plain: Any) -> str:
         return f"compiled {len(compiled)} numbers, in Python {len(there)}"
     far = ~np.isclose(compiled, there, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True)
     n = int(np.argmax(far))
-    return f"number {n}: compiled {compiled[n]!r}, in Python {there[n]!r}" if far.any() else ""
+    return f"number {n}: compiled {float(compiled[n])!r}, in Python {float(there[n])!r}" if far.any() else ""
 
 
 def _short(answers: Any) -> str:

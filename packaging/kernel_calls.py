@@ -22,6 +22,17 @@ CALLS_FILE = ROOT / "anatomy" / "machine_code" / "kernel_calls.json"
 WORKLOADS = (
     "lungaccess phantom --seed 3 --breathing --out BREATHING",
     "lungaccess plan BREATHING --nodule --iterations 20 --out breathing",
+    "lungaccess plan BREATHING --nodule --iterations 20 --phases 0.6:1.0 --out phases",
+    "lungaccess plan BREATHING --nodule --iterations 10 --objective window --out window",
+    "lungaccess plan PATIENT --nodule --iterations 2 --objective success --out success",
+    "lungaccess plan PATIENT --nodule --iterations 2 --method kuntz2015 --out kuntz2015",
+    "lungaccess window breathing/plan.json BREATHING",
+    "lungaccess start-region plan/plan.json PATIENT",
+    "lungaccess replan PATIENT --scope plan/plan.json --nodule",
+    "lungaccess shapes --system lung-default",
+    "lungaccess insert plan/plan.json PATIENT --samples 2",
+    "lungaccess selftest",
+    "lungaccess info PATIENT",
 )
 """Commands beside the tasks, in this order after them."""
 RECORDER = """

@@ -73,7 +73,7 @@ def kept_record(
 
 
 def record_path(
-    kind: str, version: int, depends_on: Mapping[str, Any], cache: str | os.PathLike[str] | None = None
+    kind: str, version: str, depends_on: Mapping[str, Any], cache: str | os.PathLike[str] | None = None
 ) -> Path:
     """Return the file in which `kept_record` keeps a record, whether or not there is one."""
     text = json.dumps({"format": version, **depends_on}, sort_keys=True, default=list)

@@ -6,7 +6,18 @@ import sys
 
 from anatomy.machine_code.ahead import compile_ahead
 
+
+def main(commands: list[str]) -> None:
+    """Compile what commands call, and show how far it is where somebody looks."""
+
+    def tell(words: str) -> None:
+        if sys.stderr.isatty():
+            sys.stderr.write(f"\rkernels: {words} ")
+
+    done = compile_ahead(commands, tell=tell)
+    if done:
+        sys.stderr.write(f"\r{done} kernels compiled\n")
+
+
 if __name__ == "__main__":
-    shown = sys.stderr.write if sys.stderr.isatty() else len
-    done = compile_ahead(sys.argv[1:], tell=lambda words: shown(f"\rkernels: {words} "))
-    sys.stderr.write(f"\r{done} kernels compiled\n" if done else "")
+    main(sys.argv[1:])

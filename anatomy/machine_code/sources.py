@@ -34,7 +34,8 @@ class Sources:
     def __init__(self) -> None:
         self._texts: dict[str, str | None] = {}
         self._imports: dict[str, tuple[str, ...]] = {}
-        self._read_anew: set[str] = set()
+        self._digests: dict[str, str] = {}
+        self._stamps: dict[str, str | None] = {}
 
     def stamp(self, module: str) -> str | None:
         """Return the SHA-256 of the sources that kernels of a module are compiled from; None without sources.
@@ -48,15 +49,21 @@ class Sources:
         module : str
             Its dotted name, such as ``anatomy.kernels.field``.
         """
-        if module not in self._read_anew:
-            self._read_anew.add(module)
-            self._texts.pop(module, None)
-            self._imports.pop(module, None)
-        return self.digest(self.closure(module)) if self.text(module) is not None else None
+        if module not in self._stamps:
+            for known in (self._texts, self._imports, self._digests):
+                known.pop(module, None)
+            there = self.text(module) is not None
+            self._stamps[module] = self.digest(self.closure(module)) if there else None
+        return self._stamps[module]
 
     def digest(self, modules: Iterable[str]) -> str:
         """Return the SHA-256 of the names and texts of modules."""
-        return _digest((name, self.text(name) or "") for name in sorted(modules))
+        return sha256("".join(f"{name} {self._text_digest(name)}\n" for name in sorted(modules)))
+
+    def _text_digest(self, module: str) -> str:
+        if module not in self._digests:
+            self._digests[module] = sha256(self.text(module) or "")
+        return self._digests[module]
 
     def closure(self, module: str) -> set[str]:
         """Return a module and what it imports of this project, directly or not; empty if it has no source."""
@@ -105,8 +112,7 @@ def kernel_digest(*rooms: str) -> str:
     """
     sources = Sources()
     names = set().union(*(sources.closure(name) for name in kernel_modules(*rooms, sources=sources)))
-    compiled_by = [(name, version_of(name)) for name in ("numba", "llvmlite")]
-    return _digest([("sources", sources.digest(names)), *compiled_by])[:16]
+    return sha256(f"{sources.digest(names)} {version_of('numba')} {version_of('llvmlite')}")[:16]
 
 
 def kernel_modules(*rooms: str, sources: Sources | None = None) -> tuple[str, ...]:
@@ -141,13 +147,9 @@ def version_of(distribution: str) -> str:
         return ""
 
 
-def _digest(parts: Iterable[tuple[str, str]]) -> str:
-    """Return the SHA-256 of names and texts, each with its length before it."""
-    digest = hashlib.sha256()
-    for part in (each for pair in parts for each in pair):
-        data = part.encode("utf-8", "surrogateescape")
-        digest.update(b"%d:" % len(data) + data)
-    return digest.hexdigest()
+def sha256(text: str) -> str:
+    """Return the SHA-256 of a text, hexadecimal."""
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def _read(module: str) -> str | None:

@@ -97,7 +97,7 @@ def atlas_is_kept(
     if not system.tubes.planar:
         return False
     depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
-    return record_path("atlas", FORMAT, depends_on, cache).is_file()
+    return record_path("atlas", atlas_format(), depends_on, cache).is_file()
 
 
 def _depends_on(

@@ -7,14 +7,17 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.14 python3; 
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --retries 10 -c constraints.txt
 # What was compiled at the first import is kept, also where the environment says otherwise.
 unexport PYTHONDONTWRITEBYTECODE
-PYTEST_ARGS ?=
+# One process a core, in which threads of linear algebra would only wait; the tests of a file share what they have made.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest
+PYTEST_ARGS ?= -n logical --dist loadfile
 BENCH_ARGS ?=
 
-.PHONY: help demo kernel-calls test first-contact lint format docs publish-docs dist try resolve bench results results-quick clean
+.PHONY: help demo kernel-calls test test-all first-contact style lint format docs publish-docs dist try resolve bench results results-quick clean
 
 help:
 	@echo "make demo    plan on a synthetic patient, results in demo-output/"
-	@echo "make test    lint, types and the default tests (import rules among them)"
+	@echo "make test    lint, types, and the tests that need few kernels (minutes)"
+	@echo "make test-all  lint, types and all default tests"
 	@echo "make first-contact  a newcomer's tasks with an installed package, outside the checkout"
 	@echo "make lint    ruff and mypy only"
 	@echo "make format  let ruff rewrite the code"
@@ -49,17 +52,25 @@ demo: $(VENV)/.installed-run
 kernel-calls: $(VENV)/.installed-test
 	$(BIN)/python packaging/kernel_calls.py
 
-lint: $(VENV)/.installed-test
+style: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+lint: style
 	$(BIN)/mypy
 
 format: $(VENV)/.installed-test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-test: lint
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+# Types are examined beside the tests, and heard of where they are wrong, so that the tests have the last word.
+test: style
+	@$(BIN)/mypy > $(VENV)/mypy.txt 2>&1 & types=$$!; \
+	$(PYTEST) --quick $(PYTEST_ARGS); tests=$$?; \
+	wait $$types || { cat $(VENV)/mypy.txt; exit 1; }; exit $$tests
+
+test-all: lint
+	$(PYTEST) $(PYTEST_ARGS)
 
 # FIRST_CONTACT_ARGS=--fresh makes an environment from nothing.
 first-contact: $(VENV)/.installed-test

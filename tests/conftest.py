@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.phantom import Phantom
 
+pytest_plugins = ["tests.compile_times", "tests.tiers"]
 _CHECKOUT = Path(__file__).resolve().parents[1]
 
 
@@ -69,6 +70,11 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000)
+
+
+def pytest_unconfigure() -> None:
+    """Let everything be freed at the exit: OMPL reports what is left as leaks, below the summary."""
+    gc.unfreeze()
 
 
 @pytest.fixture(scope="session")

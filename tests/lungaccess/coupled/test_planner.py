@@ -30,6 +30,13 @@ from tests.lungaccess.points import FAR_TARGET
 from tests.lungaccess.resample import problems
 
 
+def test_the_best_of_a_short_search_is_accepted_by_the_check(
+    small_lung: Lung, target: Target, atlas: la.Atlas
+) -> None:
+    best = plans_of(small_lung, target, atlas, iterations=20)[-1]
+    assert la.check(best, small_lung).accepted
+
+
 class TestRepeatability:
     """Iterations, not time, decide."""
 

@@ -29,17 +29,20 @@ class FirstCompilation:
     command : str
         The command that runs; "" where none is known, as in a program of a user, and then nothing is done.
     tell : callable
-        Receives how many kernels are compiled, and how many have to be, in words.
+        Receives how many kernels are compiled, and how many have to be, in words; None at the end.
     """
 
     def __init__(self) -> None:
         self.command = ""
-        self.tell: Callable[[str], None] = lambda words: None
+        self.tell: Callable[[str | None], None] = lambda words: None
 
     def prepare(self) -> bool:
         """Compile what the command will call; return whether anything was compiled."""
         command, self.command = self.command, ""
-        return bool(command) and compile_ahead([command], fewest=FEWEST, tell=self.tell) > 0
+        compiled = compile_ahead([command], fewest=FEWEST, tell=self.tell) if command else 0
+        if compiled:
+            self.tell(None)
+        return compiled > 0
 
 
 first_compilation = FirstCompilation()

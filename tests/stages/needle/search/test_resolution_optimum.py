@@ -116,7 +116,9 @@ class TestAgainstEnumeration:
         exact = run(maze, resolution)
         merged = run(maze, resolution, duplicates=Cells(position_mm=2.0, angle_deg=10.0))
         assert merged.cost >= exact.cost - 1e-6
-        assert merged.counts.nodes <= exact.counts.nodes
+        if math.isinf(exact.cost):
+            # Both have looked at all words; where one finds a path, the other may have to look longer for it.
+            assert merged.counts.nodes <= exact.counts.nodes
 
 
 class TestDuplicates:

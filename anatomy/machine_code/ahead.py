@@ -16,6 +16,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from anatomy.machine_code.folders import can_be_written, kernels_folder
+
 CALLS_FILE = Path(__file__).with_name("kernel_calls.json")
 FEWEST = 6
 """Processes that compile take seconds to start: they are not worth it for fewer kernels."""
@@ -39,7 +41,8 @@ class FirstCompilation:
     def prepare(self) -> bool:
         """Compile what the command will call; return whether anything was compiled."""
         command, self.command = self.command, ""
-        compiled = compile_ahead([command], fewest=FEWEST, tell=self.tell) if command else 0
+        wanted = command and can_be_written(kernels_folder())  # Otherwise nobody would find what is compiled.
+        compiled = compile_ahead([command], fewest=FEWEST, tell=self.tell) if wanted else 0
         if compiled:
             self.tell(None)
         return compiled > 0
@@ -122,9 +125,10 @@ def _dispatcher(call: Mapping[str, Any]) -> tuple[Any, tuple[Any, ...]] | None:
 
     try:
         kernel = getattr(import_module(call["module"]), call["function"])
-        return kernel, tuple(decoded(kind) for kind in call["kinds"])
+        kinds = tuple(decoded(kind) for kind in call["kinds"])
     except (ImportError, AttributeError, LookupError, TypeError, ValueError):
         return None
+    return (kernel, kinds) if hasattr(kernel, "_cache") else None
 
 
 def _compile(number: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 import warnings
 from functools import cache
 from importlib import util
@@ -49,6 +50,16 @@ def code_folders() -> tuple[Path, ...]:
     """Return where code is looked for, in this order; new code is kept in the last."""
     prebuilt = prebuilt_folder()
     return (*(() if prebuilt is None else (prebuilt,)), kernels_folder() / generation())
+
+
+def can_be_written(folder: Path) -> bool:
+    """Tell whether files can be made in a folder; it is made if it is not there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
 
 
 def module_folder(module: str, stamp: str) -> str:

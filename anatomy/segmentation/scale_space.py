@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.machine_code.ahead import usable_cores
 from anatomy.morphology import Window, bounds, window
 from anatomy.typed import Float, Float32, Int16, Mask, UInt8
 
@@ -91,8 +91,8 @@ class ScaleSpace:
             box=box,
             spacing_mm=spacing,
             hu=np.ascontiguousarray(image),
-            n_scales=_scales_that_apply(np.array(lung[box], order="F"), spacing, threads or _processors()),
-            threads=threads or _processors(),
+            n_scales=_scales_that_apply(np.array(lung[box], order="F"), spacing, threads or usable_cores()),
+            threads=threads or usable_cores(),
         )
 
     def images(self) -> Iterator[tuple[float, Float32]]:
@@ -175,9 +175,3 @@ def _scales_that_apply(lung: Mask, spacing: Float, threads: int) -> UInt8:
     for limit in DEEPER_THAN_MM:
         count += depth > limit
     return count
-
-
-def _processors() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

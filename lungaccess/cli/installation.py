@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from anatomy.cache import default_cache
+from anatomy.machine_code.ahead import usable_cores
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.records import frozen_value
 
@@ -127,7 +128,7 @@ def examine(cache: Path | None = None) -> Health:
         python=f"{platform.python_version()} ({sys.executable})",
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
         cores=os.cpu_count() or 1,
-        usable_cores=_usable_cores(),
+        usable_cores=usable_cores(),
         memory_bytes=_pages("SC_PHYS_PAGES"),
         free_memory_bytes=_free_memory(),
         libraries=_libraries(),
@@ -158,12 +159,6 @@ def _libraries() -> tuple[Library, ...]:
             name, required = each.name, str(each.specifier)
             found.append(Library(name=name, required=required, version=_version(name)))
     return tuple(found)
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _pages(name: str) -> int | None:

@@ -137,20 +137,25 @@ def steps() -> list[list[str]]:
 
 
 def as_json(calls: dict[str, tuple[set[str], int]]) -> str:
-    """Return the calls as JSON, a line each; kinds of arguments and commands stand there once each."""
+    """Return the calls as JSON by module and function: kinds of arguments, commands, and doublings of the size.
+
+    Kinds and sets of commands stand there once each.
+    """
     given = {call: [json.dumps(kind) for kind in json.loads(call)[2]] for call in calls}
     kinds = sorted({kind for each in given.values() for kind in each})
-    commands = sorted({name for users, _size in calls.values() for name in users})
-    lines = []
+    commands = sorted({" ".join(sorted(users)) for users, _size in calls.values()})
+    tree: dict[str, dict[str, list[list[object]]]] = {}
     for call, (users, size) in sorted(calls.items()):
         module, function, _kinds = json.loads(call)
-        row = [module, function, [kinds.index(kind) for kind in given[call]]]
-        row += [[n for n, name in enumerate(commands) if name in users], size]
-        lines.append(json.dumps(row, separators=(",", ":")))
-    return (
-        '{"commands": ' + json.dumps(commands) + ',\n"kinds": [\n' + ",\n".join(kinds)
-        + '\n],\n"calls": [\n' + ",\n".join(lines) + "\n]}\n"
-    )  # fmt: skip
+        row = [
+            [kinds.index(kind) for kind in given[call]],
+            commands.index(" ".join(sorted(users))),
+            size.bit_length(),
+        ]
+        tree.setdefault(module, {}).setdefault(function, []).append(row)
+    rows = [f"{json.dumps(module)}: {json.dumps(tree[module], separators=(',', ':'))}" for module in tree]
+    lines = ["{", f'"commands": {json.dumps(commands, indent=0)},', '"kinds": [', ",\n".join(kinds), "],"]
+    return "\n".join([*lines, '"calls": {', ",\n".join(rows), "}", "}", ""])
 
 
 if __name__ == "__main__":

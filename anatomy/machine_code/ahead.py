@@ -92,17 +92,19 @@ def usable_cores() -> int:
 
 @cache
 def _calls() -> tuple[Mapping[str, Any], ...]:
-    """Return the calls that are written down, with the commands that make them and the size of the code."""
+    """Return the calls that are written down, with commands and how often the size of the code doubles."""
     stored = json.loads(CALLS_FILE.read_text(encoding="ascii"))
     return tuple(
         {
             "module": module,
             "function": function,
             "kinds": [stored["kinds"][n] for n in kinds],
-            "commands": {stored["commands"][n] for n in commands},
+            "commands": set(stored["commands"][users].split()),
             "size": size,
         }
-        for module, function, kinds, commands, size in stored["calls"]
+        for module, functions in stored["calls"].items()
+        for function, calls in functions.items()
+        for kinds, users, size in calls
     )
 
 

@@ -40,17 +40,21 @@ def test_other_kinds_are_not_written() -> None:
 
 def tree_with(place: Path, calls: list[list[Any]]) -> Tree:
     tree = Tree(place)
-    content = {"commands": ["plan", "check"], "kinds": ["float64", "int64", "no such kind"], "calls": calls}
+    by_place: dict[str, dict[str, list[Any]]] = {}
+    for module, function, *row in calls:
+        by_place.setdefault(module, {}).setdefault(function, []).append(row)
+    kinds = ["float64", "int64", "no such kind"]
+    content = {"commands": ["plan", "check"], "kinds": kinds, "calls": by_place}
     (place / "anatomy" / "machine_code" / "kernel_calls.json").write_text(json.dumps(content))
     return tree
 
 
 def outer(kind: int, command: int) -> list[Any]:
-    return ["anatomy.kernels.caller", "outer", [kind], [command], 9]
+    return ["anatomy.kernels.caller", "outer", [kind], command, 9]
 
 
 def inner(kind: int, command: int) -> list[Any]:
-    return ["anatomy.kernels.callee", "inner", [kind], [command], 5]
+    return ["anatomy.kernels.callee", "inner", [kind], command, 5]
 
 
 def compile_for(tree: Tree, *commands: str) -> str:
@@ -71,14 +75,14 @@ def test_what_commands_call_is_compiled_once_on_all_cores(tmp_path: Path) -> Non
 
 
 def test_calls_of_kernels_that_are_gone_are_left_out(tmp_path: Path) -> None:
-    gone = ["anatomy.kernels.gone", "f", [0], [0], 1], ["anatomy.kernels.callee", "gone", [0], [0], 1]
-    tree = tree_with(tmp_path, [*gone, ["anatomy.kernels.callee", "inner", [2], [0], 1], outer(0, 0)])
+    gone = ["anatomy.kernels.gone", "f", [0], 0, 1], ["anatomy.kernels.callee", "gone", [0], 0, 1]
+    tree = tree_with(tmp_path, [*gone, ["anatomy.kernels.callee", "inner", [2], 0, 1], outer(0, 0)])
     assert compile_for(tree).strip() == "1 kernels compiled"
     assert tree.call(1.0) == [[3.0], [], []]
 
 
 def test_the_first_compilation_of_a_command_compiles_all_that_it_calls(tmp_path: Path) -> None:
-    others = [["anatomy.kernels.arcs", name, [0, 0], [0], 3] for name in ("sine_length", "versine_length")]
+    others = [["anatomy.kernels.arcs", name, [0, 0], 0, 3] for name in ("sine_length", "versine_length")]
     tree = tree_with(tmp_path, [inner(0, 0), outer(0, 0), *others])
     program = """
 from anatomy.machine_code import ahead

@@ -137,7 +137,7 @@ def steps() -> list[list[str]]:
 
 
 def as_json(calls: dict[str, tuple[set[str], int]]) -> str:
-    """Return the calls as JSON by module and function: kinds of arguments, commands, and doublings of the size.
+    """Return calls as JSON by module and function: kinds of arguments, commands, and doublings of the size.
 
     Kinds and sets of commands stand there once each.
     """

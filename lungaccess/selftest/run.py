@@ -1,4 +1,8 @@
-"""Compares answers of compiled kernels with those of their sources in plain Python, and with the truth."""
+"""Compares answers of compiled kernels with those of their sources in plain Python, and with the truth.
+
+`python -m lungaccess.selftest.run KIND ...` is the process that answers in plain Python: with
+NUMBA_DISABLE_JIT=1 the sources of the kernels run as they are, and numpy tests every index of an array.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.child_process import end_with_parent
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_value
 from lungaccess.selftest.kinds import KINDS
@@ -125,7 +130,7 @@ def _plain(names: list[str]) -> Iterator[Callable[[], dict[str, Answers]]]:
     """Let another process answer in plain Python meanwhile; what is given waits for its answers."""
     path = os.pathsep.join(filter(None, [str(PACKAGES), os.environ.get("PYTHONPATH")]))
     with subprocess.Popen(
-        [sys.executable, "-m", "lungaccess.selftest.plain", *names],
+        [sys.executable, "-m", "lungaccess.selftest.run", *names],
         env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": path},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
@@ -174,3 +179,21 @@ def _difference(compiled: Any, plain: Any) -> str:
 
 def _short(answers: Any) -> str:
     return answers if isinstance(answers, str) else f"{len(answers)} numbers"
+
+
+def _print_answers(names: list[str]) -> None:
+    """Print as JSON, by kind and seed, the numbers or an error in words."""
+    end_with_parent()
+    found = {name: {str(seed): _plain_answer(name, seed) for seed in KINDS[name].seeds} for name in names}
+    json.dump(found, sys.stdout)
+
+
+def _plain_answer(name: str, seed: int) -> Any:
+    try:
+        return KINDS[name].case(seed).answers.tolist()
+    except Exception as error:  # Whatever a broken kernel does is a result.
+        return f"{type(error).__name__}: {error}"
+
+
+if __name__ == "__main__":
+    _print_answers(sys.argv[1:])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from html import escape
 from typing import TYPE_CHECKING
 
 from anatomy.errors import SettingsError
 from anatomy.records import frozen_value
 from lungaccess.appraisal.headline import Headline
-from lungaccess.appraisal.limits import SHOWN_LIMITS, Limit, limits_of
+from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 from lungaccess.checking import Checker, CheckReport
 from lungaccess.procedure import Procedure, load_procedure
 from lungaccess.risk import ErrorModel, load_errors
@@ -59,9 +60,14 @@ class Appraisal:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the headline and the nearest limits."""
-        from lungaccess.appraisal.display import appraisal_html
+        from anatomy.display import table
 
-        return appraisal_html(self.headline, self.limits[:SHOWN_LIMITS])
+        headline, limits = self.headline, self.limits[:SHOWN_LIMITS]
+        said = escape(f"{headline.grade.mark} {headline.verdict}: {headline.text}")
+        details = "".join(f"<div><small>{escape(each)}</small></div>" for each in headline.details)
+        rows = [(each.what, f"{each.found_words}, {each.bound_words}") for each in limits]
+        first = f'<div style="color:{headline.grade.colour}"><b>{said}</b></div>'
+        return f"{first}{details}{table(rows, LIMITS_TITLE)}"
 
     def to_mapping(self) -> dict[str, object]:
         """Return headline and limits as plain JSON values."""

@@ -17,7 +17,7 @@ ABANDONED_AFTER_DAYS = 1.0
 """No anatomy takes so long to prepare: what is older and bears no lock was left behind."""
 SECONDS_PER_DAY = 24 * 3600.0
 LOCK, CONTENT = "lock", "content"
-"""What is filled lies beside its lock: Windows renames no folder in which a file is open."""
+"""The lock of a folder, and what is filled beside it: Windows renames no folder in which a file is open."""
 
 
 @contextlib.contextmanager

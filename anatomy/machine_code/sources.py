@@ -1,4 +1,4 @@
-"""What machine code is bound to: the sources of a kernel and of all that it calls, by their content.
+"""Stamps of machine code: the contents of the sources of a kernel and of all that it calls.
 
 numba binds the code that it keeps to the file of the function alone, while functions of other files are
 compiled into it: after a change of such a file the old arithmetic would run on.  A stamp here covers the

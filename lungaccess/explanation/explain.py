@@ -46,7 +46,7 @@ PROOF_BOXES = 2_000_000
 NO_NEEDLE = "the system has no needle"
 
 SHARED, KEPT, TO_BE_MADE = range(3)
-"""What the atlas of a preset costs: nothing, as it is the system's own; a file to read; many seconds."""
+"""The cost of a preset's atlas: nothing, as it is the system's own; a file to read; many seconds."""
 
 AtlasOf = Callable[[System, Callable[[float], None]], Atlas]
 IsKept = Callable[[System], bool]

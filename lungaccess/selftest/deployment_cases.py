@@ -53,7 +53,7 @@ for _column, _value in {
 FRAME = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 """X, Y and the axis of the airway, which leads down from the origin."""
 WEIGHTS = 1.0, 0.1
-"""Of a path's integral of 1 / clearance, and of its length."""
+"""The weights of a path's integral of 1 / clearance, and of its length."""
 HALVES = np.array([0.3, 0.3, 1.5, 4.0, 4.0, 0.5, 0.5, 0.5])
 """Half widths of a large box of deployments, rad and mm."""
 

@@ -99,7 +99,7 @@ def self_test(
 
 
 Answers = dict[int, Any]
-"""By the seed: numbers, or an error in words."""
+"""The answers to cases by their seeds: numbers, or an error in words."""
 
 
 def _reported(progress: Callable[[str], None]) -> Callable[[str], str]:

@@ -28,11 +28,10 @@ MARKS = {True: Text("ok", "green"), False: Text("refused", "bold red"), None: Te
 
 def no_plan_record(failure: NoPlan) -> dict[str, Any]:
     """Return why there is no plan."""
-    from lungaccess.plans.version import software_kernels, software_version
+    from lungaccess.plans.version import made_by
 
     return {
-        "software_version": software_version(),
-        "kernels": software_kernels(),
+        **made_by(),
         "found": False,
         "accepted": False,
         "why": failure.found,

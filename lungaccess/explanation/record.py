@@ -13,6 +13,7 @@ from lungaccess.coupled import Attempt
 from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, Structure
 from lungaccess.explanation.explanation import Change, Explanation
 from lungaccess.explanation.neighbours import ReachedShare
+from lungaccess.plans.version import made_by
 from lungaccess.risk import Share
 
 Record = dict[str, Any]
@@ -37,6 +38,7 @@ def explanation_record(explanation: Explanation) -> Record:
     """Return an explanation as plain values: lengths in mm, points in LPS and RAS mm."""
     e = explanation
     return {
+        **made_by(),
         "found": False,
         "accepted": False,
         "headline": e.headline,

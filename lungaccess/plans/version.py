@@ -21,3 +21,8 @@ def software_version() -> str:
 def software_kernels() -> str:
     """Return the digest of the kernels that run here: the same version may have others, in a checkout."""
     return kernel_digest()
+
+
+def made_by() -> dict[str, str]:
+    """Return what answers that are not plans state of the software that gave them."""
+    return {"software_version": software_version(), "kernels": software_kernels()}

@@ -51,7 +51,7 @@ def certify(
     out : Path
         PNG file that shows what is ruled out and what is open.
     """
-    from lungaccess.plans.version import software_kernels, software_version
+    from lungaccess.plans.version import made_by
     from lungaccess.reachability import MOST_BOXES, UnreachableProof
 
     if out is not None:
@@ -74,8 +74,7 @@ def certify(
         open_places_png(lung, proof, verdict, point, out)
     if output.json:
         asked = {"patient": lung.name, "system": device.name, "target_lps_mm": point.tolist()}
-        made_by = {"software_version": software_version(), "kernels": software_kernels()}
-        terminal.show_json(asked | made_by | _as_json(verdict))
+        terminal.show_json(asked | made_by() | _as_json(verdict))
         return ExitCode.of(verdict.proved)
     rows = [
         ("system", device.name),

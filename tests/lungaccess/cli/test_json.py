@@ -15,11 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from anatomy.machine_code.sources import kernel_digest
 from lungaccess.cli import anatomy_tables, plan_search, terminal
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import OutputOptions
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.version import software_version
 from lungaccess.problem.system import shipped_names
 from tests.lungaccess.appraisals import appraise_as_told, make_risk
 from tests.lungaccess.cli.every_command import commands
@@ -119,6 +121,8 @@ def test_a_plan_as_json_says_what_the_check_says(
     monkeypatch.setattr(plan_search, "run_search", fail)
     assert cli.main([*words, "--explain-time", "0"]) == ExitCode.NEGATIVE
     assert json.loads(capsys.readouterr().out) == {
+        "software_version": software_version(),
+        "kernels": kernel_digest(),
         "found": False,
         "accepted": False,
         "why": "No way",

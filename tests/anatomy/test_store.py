@@ -159,3 +159,11 @@ def test_the_default_cache_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     monkeypatch.setenv("LUNGACCESS_CACHE", str(tmp_path / "deep" / "cache"))
     open_lung(SOURCES, toy)
     assert (tmp_path / "deep" / "cache" / FOLDER / META).is_file()
+
+
+def test_a_lung_made_by_other_kernels_is_made_anew(stored: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "kernel_digest", lambda *_rooms: "0123456789abcdef")
+    with pytest.raises(AssertionError, match="the images were read"):
+        open_lung(SOURCES, no_reading, cache=stored)
+    monkeypatch.undo()
+    open_lung(SOURCES, no_reading, cache=stored)

@@ -14,7 +14,9 @@ from anatomy.errors import FileError
 from anatomy.lung import Lung
 from lungaccess.coupled import atlas_store
 from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.atlas_store import atlas_is_kept, open_atlas
+from lungaccess.coupled.atlas_store import atlas_format, atlas_is_kept, open_atlas
+from stages.tube import shape_store
+from stages.tube.shape_store import shapes_format
 
 SYSTEM = la.load_system("ultrathin")
 COARSE: dict[str, Any] = {"rotations": 4, "stop_spacing_mm": 10.0, "site_spacing_mm": 4.0}
@@ -100,3 +102,10 @@ def test_a_folder_that_cannot_be(small_lung: Lung, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="--cache"):
         open_atlas(small_lung, SYSTEM, cache=tmp_path / "file" / "cache", **COARSE)
+
+
+def test_an_atlas_and_shapes_of_other_kernels_are_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    here = atlas_format(), shapes_format()
+    for module in (atlas_store, shape_store):
+        monkeypatch.setattr(module, "kernel_digest", lambda *_rooms: "0123456789abcdef")
+    assert here[0] != atlas_format() and here[1] != shapes_format()

@@ -9,7 +9,7 @@ tasks of a first look, as packaging/release.py asks for each version of Python.
 The package is built and installed as a user would get it, so that a file that was forgotten is missed.
 Without --fresh, what the checkout has compiled of modules is copied, and the libraries are those of the
 Python that runs this.  With --kernels, the wheel of compiled kernels is installed too: then the tasks must
-compile no kernel.  Without it they use those that this user has compiled.
+compile none of their kernels, or few.  Without it they use those that this user has compiled.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 PACKAGES = ("anatomy", "stages", "lungaccess")
 HANGS_AFTER_S = 600.0
+MOST_COMPILED = 5
+"""A search that ends by the clock may come to a kernel to which no recorded one came."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +111,11 @@ def fresh_place(home: Path, package: str, python: str, constraints: str) -> Plac
 
 
 def compiled_kernels(home: Path) -> list[str]:
-    """Return a fault if the tasks compiled kernels that the wheel of kernels lacks."""
+    """Return a fault if the tasks compiled more than a few kernels that the wheel of kernels lacks."""
     made = sorted(f"{each.parent.name.rpartition('-')[0]}:{each.stem}" for each in home.rglob("*.code"))
     said = [f"the wheel of kernels lacks {len(made)}: run `make kernel-calls`", *made] if made else []
     print("\n".join(said), end="\n" if said else "", flush=True)
-    return said[:1]
+    return said[:1] if len(made) > MOST_COMPILED else []
 
 
 def place_with_these_libraries(home: Path, package: str, kernels: str | None) -> Place:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 from pathlib import Path
 
 from anatomy.errors import SettingsError
@@ -27,14 +26,17 @@ def default_cache() -> Path:
 
 
 def user_cache() -> Path:
-    """Return the user's folder for what can be made again; one for temporary files if there is no home."""
+    """Return the user's folder for what can be made again; one that cannot be written if there is no home.
+
+    A folder for temporary files would not do: anybody may leave code there, under a name that is known.
+    """
     base = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
     if base:
         return Path(base)
     try:
         return Path.home() / ".cache"
     except RuntimeError:
-        return Path(tempfile.gettempdir())
+        return Path(os.devnull)
 
 
 def cache_limit_bytes() -> int:

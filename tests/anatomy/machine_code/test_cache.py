@@ -15,7 +15,7 @@ import numba
 import pytest
 
 import anatomy
-from anatomy.machine_code.folders import generation
+from anatomy.machine_code.folders import can_be_written, generation, kernels_folder
 from tests.test_release import load
 
 CALLEE = """from anatomy.kernels.compiling import kernel
@@ -130,6 +130,18 @@ def test_where_nothing_can_be_kept_kernels_are_compiled_and_it_is_said_once(tree
     assert (values, compiled) == ([3.0, 5.0], COMPILED)
     (message,) = said
     assert str(tree.kept) in message and "NUMBA_CACHE_DIR" in message
+
+
+def test_without_a_home_nothing_is_kept_where_others_could_leave_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    assert not can_be_written(kernels_folder())
 
 
 def test_processes_that_begin_at_once_do_not_disturb_each_other(tree: Tree) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import lazy_exports
+from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
-    from anatomy.build import build_lung
-    from anatomy.errors import (
+    from anatomy.base.errors import (
         AnatomyError,
         FileError,
         FrameError,
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
         LungaccessError,
         SettingsError,
     )
+    from anatomy.build import build_lung
     from anatomy.fields import DistanceField
     from anatomy.grid import Grid, Volume
     from anatomy.io import (

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.grid import freeze_arrays, read_only
-from anatomy.records import frozen_record
 from anatomy.tree_report import TreeReport
-from anatomy.typed import Bool, Float, Int
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

@@ -11,7 +11,8 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Array, Mask, UInt16
 from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import FISSURES_UNKNOWN
@@ -21,7 +22,6 @@ from anatomy.motion.motion import Motion
 from anatomy.motion.source import MotionSource
 from anatomy.patient import PatientImages
 from anatomy.sides import septum
-from anatomy.typed import Array, Mask, UInt16
 
 Progress = Callable[[str], None]
 Keep = Callable[[str, Array], Array]

@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 
 CORONAL, AXIAL = "coronal, from the front", "axial, from the feet"
 GENERATION_COLOURS = ("#08306b", "#2171b5", "#4eb3d3", "#41ab5d", "#fe9929", "#cc4c02", "#7f0000")

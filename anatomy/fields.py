@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import GridMismatchError
+from anatomy.base.errors import GridMismatchError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Mask, UInt16
 from anatomy.grid import Grid, read_only
 from anatomy.kernels import field as kernel
-from anatomy.records import frozen_record
-from anatomy.typed import Array, Float, Mask, UInt16
 
 MAX_STORED = np.iinfo(np.uint16).max
 """Distances from this on, 256 mm, are stored as it: no device looks so far."""

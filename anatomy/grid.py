@@ -8,9 +8,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from anatomy.errors import FrameError, GridMismatchError
-from anatomy.records import frozen_record
-from anatomy.typed import Array, Bool, Float
+from anatomy.base.errors import FrameError, GridMismatchError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Bool, Float
 
 ORTHONORMAL_TOLERANCE = 1e-4
 """Headers store directions in single precision with six digits or so; grids have the nearest rotation."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.typed import Int, Mask
+from anatomy.base.typed import Int, Mask
 
 ROUNDING = 1e-6
 """Relative: quotients and squared distances are whole numbers and fractions of small ones."""

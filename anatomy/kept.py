@@ -11,10 +11,10 @@ import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from anatomy.checksums import values_checksum, warn_of_damage
-from anatomy.errors import FileError
-from anatomy.io.files import DAMAGE, write_text
-from anatomy.unfinished import clear_place
+from anatomy.base.checksums import values_checksum, warn_of_damage
+from anatomy.base.errors import FileError
+from anatomy.base.files import DAMAGE, write_text
+from anatomy.base.unfinished import clear_place
 
 if TYPE_CHECKING:
     from anatomy.organ import Organ

@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from anatomy.cache import cache_limit_bytes, default_cache
-from anatomy.cache_entries import make_room, note_use
-from anatomy.checksums import array_checksum, values_checksum, warn_of_damage
-from anatomy.errors import FileError, LungaccessError
+from anatomy.base.cache import cache_limit_bytes, default_cache
+from anatomy.base.cache_entries import make_room, note_use
+from anatomy.base.checksums import array_checksum, values_checksum, warn_of_damage
+from anatomy.base.errors import FileError, LungaccessError
+from anatomy.base.files import DAMAGE, atomic_write
+from anatomy.base.unfinished import clear_place
 from anatomy.grid import read_only
-from anatomy.io.files import DAMAGE, atomic_write
-from anatomy.unfinished import clear_place
 
 T = TypeVar("T")
 
@@ -39,7 +39,7 @@ def kept_record(
     Parameters
     ----------
     kind : str
-        What it is, one of `anatomy.cache_entries`; the file is named after it.
+        What it is, one of `anatomy.base.cache_entries`; the file is named after it.
     version : str
         Another one where `make` returns something else for the same `depends_on`, as other kernels may.
     depends_on : mapping
@@ -47,7 +47,7 @@ def kept_record(
     parts, rebuilt : callable
         Returns the arrays and the plain values of a record by name, and the record from them.
     cache : path, optional
-        Folder of the cache; `anatomy.cache.default_cache()` if None.
+        Folder of the cache; `anatomy.base.cache.default_cache()` if None.
     name : str
         Whose it is; empty if it belongs to no patient.
     in_use : tuple of Path

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Mask
 from anatomy.build import WorkingBox, clearance_fields, lung_key
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, OUTSIDE, VESSEL, close_border
-from anatomy.typed import Float, Mask
 
 ENTRY_BRANCH = 0
 """The branch of the labels that stands for the surface a needle pierces; a liver has no other."""

@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
+from anatomy.base.typed import Mask, UInt8
 from anatomy.morphology import bounds, window
-from anatomy.typed import Mask, UInt8
 
 RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
 LOBES: Mapping[int, str] = MappingProxyType(

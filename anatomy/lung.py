@@ -7,15 +7,15 @@ from functools import cached_property
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.fields import DistanceField
 from anatomy.grid import Volume
 from anatomy.lobes import LOBES
 from anatomy.morphology import voxels_in
 from anatomy.motion.motion import Motion
 from anatomy.organ import Organ
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE
-from anatomy.typed import Float
 
 HEIGHT_STEP = 4
 """Every fourth voxel is looked at to find apex and base: within 2 mm or so of 250 mm."""

@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, Mask
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.morphology import bounds, window
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int, Mask
 
 _RING = ((0, 0), (1, 0), (1, 1), (0, 1))
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from anatomy.typed import Array, Int, Mask
+from anatomy.base.typed import Array, Int, Mask
 
 Window = tuple[slice, slice, slice]
 """A box of voxels, as an index of arrays."""

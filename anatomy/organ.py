@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy import structures
-from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.base.errors import AnatomyError, GridMismatchError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Labels
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels import field as kernel
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Labels
 
 if TYPE_CHECKING:
     from anatomy.meshes import SurfaceMesh

@@ -8,11 +8,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.motion.source import MotionSource
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 MASKS = ("lumen", "wall", "vessels", "lung", "fissures", "nodules")
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import FrameError
+from anatomy.base.errors import FrameError
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.typed import Float
 
 ANTERIOR = np.array([0.0, -1.0, 0.0])
 SUPERIOR = np.array([0.0, 0.0, 1.0])

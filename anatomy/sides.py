@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Array, Float, Int32, Mask
 from anatomy.grid import Grid
-from anatomy.typed import Array, Float, Int32, Mask
 
 COARSE_VOXEL_MM = 2.4
 """The lungs are told apart on voxels of about this side: fast, and finer than any gap that matters."""

@@ -14,21 +14,21 @@ from typing import Any
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.cache import LUNG_FILE, cache_limit_bytes, default_cache
+from anatomy.base.cache_entries import make_room, note_use, remove_abandoned
+from anatomy.base.checksums import are_unchanged, file_states, values_checksum, warn_of_damage
+from anatomy.base.errors import FileError, LungaccessError
+from anatomy.base.files import DAMAGE
+from anatomy.base.typed import Array, Float
+from anatomy.base.unfinished import clear_place, filled_folder
 from anatomy.build import FORMAT, build_lung, lung_key
-from anatomy.cache import LUNG_FILE, cache_limit_bytes, default_cache
-from anatomy.cache_entries import make_room, note_use, remove_abandoned
-from anatomy.checksums import are_unchanged, file_states, values_checksum, warn_of_damage
-from anatomy.errors import FileError, LungaccessError
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
-from anatomy.io.files import DAMAGE
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.motion.motion import stored_motion
 from anatomy.patient import PatientImages
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
-from anatomy.typed import Array, Float
-from anatomy.unfinished import clear_place, filled_folder
 
 META = LUNG_FILE
 REPORT_RECORDS: dict[str, Any] = {
@@ -55,7 +55,7 @@ def open_lung(
     read : callable
         Reads the images; called only if the cache does not hold the lung.
     cache : Path, optional
-        Folder of the cache; `anatomy.cache.default_cache()` if None.
+        Folder of the cache; `anatomy.base.cache.default_cache()` if None.
     progress : callable, optional
         Told each step as it begins.
 

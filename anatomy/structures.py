@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Labels
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
-from anatomy.typed import Labels
 
 __all__ = [
     "AIRWAY",

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 
 
 @frozen_record

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Int16, Mask
 from anatomy.grid import Grid
-from anatomy.records import frozen_record
-from anatomy.typed import Array, Float, Int16, Mask
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

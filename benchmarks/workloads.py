@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from benchmarks import scenes
 
 Work = Callable[[], object]

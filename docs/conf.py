@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sphinx.application import Sphinx
 
-from anatomy.facade import public_names
+from anatomy.base.facade import public_names
 
 project = "lungaccess"
 author = "The lungaccess contributors"

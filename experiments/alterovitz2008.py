@@ -20,8 +20,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates, shift
 from scipy.stats import norm
 
-from anatomy.records import frozen_value
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Bool, Float, Int
 from experiments.support.results import Result, setting_of, study_parser, write_result
 
 if TYPE_CHECKING:

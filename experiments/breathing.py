@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import lungaccess as la
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from experiments.support.anatomies import PATIENTS, anatomy, require_data
 from experiments.support.borrowed_motion import borrowed_motion
 from experiments.support.results import Result, setting_of, study_parser, write_result

@@ -27,10 +27,10 @@ from typing import Any
 import numpy as np
 
 import lungaccess as la
+from anatomy.base.typed import Float
 from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
-from anatomy.typed import Float
 from experiments.support.mutants.all import mutate
 from experiments.support.mutants.mutant import Case, Mutant
 from experiments.support.mutants.random_plans import plans_of_batch

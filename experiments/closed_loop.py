@@ -17,10 +17,10 @@ from dataclasses import replace
 import numpy as np
 
 import lungaccess as la
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, anatomy, default_anatomies
 from experiments.support.insertion.figure import draw_insertions
 from experiments.support.results import Result, setting_of, study_parser, write_result

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 import lungaccess as la
-from anatomy.settings import override
+from anatomy.base.settings import override
 from experiments.support.reached import run_study
 from lungaccess.problem.system import System
 

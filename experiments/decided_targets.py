@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 import lungaccess as la
-from anatomy.io.files import write_text
-from anatomy.typed import Float
+from anatomy.base.files import write_text
+from anatomy.base.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.peripheral import peripheral_targets

@@ -20,18 +20,18 @@ import numpy as np
 import SimpleITK
 from matplotlib.figure import Figure
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float32
 from anatomy.grid import Volume
 from anatomy.io import load_patient
 from anatomy.patient import PatientImages
 from anatomy.phantom import make_phantom
-from anatomy.records import frozen_record
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.lungs import segment_lungs
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
 from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, vesselness
 from anatomy.segmentation.vessels import Vessels, segment_vessels
 from anatomy.tree import tree_from_mask
-from anatomy.typed import Float32
 from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.segmentation import scores

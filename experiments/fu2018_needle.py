@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from experiments.support.anatomies import PHANTOM, data_folder
 from experiments.support.cost_map.case import NEEDLE, SAFETY_MM, Case, case_of
 from experiments.support.cost_map.figure import draw

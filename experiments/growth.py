@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from benchmarks.workloads import WORKLOADS, Workload
 from experiments.support.results import Result, setting_of, study_parser, write_result
 

@@ -17,8 +17,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 import lungaccess as la
-from anatomy.records import frozen_value
-from anatomy.typed import Float
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.kuntz2015 import cost_over_time, workspace_rejection
 from experiments.support.kuntz2015.rrt_time import LONG_S, PAPER_S, PAPER_SHARE, TimedRRT, success_times

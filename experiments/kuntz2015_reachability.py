@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from anatomy.records import frozen_value
-from anatomy.typed import Float
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.report import style

@@ -15,21 +15,21 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Volume
 from anatomy.io import load_patient
 from anatomy.io.placement import place
 from anatomy.lobes import LOBES
 from anatomy.phantom import make_phantom
 from anatomy.phantom.patient import Size
-from anatomy.records import frozen_record
 from anatomy.segmentation.airway import Airways, segment_airway
 from anatomy.segmentation.airway_warnings import tree_or_error
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.lobes import FISSURES, OF_LUNG, SEEN, Lobes, segment_lobes
 from anatomy.segmentation.lungs import segment_lungs
 from anatomy.segmentation.vessels import segment_vessels
-from anatomy.typed import Array, Float, Mask
 from experiments.support.anatomies import PATIENTS, data_folder, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.segmentation.synthetic_ct import CtLook, SyntheticCt, middle_sheet, render_ct

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import lungaccess as la
-from anatomy.errors import SettingsError
-from anatomy.io.files import atomic_write
-from anatomy.typed import Float
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import atomic_write
+from anatomy.base.typed import Float
 from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles

@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.tour_models import random_airway, random_lesions

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import lungaccess as la
+from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
 from anatomy.phantom import write_phantom
-from anatomy.records import frozen_value
 from experiments.support.anatomies import PATIENTS, require_data
 from experiments.support.likeness import DEPTHS_MM, FAR_MM, GENERATIONS, Likeness, likeness_of
 from experiments.support.reached import reached_of

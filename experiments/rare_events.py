@@ -14,9 +14,9 @@ from collections.abc import Iterator
 import numpy as np
 
 import lungaccess as la
+from anatomy.base.records import frozen_value
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
-from anatomy.records import frozen_value
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.risk import RiskAssessor, load_errors, rare_touch
 from lungaccess.risk.statistics import Share

@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import lungaccess as la
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.problem.system import System

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 
 import lungaccess as la
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
 from anatomy.segmentation.pipeline import read_ct, segment
 from anatomy.segmentation.request import SegmentationRequest
-from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, data_folder, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.segmentation.slices import thickened

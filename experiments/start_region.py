@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 import lungaccess as la
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.typed import Float
 from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.plan import Plan
 from lungaccess.procedure import load_procedure, simulate_procedure

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import lungaccess as la
+from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from experiments.procedures import ITERATIONS, plans_of
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result

@@ -12,7 +12,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from anatomy.io.files import write_text
+from anatomy.base.files import write_text
 from lungaccess.benchmark.synthetic.manifest import Entry, manifest_text, measured_entry
 from lungaccess.benchmark.synthetic.phantoms import benchmark_phantoms
 

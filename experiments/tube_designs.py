@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import Any
 
 import lungaccess as la
-from anatomy.errors import SettingsError
-from anatomy.settings import override
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import override
 from experiments.support.reached import run_study
 from lungaccess.problem.system import System
 

@@ -16,8 +16,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from anatomy.errors import FileError
-from anatomy.io.files import atomic_write, read_text
+from anatomy.base.errors import FileError
+from anatomy.base.files import atomic_write, read_text
 from experiments.support.headlines import HEADLINES, MEASURED_ON
 from experiments.support.results import Row, cells, number
 

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import lazy_exports
+from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
-    from anatomy.errors import LungaccessError
+    from anatomy.base.errors import LungaccessError
     from anatomy.lung import Lung
     from lungaccess.appraisal import Appraisal, appraise
     from lungaccess.breathing.window import breathing_window

@@ -16,7 +16,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from anatomy.io.files import atomic_write
+from anatomy.base.files import atomic_write
 from experiments.support.results import small_png
 from experiments.write_results import read_all
 from lungaccess.report import style

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 import lungaccess as la
-from anatomy.facade import public_names
+from anatomy.base.facade import public_names
+from anatomy.base.settings import parse
 from anatomy.io.own_masks import PatientFile
 from anatomy.segmentation.learned import NetworkSettings
-from anatomy.settings import parse
 from lungaccess.cli.app import app
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.usage import with_nodule_number

@@ -73,7 +73,7 @@ def test_kernels_use_only_numpy_numba_array_types_and_kernels_below_them(graph: 
         for module in kernels
         for used in graph.find_modules_directly_imported_by(module)
         if used.split(".")[0] not in KERNELS_MAY_USE
-        and used not in ("anatomy.facade", "anatomy.typed", *COMPILED_WITH)
+        and used not in ("anatomy.base.facade", "anatomy.base.typed", *COMPILED_WITH)
         and not (is_kernel(used) and kernels_may_use(module, used))
     ]
     assert kernels

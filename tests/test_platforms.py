@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from anatomy.errors import FileError
-from anatomy.io import files
+from anatomy.base import files
+from anatomy.base.errors import FileError
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = [path for package in ("anatomy", "stages", "lungaccess") for path in (ROOT / package).rglob("*.py")]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.io.cost_maps import from_stored
 from anatomy.io.lungs import with_lobes

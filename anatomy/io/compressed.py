@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 
 PIECE_BYTES = 1 << 22
 _ANY_HEADER = 47  # zlib or gzip, found out from the first bytes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Array, Float32
+from anatomy.base.typed import Array, Float32
 
 OBSTACLE_COST = 1000.0
 """What a file holds where passing is forbidden: finite, exact in every type, and far from costs of 0 to 1."""

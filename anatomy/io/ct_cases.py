@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from anatomy.errors import FileError
-from anatomy.records import frozen_value
+from anatomy.base.errors import FileError
+from anatomy.base.records import frozen_value
 
 _AEROPATH = re.compile(
     r"(?P<case>.+)_CT_HR(?P<label>_label_airways|_label_lungs|)\.nii(\.gz)?", re.IGNORECASE

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
+from anatomy.base.files import reading, reason
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
-from anatomy.io.files import reading, reason
 from anatomy.io.image_header import image_shape, named_grid
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset

@@ -9,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
+from anatomy.base.files import DAMAGE, read_text, reason
+from anatomy.base.typed import Float
 from anatomy.grid import ORTHONORMAL_TOLERANCE, read_only, transform_points
-from anatomy.io.files import DAMAGE, read_text, reason
-from anatomy.typed import Float
 
 Frame = Literal["ras", "lps"]
 

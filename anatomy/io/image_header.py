@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 MOST_IMAGE_BYTES = 1 << 32
 """Most stored voxels of one image: four times a chest of 1024 x 1024 x 500 voxels of 16 bits."""

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import FileError, LungaccessError
+from anatomy.base.errors import FileError, LungaccessError
+from anatomy.base.files import DAMAGE, atomic_write, reading, reason, require_file
+from anatomy.base.typed import Array
 from anatomy.grid import Grid, Volume
-from anatomy.io.files import DAMAGE, atomic_write, reading, reason, require_file
 from anatomy.io.frames import Frame
 from anatomy.io.image_header import ImageHeader
 from anatomy.io.metaimage import open_metaimage
 from anatomy.io.nifti import begins_as_nifti, open_nifti
 from anatomy.io.nrrd import open_nrrd
 from anatomy.io.voxels import read_nonzero, read_values, require_whole
-from anatomy.typed import Array
 
 if TYPE_CHECKING:
     import SimpleITK

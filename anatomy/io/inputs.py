@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import DAMAGE, require_file, sha256
+from anatomy.base.files import DAMAGE, require_file, sha256
 from anatomy.io.images import image_suffix
 from anatomy.io.own_masks import DESCRIPTION
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, FileError
-from anatomy.io.files import read_json
+from anatomy.base.errors import AnatomyError, FileError
+from anatomy.base.files import read_json
 from anatomy.io.images import image_stem, read_labels, read_volume
 
 # Class tables published with TotalSegmentator [Wasserthal2023]: task lung_vessels since 2.5, and the lobes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.io.assembly import volumes_of
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.med_rad import numbered_nodules, text_poses

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.typed import Mask, UInt8
 from anatomy.io.masks import MaskSet
 from anatomy.lobes import LOBES, fissures_between, grown_into, main_pieces
 from anatomy.morphology import bounds, grown_by_one, window
-from anatomy.typed import Mask, UInt8
 
 
 def with_lobes(masks: MaskSet) -> MaskSet:

@@ -16,12 +16,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
+from anatomy.base.files import read_text, reading, require_file
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import ORTHONORMAL_TOLERANCE, freeze_arrays
-from anatomy.io.files import read_text, reading, require_file
 from anatomy.io.frames import LPS_FROM
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 MASKS_TRANSFORMS = ("breathing tissue", "breathing devices")
 """Transforms of an exported breathing scene, by name: points below them are stored in the masks' phase."""

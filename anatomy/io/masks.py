@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.files import sha256
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Array, Mask, UInt8
 from anatomy.grid import Grid
-from anatomy.io.files import sha256
 from anatomy.io.frames import Frame
 from anatomy.io.images import read_grid, read_mask, read_volume
 from anatomy.io.placement import Placed, covers_same_voxels, place, union_grid
 from anatomy.io.placement_words import moved, placement
 from anatomy.io.voxels import require_numbers
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Array, Mask, UInt8
 
 _READERS = 2  # decompression releases the interpreter; more threads only raise the peak of memory
 SOLID = ("wall", "vessels", "fissures", "hepatic-vein", "portal-vein", "hepatic-artery")

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, FileError, FrameError
+from anatomy.base.errors import AnatomyError, FileError, FrameError
+from anatomy.base.files import sha256
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
 from anatomy.io.assembly import LUNG_ROLES, assemble, describe_yourself
-from anatomy.io.files import sha256
 from anatomy.io.frames import Frame, read_points, read_pose
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.near_names import by_name, looks_like, plain
 from anatomy.lobes import lobe_named
 from anatomy.patient import PatientImages
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 LUNG_FILES: Mapping[str, tuple[str, ...]] = {
     "lumen": ("bronchialTree", "airway", "airways", "bronchi", "airwayTree"),

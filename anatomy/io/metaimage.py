@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
+from anatomy.base.typed import Float
 from anatomy.io.compressed import inflate, plain_pieces
 from anatomy.io.image_header import (
     MOST_HEADER_BYTES,
@@ -21,7 +22,6 @@ from anatomy.io.image_header import (
     not_of_components,
     right_handed_grid,
 )
-from anatomy.typed import Float
 
 _DTYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",

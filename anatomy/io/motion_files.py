@@ -8,16 +8,16 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from anatomy.errors import AnatomyError, FileError, FrameError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, FrameError, SettingsError
+from anatomy.base.files import read_text, reading, require_file
+from anatomy.base.settings import quantity, settings, switch, text
+from anatomy.base.typed import Array, Float
 from anatomy.grid import Grid, transform_points
-from anatomy.io.files import read_text, reading, require_file
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS
 from anatomy.io.image_header import right_handed_grid
 from anatomy.io.images import SUFFIXES, image_suffix, itk_image, open_image, read_mask, write_image
 from anatomy.io.voxels import read_array
 from anatomy.motion.source import MotionSource
-from anatomy.settings import quantity, settings, switch, text
-from anatomy.typed import Array, Float
 
 TRANSFORMS = (".h5", ".hdf5", ".tfm", ".txt", ".mat", ".xfm")
 LANDMARKS = ".csv"

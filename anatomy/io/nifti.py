@@ -16,7 +16,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
+from anatomy.base.typed import Float
 from anatomy.grid import transform_points
 from anatomy.io.compressed import pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
@@ -28,7 +29,6 @@ from anatomy.io.image_header import (
     not_of_components,
     right_handed_grid,
 )
-from anatomy.typed import Float
 
 _VERSION_1: dict[str, tuple[int, str]] = {
     "dim": (40, "8h"), "datatype": (70, "2h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
+from anatomy.base.typed import Float
 from anatomy.io.compressed import inflate, plain_pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
 from anatomy.io.image_header import (
@@ -23,7 +24,6 @@ from anatomy.io.image_header import (
     not_of_components,
     right_handed_grid,
 )
-from anatomy.typed import Float
 
 _LPS_FROM_LAS = np.diag([1.0, -1.0, 1.0, 1.0])
 _LPS_WORDS = ("left-posterior-superior", "lps")

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import ORTHONORMAL_TOLERANCE
 from anatomy.io.frames import LPS_FROM_RAS
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 HEADER_BYTES = 58
 NAME_BYTES = 20

@@ -9,9 +9,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from anatomy.errors import AnatomyError, FileError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, SettingsError
+from anatomy.base.files import read_toml, sha256
+from anatomy.base.settings import parse, quantity, settings
+from anatomy.base.suggestion import did_you_mean
 from anatomy.io.assembly import assemble, require_cost
-from anatomy.io.files import read_toml, sha256
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume
 from anatomy.io.label_names import stored_names
@@ -19,8 +21,6 @@ from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.motion_files import MotionFile, read_motion
 from anatomy.lobes import LOBES, lobe_named
 from anatomy.patient import PatientImages
-from anatomy.settings import parse, quantity, settings
-from anatomy.suggestion import did_you_mean
 
 DESCRIPTION = "patient.toml"
 _ROLES = {

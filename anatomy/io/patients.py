@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.io.assembly import describe_yourself
 from anatomy.io.ct_cases import cases_in, require_no_ct_case
 from anatomy.io.images import image_suffix, images_in
@@ -49,7 +49,7 @@ def load_patient(path: str | Path) -> PatientImages:
     --------
     >>> load_patient("nowhere")
     Traceback (most recent call last):
-    anatomy.errors.FileError: There is no patient at nowhere. ...
+    anatomy.base.errors.FileError: There is no patient at nowhere. ...
     """
     path = Path(path)
     if path.is_file():

@@ -6,10 +6,10 @@ from itertools import product
 
 import numpy as np
 
-from anatomy.errors import FrameError
+from anatomy.base.errors import FrameError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Bool, Float, Int
 from anatomy.grid import Grid, transform_points
-from anatomy.records import frozen_record
-from anatomy.typed import Array, Bool, Float, Int
 
 SHIFT_TOLERANCE = 0.05
 """Largest deviation of voxels that count as the same, in voxels: headers are rounded to some digits."""

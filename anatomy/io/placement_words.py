@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Float, Mask
 from anatomy.grid import Grid
 from anatomy.io.placement import Placed, box_in
-from anatomy.typed import Float, Mask
 
 _BEYOND = {
     "lumen": "nothing counts as airway",

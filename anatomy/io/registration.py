@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.files import reason
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
-from anatomy.io.files import reason
 from anatomy.io.images import itk_image, read_volume
-from anatomy.typed import Float
 
 WORKING_MM = 4.0
 """Voxels that are registered: what is left of a good registration is 1 mm, and motion varies over cm."""

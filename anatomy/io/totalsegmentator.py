@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from anatomy.base.files import sha256
 from anatomy.io.assembly import assemble
-from anatomy.io.files import sha256
 from anatomy.io.images import image_stem, images_in
 from anatomy.io.label_names import label_values, published_names, stored_names
 from anatomy.io.lungs import fill_lung

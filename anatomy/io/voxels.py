@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, FileError
+from anatomy.base.errors import AnatomyError, FileError
+from anatomy.base.typed import Array
 from anatomy.grid import Volume
 from anatomy.io.image_header import ImageHeader, truncated
-from anatomy.typed import Array
 
 
 def read_values(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume:

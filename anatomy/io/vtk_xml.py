@@ -11,9 +11,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from anatomy.io.files import reading, require_file
-from anatomy.records import frozen_record
-from anatomy.typed import Array
+from anatomy.base.files import reading, require_file
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array
 
 _TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",

@@ -10,7 +10,7 @@ from functools import cache
 from importlib import util
 from pathlib import Path
 
-from anatomy.cache import user_cache
+from anatomy.base.cache import user_cache
 from anatomy.machine_code.sources import version_of
 
 PREBUILT = "lungaccess_kernels"

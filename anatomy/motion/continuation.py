@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from anatomy.base.typed import Float, Mask
 from anatomy.motion.stretch import cell_bounds
-from anatomy.typed import Float, Mask
 
 RELAXATIONS = 60
 """Steps that even out what the continuation begins with, over the width of some ten cells."""

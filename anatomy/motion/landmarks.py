@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float
 
 SMOOTHINGS = (1e2, 1e3, 1e4, 1e5)
 """From a spline that passes its pairs by a tenth of a mm to one that is nearly affine over a lung."""

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, freeze_arrays, read_only
 from anatomy.kernels import motion as kernel
 from anatomy.motion.stretch import cell_bounds
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 RIGHT, LEFT = 0, 1
 """Each lung slides along chest wall and mediastinum by itself, and has a displacement of its own."""

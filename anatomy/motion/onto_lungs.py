@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Float, Labels, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.motion.motion import LEFT, RIGHT, Motion
 from anatomy.structures import OUTSIDE
-from anatomy.typed import Float, Labels, Mask
 
 SAMPLE_MM = 4.0
 """Distance of the places that are compared: a lung has some fifty thousand."""

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Float
 from anatomy.motion.motion import LEFT, RIGHT, Motion
-from anatomy.typed import Float
 
 BASAL_SHARE = 1.0 / 3.0
 """The third of the height next to the diaphragm, which moves most."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 
 HEIGHTS = np.arange(0.05, 1.0, 0.1)
 """Middles of the tenths of a lung's height, from the apex."""

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from anatomy.errors import AnatomyError, FrameError
+from anatomy.base.errors import AnatomyError, FrameError
+from anatomy.base.typed import Float, Labels, Mask
 from anatomy.grid import Grid
 from anatomy.motion.continuation import continued, continued_unfolded
 from anatomy.motion.landmarks import Fitted, fit_landmarks
@@ -18,7 +19,6 @@ from anatomy.motion.plausible import require_plausible
 from anatomy.motion.population import POPULATION_ERROR_MM, shares_of_motion
 from anatomy.motion.source import MotionSource
 from anatomy.structures import OUTSIDE
-from anatomy.typed import Float, Labels, Mask
 
 NODE_MM = 5.0
 """Distance of nodes: motion varies over centimetres, and its bounds are tighter the smaller the cells."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 BreathEnd = Literal["end-exhale", "end-inhale"]
 

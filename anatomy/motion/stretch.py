@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.kernels import motion as kernel
-from anatomy.typed import Float
 
 
 def cell_bounds(nodes: Float, spacing_mm: float) -> Float:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.grid import freeze_arrays
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
 
 
 def unit(vector: Float) -> Float:

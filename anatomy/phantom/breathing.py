@@ -11,11 +11,11 @@ from typing import Self
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
 from anatomy.motion.source import MotionSource
 from anatomy.phantom.patient import SCALES, Phantom
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 
 MOTION_MM = 16.0
 """Motion of the base of an adult's right lung, about the median of the population's."""

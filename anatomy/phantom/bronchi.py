@@ -14,14 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.chest import LOBES
 from anatomy.phantom.growth import STEP_MM, GrowthRule, grow, limit_turn
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
-from anatomy.records import frozen_value
-from anatomy.typed import Float, Int
 
 TRACHEA_DIAMETER_MM = 18.0
 """Of an adult [Weibel1963]."""

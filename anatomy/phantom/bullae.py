@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from anatomy.lobes import LEFT_UPPER, RIGHT_UPPER
 from anatomy.phantom.territory import Territory
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 FEWEST, MOST = 2, 8
 """How many bullae the mildest and the severest emphysema has."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Array
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.lobes import LOBES as NAMED_LOBES
-from anatomy.records import frozen_value
-from anatomy.typed import Array
 
 LOBES = {name.removesuffix(" lobe"): number for number, name in NAMED_LOBES.items()}
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Array, Float32
 from anatomy.grid import Volume
 from anatomy.phantom.rasterize import LABELS, Canvas
-from anatomy.typed import Array, Float32
 
 AIR_HU = -1000.0
 """By definition of the scale."""

@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from anatomy.base.files import require_writable_folder, write_text
 from anatomy.grid import Volume
-from anatomy.io.files import require_writable_folder, write_text
 from anatomy.io.images import write_volume
 from anatomy.io.motion_files import write_vectors
 from anatomy.io.own_masks import DESCRIPTION

@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.phantom.branching import Sprouts, bent_line, unit
 from anatomy.phantom.territory import Territory
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 
 Clearance = Callable[[Float], Float]
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from anatomy.phantom.bullae import Bulla
 from anatomy.phantom.territory import Territory
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 LEAST_PLEURA_MM, GREATEST_PLEURA_MM = 5.0, 30.0
 """Nodules of the outer third of the lung, which a bronchoscope cannot reach by itself."""

@@ -11,7 +11,9 @@ from typing import Literal
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Mask
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom.branching import Centerlines, centerlines
@@ -31,8 +33,6 @@ from anatomy.phantom.rasterize import (
 )
 from anatomy.phantom.territory import make_territory
 from anatomy.phantom.traits import PLAIN, RESECTED_INTO, Traits
-from anatomy.records import frozen_record
-from anatomy.typed import Mask
 
 Size = Literal["adult", "small"]
 SCALES: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 0.7})

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float, UInt8
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.bronchi import grow_airways
 from anatomy.phantom.bullae import Bulla, place_bullae
@@ -14,8 +16,6 @@ from anatomy.phantom.rim import ends_below_pleura
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
 from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Float, UInt8
 
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
 GAPLESS_RADIUS = 0.87

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.base.typed import Array, Float, Int, Int16, Mask, UInt8
 from anatomy.grid import Grid
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.chest import CAGE_CENTRE_Z, Chest, Side
 from anatomy.phantom.kernels import NODULE_OWNER, paint_tree
 from anatomy.phantom.plan import PlannedTree
-from anatomy.typed import Array, Float, Int, Int16, Mask, UInt8
 
 LABELS = {
     "background": 0,

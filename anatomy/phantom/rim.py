@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, UInt8
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.territory import Territory
-from anatomy.typed import Bool, Float, UInt8
 
 
 def ends_below_pleura(

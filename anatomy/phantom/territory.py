@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Float32, UInt8
 from anatomy.phantom.chest import LOBES, Chest
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Float32, UInt8
 
 MAP_SPACING_MM = 3.0
 """Fine enough for the borders of lobes, whose exact place the drawing decides."""

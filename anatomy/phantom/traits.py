@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.chest import LOBES
-from anatomy.records import frozen_value
 
 RESECTED_INTO = {
     RIGHT_UPPER: RIGHT_MIDDLE,

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.branching import Sprouts, smooth_line, unit
 from anatomy.phantom.growth import STEP_MM, Clearance, GrowthRule, grow, overlap_mm
 from anatomy.phantom.territory import Territory
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
 
 SHEATH_MM = 0.5
 """Arteries and airways share a sheath: about this much tissue lies between them."""

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.base.errors import AnatomyError, GridMismatchError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Int16, Mask
 from anatomy.grid import Volume, freeze_arrays
 from anatomy.morphology import Window, bounds, window
-from anatomy.records import frozen_record
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.local_minima import local_minima_map
-from anatomy.typed import Array, Float, Int16, Mask
 
 if TYPE_CHECKING:
     from anatomy.segmentation.lungs import Lungs

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Mask
 from anatomy.grid import Grid, Volume
-from anatomy.typed import Mask
 
 LEAST_TRACHEA_MM = 25.0
 """A chest CT shows at least a quarter of the trachea, which is about 100 mm long."""

@@ -12,15 +12,15 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import GridMismatchError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
-from anatomy.records import frozen_record
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.folder import onto_grid
 from anatomy.segmentation.interpolation import REACH, between
 from anatomy.segmentation.lungs import Lungs
-from anatomy.typed import Array, Float, Int, Mask
 
 BOX_PAD_MM = 10.0
 """More than any filter of the segmentation looks beyond a voxel of the lung."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
-from anatomy.typed import Float
 
 
 def canonical(volume: Volume) -> Volume:

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, Mask
 from anatomy.grid import Volume
 from anatomy.morphology import bounds, window
-from anatomy.records import frozen_record
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
-from anatomy.typed import Float, Int, Mask
 
 COLUMN_HU = -850.0
 """The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`."""

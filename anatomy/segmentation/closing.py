@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.typed import Float32, Mask
+from anatomy.base.typed import Float32, Mask
 
 _THREADS = 2
 

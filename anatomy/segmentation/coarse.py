@@ -6,11 +6,11 @@ from typing import Self
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Float32, Int, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds
-from anatomy.records import frozen_record
 from anatomy.segmentation.canonical import towards_lps, turned_grid
-from anatomy.typed import Array, Float, Float32, Int, Mask
 
 COARSE_MM = 1.5
 """Blocks of voxels come as near to this size as whole numbers of voxels allow."""

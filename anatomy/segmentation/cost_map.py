@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import GridMismatchError, SettingsError
+from anatomy.base.typed import Mask
 from anatomy.grid import Grid, Volume
 from anatomy.inflation import grown_by_voxels, inflation_voxels
-from anatomy.typed import Mask
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways

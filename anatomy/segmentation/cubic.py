@@ -6,9 +6,9 @@ from typing import Self
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Float32, Int
 from anatomy.grid import Grid
-from anatomy.records import frozen_record
-from anatomy.typed import Array, Float, Float32, Int
 
 EDGE_MM = 1.0
 """About the blur of a CT, and fine enough for fissures, which are 1 to 2 mm wide in it."""

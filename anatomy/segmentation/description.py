@@ -8,10 +8,10 @@ import os
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-from anatomy.io.files import sha256, write_text
+from anatomy.base.files import sha256, write_text
+from anatomy.base.typed import Float
 from anatomy.lobes import LOBES
 from anatomy.segmentation.folder import SegmentationFolder
-from anatomy.typed import Float
 
 
 class Description:

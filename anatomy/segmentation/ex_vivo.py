@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Float, Int32, Mask
 from anatomy.segmentation.central_airway import CentralAirway, grow_from
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.labels import RIGHT, sides_from_right
-from anatomy.typed import Float, Int32, Mask
 
 GREATEST_LUNG_HU = -200.0
 """Denser than any inflated lung: trays, clamps, the heart."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Array, Float32, Mask
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float32, Mask
 
 SIGMA_MM = 1.0
 """A fissure is thinner than the blur of a CT: about as wide as this in the image."""

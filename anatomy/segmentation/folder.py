@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.checksums import values_checksum
-from anatomy.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.base.checksums import values_checksum
+from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.base.files import atomic_write, read_json, require_writable_folder, sha256, write_text
+from anatomy.base.typed import Array
 from anatomy.grid import Grid, Volume
 from anatomy.io import cost_maps
-from anatomy.io.files import atomic_write, read_json, require_writable_folder, sha256, write_text
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
 from anatomy.lobes import LOBES
 from anatomy.segmentation.canonical import canonical
-from anatomy.typed import Array
 
 STATE = "segmentation.json"
 FORMAT = 1

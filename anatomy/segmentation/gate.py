@@ -8,9 +8,9 @@ from types import MappingProxyType
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.records import frozen_value
 from anatomy.grid import Volume
-from anatomy.records import frozen_value
 from anatomy.segmentation.landmarks import Landmarks, landmarks
 from anatomy.segmentation.lungs import Lungs
 from anatomy.segmentation.missing_lung import missing_lung, solid_tissue

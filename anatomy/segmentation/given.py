@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array
 from anatomy.grid import Grid, Volume
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.images import read_volume
@@ -15,10 +17,8 @@ from anatomy.io.masks import SOLID, MaskSource, read_masks
 from anatomy.io.placement import place
 from anatomy.io.totalsegmentator import file_sources, mask_sources
 from anatomy.io.voxels import require_numbers
-from anatomy.records import frozen_record
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.labels import lobe_numbers, sides_of_lobes
-from anatomy.typed import Array
 
 ROLES = {
     "airway": "lumen",

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Int, Int16, Mask, UInt8
 from anatomy.segmentation.kernels import growing as kernel
 from anatomy.segmentation.kernels import lumen_edge
 from anatomy.segmentation.kernels.neighbours import box_offsets, face_offsets
 from anatomy.segmentation.kernels.states import BANNED, LUMEN
 from anatomy.segmentation.thin_airways import follow_thin_airways
-from anatomy.typed import Array, Float, Int, Int16, Mask, UInt8
 
 AIR_HU = -1024
 """Around the image is air, which is neither wall nor, for want of depth, lumen."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Mask
 from anatomy.grid import Volume
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
-from anatomy.typed import Mask
 
 AIR_HU = -1000.0
 """By definition of the scale."""

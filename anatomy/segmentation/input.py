@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Array
 from anatomy.grid import Volume
-from anatomy.typed import Array
 
 AIR_HU, TISSUE_HU = -700.0, (-200.0, 200.0)
 """Air of lungs and outside lies below, and soft tissue between the two others."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anatomy.typed import Array, Float
+from anatomy.base.typed import Array, Float
 
 REACH = 12
 """Voxels farther than so many from a place weigh less than 1e-6 in its spline."""

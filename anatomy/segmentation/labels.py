@@ -7,13 +7,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Array, Float, Int32, Mask, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.sides import grow_sides
-from anatomy.typed import Array, Float, Int32, Mask, UInt8
 
 RIGHT, LEFT = 1, 2
 NUMBERINGS: Mapping[str, tuple[int, ...]] = MappingProxyType(

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, Mask
 from anatomy.grid import Grid
-from anatomy.records import frozen_value
-from anatomy.typed import Float, Mask
 
 SAMPLE_MM = 3.0
 """Lungs are looked at in steps of this: their shape is known to a step."""

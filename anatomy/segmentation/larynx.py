@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Int, Mask
 from anatomy.grid import Grid
-from anatomy.typed import Int, Mask
 
 NARROW_SHARE = 0.6
 """Of the cross-section of the trachea; what is narrower at its upper end is larynx or a partial slice."""

@@ -10,13 +10,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from anatomy.errors import AnatomyError, FileError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, SettingsError
+from anatomy.base.files import read_toml, sha256
+from anatomy.base.records import frozen_value
+from anatomy.base.settings import impossible, parse, quantity, settings
+from anatomy.base.typed import Array, Float, Float32, Mask
 from anatomy.grid import Volume
-from anatomy.io.files import read_toml, sha256
-from anatomy.records import frozen_value
 from anatomy.segmentation.closing import largest_piece
-from anatomy.settings import impossible, parse, quantity, settings
-from anatomy.typed import Array, Float, Float32, Mask
 
 SUFFIX = ".onnx"
 EXTRA = "learned"

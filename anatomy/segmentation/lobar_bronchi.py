@@ -8,9 +8,9 @@ from types import MappingProxyType
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
 
 USUAL_SHARES: Mapping[int, tuple[float, float]] = MappingProxyType(
     {

@@ -11,18 +11,18 @@ from collections.abc import Mapping
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float32, Int, Int32, Mask, UInt8
 from anatomy.grid import Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER, fissures_between
 from anatomy.morphology import bounds, window
-from anatomy.records import frozen_record
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.closing import closed, largest_piece
 from anatomy.segmentation.cubic import EDGE_MM, Cubic
 from anatomy.segmentation.fissures import BLOCK, Fissureness, blocks_of, fissureness
 from anatomy.segmentation.lobar_bronchi import TRUNK_SHARE, Regions, lobes_of_branches
 from anatomy.segmentation.lungs import Lungs
-from anatomy.typed import Bool, Float32, Int, Int32, Mask, UInt8
 
 OF_LUNG = {"right": (RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER), "left": (LEFT_UPPER, LEFT_LOWER)}
 FISSURES = {

@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
+from anatomy.base.typed import Float, Int16
 from anatomy.segmentation.kernels.local_minima import depth_slice, smooth_slice
-from anatomy.typed import Float, Int16
 
 LARGEST_SCALE = 12
 """N: the largest structuring element of the paper reaches this many pixels."""

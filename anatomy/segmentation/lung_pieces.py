@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Mask
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
-from anatomy.typed import Mask
 
 SMALLEST_LUNG_ML = 150.0
 """The smallest lung of a child after breathing out is about this large."""

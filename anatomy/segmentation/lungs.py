@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Float32, Int, Int32, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
 from anatomy.morphology import bounds, grown_by_one, window
-from anatomy.records import frozen_record
 from anatomy.segmentation.central_airway import CentralAirway, central_airways, find_central_airway
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
@@ -28,7 +29,6 @@ from anatomy.segmentation.lung_pieces import gas_pockets, lung_pieces
 from anatomy.segmentation.outside_air import outside_air
 from anatomy.segmentation.pleural_nodules import notches
 from anatomy.segmentation.truncation import truncation
-from anatomy.typed import Float, Float32, Int, Int32, Mask
 
 Progress = Callable[[str], None]
 

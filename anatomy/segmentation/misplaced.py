@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Volume
 from anatomy.morphology import bounds, window
-from anatomy.records import frozen_value
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.gate import Implausible
-from anatomy.typed import Array, Float, Mask
 
 STEP_MM = 3.0
 """More than the width of an airway's wall, less than the distance of vessels."""

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from anatomy.base.typed import Float, Int, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm
-from anatomy.typed import Float, Int, Mask
 
 SAMPLE_MM = 4.0
 """The shape of the chest is looked at on voxels of this size."""

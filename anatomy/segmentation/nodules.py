@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import FileError, GridMismatchError
+from anatomy.base.errors import FileError, GridMismatchError
+from anatomy.base.files import DAMAGE, read_json, reading
+from anatomy.base.typed import Float, Int16, Mask
 from anatomy.grid import Grid
-from anatomy.io.files import DAMAGE, read_json, reading
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm, largest_piece
-from anatomy.typed import Float, Int16, Mask
 
 _CONTOURS = '{"annotations": [{"contours": [{"z_mm": ..., "ij": [[column, row], ...]}]}]}'
 _REMEDY = "`lungaccess template contours` prints an example; a mask can be given with --nodule-mask"

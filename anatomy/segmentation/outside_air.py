@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Float32, Mask
+from anatomy.base.typed import Float32, Mask
 
 OUTSIDE_HU = -950.0
 """Air that touches the edge of a slice and has a median below this is not lung."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float32, Mask, UInt8
 from anatomy.grid import Volume
-from anatomy.records import frozen_record
 from anatomy.segmentation.lungs import Lungs
-from anatomy.typed import Float32, Mask, UInt8
 
 
 @frozen_record

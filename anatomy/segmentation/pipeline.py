@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION
-from anatomy.records import frozen_record
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.description import Description, description_text
@@ -25,7 +26,6 @@ from anatomy.segmentation.parts import Parts
 from anatomy.segmentation.request import SegmentationRequest
 from anatomy.segmentation.steps import VERSION, Steps
 from anatomy.segmentation.vessels import require_large_radius
-from anatomy.typed import Float
 
 Progress = Callable[[str], None]
 
@@ -193,9 +193,9 @@ def read_ct(path: str | Path, series_uid: str | None = None) -> tuple[Volume, di
     FileError, FrameError
         If there is no CT, or it cannot be read; see `anatomy.io.read_dicom` and `anatomy.io.read_volume`.
     """
-    from anatomy.errors import FileError
+    from anatomy.base.errors import FileError
+    from anatomy.base.files import sha256
     from anatomy.io.dicom import list_series, read_dicom
-    from anatomy.io.files import sha256
     from anatomy.io.images import image_suffix, read_volume
 
     path = Path(path)

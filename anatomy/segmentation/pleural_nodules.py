@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Int, Mask
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
-from anatomy.typed import Int, Mask
 
 NOTCH_MM = 12.0
 """Ball of the wider closing: notches of up to about 24 mm across become lung."""

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
-from anatomy.records import frozen_record
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
 from anatomy.segmentation.parts import Parts
 
 WIDENING = 1.6

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
 
+from anatomy.base.files import sha256
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
-from anatomy.io.files import sha256
 from anatomy.io.images import images_in
-from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.given import ROLES, GivenImages, read_given
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM
-from anatomy.typed import Float
 
 
 @frozen_value

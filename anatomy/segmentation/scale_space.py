@@ -11,10 +11,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.base.errors import AnatomyError, GridMismatchError
+from anatomy.base.typed import Float, Float32, Int16, Mask, UInt8
 from anatomy.machine_code.ahead import usable_cores
 from anatomy.morphology import Window, bounds, window
-from anatomy.typed import Float, Float32, Int16, Mask, UInt8
 
 SIGMAS_MM = (1.0, math.sqrt(2.0), 2.0, 2.0 * math.sqrt(2.0), 4.0)
 DEEPER_THAN_MM = (0.0, 1.0, 1.0, 2.0, 2.0 * math.sqrt(2.0))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Array, Mask
 from anatomy.grid import Volume
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.input import slice_mm
-from anatomy.typed import Array, Mask
 
 TISSUE_HU = (-50.0, 150.0)
 """Muscle and blood, whose own texture is weak."""

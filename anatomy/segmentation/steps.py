@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.files import sha256
+from anatomy.base.typed import Array, Float32, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io.cost_maps import OBSTACLE_COST, as_stored, from_stored
-from anatomy.io.files import sha256
 from anatomy.io.images import read_volume
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.description import Description
@@ -28,7 +29,6 @@ from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.segmentation.scan_warnings import scan_warnings
 from anatomy.segmentation.wall import wall_around
-from anatomy.typed import Array, Float32, Mask
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways

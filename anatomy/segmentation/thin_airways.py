@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, Int, Int16, Mask, UInt8
 from anatomy.segmentation.kernels import lumen_ends, tube_stretch
 from anatomy.segmentation.kernels import thin_airways as kernel
 from anatomy.segmentation.kernels.neighbours import box_offsets
-from anatomy.typed import Float, Int, Int16, Mask, UInt8
 
 N_DIRECTIONS = 260
 """Over the sphere: one every 13 degrees, 1.1 mm at the end of a stretch."""

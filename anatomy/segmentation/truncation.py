@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Mask
 from anatomy.grid import Grid
-from anatomy.typed import Mask
 
 
 def truncation(lung: Mask, grid: Grid) -> tuple[str, ...]:

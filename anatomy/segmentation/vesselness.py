@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.typed import Float, Float32, Int16, Mask
 from anatomy.segmentation.scale_space import ScaleSpace
-from anatomy.typed import Float, Float32, Int16, Mask
 
 ALPHA, BETA, C_HU = 0.5, 0.5, 70.0
 """Sensitivity to plates and to blobs; Hessian of 39 % of the greatest response [Fu2018]."""

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import GridMismatchError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Float32, Int16, Mask, UInt8
 from anatomy.grid import Volume
-from anatomy.records import frozen_record
 from anatomy.segmentation.closing import closed
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
 from anatomy.segmentation.vesselness import ALPHA, BETA, C_HU, add_vesselness_of
-from anatomy.typed import Float, Float32, Int16, Mask, UInt8
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways

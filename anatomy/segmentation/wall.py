@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Mask
 from anatomy.grid import Grid
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm
-from anatomy.typed import Mask
 
 WALL_MM = 1.5
 """Walls of lobar bronchi are 1 to 1.5 mm thick; those of thinner ones less."""

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 
 MAX_TURN_COS = 0.5
 """Both sides may turn away from the gap by at most 60 degrees."""

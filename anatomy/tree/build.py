@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.typed import Int
 from anatomy.grid import Volume
 from anatomy.tree.branches import Strand, assemble, divide
 from anatomy.tree.cavities import around_cavities
@@ -21,7 +22,6 @@ from anatomy.tree.trachea import find_trachea
 from anatomy.tree.voxel_tree import ROUNDS, VoxelTree, centred, rooted_voxel_tree
 from anatomy.tree.warn import warnings_of
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
-from anatomy.typed import Int
 
 
 def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float = 0.75) -> AirwayTree:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, Float32, Int
 from anatomy.tree.lumen import CONNECT_26, PreparedLumen
 from anatomy.tree.noise import require_at_most
-from anatomy.typed import Bool, Float, Float32, Int
 
 SIDE_RADII = 2.0
 """A flattened airway is up to this many times as wide as its inscribed sphere."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.typed import Bool, Float, Int
 
 TOUCH = 1e-6
 """Fraction of a voxel by which a segment must stay clear of every other voxel."""

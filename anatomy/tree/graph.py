@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Float, Int
 from anatomy.tree.skeleton import SkeletonTree, span
 from anatomy.tree_report import LoopOpened, TreeReport
-from anatomy.typed import Float, Int
 
 SAME_POINT_MM = 1e-3
 """Files store points in single precision; true neighbours are a hundred times farther apart."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Float32, Int, Int32
 from anatomy.grid import Grid, Volume
-from anatomy.records import frozen_record
 from anatomy.tree.bridge import Piece, join_pieces
 from anatomy.tree.noise import MOST_PIECES, require_at_most
 from anatomy.tree_report import GapBridged
-from anatomy.typed import Bool, Float, Float32, Int, Int32
 
 CONNECT_26 = np.ones((3, 3, 3), dtype=bool)
 

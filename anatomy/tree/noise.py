@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
-from anatomy.typed import Int
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Int
 
 MOST_PIECES = 2000
 """A CT shows some hundred branches; every pair of pieces is looked at, which takes minutes for more."""

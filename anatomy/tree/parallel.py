@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Bool
 from anatomy.tree.depth import segments_inside
 from anatomy.tree.voxel_tree import VoxelTree, voxel_tree_of
-from anatomy.typed import Bool
 
 
 def unite_parallel(voxel_tree: VoxelTree, lumen: Bool) -> VoxelTree:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.tree.branches import NodeBranch, Strand, divide
 from anatomy.tree.depth import exact_depth_mm, segments_inside
 from anatomy.tree.lumen import PreparedLumen
 from anatomy.tree.voxel_tree import VoxelTree
-from anatomy.typed import Float
 
 CAP_FRACTION = 0.8
 """The trachea begins where the inscribed sphere reaches this fraction of the trachea's radius."""

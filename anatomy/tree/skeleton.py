@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.tree.bridge import face_paths
-from anatomy.typed import Bool, Float, Int
 
 COST_RANGE = (1e-300, 1e300)
 """The spanning tree leaves out edges that cost nothing, as it does those that are not there."""

@@ -9,10 +9,10 @@ from typing import NoReturn
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
-from anatomy.records import frozen_record
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.tree.skeleton import SkeletonTree
-from anatomy.typed import Float
 
 MIN_RADIUS_MM = 2.0
 """Half the tracheal diameter of a newborn."""

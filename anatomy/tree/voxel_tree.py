@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Float32, Int
 from anatomy.tree.bridge import face_paths
 from anatomy.tree.depth import segments_inside
 from anatomy.tree.lumen import PreparedLumen
 from anatomy.tree.skeleton import SkeletonTree
-from anatomy.typed import Bool, Float, Float32, Int
 
 ROUNDS = 30
 """Rounds of centring and smoothing; together they reach about 4 voxels and smooth over about 2 mm."""

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

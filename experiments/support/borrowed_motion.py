@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.motion.motion import Motion
 from anatomy.motion.prepare import prepare_motion
 from anatomy.motion.source import MotionSource
 from anatomy.structures import OUTSIDE
-from anatomy.typed import Float
 
 SPACING_MM = 4.0
 """Of the carried field: a quadratic over a lung varies slowly."""

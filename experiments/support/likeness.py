@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Array, Float, Mask
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Array, Float, Mask
 
 GENERATIONS = (1, 2, 3, 4, 5, 6, 7, 8)
 DEPTHS_MM = ((2.0, 5.0), (5.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 30.0), (30.0, 60.0))

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import lungaccess as la
-from anatomy.errors import SettingsError
-from anatomy.io.files import write_text
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import write_text
 from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result

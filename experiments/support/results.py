@@ -15,9 +15,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from anatomy.errors import FileError
-from anatomy.io.files import atomic_write, require_writable_folder
-from anatomy.records import frozen_value
+from anatomy.base.errors import FileError
+from anatomy.base.files import atomic_write, require_writable_folder
+from anatomy.base.records import frozen_value
 from experiments.support.machine import cpu_seconds, machine
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from anatomy.motion.motion import Motion
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, OBSTACLES, OUTSIDE
-from anatomy.typed import Bool, Float, Int
 from lungaccess.breathing.window import TIP_BALL_MM, TIP_STEP_MM
 from lungaccess.plans.plan import Plan
 

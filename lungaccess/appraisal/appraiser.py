@@ -5,8 +5,8 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING
 
-from anatomy.errors import SettingsError
-from anatomy.records import frozen_value
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
 from lungaccess.appraisal.headline import Headline
 from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 from lungaccess.checking import Checker, CheckReport

@@ -6,9 +6,9 @@ import math
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+from anatomy.base.records import frozen_value
+from anatomy.base.words import plural
 from anatomy.lobes import FISSURES_UNKNOWN
-from anatomy.records import frozen_value
-from anatomy.words import plural
 from lungaccess.appraisal.grade import Grade, grade_of_chance
 from lungaccess.plans.chance import Chance
 from lungaccess.procedure.report import NO_PATH
@@ -236,7 +236,7 @@ class Headline:
 
 def _errors(chance: Chance, estimate: Estimate | None) -> dict[str, object]:
     """Return the error model by its keys, or of what a plan states its name and sizes."""
-    from anatomy.settings import to_mapping
+    from anatomy.base.settings import to_mapping
 
     if estimate is None or isinstance(estimate, Chance):
         return {"name": chance.errors, "sizes": chance.sizes}

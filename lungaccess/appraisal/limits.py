@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from lungaccess.checking.clearances import REACH_MM
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from anatomy.errors import FileError
-from anatomy.io.files import atomic_write
+from anatomy.base.errors import FileError
+from anatomy.base.files import atomic_write
 from lungaccess.benchmark.runs import BenchmarkRow
 
 SUFFIXES = (".csv", ".json")

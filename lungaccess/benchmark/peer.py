@@ -11,9 +11,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from anatomy.errors import FileError
-from anatomy.io.files import DAMAGE, reason
-from anatomy.records import frozen_value
+from anatomy.base.errors import FileError
+from anatomy.base.files import DAMAGE, reason
+from anatomy.base.records import frozen_value
 from lungaccess.benchmark.unc_rules import UNC_EXEMPT_MM
 
 Key = tuple[int, int, float]

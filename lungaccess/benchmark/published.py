@@ -6,12 +6,12 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.liver import LiverImages
 from anatomy.organ import Organ
 from anatomy.patient import PatientImages
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 NO_STARTS = "no query: the patient came without start poses"
 NO_TARGETS = "no query: the patient came without targets"

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Labels
 from anatomy.fields import CENTRES
 from anatomy.grid import Grid
 from anatomy.liver import LiverImages
 from anatomy.morphology import voxels_in
 from anatomy.patient import PatientImages
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
-from anatomy.typed import Float, Labels
 from stages.needle import Needle, NeedleEnvironment, environment_of_labels
 
 UNC_NEEDLE_DIAMETER_MM = 2.0

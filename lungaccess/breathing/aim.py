@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.motion.motion import Motion
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 from lungaccess.breathing.kernels.aim import aim_between, most_shares
 from lungaccess.breathing.window import TOLERANCE_MM, WHOLE_BREATH, carrier, distance_mm, miss_allowed
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.poses import poses_on_arc
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.breathing.kernels.rules import BEFORE_WALL, IN_LUMEN, IN_WALL, NEEDLE, NEEDLE_AT_EXIT, TUBE
 from lungaccess.plans.curves import needle_pieces, tube_pieces, tube_radii
 from lungaccess.plans.plan import Plan

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 from lungaccess.breathing.devices import device_points
 from lungaccess.breathing.moving import Moving
 from lungaccess.plans.plan import Plan

@@ -7,10 +7,10 @@ from typing import Self
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.motion import Motion
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.breathing.kernels.rigid import Rigid, turned
 from lungaccess.breathing.window import carrier, require_motion
 from lungaccess.plans.plan import Plan

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.motion import Motion
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
-from anatomy.typed import Float
 from lungaccess.breathing.devices import DevicePoints, device_points
 from lungaccess.breathing.kernels import rules
 from lungaccess.breathing.kernels.rigid import Rigid

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from anatomy.base.typed import Bool, Float
 from anatomy.meshes import MeshDistance, SurfaceMesh, box_surface
-from anatomy.typed import Bool, Float
 from lungaccess.checking.space import Select, labels_at
 from lungaccess.checking.tiles import Cluster, Tiles
 

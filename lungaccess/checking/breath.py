@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 
 if TYPE_CHECKING:
     from anatomy.motion.motion import Motion

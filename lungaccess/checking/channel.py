@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.scope_motion import motion_of
 from lungaccess.plans.plan import Plan

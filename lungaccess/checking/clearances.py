@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from anatomy.base.typed import Float
 from anatomy.lobes import FISSURES_UNKNOWN
-from anatomy.typed import Float
 from lungaccess.checking.boxes import Boxes, PathDistances
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.shapes import STEP_MM

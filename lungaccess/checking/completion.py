@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from lungaccess.checking import shapes
 from lungaccess.checking.deployment import replayed_mm
 from lungaccess.checking.environment import Environment

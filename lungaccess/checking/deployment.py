@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy import structures
-from anatomy.typed import Float, Labels
+from anatomy.base.typed import Float, Labels
 from lungaccess.checking import shapes
 from lungaccess.checking.boxes import PathDistances
 from lungaccess.checking.channel import check_channel, deployed_strain_factor

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from anatomy.typed import Float, Int
+from anatomy.base.typed import Float, Int
 from lungaccess.checking.boxes import Boxes
 from lungaccess.checking.space import Select
 from lungaccess.checking.tiles import Tiles

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 
 Side = Literal["at least", "at most"]
 

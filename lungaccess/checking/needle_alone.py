@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import structures
-from anatomy.typed import Bool, Float
+from anatomy.base.typed import Bool, Float
 from lungaccess.checking.clearances import CLEARANCE_TOLERANCE_MM, REACH_MM, check_clear, structures_known
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import CheckReport, Findings

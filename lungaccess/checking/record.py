@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
+from anatomy.base.settings import to_mapping
+from anatomy.base.typed import Float
 from anatomy.lobes import FISSURES_UNKNOWN
-from anatomy.settings import to_mapping
-from anatomy.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.plans.file import SCHEMA
 from lungaccess.plans.plan import Plan

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import (

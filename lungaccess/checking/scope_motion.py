@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 
 SMALL_RAD = 1e-2
 """Below this angle the coefficients of a screw come from their series, whose next term is below 1e-12."""

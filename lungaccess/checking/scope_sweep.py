@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from lungaccess.checking.boxes import Boxes
 from lungaccess.checking.scope_motion import Motion
 

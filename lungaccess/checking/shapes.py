@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from lungaccess.plans.plan import Plan
 from stages.tube.device import ConcentricTubes
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy import structures
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Bool, Float, Int, Labels
 from anatomy.grid import Grid
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Bool, Float, Int, Labels
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

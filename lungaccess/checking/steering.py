@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy import structures
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.checking.clearances import REACH_MM, check_clear, check_stated_clearance, structures_known
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings

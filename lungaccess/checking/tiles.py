@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from anatomy import structures
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int, Labels
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int, Labels
 from lungaccess.checking.space import Select, branch_of, window_of
 
 if TYPE_CHECKING:

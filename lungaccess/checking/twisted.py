@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import LungaccessError
-from anatomy.typed import Float
+from anatomy.base.errors import LungaccessError
+from anatomy.base.typed import Float
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import ANGLE_TOLERANCE_RAD, angle_between
 from lungaccess.checking.shapes import Curve, distance_to_polyline, radius_at

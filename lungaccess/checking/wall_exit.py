@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy import structures
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from lungaccess.checking.environment import Environment
 from lungaccess.checking.findings import Findings
 from lungaccess.checking.poses import POSITION_TOLERANCE_MM

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from anatomy import structures
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.meshes import MeshDistance, SurfaceMesh
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.checking import shapes
 from lungaccess.checking.breath import Breath
 from lungaccess.checking.deployment import OUT_OF_LUMEN_MM, RIM_POINTS, WALL_ZONE_MM

@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
-from anatomy.checksums import DamagedCacheWarning
-from anatomy.errors import AnatomyError, FileError, LungaccessError
+from anatomy.base.checksums import DamagedCacheWarning
+from anatomy.base.errors import AnatomyError, FileError, LungaccessError
 from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import KernelsNotKeptWarning
 from lungaccess.cli import plan_tables, terminal

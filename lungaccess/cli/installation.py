@@ -10,10 +10,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from anatomy.cache import default_cache
+from anatomy.base.cache import default_cache
+from anatomy.base.records import frozen_value
 from anatomy.machine_code.ahead import usable_cores
 from anatomy.machine_code.sources import kernel_digest
-from anatomy.records import frozen_value
 
 
 @frozen_value

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, Token
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 
 LARGEST_PORT = 2**16 - 1
 """Of TCP."""

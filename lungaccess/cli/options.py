@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import require_writable_folder
-from anatomy.records import frozen_value
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import require_writable_folder
+from anatomy.base.records import frozen_value
 from lungaccess.cli.numbers import Count, NotNegative, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS, Objective
 
 if TYPE_CHECKING:
+    from anatomy.base.typed import Float
     from anatomy.lung import Lung
     from anatomy.organ import Organ
-    from anatomy.typed import Float
     from lungaccess.coupled.atlas import Atlas
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget

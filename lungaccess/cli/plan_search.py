@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from anatomy.io.files import write_text
-from anatomy.records import frozen_value
+from anatomy.base.files import write_text
+from anatomy.base.records import frozen_value
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOptions, SearchOptions, StatedPlace

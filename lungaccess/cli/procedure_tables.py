@@ -27,7 +27,7 @@ def share_row(name: str, share: Share) -> terminal.Row:
 
 def procedure_record(report: ProcedureReport) -> dict[str, object]:
     """Return a report as plain values."""
-    from anatomy.settings import to_mapping
+    from anatomy.base.settings import to_mapping
 
     return {
         "errors": {**to_mapping(report.model), "name": report.model.label},

@@ -70,7 +70,7 @@ class _Shown:
     """Whether this process has said that kernels are compiled."""
 
     def __enter__(self) -> Self:
-        from anatomy.kernel_clock import watching_compilations
+        from anatomy.base.kernel_clock import watching_compilations
         from anatomy.machine_code.ahead import first_compilation
 
         self._interrupted_words: str | None = None

@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from anatomy.errors import LungaccessError
+    from anatomy.base.errors import LungaccessError
     from lungaccess.plans.no_plan import NoPlan
 
 

@@ -15,7 +15,7 @@ from cyclopts.exceptions import (
     ValidationError,
 )
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
 from lungaccess.cli.examples import EXAMPLES
 
 _GUESS = re.compile(r"\s*(Did you mean [^?]*\?)")

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from lungaccess.problem.channel import bends_with_tubes_rad
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles

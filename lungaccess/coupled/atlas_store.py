@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any, get_type_hints
 
+from anatomy.base.settings import to_mapping
 from anatomy.kept_records import kept_record, record_path
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
-from anatomy.settings import to_mapping
 from lungaccess.coupled.atlas import TIP_SPACING_MM, Atlas, build_atlas
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
 from anatomy.structures import AIRWAY
-from anatomy.typed import Float
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.cost_to_go import cost_to_go
 from lungaccess.coupled.kernels.box_queue import ENDED, MOST_BOXES, WAITING, begin_queue, divide

@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 
+from anatomy.base.typed import Float, UInt16
 from anatomy.kernels.field import UNITS_PER_MM
-from anatomy.typed import Float, UInt16
 from lungaccess.coupled.kernels.cost_to_go import (
     LEVELS,
     MOST_UNITS,

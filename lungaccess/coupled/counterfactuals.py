@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.direct_candidates import direct_candidates

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from lungaccess.breathing.window import with_window
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.explanation import explain

@@ -9,9 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from lungaccess.coupled.atlas import Atlas, require_same
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.costs import obstacle_clearance_mm

@@ -8,8 +8,8 @@ from dataclasses import replace
 from itertools import count
 from multiprocessing.connection import Connection
 
-from anatomy.child_process import end_with_parent
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.child_process import end_with_parent
+from anatomy.base.errors import AnatomyError, SettingsError
 from lungaccess.coupled.search.base import ParallelSearch, Step
 
 ROUND_ITERATIONS = 100

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
-from anatomy.errors import SettingsError
-from anatomy.kernel_clock import working_s
+from anatomy.base.errors import SettingsError
+from anatomy.base.kernel_clock import working_s
+from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.cost_bound import CostBound, GapGoal, guided
 from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch

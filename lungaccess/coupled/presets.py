@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from anatomy.errors import SettingsError
-from anatomy.kernel_clock import working_s
+from anatomy.base.errors import SettingsError
+from anatomy.base.kernel_clock import working_s
+from anatomy.base.records import frozen_record
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from lungaccess.checking import Checker, CheckReport
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.coupled.planner import plan

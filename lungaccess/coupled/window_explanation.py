@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from anatomy.words import plural
+from anatomy.base.words import plural
 from lungaccess.breathing.window import require_motion
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.window_search import WindowSearch

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.motion.motion import require_phase
 from lungaccess.breathing.window import breathing_window, require_motion

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT
-from anatomy.typed import Float, Int
 from lungaccess.coupled import DirectArcs
 from lungaccess.explanation import kernels
 from lungaccess.plans.evaluator import blocker_name

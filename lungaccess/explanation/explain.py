@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, cast
 
-from anatomy.kernel_clock import working_cpu_s
+from anatomy.base.kernel_clock import working_cpu_s
 from anatomy.lung import Lung
 from lungaccess.appraisal import DRAWS, SEED
 from lungaccess.checking import Checker

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import field
 
-from anatomy.records import frozen_record, frozen_value
+from anatomy.base.records import frozen_record, frozen_value
 from lungaccess.coupled import Attempt, Counterfactual
 from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking
 from lungaccess.explanation.neighbours import Neighbour, ReachedShare

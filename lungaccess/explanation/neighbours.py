@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.structures import obstacle_bits
-from anatomy.typed import Float
 from lungaccess.coupled import DirectCandidates, plan, reach_scan
 from lungaccess.explanation.blocking import region_of
 from lungaccess.plans.no_plan import NoPlan

@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import write_json
+from anatomy.base.files import write_json
+from anatomy.base.typed import Float
 from anatomy.io.frames import LPS_FROM_RAS
-from anatomy.typed import Float
 from lungaccess.coupled import Attempt
 from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, Structure
 from lungaccess.explanation.explanation import Change, Explanation

@@ -7,8 +7,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from lungaccess.coupled import DirectArcs
 from lungaccess.plans.evaluator import blocker_name
 

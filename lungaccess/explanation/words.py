@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from anatomy.records import frozen_value
-from anatomy.typed import Float
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from lungaccess.explanation.explanation import Explanation
 from lungaccess.explanation.record import point
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import LungaccessError, SettingsError
+from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.settings_file import settings_toml
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.settings_file import settings_toml
-from anatomy.typed import Float, Int
 from lungaccess.breathing.window import with_window
 from lungaccess.coupled import Atlas, ProgressEvent, atlas_is_kept, feasible_exits, open_atlas, plan
 from lungaccess.explorer import questions as ask

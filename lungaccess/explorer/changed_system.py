@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.explorer.chosen_place import ChosenPlace
 from lungaccess.explorer.questions import PlanQuestion, WhatIf
 from lungaccess.problem import System, load_system, shipped_names

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from lungaccess.coupled.exits import PLACE_MM
 from lungaccess.one_stage import TIP_WITHIN_MM, plan_near_exit, plan_near_scope_tip
 from lungaccess.plans.plan import Plan

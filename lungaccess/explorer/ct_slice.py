@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.typed import Float32
 from anatomy.grid import Volume
-from anatomy.typed import Float32
 
 
 def ct_slice(

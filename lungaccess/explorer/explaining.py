@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.coupled import Atlas, plan
 from lungaccess.explanation import DEFAULT_TIME_S, explain_no_plan, sections

@@ -7,9 +7,9 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from anatomy.io.files import write_json, write_text
+from anatomy.base.files import write_json, write_text
+from anatomy.base.settings_file import settings_toml
 from anatomy.lung import Lung
-from anatomy.settings_file import settings_toml
 from lungaccess.appraisal import appraise, plan_record
 from lungaccess.plans.plan import Plan
 from lungaccess.report import CostPoint, cost_over_time_csv, cost_over_time_png, overview_png, tree_png

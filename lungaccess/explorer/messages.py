@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import LungaccessError
-from anatomy.typed import Array
+from anatomy.base.errors import LungaccessError
+from anatomy.base.typed import Array
 from lungaccess.report.pack import TYPES
 
 ALIGNMENT = 4

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
 from anatomy.lung import Lung
-from anatomy.typed import Float
 from lungaccess.explorer.worker import PatientSource
 from lungaccess.problem import System, Target, load_system, nodule_target, preset_names, resolve_target
 from lungaccess.report.html.meshes import structure_meshes

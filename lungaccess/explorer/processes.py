@@ -10,8 +10,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from anatomy.child_process import end_with_parent
-from anatomy.errors import AnatomyError
+from anatomy.base.child_process import end_with_parent
+from anatomy.base.errors import AnatomyError
 from lungaccess.explorer.answers import Answers
 from lungaccess.explorer.messages import error_message, frame
 from lungaccess.explorer.questions import ANSWERS, CLICKS, PLANS, REACH

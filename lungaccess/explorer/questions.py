@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Len
 from pydantic import Field
 
-from anatomy.errors import SettingsError
-from anatomy.settings import parse, quantity, settings, text
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import parse, quantity, settings, text
 
 MOST_CHARACTERS = 20_000
 """A message of the page is shorter by far."""

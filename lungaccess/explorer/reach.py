@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.typed import Int
 from anatomy.lung import Lung
-from anatomy.typed import Int
 from lungaccess.coupled import Atlas
 from lungaccess.explorer.worker import Part, Turn
 from lungaccess.problem import System

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from aiohttp import WSMsgType, web
 
-from anatomy.errors import LungaccessError, SettingsError
-from anatomy.records import frozen_value
+from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.records import frozen_value
 from lungaccess.explorer.messages import error_message, frame
 from lungaccess.explorer.processes import NAMES, Process
 from lungaccess.explorer.questions import CANCEL, MOST_CHARACTERS, number_of, read_message

@@ -9,8 +9,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from anatomy.errors import AnatomyError, LungaccessError
-from anatomy.records import frozen_value
+from anatomy.base.errors import AnatomyError, LungaccessError
+from anatomy.base.records import frozen_value
 from lungaccess.explorer.messages import Frame, error_message, frame
 from lungaccess.explorer.questions import Question
 from lungaccess.problem import System

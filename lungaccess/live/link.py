@@ -12,9 +12,9 @@ import time
 from collections import Counter, deque
 from typing import Self
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.records import frozen_value
 from anatomy.io.openigtlink import Decoder, Received
-from anatomy.records import frozen_value
 
 HOST, PORT = "127.0.0.1", 18944
 """This machine alone, and the port of OpenIGTLink."""

@@ -8,11 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_pieces
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.one_stage import RestOfPlan, ScopeReplanner, measured_pose, replan_from_tube
 from lungaccess.plans.curves import STEP_MM, needle_pieces, tube_pieces
 from lungaccess.plans.plan import Plan

@@ -8,11 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.io.openigtlink import Received, points_message, pose_message, text_message
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 from lungaccess.breathing.moving import Moving
 from lungaccess.live.link import Link, LinkCounts
 from lungaccess.live.replanning import TARGET, TRACKED, Answer, TrackedReplanner

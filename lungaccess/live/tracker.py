@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.live.link import Link
 from lungaccess.live.replanning import NEEDLE_TIP, TARGET
 from lungaccess.procedure.tracker import Measured

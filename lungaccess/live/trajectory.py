@@ -7,12 +7,12 @@ from typing import Annotated
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float
 from anatomy.grid import freeze_arrays
 from anatomy.poses import poses_on_pieces
-from anatomy.records import frozen_record
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float
 from lungaccess.plans.curves import deployed_pieces, needle_pieces
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.plan import Plan

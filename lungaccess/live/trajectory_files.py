@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anatomy.io.files import require_writable_folder, write_text
-from anatomy.typed import Float
+from anatomy.base.files import require_writable_folder, write_text
+from anatomy.base.typed import Float
 from lungaccess.live.trajectory import NEEDLE, SCOPE, TUBES, Trajectory
 
 TABLE_FILE, JOINTS_FILE = "trajectory.csv", "joint_trajectory.yaml"

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.typed import Bool, Float, Int
 from lungaccess.coupled.kernels.direct_arcs import cost_bounds, evaluate_arcs
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.coupled.search.aimed_tubes import AimedFromPose

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.typed import Float, Int
 from lungaccess.coupled import Atlas, atlas_part, build_atlas, plan
 from lungaccess.coupled.atlas import require_same
 from lungaccess.plans.no_plan import NoPlan

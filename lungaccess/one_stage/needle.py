@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.kernels.field import exact_distance
 from anatomy.liver import with_entry
 from anatomy.lung import Lung
 from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
-from anatomy.typed import Float
 from lungaccess.one_stage.needle_search import PathSearch, search_path
 from lungaccess.one_stage.obstruction import obstruction_record
 from lungaccess.plans.costs import known_costs

@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from anatomy.kernel_clock import working_s
-from anatomy.records import frozen_record
+from anatomy.base.kernel_clock import working_s
+from anatomy.base.records import frozen_record
 from stages.needle import (
     OMPL_PLANNERS,
     OMPL_TOLERANCE_MM,

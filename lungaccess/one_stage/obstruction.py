@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from anatomy.base.typed import Float
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from stages.needle import Obstruction
 
 NAMES = ((VESSEL, "a vessel"), (FISSURE, "a fissure"), (OUTSIDE, "the outside of the organ"))

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import poses
-from anatomy.errors import FrameError, TargetError
+from anatomy.base.errors import FrameError, TargetError
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.typed import Float
 from lungaccess.one_stage.from_scope import SEARCHED, TRIES, ScopeReplanner
 from lungaccess.one_stage.needle import needle_question
 from lungaccess.one_stage.obstruction import reason_in_words

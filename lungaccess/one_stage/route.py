@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.liver import LUMENS, is_liver, load_liver
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 if TYPE_CHECKING:
     from stages.scope.route import Centreline, Route
@@ -177,7 +177,7 @@ def widest_end(centreline: Centreline) -> Float:
 
 def route_record(source: RouteSource, route: Route) -> dict[str, Any]:
     """Return a route as plain JSON types, in LPS mm."""
-    from anatomy.settings import to_mapping
+    from anatomy.base.settings import to_mapping
     from stages.scope.route import measure
 
     measured = measure(route.curve, source.centreline)

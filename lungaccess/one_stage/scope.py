@@ -7,10 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import write_text
+from anatomy.base.files import write_text
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.problem.system import System
 from stages.scope.advisor import (
     Advisor,

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, UInt8
 from anatomy.lung import Lung
 from anatomy.poses import pose
-from anatomy.records import frozen_record
-from anatomy.typed import Float, UInt8
 from lungaccess.one_stage.replan import replan_from_scope
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan

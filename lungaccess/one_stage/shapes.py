@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.io.files import atomic_write
+from anatomy.base.files import atomic_write
 from lungaccess.one_stage.tubes import BareTubes, tubes_of
 from lungaccess.problem.system import System
 from stages.tube import ShapeLimits, TubeShapes, open_shapes

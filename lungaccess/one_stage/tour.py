@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.errors import FileError, TargetError
-from anatomy.io.files import read_text
+from anatomy.base.errors import FileError, TargetError
+from anatomy.base.files import read_text
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.plans.no_plan import NoPlan
 from stages.scope.tour import (
     MOST_COMBINATIONS,

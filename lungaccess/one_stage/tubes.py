@@ -8,10 +8,10 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import read_toml
-from anatomy.records import frozen_value
-from anatomy.settings import impossible, parse, settings, text, to_mapping
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import read_toml
+from anatomy.base.records import frozen_value
+from anatomy.base.settings import impossible, parse, settings, text, to_mapping
 from lungaccess.problem.system import System, load_system
 from stages.tube import (
     BEND_RAD,

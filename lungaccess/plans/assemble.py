@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import BITS
-from anatomy.typed import Float
 from lungaccess.plans.candidate import Candidate, wall_in_path_mm
 from lungaccess.plans.costs import path_costs
 from lungaccess.plans.insertion import scope_insertion

@@ -7,10 +7,10 @@ from dataclasses import asdict
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LOBES
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.clock_face import STRAIGHT_AHEAD, clock_hour, clock_words
 from stages.scope import ScopeMotion
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from lungaccess.plans.curves import deployed_pieces, pieces_beyond
 from lungaccess.problem.system import System
 from stages.needle import ArcPath

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from anatomy.errors import PlanFileError
-from anatomy.records import frozen_record
+from anatomy.base.errors import PlanFileError
+from anatomy.base.records import frozen_record
 from lungaccess.plans.record import Record
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 
 STRAIGHT_RAD = math.radians(4.0)
 """What lies nearer to the middle of the picture is straight ahead."""

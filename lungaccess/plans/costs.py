@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
-from anatomy.typed import Float
 from lungaccess.plans.curves import pieces_beyond
 from stages import needle
 from stages.needle import TERMS, ArcPath, Objective, Obstacles, Term

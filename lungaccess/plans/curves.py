@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import freeze_arrays
 from anatomy.poses import poses_on_arc, poses_on_pieces
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.plans.parts import NeedlePath, ScopeInsertion, TubeDeployment
 from lungaccess.problem.system import System
 from stages.scope.device import laid_pieces

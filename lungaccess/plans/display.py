@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from anatomy.base.typed import Float
 from anatomy.display import AXIAL, CORONAL, Drawing, side_by_side, table
-from anatomy.typed import Float
 from lungaccess.plans.curves import DeviceCurves
 
 TARGET_COLOUR, EXIT_COLOUR = "#2ca02c", "#d62728"

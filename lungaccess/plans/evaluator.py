@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float, Float32, Int
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Float, Float32, Int
 from lungaccess.plans.candidate import Candidate, tubes_in_tissue, wall_in_path_mm
 from lungaccess.plans.costs import path_beyond, path_cost
 from lungaccess.plans.tip_rows import TipRows

@@ -17,10 +17,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anatomy.errors import PlanFileError, SettingsError
-from anatomy.io.files import DAMAGE, reason
-from anatomy.records import LEFT_OUT_IF_EMPTY
-from anatomy.settings import parse, to_mapping
+from anatomy.base.errors import PlanFileError, SettingsError
+from anatomy.base.files import DAMAGE, reason
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
+from anatomy.base.settings import parse, to_mapping
 from lungaccess.plans.record import Record
 from lungaccess.problem.system import System
 
@@ -30,7 +30,7 @@ LINES = "lungaccess-plan-1"
 """The format whose plans state a line for the scope."""
 
 ARRAY_TYPES = (np.ndarray, NDArray)
-"""What `anatomy.typed` is made of: numpy resolves its name of arrays before 2.5, and keeps it since."""
+"""What `anatomy.base.typed` is made of: numpy resolves its name of arrays before 2.5, and keeps it since."""
 
 P = TypeVar("P", bound=Record)
 _REMEDY = "Run `lungaccess plan` again"
@@ -108,7 +108,7 @@ def plain(part: Record) -> Any:
 
 def save(plan: Record, path: str | os.PathLike[str]) -> None:
     """Write `plan` beside `path` under a temporary name, then put it in place."""
-    from anatomy.io.files import write_text
+    from anatomy.base.files import write_text
 
     write_text(os.fspath(path), to_json(plan))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.plans.plan import Plan
 from stages.scope import ScopeMotion

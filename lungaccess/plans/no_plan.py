@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
 
 if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan

@@ -7,8 +7,8 @@ from dataclasses import field
 
 import numpy as np
 
-from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
-from anatomy.typed import Float, Int
+from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
+from anatomy.base.typed import Float, Int
 from lungaccess.plans.record import Record, shaped
 from stages.tube.device import ConcentricTubes
 

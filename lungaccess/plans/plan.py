@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from anatomy.errors import PlanFileError
+from anatomy.base.errors import PlanFileError
+from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
+from anatomy.base.typed import Float
+from anatomy.base.words import plural
 from anatomy.poses import poses_on_pieces
-from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
-from anatomy.typed import Float
-from anatomy.words import plural
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.curves import (

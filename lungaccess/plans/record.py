@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import PlanFileError
+from anatomy.base.errors import PlanFileError
+from anatomy.base.typed import Array
 from anatomy.grid import read_only
-from anatomy.typed import Array
 
 
 def shaped(*shape: int | None, dtype: type = np.float64) -> dict[str, Any]:

@@ -8,9 +8,9 @@ from dataclasses import asdict
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Float, Int
 from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.clock_face import STRAIGHT_AHEAD, clock_hour
 from lungaccess.plans.insertion import scope_motion, shown_motion

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, Mask
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import LUMEN
-from anatomy.typed import Float, Int, Mask
 
 DIRECTIONS = 90
 """Rays around the tip, every 4 degrees."""

@@ -8,9 +8,9 @@ from dataclasses import field
 
 import numpy as np
 
-from anatomy.errors import PlanFileError
-from anatomy.records import LEFT_OUT_IF_EMPTY, frozen_record
-from anatomy.typed import Float
+from anatomy.base.errors import PlanFileError
+from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
+from anatomy.base.typed import Float
 from lungaccess.plans.record import Record, shaped
 
 

@@ -23,7 +23,7 @@ def load_patient(
     path : path
         A Med-RAD folder, a folder with a `patient.toml`, or output of TotalSegmentator.
     cache : path, optional
-        Folder for prepared anatomies; `anatomy.cache.default_cache()` if None.
+        Folder for prepared anatomies; `anatomy.base.cache.default_cache()` if None.
     progress : callable, optional
         Receives each step as it begins.
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Float
 
 PLEURA_MM = (5.0, 25.0)
 """Distances from the pleura between which targets count as peripheral: near it, but not at it."""

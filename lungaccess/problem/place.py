@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
-from anatomy.typed import Float
 
 CAP_MM = 30.0
 """Distances are measured up to here: farther structures do not limit a needle."""

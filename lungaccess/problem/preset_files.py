@@ -7,10 +7,10 @@ import tomllib
 from importlib import resources
 from typing import Any
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import read_toml
-from anatomy.records import frozen_value
-from anatomy.suggestion import did_you_mean
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import read_toml
+from anatomy.base.records import frozen_value
+from anatomy.base.suggestion import did_you_mean
 
 
 @frozen_value

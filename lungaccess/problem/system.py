@@ -12,9 +12,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import impossible, parse, settings, switch, text, to_mapping
 from anatomy.margins import Margins
-from anatomy.settings import impossible, parse, settings, switch, text, to_mapping
 from lungaccess.problem.preset_files import PresetFiles
 from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope

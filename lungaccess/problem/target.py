@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume, read_only
 from anatomy.lung import Lung
 from anatomy.morphology import components
 from anatomy.organ import Organ
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
-from anatomy.typed import Float, Int
 
 
 @frozen_record

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from anatomy.base.records import frozen_record
 from anatomy.lung import Lung
 from anatomy.organ import Organ
-from anatomy.records import frozen_record
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, require_free
 from stages.needle import DEFAULT, Objective

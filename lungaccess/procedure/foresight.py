@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy import poses
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.typed import Float, Int
 from lungaccess.procedure.residuals import Residuals
 from lungaccess.procedure.settings import Procedure
 from lungaccess.procedure.spread import Spread

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.procedure.residuals import Residuals
 from stages.needle import tilt
 

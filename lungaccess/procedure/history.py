@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 
 SCOPE, TUBE, NEEDLE = "scope", "tube", "needle"
 STAGES = (SCOPE, TUBE, NEEDLE)

@@ -10,9 +10,9 @@ from itertools import product
 import numpy as np
 
 from anatomy import poses
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.typed import Float
 from lungaccess.one_stage import RestOfPlan, ScopeReplanner, replan_from_tube
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from lungaccess.procedure.settings import Procedure
 from lungaccess.risk import ErrorModel, Share
 

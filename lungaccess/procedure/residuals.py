@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
 from lungaccess.procedure.settings import Procedure
 from lungaccess.risk.errors import BREATHING, CURVATURE, ErrorModel
 

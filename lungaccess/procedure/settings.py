@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Annotated
 
-from anatomy.settings import parse, quantity, settings, switch, text
+from anatomy.base.settings import parse, quantity, settings, switch, text
 from lungaccess.problem.preset_files import PresetFiles
 
 DEFAULT_PROCEDURE = "open-loop"

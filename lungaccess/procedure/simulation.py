@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.child_process import end_with_parent
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.child_process import end_with_parent
+from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
-from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
 from lungaccess.procedure.history import STAGES, History
 from lungaccess.procedure.policy import Policy

@@ -11,9 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.population import share_of_motion
-from anatomy.typed import Float
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from lungaccess.procedure.kernels import spread as kernel

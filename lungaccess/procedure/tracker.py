@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 
 
 @frozen_record

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from anatomy import poses
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.deviations import Deviations, deviated_pieces

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int, Int32
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, Int32
 from lungaccess.reachability.kernels.blocked import ProofEnvironment
 from lungaccess.reachability.kernels.deployment_boxes import BOX_COLUMNS
 from lungaccess.reachability.kernels.unreachable import Pieces, divide, first_boxes, measures

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.checksums import array_checksum, values_checksum, warn_of_damage
+from anatomy.base.checksums import array_checksum, values_checksum, warn_of_damage
+from anatomy.base.files import DAMAGE, atomic_write, require_writable_folder
+from anatomy.base.typed import Float, Float32, Int, Int32, Mask, UInt64
 from anatomy.grid import Grid
-from anatomy.io.files import DAMAGE, atomic_write, require_writable_folder
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
-from anatomy.typed import Float, Float32, Int, Int32, Mask, UInt64
 from lungaccess.coupled import Scan
 from stages.needle import BLOCK_MM, Reached
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.reachability.deployment_space import DeploymentSpace
 from lungaccess.reachability.kernels.deployment_boxes import HALF, INNER, OUTER, PLACE_X
 from lungaccess.reachability.kernels.unreachable import RULED_OUT, TOO_MANY, Found

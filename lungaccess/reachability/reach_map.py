@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import require_writable_folder
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Bool
 from anatomy.grid import Grid, Volume
-from anatomy.io.files import require_writable_folder
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Bool
 from lungaccess.breathing.window import require_motion
 from lungaccess.coupled import reach_scan
 from lungaccess.coupled.atlas import Atlas, build_atlas

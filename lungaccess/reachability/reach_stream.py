@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Int, UInt8
 from anatomy.grid import Grid
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Int, UInt8
 from lungaccess.coupled import reach_scan
 from lungaccess.coupled.atlas import Atlas, require_same
 from lungaccess.problem.system import System

@@ -7,12 +7,12 @@ from types import MappingProxyType
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Mask, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import LOBES
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import OBSTACLES
-from anatomy.typed import Float, Mask, UInt8
 
 RIGHT, LEFT = 1, 2
 NAMES: Mapping[int, str] = MappingProxyType({RIGHT: "right lung", LEFT: "left lung"})

@@ -8,10 +8,10 @@ import numpy as np
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Array, Float, Int, Mask
 from lungaccess.reachability.kernels.blocked import deep_enough
 from stages.scope import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD
 

@@ -12,13 +12,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, Int32, Mask
 from anatomy.fields import distance_corners
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
-from anatomy.typed import Float, Int, Int32, Mask
 from lungaccess.problem.system import System
 from lungaccess.reachability.deployment_space import DeploymentSpace, divided_space, in_tasks
 from lungaccess.reachability.kernels.blocked import ProofEnvironment

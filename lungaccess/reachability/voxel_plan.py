@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import SettingsError, TargetError
-from anatomy.typed import Int
+from anatomy.base.errors import SettingsError, TargetError
+from anatomy.base.typed import Int
 from lungaccess.coupled import direct_candidates, reach_scan
 from lungaccess.coupled.atlas import Atlas, require_same
 from lungaccess.coupled.search.direct_arcs import DirectArcs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.plans.tip_rows import TipRows
 from lungaccess.refinement.layout import AXIS_DEGREE, AXIS_SCALE_MM
 from stages.scope import ScopeTip, evenly

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Int
 from anatomy.fields import corner_geometry, distance_corners
 from anatomy.grid import Grid, Volume
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN
-from anatomy.typed import Array, Float, Int
 
 BOX_VALUES = (100_000, 100_000, 40_000, 20_000, 100_000)
 """Most values of the boxes, in this order: clearance, spared, wall, lumen, map.  From a finer lattice every

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.needle import ArcPath, arc_transform, bend_direction
 
 AIM_STEPS = 6

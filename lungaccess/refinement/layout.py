@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
 
 AXIS_DEGREE = 5
 """The airway's axis near the site is a polynomial of this degree in the arc length along it."""

@@ -18,7 +18,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.refinement.boxes import BOX_VALUES, CLEARANCE, LUMEN_SHARE, MAP, SPARED, WALL, FieldBox
 from lungaccess.refinement.geometry import Geometry
 from lungaccess.refinement.layout import SLOPE_MM, Layout, Numbers

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy import poses
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.refinement.curve import aimed, path_of

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.refinement.layout import CURVE_DEGREE, N_FEATURES
 from stages.needle import arc_transform
 from stages.tube import (

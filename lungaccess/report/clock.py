@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 
 if TYPE_CHECKING:
     from lungaccess.plans.window import BreathingWindow

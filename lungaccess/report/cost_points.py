@@ -7,8 +7,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from anatomy.io.files import atomic_write
-from anatomy.records import frozen_value
+from anatomy.base.files import atomic_write
+from anatomy.base.records import frozen_value
 
 
 @frozen_value
@@ -33,7 +33,7 @@ def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str
 
     Raises
     ------
-    anatomy.errors.FileError
+    anatomy.base.errors.FileError
         If the file cannot be written.
     """
     with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Polygon
 from matplotlib.ticker import Formatter
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.report import style
 from lungaccess.report.layers import Footprint, Layers
 from lungaccess.report.views import View

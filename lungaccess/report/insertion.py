@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.io.files import atomic_write
-from anatomy.typed import Float
+from anatomy.base.files import atomic_write
+from anatomy.base.typed import Float
 from lungaccess.report import style
 
 if TYPE_CHECKING:

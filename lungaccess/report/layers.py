@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Bool, Float, Int
 from anatomy.kept import kept
-from anatomy.records import frozen_record
 from anatomy.structures import BITS, OUTSIDE
-from anatomy.typed import Array, Bool, Float, Int
 from lungaccess.report.pack import Packed, pack, unpack
 from lungaccess.report.views import STANDARD, View
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import View, plane_view

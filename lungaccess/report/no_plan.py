@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.explanation import FAILS
 from lungaccess.report import drawing, style
 from lungaccess.report.colours import MISS, NEAREST, OTHER, START_COLOURS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.lines import Line2D
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import AXIAL, CORONAL, View

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.appraisal.headline import Headline
 from lungaccess.report import drawing, panels, style, zoom
 from lungaccess.report.layers import Layers

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError
-from anatomy.typed import Array
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Array
 
 Packed = dict[str, Any]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.key_numbers import key_numbers
 

@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.report import drawing, style
 from lungaccess.report.views import CORONAL, SAGITTAL, View
 
@@ -36,7 +36,7 @@ def route_png(name: str, centreline: Centreline, route: Route, path: str | os.Pa
 
     Raises
     ------
-    anatomy.errors.FileError
+    anatomy.base.errors.FileError
         If the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)

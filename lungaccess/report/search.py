@@ -19,7 +19,7 @@ def cost_over_time_png(
 
     Raises
     ------
-    anatomy.errors.FileError
+    anatomy.base.errors.FileError
         If the file cannot be written.
     """
     figure = style.new_figure(8.0, 4.5)

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds
 from anatomy.segmentation.parts import Parts
-from anatomy.typed import Array, Float, Mask
 from lungaccess.report import style
 
 SLICES = 5
@@ -38,7 +38,7 @@ def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[st
 
     Raises
     ------
-    anatomy.errors.FileError
+    anatomy.base.errors.FileError
         If the file cannot be written.
     """
     low, high = _shown_lps(ct, parts)

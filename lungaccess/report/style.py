@@ -12,7 +12,7 @@ matplotlib.use("Agg")
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from anatomy.io.files import atomic_write
+from anatomy.base.files import atomic_write
 from lungaccess.report.colours import DEVICE_COLOURS
 
 # Mostly Okabe and Ito's palette: distinct with every common colour vision, and in grey by lightness.

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Rectangle
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.report import drawing, style
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def tubes_png(
 
     Raises
     ------
-    anatomy.errors.FileError
+    anatomy.base.errors.FileError
         If the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)

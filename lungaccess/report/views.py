@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 
 LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.plans.curves import SHORTEST_MM
 from lungaccess.report import drawing, style
 from lungaccess.report.layers import Layers

@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.breathing import model_for

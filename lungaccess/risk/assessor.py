@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from anatomy.morphology import components
 from anatomy.motion.population import share_of_motion
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
-from anatomy.typed import Bool, Float, Int
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.breathing import PatientMotion
 from lungaccess.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations

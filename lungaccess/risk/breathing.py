@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.motion import LEFT, Motion
-from anatomy.typed import Float
 from lungaccess.breathing.window import carrier
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.errors import IN_WINDOW, BreathingError, ErrorModel

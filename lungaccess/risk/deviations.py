@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import SettingsError
-from anatomy.typed import Float
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
 from lungaccess.risk.breathing import PatientMotion, phase
 from lungaccess.risk.deviations import FIELD_OF, Deviations, no_deviations
 from lungaccess.risk.errors import BOUNDED, BREATHING, CURVATURE, IN_WINDOW, UNITS, ErrorModel

@@ -7,8 +7,8 @@ import os
 import tomllib
 from typing import Any
 
-from anatomy.errors import SettingsError
-from anatomy.settings import parse, to_mapping
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import parse, to_mapping
 from lungaccess.problem.preset_files import PresetFiles
 from lungaccess.risk.errors import ErrorModel
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Self
 
-from anatomy.settings import impossible, quantity, settings, text
+from anatomy.base.settings import impossible, quantity, settings, text
 
 CURVATURE, BREATHING = "needle_curvature", "breathing"
 UNITS: dict[str, str] = {

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.records import frozen_value
-from anatomy.typed import Bool, Float
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Bool, Float
 from lungaccess.risk.draws import Draws
 from lungaccess.risk.errors import ErrorModel
 from lungaccess.risk.statistics import Z_95

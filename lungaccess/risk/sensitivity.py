@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.records import frozen_value
-from anatomy.typed import Float
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.deviations import FIELD_OF, Deviations
 from lungaccess.risk.errors import BREATHING, CURVATURE, ErrorModel

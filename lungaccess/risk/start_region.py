@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.plan import Plan

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from anatomy.records import frozen_value
-from anatomy.typed import Bool
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Bool
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""

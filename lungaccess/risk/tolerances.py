@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.assessor import RiskAssessor
 from lungaccess.risk.deviations import FIELD_OF, Deviations

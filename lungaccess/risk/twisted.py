@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Float, Int
+from anatomy.base.typed import Float, Int
 from lungaccess.plans.plan import Plan
 from lungaccess.risk.kernels import deviation as kernel
 from stages.tube import Neighbourhood, pieces_of_arcs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from anatomy.facade import lazy_exports
+from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.selftest.kinds import KINDS, Kind

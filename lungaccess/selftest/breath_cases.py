@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Float, Labels
 from anatomy.grid import Grid
 from anatomy.motion.motion import LEFT, Motion
 from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, VESSEL
-from anatomy.typed import Float, Labels
 from lungaccess.breathing.kernels import rules
 from lungaccess.breathing.kernels.rigid import Rigid
 from lungaccess.breathing.kernels.window import MOST_LEAVES, divide

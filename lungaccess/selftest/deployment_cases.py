@@ -7,13 +7,13 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.fields import distance_corners
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.poses import pose
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from lungaccess.coupled.cost_to_go import cost_to_go
 from lungaccess.coupled.kernels import box_queue, deployment_box
 from lungaccess.coupled.kernels.cost_bound import BoundEnvironment

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from lungaccess.selftest import breath_cases, deployment_cases, needle_cases, scope_cases
 from lungaccess.selftest.scenes import Case
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.fields import corner_geometry, distance_field
 from anatomy.kernels.field import MIN_GAP_MM, UNITS_PER_MM, exact_at
 from anatomy.poses import pose
 from anatomy.structures import LUMEN, OBSTACLES, VESSEL
-from anatomy.typed import Float
 from lungaccess.selftest.scenes import (
     ROUNDING_MM,
     Case,

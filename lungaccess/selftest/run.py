@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.child_process import end_with_parent
-from anatomy.errors import SettingsError
-from anatomy.records import frozen_value
+from anatomy.base.child_process import end_with_parent
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
 from lungaccess.selftest.kinds import KINDS
 
 TOLERANCE = 1e-9

@@ -11,12 +11,12 @@ from scipy.spatial import cKDTree
 
 from anatomy import poses
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, Labels, Mask
 from anatomy.fields import distance_field
 from anatomy.grid import Grid
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FIELD_BITS, LUMEN, OUTSIDE, close_border
-from anatomy.typed import Float, Int, Labels, Mask
 
 Random = np.random.Generator
 NEAREST = 16

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.poses import pose, poses_on_arc
 from anatomy.structures import AIRWAY, LUMEN
-from anatomy.typed import Float
 from lungaccess.selftest.scenes import (
     ROUNDING_MM,
     Case,

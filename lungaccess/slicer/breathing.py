@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.io.files import atomic_write, write_text
+from anatomy.base.files import atomic_write, write_text
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.io.motion_files import write_vectors
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 from lungaccess.breathing.moving import Moving
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer.scene import Item, element, scene

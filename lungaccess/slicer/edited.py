@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.io.markups import Markup
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import BITS
-from anatomy.typed import Float
 from lungaccess.checking import CheckReport, Finding, check
 from lungaccess.checking.findings import Findings
 from lungaccess.one_stage import RestOfPlan

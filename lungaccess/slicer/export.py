@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import require_writable_folder, write_text
+from anatomy.base.records import frozen_value
 from anatomy.io.centerlines import write_centerlines
-from anatomy.io.files import require_writable_folder, write_text
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from lungaccess.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurves
 from lungaccess.plans.plan import Plan

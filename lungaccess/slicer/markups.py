@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.plans.curves import DeviceCurve
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim

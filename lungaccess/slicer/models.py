@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from anatomy.base.files import atomic_write, require_suffix
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
-from anatomy.io.files import atomic_write, require_suffix
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, smooth_surface
-from anatomy.typed import Float
 from lungaccess.plans.curves import DeviceCurve
 
 MOST_TRIANGLES = 150_000

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Literal
 from xml.sax.saxutils import quoteattr
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 
 Kind = Literal["Model", "MarkupsCurve", "MarkupsFiducial", "Segmentation"]
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import UInt8
 from anatomy.grid import Volume
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.morphology import bounds
-from anatomy.records import frozen_value
-from anatomy.typed import UInt8
 
 _LIST = "Segmentation category and type - 3D Slicer General Anatomy list"
 _STRUCTURE = "SCT^123037004^Anatomical Structure"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from lungaccess.plans.version import software_kernels
 
 PLAN, PATH, NO_PLAN = "plan", "path", "no plan"

@@ -7,7 +7,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import DAMAGE
+from anatomy.base.files import DAMAGE
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.tables import QUERIES, TIMES, table
 

@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from lungaccess.plans.version import software_kernels
 from lungaccess.study.answers import CRASH, UNKNOWN, Answer
 from lungaccess.study.cluster import Backlog, connect, interruptions_noted, require_dask

@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.base.files import atomic_write, require_writable_folder
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.settings import StudyError
 from lungaccess.study.tables import INTEGERS, QUERIES, TEXTS, TRUTHS, Table, table

@@ -7,7 +7,7 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 
 BUSY_S = 60.0
 """Longer than any other process needs for the transaction of a run."""

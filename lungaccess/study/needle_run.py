@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.one_stage import plan_needle
 from lungaccess.problem.target import point_target

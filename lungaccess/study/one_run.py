@@ -20,8 +20,8 @@ import numba
 import numpy as np
 import psutil
 
-from anatomy.child_process import end_with_parent
-from anatomy.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
+from anatomy.base.child_process import end_with_parent
+from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
 from lungaccess.checking import Checker
 from lungaccess.coupled.atlas import Atlas
@@ -64,7 +64,7 @@ def answer(run: Run, cache: Path | None = None) -> Answer:
     Parameters
     ----------
     cache : Path, optional
-        Folder of prepared anatomies and atlases; `anatomy.cache.default_cache()` if None.
+        Folder of prepared anatomies and atlases; `anatomy.base.cache.default_cache()` if None.
 
     Raises
     ------

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from anatomy.base.errors import FileError
+from anatomy.base.records import frozen_value
 from anatomy.build import lung_key
-from anatomy.errors import FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
-from anatomy.records import frozen_value
 from lungaccess.study.settings import PHANTOM, Case, PhantomPatient
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from anatomy.errors import FileError
-from anatomy.settings import to_mapping
+from anatomy.base.errors import FileError
+from anatomy.base.settings import to_mapping
 from lungaccess.study.answers import Answer
 from lungaccess.study.file_errors import BUSY_S, damaged, file_errors
 from lungaccess.study.rows import add_rest, experiment_row, problem_row, run_row

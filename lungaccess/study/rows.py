@@ -8,7 +8,7 @@ import platform
 import sqlite3
 from typing import Any
 
-from anatomy.settings import to_mapping
+from anatomy.base.settings import to_mapping
 from lungaccess.plans.version import software_version
 from lungaccess.study.answers import Answer
 from lungaccess.study.runs import Problem, Run

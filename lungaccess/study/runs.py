@@ -10,11 +10,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
+from anatomy.base.records import frozen_value
+from anatomy.base.settings import to_mapping
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.settings import to_mapping
 from lungaccess.plans.version import software_version
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, load_system, system_fingerprint
@@ -140,7 +140,7 @@ class Run:
     @staticmethod
     def from_json(text: str) -> Run:
         """Return the run that `to_json` wrote."""
-        from anatomy.settings import parse
+        from anatomy.base.settings import parse
 
         values = json.loads(text)
         problem = values["problem"]

@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
-from anatomy.errors import LungaccessError, SettingsError
-from anatomy.io.files import read_toml
-from anatomy.records import LEFT_OUT_IF_EMPTY
-from anatomy.settings import impossible, parse, quantity, settings, switch, text
+from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.files import read_toml
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
+from anatomy.base.settings import impossible, parse, quantity, settings, switch, text
 from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS, Objective
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 

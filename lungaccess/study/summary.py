@@ -6,7 +6,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from lungaccess.study.results import ResultsFile
 
 _QUERY = """

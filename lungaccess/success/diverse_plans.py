@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from anatomy.typed import Float, Int
 from lungaccess.coupled import COUNT, SEPARATION_MM, Alternative, separated_plans, with_front
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.search.direct_arcs import DirectArcs

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task

@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+from anatomy.base.records import frozen_record
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.planner import Clock, ProgressEvent, atlas_event
 from lungaccess.plans.plan import Plan

@@ -10,8 +10,8 @@ from itertools import count, islice
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Int
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.planner import plan
 from lungaccess.coupled.search.direct_arcs import DirectArcs

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from anatomy.base.typed import Float, Int
 from anatomy.fields import corner_geometry
 from anatomy.grid import Grid, Volume
 from anatomy.kernels import field as field_kernel
-from anatomy.typed import Float, Int
 from stages.needle.kernels import cost as kernel
 from stages.needle.kernels.proof import Obstacles
 from stages.needle.objective import TERMS, Term

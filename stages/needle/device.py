@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from anatomy.settings import quantity, settings
+from anatomy.base.settings import quantity, settings
 
 
 @settings

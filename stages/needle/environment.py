@@ -8,15 +8,15 @@ from dataclasses import field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import GridMismatchError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, Labels
 from anatomy.fields import CENTRES, SOLID, DistanceField, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import EXACT_REACH_MM
 from anatomy.margins import Margins
 from anatomy.organ import Organ
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, close_border, obstacle_bits
-from anatomy.typed import Float, Int, Labels
 from stages.needle.device import Needle
 from stages.needle.kernels import scan
 from stages.needle.kernels.cost import ObjectiveArrays

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
+from anatomy.base.suggestion import did_you_mean
+from anatomy.base.typed import Float32
 from anatomy.grid import read_only
-from anatomy.records import frozen_value
-from anatomy.suggestion import did_you_mean
-from anatomy.typed import Float32
 
 if TYPE_CHECKING:
     from stages.needle.kernels.cost import ObjectiveArrays

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.morphology import voxels_in
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import obstruction as kernels
 from stages.needle.kernels.connections import seen_from

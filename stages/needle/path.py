@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
 from anatomy.kernels import arcs as arc_kernels
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import least_cosine

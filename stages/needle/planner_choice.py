@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
-from anatomy.errors import MissingLibraryError, SettingsError
-from anatomy.suggestion import did_you_mean
+from anatomy.base.errors import MissingLibraryError, SettingsError
+from anatomy.base.suggestion import did_you_mean
 from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS
 
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from anatomy.errors import FrameError, SettingsError
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.errors import FrameError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 
 
 @frozen_record

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int, UInt8, UInt64
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, UInt8, UInt64
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import reach_arcs, reach_search, tree
 from stages.needle.objective import Objective

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.typed import Float, Int
+from anatomy.base.typed import Float, Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_index as kernel
 

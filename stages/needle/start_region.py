@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int, UInt8
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int, UInt8
 from stages.needle.kernels import start_trial as kernel
 from stages.needle.path import CURVATURE, ArcPath, arc_transform, direct_path
 from stages.needle.query import Query

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_region as kernel
 from stages.needle.kernels.limits import Limits

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float, UInt8
 from anatomy.grid import read_only
-from anatomy.typed import Float, UInt8
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_trial as kernel
 from stages.needle.kernels import tree

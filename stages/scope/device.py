@@ -7,8 +7,8 @@ from typing import Annotated
 
 import numpy as np
 
-from anatomy.settings import impossible, quantity, settings, text
-from anatomy.typed import Float
+from anatomy.base.settings import impossible, quantity, settings, text
+from anatomy.base.typed import Float
 
 SHORTEST_MM = 1e-9
 """A shorter advance is rounding."""

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from stages.scope.kernels import growth as kernel
 from stages.scope.kernels.body import Walls
 from stages.scope.kernels.growth import Device, Route

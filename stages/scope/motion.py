@@ -12,10 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from anatomy.poses import poses_on_arc, poses_on_pieces
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.scope.device import laid_pieces
 
 ADVANCE, TWIST, BEND = range(3)

@@ -8,8 +8,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.typed import Float
 from stages.scope.device import SHORTEST_MM, Bronchoscope
 from stages.scope.kernels.body import MOST_TWIST_RAD, motion_room
 from stages.scope.kernels.shifting import shifted_tips

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
 from stages.scope.device import Bronchoscope
 from stages.scope.growth import Growth, StateTree
 from stages.scope.kernels import growth as kernel
@@ -137,7 +137,7 @@ MM_AS_ANGLE_RAD = math.radians(10.0)
 
 
 def _no_tip() -> Exception:
-    from anatomy.errors import AnatomyError
+    from anatomy.base.errors import AnatomyError
 
     return AnatomyError(
         "No motion brings this bronchoscope to a place from which tubes leave the airway",

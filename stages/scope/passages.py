@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Labels
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
 from anatomy.structures import AIRWAY, OUTSIDE
-from anatomy.typed import Bool, Float, Labels
 from stages.scope.device import Bronchoscope
 
 

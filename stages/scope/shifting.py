@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float
 from stages.scope.device import SHORTEST_MM
 from stages.scope.motion import ADVANCE, ScopeMotion
 from stages.scope.motion_steps import slide, turn

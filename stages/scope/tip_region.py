@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.typed import Bool, Float, Int
 
 MAX_OFF_AXIS_MM = 3.0
 """A tip lies at most so far from the nearest point of the tree.

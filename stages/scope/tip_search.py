@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.typed import Bool, Float, Int
 from stages.scope.growth import StateTree, rings
 from stages.scope.kernels import turning
 from stages.scope.kernels.body import Walls

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.poses import poses_on_arc
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 
 SHORTEST_ARC_MM = 1e-9
 """A piece of tube that is shorter than this is only the rounding of its neighbours' lengths."""

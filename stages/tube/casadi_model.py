@@ -20,10 +20,10 @@ import casadi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Float
 from stages.tube.casadi_rates import (
     FIRST_ANGLE,
     POSITION,

@@ -12,7 +12,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.tube.device import Tube
 
 POSITION, ROTATION, FIRST_ANGLE = slice(0, 3), slice(3, 7), 7

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.tube.casadi_model import CasadiTubes
 from stages.tube.device import Tube
 from stages.tube.errors import ConvergenceError

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
 from stages.tube import kernels
 from stages.tube.design_shapes import coarser_shapes, shapes_of
 from stages.tube.device import ConcentricTubes

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from anatomy.typed import Int
+from anatomy.base.typed import Int
 from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.shape_store import open_shapes
 from stages.tube.shape_tree import ShapeTree, tree_of_shapes

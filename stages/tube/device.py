@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from anatomy.errors import SettingsError
-from anatomy.records import LEFT_OUT_IF_EMPTY
-from anatomy.settings import impossible, quantity, settings
-from anatomy.typed import Float
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
+from anatomy.base.settings import impossible, quantity, settings
+from anatomy.base.typed import Float
 from stages.tube.parts import Bend, SlottedSegment, TubeParts, tube_parts
 
 ROUNDING = 1e-9

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import obstacle_bits
-from anatomy.typed import Float
 from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
 from stages.tube.kernels import TubeEnvironment

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Bool, Float
 from anatomy.grid import read_only
-from anatomy.typed import Bool, Float
 from stages.tube.errors import ConvergenceError
 from stages.tube.kernels import equilibrium, jacobian, pose, torsion
 from stages.tube.nesting import NestedTubes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
 
 
 class ConvergenceError(LungaccessError):

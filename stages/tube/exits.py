@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.typed import Float, Int
 from anatomy.margins import Margins
 from anatomy.poses import pose
-from anatomy.typed import Float, Int
 from stages.tube import kernels
 from stages.tube.arcs import points_on_arcs
 from stages.tube.deployments import Deployments

@@ -7,10 +7,10 @@ from collections.abc import Sequence as SequenceOf
 import numpy as np
 from scipy.spatial import cKDTree
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from stages.tube.equilibrium import Equilibrium
 from stages.tube.errors import ConvergenceError
 from stages.tube.kernels.shapes import LARGEST_STRAY_RAD, SAME_BRANCH_RAD, UNSUSPICIOUS_RAD

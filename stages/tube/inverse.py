@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 from scipy.stats import qmc
 
-from anatomy.errors import FrameError, SettingsError
+from anatomy.base.errors import FrameError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.tube.equilibrium import Equilibrium
 from stages.tube.mechanics import TubeMechanics
 

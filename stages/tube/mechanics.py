@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float
 from stages.tube.equilibrium import Equilibrium, matrices, torsion_scratch
 from stages.tube.errors import ConvergenceError
 from stages.tube.kernels import all_equilibria, equilibrium

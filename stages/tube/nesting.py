@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.typed import Float
 from stages.tube.device import Tube
 from stages.tube.kernels import assembly
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.typed import Int
+from anatomy.base.typed import Int
 from stages.tube.arcs import TubeShape
 from stages.tube.device import ConcentricTubes
 from stages.tube.kernels import one_shape as kernel

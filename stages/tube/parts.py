@@ -8,8 +8,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float
 
 
 @settings

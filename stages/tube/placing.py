@@ -9,11 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from stages.tube import kernels
 from stages.tube.environment import DEFAULT_ROTATIONS, THREADS, tube_environment
 from stages.tube.kernels import placing

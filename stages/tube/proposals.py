@@ -13,11 +13,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float, Int
 from anatomy.margins import Margins
-from anatomy.records import frozen_record, frozen_value
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float, Int
 from stages.tube import kernels
 from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.environment import tube_constants

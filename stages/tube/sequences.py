@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.tube.device import Tube
 
 BEND_RAD = 0.5 * np.pi

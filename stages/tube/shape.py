@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.typed import Float
 from anatomy.margins import Margins
 from anatomy.poses import bending_directions
-from anatomy.typed import Float
 from stages.tube import kernels
 from stages.tube.device import ConcentricTubes
 from stages.tube.environment import tube_constants

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.settings import to_mapping
 from anatomy.kept_records import kept_record
 from anatomy.machine_code.sources import kernel_digest
-from anatomy.settings import to_mapping
 from stages.tube.device import Tube
 from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
 

@@ -15,11 +15,11 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float, Int
 from stages.tube.arcs import TubeShape
 from stages.tube.device import Tube
 from stages.tube.equilibrium import matrices

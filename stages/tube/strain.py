@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.tube.device import ConcentricTubes
 
 

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.tube import kernels
 from stages.tube.arcs import TubeShape, points_on_arcs
 from stages.tube.design_shapes import shapes_of

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.typed import Float, Mask
 from anatomy.grid import Grid
-from anatomy.typed import Float, Mask
 
 
 def rotated_grid(shape: tuple[int, int, int], spacing_mm: Float, turn: Float, first_lps: Float) -> Grid:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.tree import tree_from_graph
 
 

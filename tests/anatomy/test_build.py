@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from anatomy import build
+from anatomy.base.errors import AnatomyError
 from anatomy.build import build_lung, lung_key
-from anatomy.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.typed import Float, Labels
 from anatomy.fields import CENTRES, SOLID, DistanceField, corner_geometry, distance_corners
 from anatomy.grid import ORTHONORMAL_TOLERANCE, Grid
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.structures import OBSTACLES, OUTSIDE, VESSEL, close_border
-from anatomy.typed import Float, Labels
 
 POINTS = 50
 ROUNDING_MM = 1e-9

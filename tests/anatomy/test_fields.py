@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import GridMismatchError
+from anatomy.base.errors import GridMismatchError
 from anatomy.fields import MAX_STORED, corner_geometry, distance_corners, distance_field, touched_corners
 from anatomy.fields import DistanceField as Field
 from anatomy.grid import Grid

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import FrameError, GridMismatchError
+from anatomy.base.errors import FrameError, GridMismatchError
 from anatomy.grid import Grid, Volume, read_only, transform_points
 from tests.anatomy.boxes import rotated_grid
 

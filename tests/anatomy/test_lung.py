@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.build import build_lung
-from anatomy.errors import AnatomyError, GridMismatchError
 from anatomy.fields import distance_field
 from anatomy.grid import Grid
 from anatomy.lung import Lung

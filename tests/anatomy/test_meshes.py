@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.meshes import MeshDistance, SurfaceMesh, box_surface, smooth_surface
 

@@ -12,11 +12,11 @@ import pytest
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.typed import Float, Int16, UInt8
 from anatomy.io import load_patient, read_volume
 from anatomy.phantom import LABELS, LOBES, Centerlines, Phantom, make_phantom, write_phantom
 from anatomy.tree import tree_from_mask
-from anatomy.typed import Float, Int16, UInt8
 
 FULL = np.ones((3, 3, 3))
 SIZES = pytest.mark.parametrize("size", ["small", pytest.param("adult", marks=pytest.mark.slow)])

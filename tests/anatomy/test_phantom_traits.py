@@ -9,7 +9,8 @@ import edt
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Array, Float
 from anatomy.phantom import LABELS, Phantom, make_phantom
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.bronchi import CENTRAL, TEMPLATE
@@ -18,7 +19,6 @@ from anatomy.phantom.rasterize import draw_body, phantom_grid
 from anatomy.phantom.rim import ends_below_pleura
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
-from anatomy.typed import Array, Float
 
 SPACING_MM, RIM_MM, HILAR_MM = 1.75, 8.0, 9.0
 SCALE = 0.7

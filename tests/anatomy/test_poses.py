@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from anatomy.errors import FrameError
+from anatomy.base.errors import FrameError
 from anatomy.poses import ANTERIOR, SUPERIOR, bending_directions, pose, roll_towards
 
 vectors = st.tuples(*[st.floats(-10.0, 10.0)] * 3).map(np.array)

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
 from anatomy.sides import septum
-from anatomy.typed import Float
 
 LEFT, RIGHT = (32.0, 0.0, 0.0), (-32.0, 0.0, 0.0)
 

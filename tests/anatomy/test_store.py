@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from anatomy import store
+from anatomy.base.cache import default_cache
 from anatomy.build import build_lung
-from anatomy.cache import default_cache
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.store import META, open_lung

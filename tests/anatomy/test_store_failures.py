@@ -17,15 +17,16 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from anatomy import store, unfinished
+from anatomy import store
+from anatomy.base import unfinished
+from anatomy.base.cache_entries import cache_entries, remove_abandoned
+from anatomy.base.checksums import DamagedCacheWarning
+from anatomy.base.errors import AnatomyError, FileError
+from anatomy.base.unfinished import CONTENT, LOCK, filled_folder, is_abandoned, locked
 from anatomy.build import build_lung, lung_key
-from anatomy.cache_entries import cache_entries, remove_abandoned
-from anatomy.checksums import DamagedCacheWarning
-from anatomy.errors import AnatomyError, FileError
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.store import META, folder_name, open_lung
-from anatomy.unfinished import CONTENT, LOCK, filled_folder, is_abandoned, locked
 from tests.anatomy import toys
 from tests.anatomy.stored_toy import FOLDER, KEY, SOURCES, no_reading, require_same
 from tests.anatomy.toys import toy
@@ -176,7 +177,8 @@ def test_what_a_patient_may_not_be_is_not_stored(tmp_path: Path) -> None:
 KILLED = """
 import os, sys
 from pathlib import Path
-from anatomy import store, unfinished
+from anatomy import store
+from anatomy.base import unfinished
 from tests.anatomy.toys import toy
 
 def die(*_args):

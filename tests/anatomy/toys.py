@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
-from anatomy.typed import Array, Float, Mask
 from tests.anatomy.tubes import Y, distance_to_segment
 
 SPACING_MM = (2.0, 2.0, 2.0)

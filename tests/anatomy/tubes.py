@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
-from anatomy.typed import Float
 
 Tube = tuple[ArrayLike, ArrayLike, float]
 """Both ends, LPS mm, and the radius."""

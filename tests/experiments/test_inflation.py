@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 import lungaccess
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
 from experiments.support.cost_map.inflation import (

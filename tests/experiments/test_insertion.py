@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL

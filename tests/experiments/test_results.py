@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.lung import Lung
 from experiments import pan2025_tour, run_all, write_results
 from experiments.support import anatomies, results

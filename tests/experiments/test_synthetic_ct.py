@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
 from experiments.support.segmentation.slices import thickened

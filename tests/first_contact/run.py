@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from anatomy.cache import user_cache
+from anatomy.base.cache import user_cache
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]

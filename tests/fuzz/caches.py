@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.unfinished import clear_place
+from anatomy.base.unfinished import clear_place
 from tests.fuzz.mutations import mutated
 
 DEEP = "[" * 5000 + "]" * 5000

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
 from anatomy.grid import Volume
 from tests.fuzz.targets import Target, damaged, targets
 

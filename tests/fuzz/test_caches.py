@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.cache_entries import cache_entries
-from anatomy.checksums import DamagedCacheWarning
+from anatomy.base.cache_entries import cache_entries
+from anatomy.base.checksums import DamagedCacheWarning
 from anatomy.kept import kept
 from anatomy.lung import Lung
 from anatomy.motion.source import MotionSource

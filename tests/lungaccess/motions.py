@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
 from anatomy.motion.motion import Motion
-from anatomy.typed import Float
 
 NODE_MM = 5.0
 

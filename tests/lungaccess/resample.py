@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL, obstacle_bits
-from anatomy.typed import Float
 from lungaccess.plans.plan import Plan
 from tests.stages.scenes import brute_clearance
 

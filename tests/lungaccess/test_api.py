@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import FileError, LungaccessError
-from anatomy.facade import public_names
+from anatomy.base.errors import FileError, LungaccessError
+from anatomy.base.facade import public_names
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 

@@ -6,7 +6,7 @@ in expected.json, so that they stay the same when the code that drew them change
 
 from __future__ import annotations
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 
 COST_TOLERANCE = 0.02
 """Share by which a cost may exceed the stored one: rounding that differs between processors, no more."""

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import atomic_write
+from anatomy.base.files import atomic_write
 
 FILE = Path(__file__).with_name("expected.json")
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 import lungaccess as la
+from anatomy.base.records import frozen_value
 from anatomy.poses import pose
-from anatomy.records import frozen_value
 from lungaccess.one_stage.needle import plan_needle
 from lungaccess.problem.target import point_target
 from stages.needle.query import Query

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
 from anatomy.phantom import make_phantom
-from anatomy.records import frozen_record
 from anatomy.segmentation.pipeline import read_ct, segment
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, require_data
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
@@ -71,7 +71,7 @@ def case_of(name: str, work: Path, seed: int) -> Case:
 
     Raises
     ------
-    anatomy.errors.AnatomyError, anatomy.errors.FileError
+    anatomy.base.errors.AnatomyError, anatomy.base.errors.FileError
         If the CT cannot be read or segmented.
     """
     title, ct, given = _input_of(name, seed)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from experiments.support.cost_map.case import Case
 from experiments.support.cost_map.problems import Scenario, unit
 from experiments.support.cost_map.runs import COST_MAP, INTENSITY, SHORTEST_PATH, Run, success_and_means

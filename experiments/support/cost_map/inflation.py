@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Int
 from anatomy.grid import Volume, read_only
 from anatomy.inflation import grown_by_voxels, inflation_voxels
 from anatomy.structures import OUTSIDE
-from anatomy.typed import Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels.proof import Obstacles
 from stages.needle.path import ArcPath, blocker_on_path

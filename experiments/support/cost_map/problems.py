@@ -9,9 +9,9 @@ from itertools import islice
 import edt
 import numpy as np
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.structures import OUTSIDE
-from anatomy.typed import Float
 from experiments.support.cost_map.case import Case
 from experiments.support.cost_map.inflation import refuting_labels
 from stages.needle.costs import voxel_sum

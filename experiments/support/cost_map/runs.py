@@ -9,9 +9,9 @@ from itertools import product
 
 import numpy as np
 
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Float
 from experiments.support.cost_map.case import Case
 from experiments.support.cost_map.inflation import inflated_environment, refuting_labels
 from experiments.support.cost_map.problems import LEAST_COST, TRIES, TRY_ITERATIONS, Scenario, candidates

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.coupled import AtlasSearch, Step
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.problem.peripheral import peripheral_targets

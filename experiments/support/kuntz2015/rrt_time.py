@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT

@@ -16,9 +16,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
-from anatomy.typed import Float
 from lungaccess.coupled import ReferenceSearch
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles

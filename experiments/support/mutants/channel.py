@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from anatomy.errors import SettingsError
-from anatomy.settings import override
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import override
 from experiments.support.mutants.draws import Rng, far
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, with_system
 

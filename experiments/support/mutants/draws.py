@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 
 Rng = np.random.Generator
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from anatomy import structures
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from experiments.support.mutants.draws import Rng, direction, far, signed
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle, tube_points
 from lungaccess.plans.parts import NeedleArc, NeedlePath

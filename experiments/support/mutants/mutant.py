@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng
 from lungaccess.checking import CheckReport
 from lungaccess.plans.assemble import required_clearance_mm

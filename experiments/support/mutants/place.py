@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from experiments.support.mutants.draws import Rng, direction, far, rotation, signed
 from experiments.support.mutants.motion import end_of
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle

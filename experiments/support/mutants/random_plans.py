@@ -11,10 +11,10 @@ import numpy as np
 
 import lungaccess as la
 from anatomy import structures
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
+from anatomy.base.settings import override
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.settings import override
-from anatomy.typed import Float
 from experiments.support.mutants.draws import Rng
 from lungaccess.coupled import DirectArcs, alternatives
 from lungaccess.coupled.atlas import Atlas

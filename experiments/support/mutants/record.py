@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
-from anatomy.settings import override, to_mapping
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import override, to_mapping
 from experiments.support.mutants.draws import Rng, direction, far, signed
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, with_system
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from anatomy import structures
-from anatomy.errors import SettingsError
-from anatomy.settings import override
-from anatomy.typed import Float
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import override
+from anatomy.base.typed import Float
 from experiments.support.mutants.draws import Rng, far, rotation, signed
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, with_system
 from lungaccess.plans.insertion import scope_motion

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from anatomy import structures
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from experiments.support.mutants.draws import Rng, direction
 from experiments.support.mutants.mutant import Case, Mutant, Mutation, changed, of_needle, tube_points
 from lungaccess.plans.insertion import scope_motion

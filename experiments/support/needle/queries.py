@@ -17,11 +17,11 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.io.med_rad import load_med_rad
-from anatomy.records import frozen_record
 from anatomy.structures import OBSTACLES
-from anatomy.typed import Float
 from lungaccess.benchmark import UNC_GOAL_TOLERANCE_MM, UncObstacles, unc_needle, unc_obstacles
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import numpy as np
 
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float, Int
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float, Int
 from experiments.support.route.sampling import grow
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve, interpolate

@@ -15,11 +15,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.io import read_mask
 from anatomy.io.centerlines import read_centerlines
 from anatomy.phantom import make_phantom
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from experiments.support.anatomies import PHANTOM, anatomy, data_folder, require_data
 from stages.scope.route.centreline import Centreline, from_image, from_lung, from_mask, from_tree
 from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links

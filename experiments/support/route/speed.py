@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 
 import numpy as np
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
 from experiments.support.route.groups import Tubes, trials
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve

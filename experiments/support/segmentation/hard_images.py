@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Float32, Mask, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom
-from anatomy.records import frozen_record
 from anatomy.segmentation.canonical import towards_lps
-from anatomy.typed import Array, Float, Float32, Mask, UInt8
 
 AIR_HU, FOAM_HU, SHELL_HU, TISSUE_HU, FLUID_HU = -1000.0, -930.0, -150.0, 40.0, 15.0
 """Air, foam and shell of a table, muscle, and fluid in the pleura."""

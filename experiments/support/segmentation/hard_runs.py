@@ -8,10 +8,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Mask
 from anatomy.grid import Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.airway_warnings import airway_warnings, tree_or_error
 from anatomy.segmentation.box import Box
@@ -21,7 +22,6 @@ from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.input import require_chest_ct
 from anatomy.segmentation.lungs import Lungs, segment_lungs
 from anatomy.segmentation.scan_warnings import scan_warnings
-from anatomy.typed import Mask
 from experiments.support.segmentation.hard_images import HardImage, upright
 from experiments.support.segmentation.scores import dice
 

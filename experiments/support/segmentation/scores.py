@@ -8,10 +8,10 @@ import edt
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float32, Int, Mask
 from anatomy.grid import Grid
-from anatomy.records import frozen_record, frozen_value
 from anatomy.segmentation.airway import Airways
-from anatomy.typed import Float32, Int, Mask
 from experiments.support.segmentation.synthetic_ct import SyntheticCt
 
 POINTS, VESSEL_POINTS, NEAR_MM = 882, 281, 3.0

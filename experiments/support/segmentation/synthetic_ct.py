@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float, Float32, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Float, Float32, Mask
 
 AIR_HU, LUMEN_HU, FAT_HU, TISSUE_HU, WALL_HU, NODULE_HU, FISSURE_HU = (
     -1000.0,

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
-from anatomy.typed import Float
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
 from lungaccess.benchmark.synthetic.cases import BenchmarkQuery
 from lungaccess.benchmark.synthetic.submission import (
     ArcAnswer,

@@ -17,11 +17,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from anatomy.errors import FileError
-from anatomy.io.files import read_json, require_writable_folder, write_json, write_text
+from anatomy.base.errors import FileError
+from anatomy.base.files import read_json, require_writable_folder, write_json, write_text
+from anatomy.base.records import frozen_value
+from anatomy.base.settings import to_mapping
 from anatomy.phantom import write_phantom
-from anatomy.records import frozen_value
-from anatomy.settings import to_mapping
 from lungaccess.benchmark.synthetic.manifest import Point, entries, make_benchmark_phantom, manifest_sha256
 from lungaccess.benchmark.synthetic.phantoms import (
     SYSTEMS,

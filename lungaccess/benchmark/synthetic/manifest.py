@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_value
 from anatomy.grid import Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom import Phantom, make_phantom, write_phantom
-from anatomy.records import frozen_value
 from lungaccess.benchmark.synthetic.phantoms import TARGETS_A_LUNG, VERSION, BenchmarkPhantom
 from lungaccess.problem.peripheral import peripheral_targets
 

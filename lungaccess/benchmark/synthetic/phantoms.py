@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
 from anatomy.phantom.patient import Size
 from anatomy.phantom.traits import Traits
-from anatomy.records import frozen_value
 
 VERSION = "synthetic-v1"
 """Name of the benchmark; other phantoms, targets, devices or rules are another version."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.benchmark.synthetic.answers import answer_of_plan
 from lungaccess.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
 from lungaccess.benchmark.synthetic.manifest import entries

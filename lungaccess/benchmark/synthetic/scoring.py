@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.errors import AnatomyError, PlanFileError
+from anatomy.base.errors import AnatomyError, PlanFileError
+from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
-from anatomy.records import frozen_value
 from lungaccess.benchmark.synthetic.answers import motions_of_answer
 from lungaccess.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
 from lungaccess.benchmark.synthetic.manifest import entries

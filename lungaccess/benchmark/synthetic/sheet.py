@@ -10,9 +10,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from anatomy.errors import FileError
-from anatomy.io.files import atomic_write, read_json
-from anatomy.records import frozen_value
+from anatomy.base.errors import FileError
+from anatomy.base.files import atomic_write, read_json
+from anatomy.base.records import frozen_value
 from lungaccess.benchmark.export import require_table_file
 from lungaccess.benchmark.synthetic.manifest import manifest_sha256
 from lungaccess.benchmark.synthetic.phantoms import VERSION

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter
 
-from anatomy.errors import FileError, SettingsError
-from anatomy.io.files import read_json, write_text
-from anatomy.settings import impossible, parse, quantity, settings, switch, text, to_mapping
+from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.files import read_json, write_text
+from anatomy.base.settings import impossible, parse, quantity, settings, switch, text, to_mapping
 from lungaccess.benchmark.synthetic.cases import all_queries
 from lungaccess.benchmark.synthetic.phantoms import VERSION
 

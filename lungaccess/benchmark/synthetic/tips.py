@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import read_json
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import read_json
 from anatomy.lung import Lung
 from lungaccess.coupled.atlas import motions_of
 from lungaccess.problem.system import load_system

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.kernels.compiling import inner_kernel, kernel
-from anatomy.typed import Float
 
 POLAR_STEPS = 30
 """Newton's iteration for a polar factor doubles its digits with each step: six suffice near a rotation."""

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float, Labels, UInt16
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at, pulled_back, stretch_near
-from anatomy.typed import Float, Labels, UInt16
 from lungaccess.breathing.kernels.rigid import carried
 from lungaccess.breathing.kernels.warped import deformed_distance
 

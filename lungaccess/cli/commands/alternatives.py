@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import require_writable_folder
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative
@@ -80,7 +80,7 @@ def alternatives(
 
     Those that no other beats in success, length and clearance together are marked: the Pareto front.
     """
-    from anatomy.io.files import write_text
+    from anatomy.base.files import write_text
     from lungaccess.appraisal import Appraiser
     from lungaccess.coupled import alternatives as find_alternatives
     from lungaccess.coupled import with_front

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from anatomy.errors import LungaccessError, SettingsError
+from anatomy.base.errors import LungaccessError, SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.commands.benchmark_synthetic import synthetic
 from lungaccess.cli.examples import epilogue

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
@@ -162,7 +162,7 @@ def run(
 
 
 def _write_answers(results: Path, folder: Path) -> list[Path]:
-    from anatomy.io.files import require_writable_folder
+    from anatomy.base.files import require_writable_folder
     from lungaccess.benchmark.synthetic.reference import submissions_of
     from lungaccess.benchmark.synthetic.submission import write_submission
 

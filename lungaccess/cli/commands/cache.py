@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from anatomy.cache import cache_limit_bytes, default_cache, parse_size, size_in_words
+from anatomy.base.cache import cache_limit_bytes, default_cache, parse_size, size_in_words
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
@@ -16,7 +16,7 @@ from lungaccess.cli.numbers import NotNegative
 from lungaccess.cli.options import PatientOptions
 
 if TYPE_CHECKING:
-    from anatomy.cache_entries import CacheEntry
+    from anatomy.base.cache_entries import CacheEntry
 
 cache = App(
     name="cache",
@@ -57,7 +57,7 @@ def prune(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Remove old formats, leftovers of killed commands, and what is too old or too much."""
-    from anatomy.cache_entries import overdue
+    from anatomy.base.cache_entries import overdue
 
     most = cache_limit_bytes() if max_size is None else parse_size(max_size, "--max-size")
     found = _entries(output.cache or default_cache())
@@ -72,7 +72,7 @@ def clear(*, output: PatientOptions = PatientOptions()) -> ExitCode:
 
 
 def _entries(folder: Path) -> tuple[CacheEntry, ...]:
-    from anatomy.cache_entries import cache_entries
+    from anatomy.base.cache_entries import cache_entries
     from anatomy.store import stored_format
     from lungaccess.coupled.atlas_store import atlas_format
     from stages.tube import shapes_format
@@ -84,7 +84,7 @@ def _entries(folder: Path) -> tuple[CacheEntry, ...]:
 
 def _remove(entries: Iterable[CacheEntry], output: PatientOptions) -> ExitCode:
     """Remove entries and say so."""
-    from anatomy.cache_entries import remove_entry
+    from anatomy.base.cache_entries import remove_entry
 
     gone = []
     for entry in entries:

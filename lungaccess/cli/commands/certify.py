@@ -20,7 +20,7 @@ from lungaccess.cli.options import (
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from anatomy.typed import Float
+    from anatomy.base.typed import Float
     from lungaccess.reachability import OpenPlace, ReachVerdict
 
 SHOWN = 8

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.panel import Panel
 
-from anatomy.errors import AnatomyError
-from anatomy.io.files import require_writable_folder
+from anatomy.base.errors import AnatomyError
+from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Seconds, Seed

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.table import Table
 
-from anatomy.io.files import require_writable_folder
+from anatomy.base.files import require_writable_folder
 from lungaccess.cli import anatomy_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import OutputOptions, PatientFolder, PatientOptions
@@ -67,7 +67,7 @@ def presets(
 
     Its JSON holds every setting.
     """
-    from anatomy.settings import to_mapping
+    from anatomy.base.settings import to_mapping
     from lungaccess.problem.preset_order import presets_by_invasiveness
     from lungaccess.problem.system import load_system, needle_preset_names, preset_text, tube_preset_names
 

@@ -9,7 +9,7 @@ import numpy as np
 from cyclopts import Parameter
 from rich.table import Table
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.io.frames import Frame
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -27,8 +27,8 @@ from lungaccess.cli.progress import progress
 from stages.needle import Objective
 
 if TYPE_CHECKING:
+    from anatomy.base.typed import Float
     from anatomy.organ import Organ
-    from anatomy.typed import Float
     from lungaccess.one_stage import NeedleAnswer
 
 

@@ -8,8 +8,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import require_writable_folder
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative

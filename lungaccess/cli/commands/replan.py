@@ -8,7 +8,7 @@ import numpy as np
 from cyclopts import Parameter
 from rich.table import Table
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.io.frames import Frame
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -25,7 +25,7 @@ from lungaccess.cli.progress import progress
 from stages.needle import DEFAULT, Objective
 
 if TYPE_CHECKING:
-    from anatomy.typed import Float
+    from anatomy.base.typed import Float
     from lungaccess.one_stage import RestOfPlan
     from lungaccess.plans.plan import Plan
 

@@ -89,7 +89,7 @@ def risk(
 
 def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]:
     """Return a report and tolerances as plain values."""
-    from anatomy.settings import to_mapping
+    from anatomy.base.settings import to_mapping
 
     return {
         "errors": {**to_mapping(report.model), "name": report.model.label},

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.files import require_writable_folder, write_json
 from anatomy.io.ct_cases import ct_case
-from anatomy.io.files import require_writable_folder, write_json
 from anatomy.io.frames import parse_point
 from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM

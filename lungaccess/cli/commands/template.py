@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.io.files import write_text
+from anatomy.base.files import write_text
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 

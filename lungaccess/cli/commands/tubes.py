@@ -198,7 +198,7 @@ def _show_json(answer: TubeAnswer, propose: bool) -> None:
 
 
 def _proposal(proposal: DesignProposal) -> dict[str, object]:
-    from anatomy.settings import to_mapping
+    from anatomy.base.settings import to_mapping
 
     return {
         "lateral_sweep_mm": proposal.lateral_sweep_mm,

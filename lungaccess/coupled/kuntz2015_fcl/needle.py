@@ -7,9 +7,9 @@ import time
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.poses import roll_towards
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, chord_mm
 from stages.needle import RRT_STEP_MM, ArcPath, Needle, arc_transform
 from stages.needle.kernels import least_cosine

@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, Int, Int32, Labels
 from anatomy.lung import Lung
 from anatomy.meshes import MeshDistance, box_surface
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
-from anatomy.typed import Bool, Float, Int, Int32, Labels
 
 SAGITTA_MM = 0.01
 LONGEST_CHORD_MM = 2.0

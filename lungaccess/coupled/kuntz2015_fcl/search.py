@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.errors import SettingsError
-from anatomy.records import frozen_record
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles

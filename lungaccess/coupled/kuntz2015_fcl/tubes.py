@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, Labels
 from anatomy.structures import AIRWAY, LUMEN
-from anatomy.typed import Bool, Float, Labels
 from lungaccess.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, branch_of, chord_mm, labels_at
 from lungaccess.problem.system import System
 from stages.needle import ArcPath, arc_transform

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_pieces
 from anatomy.structures import obstacle_bits
-from anatomy.typed import Bool, Float, Int
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.aimed_tubes import (
     COST,

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Protocol, runtime_checkable
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from anatomy.typed import Float, Int
+from anatomy.base.typed import Float, Int
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, cost_bounds, evaluate_arcs
 from lungaccess.coupled.search.base import Incumbent, Step, evaluated_step

@@ -6,8 +6,8 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
+from anatomy.base.typed import Float, Int, UInt64
 from anatomy.lung import Lung
-from anatomy.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search.aimed_tubes import AimedTubes
 from lungaccess.coupled.search.direct_arcs import DirectArcs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.typed import Int
+from anatomy.base.typed import Int
 from stages.tube import Deployments
 
 CELL_MM = 5.0

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from anatomy.typed import Float, Int, UInt64
+from anatomy.base.typed import Float, Int, UInt64
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.candidate import SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import sample_deployments

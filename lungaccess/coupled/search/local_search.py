@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.typed import Float, UInt64
+from anatomy.base.typed import Float, UInt64
 from lungaccess.coupled.kernels.candidate import OUTER, ROTATION, SCOPE_POSE
 from lungaccess.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.plans.candidate import Candidate

@@ -6,7 +6,7 @@ import math
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.plans.evaluator import CandidateEvaluator
 from stages.needle import OMPL_PLANNERS, PLANNERS, ArcPath, first_path, has_ompl
 from stages.tube import Deployment

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from anatomy.records import frozen_record
+from anatomy.base.records import frozen_record
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.problem.task import Task
 from stages.scope import ScopeTip

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from anatomy.typed import Int
+from anatomy.base.typed import Int
 from lungaccess.coupled.kernels.separation import choose_separated
 from lungaccess.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.plans.candidate import Candidate

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from anatomy.settings import quantity, settings
+from anatomy.base.settings import quantity, settings
 
 ESTIMATE_SLACK = 1.03
 """Estimates of the kernels that exceed the best cost by more are dropped: few are over 1 % too large."""

@@ -8,7 +8,7 @@ from itertools import count
 
 import numpy as np
 
-from anatomy.typed import Float, Int
+from anatomy.base.typed import Float, Int
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.kernels.aimed_tubes import COST
 from lungaccess.coupled.search.aimed_tubes import AimedTubes, AimStarts

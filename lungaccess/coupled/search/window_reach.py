@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.base.typed import Int, UInt64
 from anatomy.lung import Lung
-from anatomy.typed import Int, UInt64
 from lungaccess.breathing.window import breathing_window
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search.window_search import WindowSearch

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.typed import Float, Int
+from anatomy.base.typed import Float, Int
 from lungaccess.breathing.aim import Aim, MovingTarget
 from lungaccess.breathing.window import TOLERANCE_MM, breathing_window, first_limit, require_motion
 from lungaccess.coupled.atlas import Atlas

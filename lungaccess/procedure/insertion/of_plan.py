@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.settings import quantity, settings, to_mapping
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.settings import quantity, settings, to_mapping
 from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.plan import Plan
 from lungaccess.procedure.insertion.repeated import Study, Summary, study

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
-from anatomy.records import frozen_record
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
 from lungaccess.procedure.insertion.simulation import Insertion, Outcome, simulate
 from lungaccess.procedure.insertion.truth import Errors
 from lungaccess.risk import Share

@@ -11,11 +11,11 @@ from enum import StrEnum
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from anatomy.kernels.field import bounds_at, exact_at
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from lungaccess.procedure.insertion.tracking import DelayedBelief, SimulatedTracker, TrackedTruth
 from lungaccess.procedure.insertion.truth import Errors, Truth
 from stages.needle import (

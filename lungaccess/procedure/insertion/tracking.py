@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.procedure.insertion.truth import Truth
 from lungaccess.procedure.tracker import Measured, Tracker
 from stages.needle import GAIN, Belief, Query

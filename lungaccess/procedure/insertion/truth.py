@@ -7,8 +7,8 @@ from typing import Annotated
 
 import numpy as np
 
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float
 from stages.needle import Query, bend_direction, tilt
 
 KNOT_MM = 1.0

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from anatomy.base.typed import Float, UInt16
 from anatomy.kernels.compiling import borrowing_kernel, kernel
 from anatomy.kernels.field import distance_bound
-from anatomy.typed import Float, UInt16
 
 TUBE_STATIONS, NEEDLE_STATIONS = 6, 24
 """Points at which clearance is compared with the errors: some mm apart, as vessels are wide."""

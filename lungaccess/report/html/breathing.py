@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float
 from anatomy.meshes import point_distances_mm
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Bool, Float
 from lungaccess.breathing.moving import Moving
 from lungaccess.breathing.window import TOLERANCE_MM, miss_allowed
 from lungaccess.checking.environment import Environment

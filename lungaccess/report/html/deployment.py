@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Bool, Float
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Bool, Float
 from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii

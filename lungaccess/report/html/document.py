@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from anatomy.io.files import write_text
+from anatomy.base.files import write_text
 from lungaccess.report.pack import script_text
 
 SHARED_MODULES = (

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume
 from anatomy.kept import kept
-from anatomy.records import frozen_value
-from anatomy.typed import Float, Int
 from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from anatomy.io.files import atomic_write
+from anatomy.base.files import atomic_write
+from anatomy.base.typed import Array, Float, UInt8
 from anatomy.structures import LUMEN
-from anatomy.typed import Array, Float, UInt8
 from lungaccess.plans.insertion import shown_motion
 from lungaccess.report.html.deployment import moved_mm
 

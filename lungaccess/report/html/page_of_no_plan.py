@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.report.html import words
 from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
-from anatomy.records import frozen_record
-from anatomy.words import plural
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.words import plural
 from lungaccess.appraisal import Appraiser
 from lungaccess.coupled import with_front
 from lungaccess.plans.chance import Chance

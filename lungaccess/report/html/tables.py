@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from anatomy.words import plural
+from anatomy.base.words import plural
 from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
 from lungaccess.report.html import words
 from lungaccess.report.key_numbers import figures_of_plan

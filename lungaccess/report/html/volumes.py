@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Array, Float, Int, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.kept import kept
 from anatomy.morphology import window
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
-from anatomy.typed import Array, Float, Int, UInt8
 from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:

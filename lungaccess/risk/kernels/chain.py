@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from anatomy.base.typed import Float
 from anatomy.kernels.arcs import SMALL_ANGLE
 from anatomy.kernels.compiling import borrowing_kernel
 from anatomy.kernels.field import distance_bound
-from anatomy.typed import Float
 from lungaccess.risk.kernels.deviation import CURVATURE, LENGTH, RADIUS, ROLL, STEP_MM
 
 TUBE_PIECES = 4

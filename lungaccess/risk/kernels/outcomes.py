@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, UInt16
 from anatomy.kernels.compiling import borrowing_kernel, kernel
-from anatomy.typed import Bool, Float, UInt16
 from lungaccess.risk.kernels.chain import (
     ROTATION,
     TARGET,

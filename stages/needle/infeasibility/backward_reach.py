@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels.backward_reach import SHELL_MM, BackwardReach, fill_backward_reach
 

@@ -16,8 +16,8 @@ from collections.abc import Generator, Iterator
 
 import numpy as np
 
-from anatomy.errors import SettingsError
-from anatomy.typed import Int
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
 from stages.needle.infeasibility.kernels import reachability_pruning as pruning

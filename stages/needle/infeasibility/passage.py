@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from anatomy.records import frozen_value
-from anatomy.typed import Float
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from stages.needle.infeasibility.path_bounds import PathBounds
 from stages.needle.infeasibility.plane import Plane
 

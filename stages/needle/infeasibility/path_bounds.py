@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from stages.needle.infeasibility.kernels import bounds
 
 ROUNDING = 1e-8

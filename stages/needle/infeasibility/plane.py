@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.typed import Float, Int, UInt64
+from anatomy.base.typed import Float, Int, UInt64
 from stages.needle.infeasibility.kernels import bitmaps
 
 

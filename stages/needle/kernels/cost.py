@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float32
 from anatomy.kernels.arcs import SMALL_ANGLE, point_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_estimate
-from anatomy.typed import Float32
 from stages.needle.kernels.limits import TINY
 
 CLEARANCE_FLOOR_MM = 0.1

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float, Labels, UInt16
 from anatomy.kernels.arcs import point_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import LUMEN
-from anatomy.typed import Float, Labels, UInt16
 from stages.needle.kernels.limits import TINY
 
 PROBE_SPACING_MM = 1.5

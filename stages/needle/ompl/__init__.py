@@ -4,7 +4,7 @@ The only package that imports OMPL; docs/explanation/ompl.md tells how it is use
 What OMPL's own planners propagate is proved clear step by step; what they find is proved once more as arcs.
 """
 
-from anatomy.errors import MissingLibraryError
+from anatomy.base.errors import MissingLibraryError
 
 try:
     import ompl.base

@@ -9,8 +9,8 @@ from typing import Any
 
 from ompl import tools
 
-from anatomy.errors import SettingsError
-from anatomy.io.files import atomic_write, require_writable_folder
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import atomic_write, require_writable_folder
 from stages.needle.ompl.planner import NeedlePlanner, not_written
 from stages.needle.ompl.problem import NeedleProblem
 from stages.needle.ompl.runs import Outcome, PlannerRuns, log_with_outcomes, summary

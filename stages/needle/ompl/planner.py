@@ -12,9 +12,9 @@ import numpy as np
 from ompl import base, control
 
 from anatomy import poses
-from anatomy.errors import FileError
-from anatomy.io.files import atomic_write
-from anatomy.typed import Float
+from anatomy.base.errors import FileError
+from anatomy.base.files import atomic_write
+from anatomy.base.typed import Float
 from stages.needle.kernels import states, tree
 from stages.needle.ompl.states import numbers_of, put_numbers, write_state
 from stages.needle.path import ArcPath, arc_transform

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from ompl import base, control, util
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.needle.costs import map_integral
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective

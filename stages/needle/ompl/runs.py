@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from stages.needle.path import ArcPath
 
 PROPERTIES = ("proved BOOLEAN", "path length mm REAL")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.needle.kernels import states
 from stages.needle.path import ArcPath
 

@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels.proof import blocker_on_arc

@@ -9,9 +9,9 @@ from enum import StrEnum
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree

@@ -9,12 +9,12 @@ from typing import Annotated
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.field import MIN_GAP_MM
-from anatomy.records import frozen_record
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree

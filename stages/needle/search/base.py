@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.rrt import grow_rrt

@@ -9,7 +9,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import Objective
 from stages.needle.query import Query

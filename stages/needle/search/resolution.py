@@ -11,11 +11,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Array, Float, Int, Int32, UInt8
 from anatomy.kernels import arcs as arc_kernels
 from anatomy.kernels.field import UNITS_PER_MM
-from anatomy.records import frozen_value
-from anatomy.typed import Array, Float, Int, Int32, UInt8
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, ObjectiveArrays

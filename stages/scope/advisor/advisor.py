@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Float
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
 from stages.scope.advisor.best_motion import Candidates, Motion, MotionEvaluation, evaluate_motions
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, straight_state, tip_frames

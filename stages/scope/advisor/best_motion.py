@@ -12,10 +12,10 @@ from typing import Annotated
 
 import numpy as np
 
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.settings import impossible, quantity, settings
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record, frozen_value
-from anatomy.settings import impossible, quantity, settings
-from anatomy.typed import Float, Int
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels import motion as kernel
 from stages.scope.advisor.kinematics import ScopeState

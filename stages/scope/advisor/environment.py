@@ -11,8 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float
 from stages.scope.advisor.kernels import collision as kernel
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen

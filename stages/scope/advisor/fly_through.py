@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.scope.advisor.kinematics import tip_frames
 from stages.scope.advisor.path import ScopePath
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.records import frozen_value
-from anatomy.typed import Float, Int
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, Int
 from stages.scope.advisor.path import ScopePath
 
 DIRECTIONS = (

@@ -8,12 +8,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.settings import impossible, quantity, settings
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from anatomy.poses import pose
-from anatomy.records import frozen_record
-from anatomy.settings import impossible, quantity, settings
-from anatomy.typed import Float
 from stages.scope.advisor.kernels import chain
 from stages.scope.device import Bronchoscope
 

@@ -8,15 +8,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int32, Labels
 from anatomy.fields import DistanceField, corner_geometry, distance_field
 from anatomy.grid import Grid, Volume, freeze_arrays, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
 from anatomy.morphology import voxels_of
-from anatomy.records import frozen_record
 from anatomy.structures import OUTSIDE
-from anatomy.typed import Float, Int32, Labels
 from stages.scope.advisor.kernels.collision import FINE_DEPTH_MM
 from stages.scope.advisor.kernels.voxel_graph import WALL, clearance_l1, number_component, widest_paths
 

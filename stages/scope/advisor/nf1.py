@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float
 from stages.scope.advisor.kernels.voxel_graph import shortest_paths
 from stages.scope.advisor.lumen import Lumen
 

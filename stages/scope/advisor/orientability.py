@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels.orientation import pointable
 from stages.scope.advisor.kinematics import ScopeState, straight_state, tool_frames

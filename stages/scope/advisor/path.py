@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import freeze_arrays, read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.scope.advisor import kinematics
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState
 from stages.scope.advisor.nf1 import Goal

@@ -12,8 +12,8 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from anatomy.settings import impossible, quantity, settings, switch
-from anatomy.typed import Float
+from anatomy.base.settings import impossible, quantity, settings, switch
+from anatomy.base.typed import Float
 from stages.scope.advisor.best_motion import Weights
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels import motion as kernel

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from stages.scope.advisor.advisor import Advice, Advisor
 from stages.scope.advisor.best_motion import Motion
 from stages.scope.advisor.kinematics import ScopeState, joints

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float, UInt16
 from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import OUTSIDE
-from anatomy.typed import Float, UInt16
 
 EASY_MM = 0.15
 """Where the field's bound leaves so much room, voxels are not searched: a step could grow but little."""

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
-from anatomy.typed import Float
 from stages.scope.kernels.body import move_along, nearest_setting, point_along, room_along, room_at, turn_room
 
 BASE, U, V, TWIST, BEND, TIP, HEADING, NEAR, COST, ROOM, CURVATURE = 0, 12, 13, 14, 15, 16, 19, 22, 23, 24, 25

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.kernels.compiling import inner_kernel, kernel
-from anatomy.typed import Bool, Float, Int
 from stages.scope.kernels.body import move_along, nearest_setting, turn_room
 from stages.scope.kernels.growth import BEND, CURVATURE, ROOM, TWIST, U, V
 from stages.scope.kernels.shifting import put_tip

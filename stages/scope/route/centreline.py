@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError, TargetError
+from anatomy.base.errors import AnatomyError, TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.fields import CENTRES, ROUNDING_MM, SOLID, DistanceField, corner_geometry, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
 from stages.scope.route.kernels import lumen as kernel
 
 DEFAULT_SPACING_MM = 0.75

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float
 from stages.scope.route.kernels import spline as kernel
 
 DEGREE = 3

@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from anatomy.records import frozen_record, frozen_value
-from anatomy.typed import Float
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
 from stages.scope.route.guide_path import GuidePath

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.settings import quantity, settings
-from anatomy.typed import Bool, Float
+from anatomy.base.records import frozen_record
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Bool, Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
 from stages.scope.route.settings import RouteLimits

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.kernels import spline as kernel

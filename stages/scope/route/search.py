@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.errors import LungaccessError, SettingsError
+from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Int
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.kernels.search import breadth_first
 

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from stages.scope.tour.kernels.circuit import all_resistances
 from stages.scope.tour.subtree import Subtree
 

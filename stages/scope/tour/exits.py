@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import TargetError
-from anatomy.records import frozen_value
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float, Int
+from anatomy.base.errors import TargetError
+from anatomy.base.records import frozen_value
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float, Int
 
 ExitTest = Callable[[int, int], bool]
 """Tells whether a lesion, given by its number, can be reached from a tree point, given by its index."""

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Int
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.subtree import Subtree
 

@@ -7,9 +7,9 @@ from typing import Annotated
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.settings import quantity, settings
+from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from anatomy.settings import quantity, settings
-from anatomy.typed import Float
 
 EXAMPLE_BETA = 2.5
 """With this weight the paper's worked example gives what it prints; with its stated 0.2 it does not."""

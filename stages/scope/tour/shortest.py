@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.records import frozen_record
-from anatomy.typed import Bool, Float, Int
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from stages.scope.tour.itinerary import Itinerary, plan_itinerary
 from stages.scope.tour.kernels.steiner import solve
 from stages.scope.tour.subtree import Subtree

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
-from anatomy.records import frozen_record
-from anatomy.typed import Float, Int
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.resistance import Resistances, branch_resistances
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
-from anatomy.typed import Bool, Float, Int
 from stages.tube.kernels.assembly import SHORTEST_PIECE_MM as SAME_MM
 from stages.tube.kernels.pose import frames_at, lay
 from stages.tube.kernels.shapes import (

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Bool, Float, Labels, UInt16
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
-from anatomy.typed import Bool, Float, Labels, UInt16
 from stages.tube.kernels.planar import INNER_RADIUS, MAX_WALL_RUN, MIN_WALL_ANGLE, OUTER_RADIUS
 
 # trace

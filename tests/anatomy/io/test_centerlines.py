@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
 from anatomy.io.centerlines import read_centerlines, write_centerlines
 from anatomy.tree import tree_from_graph
 

@@ -8,7 +8,7 @@ import pytest
 from pydicom.uid import generate_uid
 from scipy.spatial.transform import Rotation
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
 from anatomy.grid import Grid, Volume
 from anatomy.io import list_series, read_dicom
 from tests.anatomy.io.series import write_series

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
 from anatomy.io import parse_point, read_points, read_pose
 
 numbers = st.floats(-1e4, 1e4)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.io.images import read_volume, write_volume
 from anatomy.io.motion_files import write_vectors

@@ -12,7 +12,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from anatomy.errors import AnatomyError, FileError, FrameError
+from anatomy.base.errors import AnatomyError, FileError, FrameError
 from anatomy.grid import Grid, Volume
 from anatomy.io import read_mask, read_volume, write_volume
 

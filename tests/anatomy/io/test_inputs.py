@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from anatomy.base.errors import FileError
 from anatomy.build import lung_key
-from anatomy.errors import FileError
 from anatomy.grid import Volume
 from anatomy.io import load_patient, write_volume
 from anatomy.io.inputs import input_hashes

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import FileError, FrameError
+from anatomy.base.errors import FileError, FrameError
 from anatomy.io.markups import (
     Reference,
     parse_reference,

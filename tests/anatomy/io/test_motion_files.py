@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import SimpleITK
 
-from anatomy.errors import AnatomyError, FileError, FrameError, LungaccessError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, FrameError, LungaccessError, SettingsError
+from anatomy.base.settings import parse
 from anatomy.grid import Grid
 from anatomy.io.motion_files import MotionFile, read_landmarks, read_motion, read_vectors, write_vectors
-from anatomy.settings import parse
 
 MASKS = Grid.from_spacing((20, 16, 24), (2.0, 2.0, 2.0), (-10.0, 5.0, 100.0))
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
 
 messages = pytest.importorskip("pyigtl.messages", reason="pyigtl (extra `live`) is not installed")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, FileError, FrameError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, FrameError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, write_volume
 from tests.anatomy.io.label_maps import LABELS, add_label_table, label_map, require_same

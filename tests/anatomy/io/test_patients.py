@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, FileError, FrameError
+from anatomy.base.errors import AnatomyError, FileError, FrameError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, write_volume
 from anatomy.patient import PatientImages

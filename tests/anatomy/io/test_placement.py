@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import AnatomyError, FrameError
+from anatomy.base.errors import AnatomyError, FrameError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, write_volume
 from anatomy.io.placement import SHIFT_TOLERANCE, covers_same_voxels, place, union_grid

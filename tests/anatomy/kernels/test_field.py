@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from anatomy.base.typed import Float
 from anatomy.fields import corner_geometry, distance_field
 from anatomy.grid import Grid
 from anatomy.kernels.field import distance_bound, exact_at, exact_distance, label_at, least_exact
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from tests.anatomy.boxes import boxes_mm, edge_mm, in_grid_mm, rotated_grid
 
 KINDS = np.array(

@@ -89,7 +89,7 @@ from anatomy.machine_code import ahead
 
 ahead.FEWEST = 1
 ahead.first_compilation.command = "plan"
-from anatomy.kernel_clock import watching_compilations
+from anatomy.base.kernel_clock import watching_compilations
 from anatomy.kernels.caller import outer
 
 with watching_compilations(lambda name: name and print(name)):

@@ -40,7 +40,7 @@ import json, sys, warnings
 
 with warnings.catch_warnings(record=True) as said:
     warnings.simplefilter("always")
-    from anatomy.kernel_clock import watching_compilations
+    from anatomy.base.kernel_clock import watching_compilations
     from anatomy.kernels.caller import outer
 
     compiled = []

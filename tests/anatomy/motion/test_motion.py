@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from anatomy.base.errors import AnatomyError, FrameError, SettingsError
 from anatomy.build import build_lung
-from anatomy.errors import AnatomyError, FrameError, SettingsError
 from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.motion.continuation import continued_unfolded

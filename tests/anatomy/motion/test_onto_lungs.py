@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.motion.motion import Motion

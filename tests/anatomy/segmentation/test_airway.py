@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.base.errors import AnatomyError, GridMismatchError
+from anatomy.base.typed import Int16, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom, make_phantom
 from anatomy.segmentation import growing
@@ -24,7 +25,6 @@ from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.segmentation.kernels.states import LUMEN
 from anatomy.segmentation.local_minima import local_minima_map, scale_of
 from anatomy.segmentation.lungs import Lungs
-from anatomy.typed import Int16, Mask
 
 CROSS = ndimage.generate_binary_structure(2, 1)
 FACES = ndimage.generate_binary_structure(3, 1)

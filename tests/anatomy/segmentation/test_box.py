@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.folder import onto_grid

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid
 from anatomy.io.assembly import require_cost
 from anatomy.patient import PatientImages

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
+from anatomy.base.typed import Array, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io import write_volume
 from anatomy.io.own_masks import load_own_masks
@@ -20,7 +21,6 @@ from anatomy.segmentation.given import GivenImages, read_given
 from anatomy.segmentation.labels import NUMBERINGS, lobe_numbers, sides_of
 from anatomy.segmentation.misplaced import FITS, misplaced, moved_by
 from anatomy.segmentation.request import Given
-from anatomy.typed import Array, Mask
 
 TOTAL = (
     "lung_upper_lobe_left",

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from anatomy.base.typed import Mask
 from anatomy.segmentation.growing import AIR_HU, WALL_MM, Ground, Grown, grow
 from anatomy.segmentation.kernels.growing import rings_of
 from anatomy.segmentation.kernels.lumen_edge import fill_gaps
-from anatomy.typed import Mask
 
 OLD_ROOM = 128
 """So many voxels for one of the lumen once seemed enough."""

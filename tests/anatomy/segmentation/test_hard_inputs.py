@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.grid import Volume
 from anatomy.phantom import Phantom
 from anatomy.segmentation.canonical import canonical

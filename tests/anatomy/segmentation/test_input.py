@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, FileError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, SettingsError
+from anatomy.base.typed import Array
 from anatomy.grid import Grid, Volume
 from anatomy.segmentation.learned import learned_airway, read_network
-from anatomy.typed import Array
 
 WHY = "the extra lungaccess[learned] and onnx are not installed"
 STEEP, CUT = 40.0, 0.37

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io import read_volume
 from anatomy.phantom import LABELS, Phantom, make_phantom
@@ -17,7 +18,6 @@ from anatomy.segmentation.central_airway import find_central_airway
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.lungs import CLOSING_MM, Lungs, lungs_given, segment_lungs
-from anatomy.typed import Array, Float, Mask
 
 LEAST_DICE = 0.98
 

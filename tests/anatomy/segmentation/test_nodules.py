@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import FileError, GridMismatchError
+from anatomy.base.errors import FileError, GridMismatchError
 from anatomy.grid import Grid
 from anatomy.io import read_volume
 from anatomy.segmentation.nodules import RIM_MM, centre_of, nodule_from_contours, without_nodule

@@ -14,7 +14,7 @@ import pytest
 from scipy import ndimage
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import AnatomyError, FileError, GridMismatchError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume

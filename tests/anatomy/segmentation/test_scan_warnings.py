@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from anatomy.base.typed import Mask
 from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom
 from anatomy.segmentation.missing_lung import missing_lung, solid_tissue, untilted
 from anatomy.segmentation.scan_warnings import noise_hu, scan_warnings
-from anatomy.typed import Mask
 
 CARINA = np.zeros(3)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from anatomy.base.typed import Float, Int16, Mask
 from anatomy.segmentation.kernels.states import BANNED, LUMEN
 from anatomy.segmentation.thin_airways import Tubes, follow_thin_airways
-from anatomy.typed import Float, Int16, Mask
 
 SHAPE = (96, 60, 60)
 SPACING_MM = np.full(3, 0.7)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from anatomy.errors import AnatomyError, GridMismatchError
+from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.segmentation.kernels.eigenvalues import eigenvalues
 from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace, discrete_gaussian
 from anatomy.segmentation.vesselness import vesselness

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from anatomy.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import grown_by_one
 from anatomy.phantom import make_phantom

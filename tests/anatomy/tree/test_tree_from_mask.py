@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from skimage.measure import euler_number
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.tree import tree_from_mask
 from tests.anatomy.tubes import CARINA, Tube, Y, edit, outside_mm, tubes

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.appraisal import Appraisal, Appraiser, Geometry, Grade, Headline, limits_of
 from lungaccess.appraisal.grade import FAIR_FROM, GOOD_FROM, grade_of_chance

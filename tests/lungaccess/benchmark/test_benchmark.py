@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose
 from lungaccess.benchmark import (

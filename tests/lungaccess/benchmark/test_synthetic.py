@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, FileError, LungaccessError, SettingsError
+from anatomy.base.errors import AnatomyError, FileError, LungaccessError, SettingsError
+from anatomy.base.settings import to_mapping
 from anatomy.io.patients import load_patient as read_images
 from anatomy.phantom import write_phantom
-from anatomy.settings import to_mapping
 from lungaccess.benchmark.synthetic import manifest
 from lungaccess.benchmark.synthetic.answers import answer_of_plan
 from lungaccess.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases

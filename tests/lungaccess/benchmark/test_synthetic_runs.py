@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import lungaccess as la
-from anatomy.settings import override
+from anatomy.base.settings import override
 from lungaccess.benchmark.synthetic import scoring
 from lungaccess.benchmark.synthetic.cases import all_queries, write_benchmark
 from lungaccess.benchmark.synthetic.reference import benchmark_study, submissions_of

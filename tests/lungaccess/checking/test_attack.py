@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lungaccess as la
+from anatomy.base.settings import override
 from anatomy.lung import Lung
-from anatomy.settings import override
 from experiments import check_attack
 from experiments.support.mutants import random_plans
 from experiments.support.mutants.all import MUTATIONS

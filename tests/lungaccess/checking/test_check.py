@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from anatomy import structures
-from anatomy.settings import override
+from anatomy.base.settings import override
 from lungaccess.checking import Finding, check
 from lungaccess.checking.findings import Findings
 from lungaccess.cli.plan_tables import check_tables

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from anatomy.base.settings import override
 from anatomy.grid import Volume
-from anatomy.settings import override
 from lungaccess.checking import check
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint

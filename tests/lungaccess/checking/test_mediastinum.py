@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import LungaccessError
+from anatomy.base.errors import LungaccessError
 from anatomy.lung import Lung
 from lungaccess.checking import Checker
 from lungaccess.coupled import DirectArcs

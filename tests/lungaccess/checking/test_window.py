@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.linalg import polar
 
+from anatomy.base.errors import AnatomyError, PlanFileError, SettingsError
 from anatomy.build import clearance_fields
-from anatomy.errors import AnatomyError, PlanFileError, SettingsError
 from anatomy.fields import corner_geometry, distance_field
 from anatomy.motion.motion import Motion
 from anatomy.structures import LUMEN

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 import lungaccess as la
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
 from anatomy.lung import Lung
 from lungaccess.coupled import AtlasSearch
 from lungaccess.plans.candidate import Candidate

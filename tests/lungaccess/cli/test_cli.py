@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 import lungaccess as la
-from anatomy.errors import AnatomyError, FrameError
+from anatomy.base.errors import AnatomyError, FrameError
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import DEFAULT_BUDGET_S, DEFAULT_SYSTEM

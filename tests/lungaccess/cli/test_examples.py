@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from anatomy.base.settings import parse
 from anatomy.grid import Grid
 from anatomy.io.frames import read_pose
 from anatomy.io.own_masks import PatientFile
 from anatomy.segmentation.nodules import nodule_from_contours
-from anatomy.settings import parse
 from lungaccess.cli import app as cli
 from lungaccess.cli.commands.template import FILES
 from lungaccess.cli.examples import EXAMPLES

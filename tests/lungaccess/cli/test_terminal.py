@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.panel import Panel
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from lungaccess.cli import terminal
 
 HOSTILE = (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.one_stage.tubes import BareTubes, compare_sequences, deploy_tubes, design_choices, load_tubes

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.lung import Lung
 from lungaccess.coupled import atlas_store
 from lungaccess.coupled.atlas import Atlas

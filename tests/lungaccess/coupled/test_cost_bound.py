@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lungaccess as la
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
 from anatomy.fields import distance_field
 from anatomy.grid import Grid
 from anatomy.kernels.field import most_distance

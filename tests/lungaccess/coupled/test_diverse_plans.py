@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import lungaccess as la
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.system import System

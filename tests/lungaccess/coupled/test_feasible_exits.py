@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
 from lungaccess.coupled import DirectArcs, atlas_part

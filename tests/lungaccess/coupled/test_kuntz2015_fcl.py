@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import lungaccess as la
 from anatomy import poses
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL

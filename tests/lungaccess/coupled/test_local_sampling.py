@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lungaccess as la
+from anatomy.base.settings import override
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
-from anatomy.settings import override
 from lungaccess.coupled import AtlasSearch
 from lungaccess.coupled.search.local_sampling import SPREADS, LocalSampling, nearly_reaching
 from lungaccess.coupled.search.local_search import LocalSearch

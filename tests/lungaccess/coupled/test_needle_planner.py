@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.coupled.search import needle_planner
 from lungaccess.plans.plan import Plan

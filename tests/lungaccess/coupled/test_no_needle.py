@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import override, parse, to_mapping
 from anatomy.lung import Lung
-from anatomy.settings import override, parse, to_mapping
 from lungaccess.coupled.search.direct_candidates import reach_scan
 from lungaccess.plans.parts import NeedleArc, NeedlePath
 from lungaccess.problem.preset_order import invasiveness

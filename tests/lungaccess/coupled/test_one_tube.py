@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import override
 from anatomy.lung import Lung
-from anatomy.settings import override
 from lungaccess.coupled.atlas_measures import tube_stability
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import point_target

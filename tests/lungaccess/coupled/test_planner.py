@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
 from anatomy.lung import Lung
 from lungaccess.coupled import (
     METHODS,

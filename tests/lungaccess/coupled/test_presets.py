@@ -12,8 +12,8 @@ import pytest
 from numba.core.compiler_lock import global_compiler_lock
 
 import lungaccess as la
-from anatomy import kernel_clock
-from anatomy.errors import SettingsError
+from anatomy.base import kernel_clock
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.checking import Checker
 from lungaccess.coupled import presets

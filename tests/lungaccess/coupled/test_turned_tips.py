@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
 from anatomy.lung import Lung
 from lungaccess.coupled import DirectArcs
 from lungaccess.plans.assemble import assemble

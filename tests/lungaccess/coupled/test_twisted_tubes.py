@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from experiments.support.mutants import twisted
 from experiments.support.mutants.mutant import Case

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
 from lungaccess.coupled.search.window_search import WindowSearch
 from lungaccess.problem.target import Target

@@ -11,7 +11,7 @@ import pytest
 from numba.core.compiler_lock import global_compiler_lock
 
 import lungaccess as la
-from anatomy import kernel_clock
+from anatomy.base import kernel_clock
 from anatomy.lung import Lung
 from lungaccess.coupled import Attempt
 from lungaccess.explanation import Explanation, explain, explain_no_plan, explanation_record, sections

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
-from anatomy.settings import parse
-from anatomy.settings_file import settings_toml
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import parse
+from anatomy.base.settings_file import settings_toml
 from lungaccess.explorer.changed_system import plan_command, system_of
 from lungaccess.explorer.chosen_place import ChosenPlace
 from lungaccess.explorer.messages import frame, read_frame

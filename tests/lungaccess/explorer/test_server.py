@@ -14,7 +14,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.explorer import Explorer, PatientSource
 from lungaccess.explorer.server import FOLDERS, asset_names, page_text
 from tests.lungaccess.explorer.client import Client, opened, serving, source_of, with_client

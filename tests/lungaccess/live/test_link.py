@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 
 pyigtl = pytest.importorskip("pyigtl", reason="pyigtl (extra `live`) is not installed")
 

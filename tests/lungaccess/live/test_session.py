@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.live import Speeds, plan_trajectory, write_trajectory
 from lungaccess.live.trajectory_files import joint_trajectory, table_text, tip_path, yaml_text
 from lungaccess.plans.plan import Plan

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose

@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import lungaccess as la
-from anatomy.errors import FrameError, TargetError
+from anatomy.base.errors import FrameError, TargetError
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from lungaccess.checking import check_needle_alone
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode

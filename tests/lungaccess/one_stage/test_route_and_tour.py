@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import FileError, FrameError, SettingsError, TargetError
+from anatomy.base.errors import FileError, FrameError, SettingsError, TargetError
+from anatomy.base.settings import override
 from anatomy.io.centerlines import write_centerlines
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
-from anatomy.settings import override
 from experiments.support.tour_models import random_airway
 from lungaccess.cli.app import main
 from lungaccess.one_stage import tour as tour_module

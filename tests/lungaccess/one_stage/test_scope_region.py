@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.poses import pose
 from lungaccess.one_stage.scope_region import WORDS

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import FileError, PlanFileError
+from anatomy.base.errors import FileError, PlanFileError
 from lungaccess.plans.file import SCHEMA
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan

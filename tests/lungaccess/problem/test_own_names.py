@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.problem.system import preset_named, preset_text, shipped_names
 from lungaccess.problem.target import Target
 

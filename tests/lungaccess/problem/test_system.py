@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from anatomy.errors import FileError, SettingsError
-from anatomy.settings import override, parse, to_mapping
+from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.settings import override, parse, to_mapping
 from lungaccess.problem.system import (
     System,
     load_system,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import FrameError, TargetError
+from anatomy.base.errors import FrameError, TargetError
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom
 from anatomy.structures import OUTSIDE, VESSEL

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
 from lungaccess.plans.plan import Plan

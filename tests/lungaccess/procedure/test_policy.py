@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import lungaccess as la
 from anatomy import poses
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.typed import Float
 from lungaccess.one_stage import ScopeReplanner
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
 from anatomy.lung import Lung
 from anatomy.poses import pose
 from lungaccess.cli.app import main

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.problem.system import System, load_system
 from stages.tube import tube_constants
 from tests.lungaccess.reachability.deployment_cases import KAPPA

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 
 KAPPA = 1.0 / 50.0
 

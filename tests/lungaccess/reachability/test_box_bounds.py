@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from anatomy.typed import Float
+from anatomy.base.typed import Float
 from lungaccess.reachability.kernels import deployment_boxes as boxes
 from stages.tube.kernels import (
     CURVED_LENGTH,

@@ -10,8 +10,8 @@ import numba
 import numpy as np
 import pytest
 
+from anatomy.base.typed import Float
 from anatomy.kernels.arcs import pose_on_arc
-from anatomy.typed import Float
 from lungaccess.reachability.kernels import unreachable as kernel
 from stages.needle.infeasibility.kernels import escape_depth
 from stages.needle.kernels.connections import least_cosine

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import GridMismatchError, SettingsError, TargetError
+from anatomy.base.errors import GridMismatchError, SettingsError, TargetError
 from anatomy.grid import Grid, Volume
 from anatomy.io.images import read_volume
 from anatomy.lung import Lung

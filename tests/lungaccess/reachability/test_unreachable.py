@@ -15,11 +15,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import lungaccess as la
-from anatomy.errors import TargetError
+from anatomy.base.errors import TargetError
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import bending_directions
-from anatomy.typed import Float
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.coupled.search.direct_arcs import DirectArcs

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import lungaccess as la
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES
-from anatomy.typed import Float
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator

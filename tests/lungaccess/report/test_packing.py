@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from lungaccess.report import pack
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from anatomy.errors import AnatomyError
+from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan

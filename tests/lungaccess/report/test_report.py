@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.store import open_lung
 from lungaccess import report

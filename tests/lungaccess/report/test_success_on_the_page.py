@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from anatomy.errors import PlanFileError
+from anatomy.base.errors import PlanFileError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.appraisal import Headline

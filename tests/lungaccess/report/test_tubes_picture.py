@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from lungaccess.report import style, tubes_png
 from stages.tube.device import Tube
 from stages.tube.following import deploy

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest, norm, uniform
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
 from anatomy.lung import Lung
 from anatomy.motion.population import share_of_motion
 from lungaccess.risk import UNITS, AngleError, BreathingError, CurvatureError, ErrorModel, PositionError

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.grid import Grid
 from anatomy.motion.motion import Motion
 from lungaccess.checking.breath import Breath

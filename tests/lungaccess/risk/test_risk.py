@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest, chi, norm
 
 import lungaccess as la
-from anatomy.errors import PlanFileError, SettingsError
+from anatomy.base.errors import PlanFileError, SettingsError
+from anatomy.base.settings import override
 from anatomy.grid import read_only
 from anatomy.lung import Lung
-from anatomy.settings import override
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import PlanFileError, SettingsError
+from anatomy.base.errors import PlanFileError, SettingsError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom

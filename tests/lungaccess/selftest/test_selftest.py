@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.selftest import KINDS, self_test

@@ -13,7 +13,7 @@ import pytest
 
 import lungaccess as la
 from anatomy import poses
-from anatomy.errors import FrameError, SettingsError
+from anatomy.base.errors import FrameError, SettingsError
 from anatomy.io.markups import Reference, read_named_curve, read_named_pose
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli

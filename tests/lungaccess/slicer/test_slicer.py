@@ -15,7 +15,7 @@ import pytest
 import trimesh
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import FileError, PlanFileError
+from anatomy.base.errors import FileError, PlanFileError
 from anatomy.io import load_patient, read_volume
 from anatomy.io.centerlines import read_centerlines
 from anatomy.io.images import read_labels, write_volume

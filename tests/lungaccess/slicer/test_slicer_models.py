@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.meshes import smooth_surface

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from distributed import LocalCluster
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from lungaccess.study import cluster as cluster_of_study
 from lungaccess.study import driver, one_run
 from lungaccess.study.answers import Answer

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from lungaccess.study import results as results_module
 from lungaccess.study.answers import CRASH
 from lungaccess.study.compare import differences
@@ -182,7 +182,7 @@ FULL_DISK = """
 import resource, sys
 from dataclasses import replace
 from pathlib import Path
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.runs import Run
 from tests.lungaccess.study.toys import toy_answer

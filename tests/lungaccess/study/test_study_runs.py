@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import FileError, SettingsError, TargetError
+from anatomy.base.errors import FileError, SettingsError, TargetError
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import peripheral
 from lungaccess.problem.system import load_system
@@ -227,7 +227,7 @@ from lungaccess.one_stage.needle import plan_needle
 from lungaccess.study.patients import open_patient
 from lungaccess.study.runs import Run
 from lungaccess.problem.target import point_target
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 text, tip, cache = json.loads(sys.stdin.read())
 problem, tip = Run.from_json(text).problem, np.array(tip)
 lung = open_patient(problem.patient, Path(cache))

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
 from lungaccess.study.settings import read_study, study_of
 from tests.lungaccess.study.toys import content
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Int
 from anatomy.lung import Lung
-from anatomy.typed import Int
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan

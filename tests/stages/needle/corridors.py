@@ -7,10 +7,10 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
-from anatomy.records import frozen_value
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, VESSEL
-from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, begun_at_wall, environment_of_labels
 from stages.needle.path import ArcPath, blocker_on_path

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anatomy.records import frozen_value
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
 from anatomy.structures import VESSEL
-from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.query import Query

@@ -10,10 +10,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.typed import Float
 from anatomy.fields import CENTRES, corner_geometry
 from anatomy.grid import Grid, Volume
 from anatomy.structures import VESSEL
-from anatomy.typed import Float
 from stages.needle.costs import (
     inverse_clearance,
     map_integral,

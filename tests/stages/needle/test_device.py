@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.needle.device import Needle
 
 NEEDLE: dict[str, Any] = {"diameter_mm": 1.0, "max_curvature_per_mm": 1.0 / 121.0}

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.typed import Float
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.margins import Margins
 from anatomy.structures import VESSEL
-from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import needle_environment
 from stages.needle.kernels import tree

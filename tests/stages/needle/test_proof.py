@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from stages.needle.kernels import proof
 from stages.needle.kernels.limits import Limits
 from tests.stages.needle.needles import limits_of

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from anatomy.base.typed import Float
 from anatomy.margins import Margins
 from anatomy.structures import OBSTACLES, OUTSIDE, VESSEL
-from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment, workspace_lengths
 from stages.needle.kernels import cost as cost_kernels

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
 from anatomy.kernels.arcs import arc_to_point, point_on_arc
 from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL
-from anatomy.typed import Float
 from stages.needle import (
     ArcPath,
     Needle,

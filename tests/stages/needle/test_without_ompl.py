@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 REFUSED = """
 import sys
 sys.path.insert(0, "tests/without_ompl")
-from anatomy.errors import MissingLibraryError
+from anatomy.base.errors import MissingLibraryError
 from lungaccess.cli.app import main
 from stages.needle import OMPL_PLANNERS, OUR_PLANNERS, has_ompl, require_planner
 

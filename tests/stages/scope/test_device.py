@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.scope.device import Bronchoscope
 
 SCOPE: dict[str, Any] = {

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.poses import pose
-from anatomy.typed import Float
 from stages.tube import Deployment, DeploymentValidator, kernels, tube_constants
 from stages.tube.device import ConcentricTubes, Tube
 from tests.stages.scenes import Canvas, forked_tree

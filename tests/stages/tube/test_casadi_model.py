@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipk
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.tube.casadi_model import CasadiTubes
 from stages.tube.device import BentPiece, Tube
 from stages.tube.errors import ConvergenceError

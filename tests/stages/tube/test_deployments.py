@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.poses import pose

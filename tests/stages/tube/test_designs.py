@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
-from anatomy.settings import parse, to_mapping
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import parse, to_mapping
 from stages.tube import (
     BentPiece,
     ConcentricTubes,

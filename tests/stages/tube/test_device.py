@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.tube.device import ConcentricTubes, Tube
 from tests.stages.tube.pairs import WIDE
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from anatomy.errors import FrameError, SettingsError
-from anatomy.typed import Float
+from anatomy.base.errors import FrameError, SettingsError
+from anatomy.base.typed import Float
 from stages.tube.device import Tube
 from stages.tube.inverse import Match, _Problem, inverse_kinematics
 from stages.tube.mechanics import TubeMechanics

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import ellipj
 
-from anatomy.errors import LungaccessError, SettingsError
-from anatomy.typed import Float
+from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.typed import Float
 from stages.tube import Equilibrium, TubeMechanics
 from stages.tube.device import BentPiece, ConcentricTubes, Tube
 from stages.tube.shape import centreline

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.tube.following import deploy
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.proposals import (

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.poses import pose
 from anatomy.structures import VESSEL
-from anatomy.typed import Float
 from stages.tube import Deployment, kernels
 from stages.tube.kernels import refused_exits
 from tests.stages.scenes import Canvas, brute_clearance

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from anatomy.errors import LungaccessError, SettingsError
+from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.margins import Margins
 from stages.tube import Equilibrium, TubeMechanics, kernels, tube_constants
 from stages.tube.device import BentPiece, Tube

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.kernels.arcs import normal_on_arc, pose_on_arc
 from anatomy.margins import Margins
 from stages.tube import (

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.tube import SlottedSegment, channel_curvature_limit, opposite_slots, straightening, transit_strain
 from stages.tube.device import ConcentricTubes, Tube
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN
-from anatomy.typed import Float
 from stages.tube import REASONS, kernels
 from tests.stages.scenes import Canvas
 from tests.stages.tube.flat_wall import (

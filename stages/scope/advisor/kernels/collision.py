@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float, Int32, Labels
 from anatomy.kernels.compiling import inlined_kernel, kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import OUTSIDE
-from anatomy.typed import Float, Int32, Labels
 from stages.scope.advisor.kernels.chain import circle_curvature, joints_of, move_base
 
 FINE_DEPTH_MM = 2.0

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from anatomy.base.typed import Float, Int
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
-from anatomy.typed import Float, Int
 from stages.scope.route.kernels.lumen import cone_depth, deep_enough
 
 CENTRING, BENDING, LIMIT, NEEDED, SPARE_CURVATURE, SPARE_DEPTH, TOLERANCE = range(7)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.typed import Float
 from anatomy.grid import Grid
 from anatomy.kernels.arcs import pose_on_arc
 from anatomy.structures import VESSEL
-from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.backward_reach import NOT_BOUNDED, backward_reach

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import OUTSIDE, VESSEL
-from anatomy.typed import Float
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.path import ArcPath
 from stages.needle.query import Query

@@ -10,7 +10,7 @@ import pytest
 from ompl import base
 from ompl.tools import readBenchmarkLog
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.ompl import NeedlePlanner, NeedleProblem, benchmark, read_state
 from stages.needle.search.base import RestartingRRT

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
-from anatomy.typed import Float
 from stages.needle import NEEDLE_PLANNERS, OUR_PLANNERS, Objective, map_integral, require_planner, violation
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.ompl import NeedleProblem

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from ompl import base
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.margins import Margins
 from stages.needle import ompl as ompl_planner
 from stages.needle.environment import NeedleEnvironment, needle_environment

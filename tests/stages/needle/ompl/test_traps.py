@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.needle import ompl as ompl_planner
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.ompl import NeedleProblem, benchmark, path_of, seed_ompl

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.typed import Float
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL
-from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.path import ArcPath

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from anatomy.errors import FrameError, SettingsError
+from anatomy.base.errors import FrameError, SettingsError
+from anatomy.base.typed import Float
 from anatomy.margins import Margins
 from anatomy.poses import roll_towards
 from anatomy.structures import VESSEL
-from anatomy.typed import Float
 from stages.needle.device import Needle
 from stages.needle.environment import needle_environment
 from stages.needle.kernels import tree

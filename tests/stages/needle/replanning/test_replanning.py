@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from anatomy.errors import FrameError, SettingsError
-from anatomy.typed import Float
+from anatomy.base.errors import FrameError, SettingsError
+from anatomy.base.typed import Float
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform, blocker_on_path, direct_path
 from stages.needle.replanning.reaiming import LEAST_GAIN, Attempts, Root, Source

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
 from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch

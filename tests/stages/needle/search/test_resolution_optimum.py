@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
-from anatomy.typed import Float
 from stages.needle.objective import Objective
 from stages.needle.search.kernels import resolution_nodes as node_kernel
 from stages.needle.search.resolution import Cells, Resolution

@@ -9,10 +9,10 @@ from itertools import product
 import numpy as np
 import pytest
 
+from anatomy.base.typed import Float
 from anatomy.grid import Volume
 from anatomy.margins import Margins
 from anatomy.structures import VESSEL
-from anatomy.typed import Float
 from stages.needle.costs import map_integral
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anatomy.errors import AnatomyError, SettingsError
+from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, start_state, why_stopped
 from stages.scope.advisor.best_motion import Motion

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import CANDIDATES, VERDICTS, Motion, Weights, evaluate_motions, offsets

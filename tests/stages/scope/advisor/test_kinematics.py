@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.scope.advisor.kinematics import (
     ScopeModel,
     ScopeState,

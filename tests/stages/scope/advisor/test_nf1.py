@@ -10,7 +10,7 @@ from scipy import ndimage
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from anatomy.errors import AnatomyError, TargetError
+from anatomy.base.errors import AnatomyError, TargetError
 from anatomy.grid import Grid, Volume
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
 from stages.scope.advisor.nf1 import Kind, entering_costs, goal_at, navigation_field

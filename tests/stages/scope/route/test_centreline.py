@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from anatomy.errors import AnatomyError, TargetError
+from anatomy.base.errors import AnatomyError, TargetError
 from anatomy.fields import SOLID
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from stages.scope.route.curve import Curve, interpolate
 from stages.scope.route.proof import prove
 from tests.stages.scope.route.tubes import chain, corner, straight

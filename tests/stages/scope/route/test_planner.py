@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
 from experiments.support.route.baselines import SamplingSettings, sampled_route
 from stages.scope.route.centreline import Centreline, from_image
 from stages.scope.route.exact import segments

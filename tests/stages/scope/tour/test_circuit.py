@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits

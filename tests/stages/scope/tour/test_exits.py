@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from anatomy.errors import SettingsError, TargetError
+from anatomy.base.errors import SettingsError, TargetError
 from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.tour.exits import ExitRule, find_exits
 from tests.stages.scope.tour.trees import figure_1, straight_branches

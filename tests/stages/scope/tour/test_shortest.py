@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.tour import shortest
 from stages.scope.tour.circuit import circuits

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.cache import BUILDING, LUNG_FILE, REMOVED
-from anatomy.errors import FileError
-from anatomy.io.files import DAMAGE
-from anatomy.records import frozen_value
-from anatomy.unfinished import SECONDS_PER_DAY, clear_abandoned, is_abandoned
+from anatomy.base.cache import BUILDING, LUNG_FILE, REMOVED
+from anatomy.base.errors import FileError
+from anatomy.base.files import DAMAGE
+from anatomy.base.records import frozen_value
+from anatomy.base.unfinished import SECONDS_PER_DAY, clear_abandoned, is_abandoned
 
 ARRAYS_PATTERN = re.compile(r"(atlas|shapes)-[0-9a-f]{64}\.npz")
 """Files of arrays: deployment atlases, and the shapes of tubes."""

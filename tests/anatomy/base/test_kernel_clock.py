@@ -9,8 +9,8 @@ import numba
 import pytest
 from numba.core.compiler_lock import global_compiler_lock
 
-from anatomy import kernel_clock
-from anatomy.kernel_clock import watching_compilations, working_cpu_s, working_s
+from anatomy.base import kernel_clock
+from anatomy.base.kernel_clock import watching_compilations, working_cpu_s, working_s
 
 
 @numba.njit

@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
 
 LUNG_FILE = "lung.json"
 """Describes a stored anatomy; its time of change is when the anatomy was last used."""

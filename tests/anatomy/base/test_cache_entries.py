@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from anatomy.cache import BUILDING, LUNG_FILE, REMOVED, cache_limit_bytes, parse_size
-from anatomy.cache_entries import cache_entries, make_room, overdue, remove_entry
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.cache import BUILDING, LUNG_FILE, REMOVED, cache_limit_bytes, parse_size
+from anatomy.base.cache_entries import cache_entries, make_room, overdue, remove_entry
+from anatomy.base.errors import FileError, SettingsError
 from anatomy.kept import kept
 from anatomy.patient import PatientImages
 from anatomy.store import open_lung, stored_format
@@ -147,7 +147,7 @@ def test_a_killed_removal_leaves_nothing_half(cache: Path) -> None:
     script = (
         "import shutil, sys, time; from pathlib import Path\n"
         "shutil.rmtree = lambda *_, **__: (print('removing', flush=True), time.sleep(60))\n"
-        "from anatomy.cache_entries import make_room\n"
+        "from anatomy.base.cache_entries import make_room\n"
         "make_room(Path(sys.argv[1]), 0, {}, keep=())\n"
     )
     process = subprocess.Popen([sys.executable, "-c", script, str(cache)], stdout=subprocess.PIPE, text=True)

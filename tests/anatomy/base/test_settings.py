@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from anatomy.errors import SettingsError
+from anatomy.base.errors import SettingsError
+from anatomy.base.settings import impossible, override, parse, quantity, settings, switch, text, to_mapping
 from anatomy.margins import Margins
-from anatomy.settings import impossible, override, parse, quantity, settings, switch, text, to_mapping
 
 
 @settings

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
-from anatomy.errors import FileError, SettingsError
+from anatomy.base.errors import FileError, SettingsError
 
 DAMAGE = (
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,

@@ -16,8 +16,8 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from anatomy.errors import SettingsError
-from anatomy.records import LEFT_OUT_IF_EMPTY
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
 
 T = TypeVar("T")
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)

@@ -6,11 +6,11 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from anatomy.settings import to_mapping
+from anatomy.base.settings import to_mapping
 
 
 def settings_toml(values: object) -> str:
-    """Return settings as TOML, from which `anatomy.settings.parse` restores them without loss.
+    """Return settings as TOML, from which `anatomy.base.settings.parse` restores them without loss.
 
     What is None is left out, as TOML has no such value; it must be the default of its field.
     """

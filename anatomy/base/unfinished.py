@@ -11,7 +11,7 @@ from pathlib import Path
 
 from filelock import FileLock, SoftFileLock, Timeout
 
-from anatomy.cache import BUILDING
+from anatomy.base.cache import BUILDING
 
 ABANDONED_AFTER_DAYS = 1.0
 """No anatomy takes so long to prepare: what is older and bears no lock was left behind."""

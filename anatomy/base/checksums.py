@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.typed import Array, UInt8
+from anatomy.base.typed import Array, UInt8
 
 
 class DamagedCacheWarning(UserWarning):

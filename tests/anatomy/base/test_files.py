@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from anatomy.errors import FileError
+from anatomy.base.errors import FileError
 from anatomy.io import atomic_write, require_writable_folder, sha256
 
 

@@ -8,7 +8,7 @@ import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from lungaccess.procedure import Simulator
-from lungaccess.risk import RiskAssessor
+from lungaccess.uncertainty.risk import RiskAssessor
 
 DEVIATED = 1_000_000
 PROCEDURES = 50

@@ -8,7 +8,7 @@ confidence intervals.
 import matplotlib.pyplot as plt
 
 import lungaccess as la
-from lungaccess.risk import assess
+from lungaccess.uncertainty.risk import assess
 
 lung = la.load_patient("phantom-3")
 plan = la.Plan.load("plan.json")

@@ -19,7 +19,7 @@ from experiments.support.results import Result, setting_of, study_parser, write_
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from lungaccess.procedure import ProcedureReport, load_procedure, procedure_names, simulate_procedure
-from lungaccess.risk import error_preset_names, load_errors
+from lungaccess.uncertainty.risk import error_preset_names, load_errors
 
 SIZES = {"quick": (2, 20), "full": (8, 100)}
 """Targets, and procedures for each target, error model and procedure."""

@@ -3,8 +3,8 @@
     python -m experiments.rare_events [--quick]
 
 Three plans in synthetic patients are carried out with small errors.  The chance that a structure is touched
-is estimated with weights from twenty thousand draws (`lungaccess.risk.rare`), and counted in a hundred
-million.
+is estimated with weights from twenty thousand draws (`lungaccess.uncertainty.risk.rare`), and counted in a
+hundred million.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from anatomy.base.records import frozen_value
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.risk import RiskAssessor, load_errors, rare_touch
-from lungaccess.risk.statistics import Share
+from lungaccess.uncertainty.risk import RiskAssessor, load_errors, rare_touch
+from lungaccess.uncertainty.risk.statistics import Share
 
 BATCH = 1_000_000
 WEIGHTED = 20_000

@@ -9,7 +9,7 @@ import argparse
 
 import lungaccess as la
 from lungaccess.plans.plan import Plan
-from lungaccess.risk import RiskAssessor, error_preset_names, load_errors
+from lungaccess.uncertainty.risk import RiskAssessor, error_preset_names, load_errors
 
 PREDICTED, COUNTED = 10_000, 100_000
 SEED, FRESH_SEED = 0, 1_000_003

@@ -29,8 +29,8 @@ from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.plan import Plan
 from lungaccess.procedure import load_procedure, simulate_procedure
 from lungaccess.procedure.settings import ScopePlacing
-from lungaccess.risk import RiskAssessor
-from lungaccess.risk.deviations import deviated_pieces, deviated_starts
+from lungaccess.uncertainty.risk import RiskAssessor
+from lungaccess.uncertainty.risk.deviations import deviated_pieces, deviated_starts
 from stages.needle import (
     REACHING,
     ArcPath,

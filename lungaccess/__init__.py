@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from anatomy.base.errors import LungaccessError
     from anatomy.lung import Lung
     from lungaccess.appraisal import Appraisal, appraise
-    from lungaccess.breathing.window import breathing_window
     from lungaccess.checking import CheckReport, check
     from lungaccess.coupled import (
         Alternative,
@@ -69,10 +68,17 @@ if TYPE_CHECKING:
     from lungaccess.procedure import Procedure, load_procedure, simulate_procedure
     from lungaccess.reachability import UnreachableProof, compare_reach, map_reach, plan_to_voxel
     from lungaccess.report.html import plan_page
-    from lungaccess.risk import ErrorModel, assess, find_tolerances, load_errors, safe_start_region
     from lungaccess.slicer import export_slicer
     from lungaccess.study import read_study, run_study
     from lungaccess.success import PlannedSuccess, alternatives_for_success, plan_for_success
+    from lungaccess.uncertainty.breathing.window import breathing_window
+    from lungaccess.uncertainty.risk import (
+        ErrorModel,
+        assess,
+        find_tolerances,
+        load_errors,
+        safe_start_region,
+    )
     from stages.needle import Objective
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -21,8 +21,8 @@ from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.usage import with_nodule_number
 from lungaccess.one_stage import load_tubes
 from lungaccess.problem.system import load_system
-from lungaccess.risk import load_errors
 from lungaccess.study import read_study
+from lungaccess.uncertainty.risk import load_errors
 from tests.pages import PAGES, ROOT, RUN, SHOWN, blocks, name_of
 
 LEAST_RUN_SHARE = 0.9

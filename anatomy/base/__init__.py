@@ -1,1 +1,1 @@
-"""What all code of the project stands on and that is no anatomy: errors, settings, files, caches, types, words."""
+"""What all code stands on and that is no anatomy: errors, settings, files, caches, types, words."""

@@ -14,8 +14,8 @@ from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from anatomy.motion.motion import Motion
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, OBSTACLES, OUTSIDE
-from lungaccess.breathing.window import TIP_BALL_MM, TIP_STEP_MM
 from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.breathing.window import TIP_BALL_MM, TIP_STEP_MM
 
 POINT_MM = 0.1
 """Along the devices: between two points a clearance is at most 0.05 mm less, mostly far less."""

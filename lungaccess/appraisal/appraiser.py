@@ -11,8 +11,8 @@ from lungaccess.appraisal.headline import Headline
 from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 from lungaccess.checking import Checker, CheckReport
 from lungaccess.procedure import Procedure, load_procedure
-from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.success import Estimate, estimate_success
+from lungaccess.uncertainty.risk import ErrorModel, load_errors
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

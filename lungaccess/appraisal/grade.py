@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from lungaccess.risk.statistics import Share
+from lungaccess.uncertainty.risk.statistics import Share
 
 GOOD_FROM = 0.90
 """From here on fewer than one procedure in ten has to be repeated or fails."""

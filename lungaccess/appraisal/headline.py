@@ -12,9 +12,9 @@ from anatomy.lobes import FISSURES_UNKNOWN
 from lungaccess.appraisal.grade import Grade, grade_of_chance
 from lungaccess.plans.chance import Chance
 from lungaccess.procedure.report import NO_PATH
-from lungaccess.risk.assessment import MISSES
-from lungaccess.risk.statistics import Share
 from lungaccess.success.estimate import Estimate, chance_of
+from lungaccess.uncertainty.risk.assessment import MISSES
+from lungaccess.uncertainty.risk.statistics import Share
 
 if TYPE_CHECKING:
     from lungaccess.checking import CheckReport
@@ -27,7 +27,7 @@ FAILURES = {
     "stays in the airway": "stays in the airway",
     NO_PATH: "has no path left",
 }
-"""What a failed procedure does, by the names of `lungaccess.risk.STRUCTURES` and `NO_PATH`."""
+"""What a failed procedure does, by the names of `lungaccess.uncertainty.risk.STRUCTURES` and `NO_PATH`."""
 
 BESIDE_TARGET = (
     "The plan was made for a window of the breath: in the phase of the masks it ends beside the target."

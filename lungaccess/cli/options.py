@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget
     from lungaccess.procedure import Procedure
-    from lungaccess.risk import ErrorModel
+    from lungaccess.uncertainty.risk import ErrorModel
 
     ObjectiveText = str
     OurPlannerName = str
@@ -267,7 +267,7 @@ class ErrorOptions:
 
     def load(self) -> ErrorModel:
         """Return the error model, the default one if none is given."""
-        from lungaccess.risk import load_errors
+        from lungaccess.uncertainty.risk import load_errors
 
         return load_errors() if self.errors is None else load_errors(self.errors)
 

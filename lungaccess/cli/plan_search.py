@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from lungaccess.problem.target import StatedTarget, Target
     from lungaccess.procedure import Procedure
     from lungaccess.report import CostPoint
-    from lungaccess.risk import ErrorModel
+    from lungaccess.uncertainty.risk import ErrorModel
 
 PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
 """The plan, saved as soon as there is one and again when there is a better one; how its cost fell."""
@@ -226,7 +226,7 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     best, history = run_search(lung, target, request, display)
     # After the search: the first plan does not wait for these.
     from lungaccess.appraisal import appraise, plan_record
-    from lungaccess.breathing.window import with_window
+    from lungaccess.uncertainty.breathing.window import with_window
 
     found = best.plan if best.plan.window is not None else with_window(best.plan, lung)
     if found is not best.plan:

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from lungaccess.cli import terminal
-from lungaccess.risk.statistics import Share
+from lungaccess.uncertainty.risk.statistics import Share
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -10,7 +10,6 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.lung import Lung
-from lungaccess.breathing.window import with_window
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.explanation import explain
 from lungaccess.coupled.planner import plan as find_plans
@@ -25,6 +24,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, require_own_name
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
+from lungaccess.uncertainty.breathing.window import with_window
 from stages.needle import DEFAULT, Objective
 
 COUNT = 15

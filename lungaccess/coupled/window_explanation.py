@@ -9,12 +9,12 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from anatomy.base.words import plural
-from lungaccess.breathing.window import require_motion
 from lungaccess.coupled.search.direct_arcs import DirectArcs
 from lungaccess.coupled.search.window_search import WindowSearch
 from lungaccess.plans.evaluator import blocker_name
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.window import WindowLimit
+from lungaccess.uncertainty.breathing.window import require_motion
 
 MOST_WINDOWS = 150
 """Deployments whose windows are computed for the advice: of many, those that may have the widest."""

@@ -10,7 +10,6 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.motion.motion import require_phase
-from lungaccess.breathing.window import breathing_window, require_motion
 from lungaccess.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.coupled.planner import Limits, ProgressEvent, atlas_event, drive
 from lungaccess.coupled.search.window_search import WindowSearch
@@ -22,6 +21,7 @@ from lungaccess.plans.window import BreathingAim
 from lungaccess.problem.system import System, require_own_name
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
+from lungaccess.uncertainty.breathing.window import breathing_window, require_motion
 from stages.needle import DEFAULT, Objective
 
 METHOD = "window"

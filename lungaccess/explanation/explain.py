@@ -34,7 +34,7 @@ from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from lungaccess.reachability import ReachVerdict, UnreachableProof
-from lungaccess.risk import Share, assess
+from lungaccess.uncertainty.risk import Share, assess
 from stages.needle import DEFAULT, Objective, needle_environment
 
 DEFAULT_TIME_S = 10.0

@@ -16,7 +16,7 @@ from lungaccess.problem.preset_order import presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.reachability import ReachVerdict
-from lungaccess.risk import Share
+from lungaccess.uncertainty.risk import Share
 
 DONE, NOT_TRIED = "done", "not tried"
 TIME_IS_UP = "the time was up"

@@ -15,7 +15,7 @@ from lungaccess.explanation.blocking import region_of
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
-from lungaccess.risk import Share
+from lungaccess.uncertainty.risk import Share
 from stages.needle import DIRECT
 
 RADII_MM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 22.0, 30.0, 40.0)

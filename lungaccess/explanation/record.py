@@ -14,7 +14,7 @@ from lungaccess.explanation.blocking import ArcBeyondLimits, BlockedArc, Blockin
 from lungaccess.explanation.explanation import Change, Explanation
 from lungaccess.explanation.neighbours import ReachedShare
 from lungaccess.plans.version import made_by
-from lungaccess.risk import Share
+from lungaccess.uncertainty.risk import Share
 
 Record = dict[str, Any]
 FILE = "no_plan.json"

@@ -15,7 +15,6 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.settings_file import settings_toml
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from lungaccess.breathing.window import with_window
 from lungaccess.coupled import Atlas, ProgressEvent, atlas_is_kept, feasible_exits, open_atlas, plan
 from lungaccess.explorer import questions as ask
 from lungaccess.explorer.changed_system import plan_command, system_of
@@ -28,6 +27,7 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
 from lungaccess.report.html.deployment import packed_plan
+from lungaccess.uncertainty.breathing.window import with_window
 from stages.tube import exit_points, shapes_digest
 
 KEPT_ATLASES = 3

@@ -13,11 +13,11 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.io.openigtlink import Received, points_message, pose_message, text_message
 from anatomy.lung import Lung
-from lungaccess.breathing.moving import Moving
 from lungaccess.live.link import Link, LinkCounts
 from lungaccess.live.replanning import TARGET, TRACKED, Answer, TrackedReplanner
 from lungaccess.live.trajectory import Speeds, Trajectory, plan_trajectory
 from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.breathing.moving import Moving
 
 RATE_HZ = 20.0
 TIPS = {"ScopeTip": "scope", "TubeTip": "tubes", "NeedleTip": "needle"}

@@ -12,6 +12,8 @@ from anatomy.base.files import read_toml
 from anatomy.base.records import frozen_value
 from anatomy.base.suggestion import did_you_mean
 
+_ROOM = resources.files("lungaccess.problem")
+
 
 @frozen_value
 class PresetFiles:
@@ -40,7 +42,7 @@ class PresetFiles:
     @staticmethod
     def names_in(folder: str) -> tuple[str, ...]:
         """Return the names of the presets in one of the folders, sorted."""
-        entries = (resources.files("lungaccess") / folder).iterdir()
+        entries = (_ROOM / folder).iterdir()
         return tuple(sorted(each.name[:-5] for each in entries if each.name.endswith(".toml")))
 
     def text(self, name: str) -> str:
@@ -53,7 +55,7 @@ class PresetFiles:
         """
         for folder in self.folders:
             if name in self.names_in(folder):
-                return (resources.files("lungaccess") / folder / f"{name}.toml").read_text(encoding="utf-8")
+                return (_ROOM / folder / f"{name}.toml").read_text(encoding="utf-8")
         names = self.names
         raise SettingsError(
             f"There is no {self.what} called {name!r}",

@@ -10,8 +10,8 @@ from anatomy.lung import Lung
 from lungaccess.procedure.residuals import Residuals
 from lungaccess.procedure.settings import Procedure
 from lungaccess.procedure.spread import Spread
-from lungaccess.risk import Deviations, ErrorModel, RiskAssessor
-from lungaccess.risk.deviations import ROUNDING_MM, in_rows, no_deviations, tubes_alone
+from lungaccess.uncertainty.risk import Deviations, ErrorModel, RiskAssessor
+from lungaccess.uncertainty.risk.deviations import ROUNDING_MM, in_rows, no_deviations, tubes_alone
 from stages.tube import Deployments
 
 KEPT, DRAWS = 3, (8, 32)

@@ -35,9 +35,9 @@ from lungaccess.procedure.truth import (
     path_of,
     with_stop,
 )
-from lungaccess.risk import ErrorModel, RiskAssessor
-from lungaccess.risk.deviations import deviated_starts
-from lungaccess.risk.errors import BREATHING
+from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor
+from lungaccess.uncertainty.risk.deviations import deviated_starts
+from lungaccess.uncertainty.risk.errors import BREATHING
 from stages.needle import (
     ArcPath,
     Belief,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from anatomy.base.records import frozen_value
 from lungaccess.procedure.settings import Procedure
-from lungaccess.risk import ErrorModel, Share
+from lungaccess.uncertainty.risk import ErrorModel, Share
 
 NO_PATH = "no path left"
 """A procedure that ended because no path was found from a pose as measured."""

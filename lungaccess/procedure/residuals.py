@@ -6,7 +6,7 @@ import math
 
 from anatomy.base.records import frozen_record
 from lungaccess.procedure.settings import Procedure
-from lungaccess.risk.errors import BREATHING, CURVATURE, ErrorModel
+from lungaccess.uncertainty.risk.errors import BREATHING, CURVATURE, ErrorModel
 
 
 @frozen_record
@@ -41,7 +41,7 @@ class Residuals:
 
     @staticmethod
     def of(errors: ErrorModel, procedure: Procedure, stretch: float) -> Residuals:
-        """Return what a procedure leaves of errors; `stretch` is that of `lungaccess.risk.Draws`."""
+        """Return what a procedure leaves of errors; `stretch` is that of `Draws`."""
         placed, aimed = errors.term("scope_position").size, errors.term("target_position").size
         angles = ("scope_direction", "tube_rotation", "needle_roll")
         turned, rotated, rolled = (math.radians(errors.term(kind).size) for kind in angles)

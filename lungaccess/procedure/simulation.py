@@ -21,12 +21,12 @@ from lungaccess.procedure.policy import Policy
 from lungaccess.procedure.report import NO_PATH, ProcedureReport, StageReport
 from lungaccess.procedure.settings import Procedure, load_procedure
 from lungaccess.procedure.truth import ARCS, Attempt
-from lungaccess.risk import MISSES, Deviations, ErrorModel, RiskAssessor, Share, load_errors
-from lungaccess.risk.assessment import MISS_QUANTILES
-from lungaccess.risk.breathing import model_for
-from lungaccess.risk.deviations import deviated_starts
-from lungaccess.risk.kernels import deviation as kernel
-from lungaccess.risk.statistics import share_of
+from lungaccess.uncertainty.risk import MISSES, Deviations, ErrorModel, RiskAssessor, Share, load_errors
+from lungaccess.uncertainty.risk.assessment import MISS_QUANTILES
+from lungaccess.uncertainty.risk.breathing import model_for
+from lungaccess.uncertainty.risk.deviations import deviated_starts
+from lungaccess.uncertainty.risk.kernels import deviation as kernel
+from lungaccess.uncertainty.risk.statistics import share_of
 
 DEFAULT_SAMPLES = 1000
 """A share of one half is then known to 3 % with 95 % confidence."""

@@ -19,7 +19,7 @@ from lungaccess.problem.task import fissures_are_obstacles
 from lungaccess.procedure.kernels import spread as kernel
 from lungaccess.procedure.residuals import Residuals
 from lungaccess.procedure.settings import Procedure
-from lungaccess.risk.errors import CURVATURE, ErrorModel
+from lungaccess.uncertainty.risk.errors import CURVATURE, ErrorModel
 from stages.tube import Deployments
 
 ASIDE = 0.6

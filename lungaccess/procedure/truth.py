@@ -12,8 +12,8 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
-from lungaccess.risk.deviations import Deviations, deviated_pieces
-from lungaccess.risk.kernels import deviation as kernel
+from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces
+from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from stages.needle import ArcPath, arc_transform, tilt
 
 ARCS = 12

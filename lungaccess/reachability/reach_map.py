@@ -18,13 +18,13 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
-from lungaccess.breathing.window import require_motion
 from lungaccess.coupled import reach_scan
 from lungaccess.coupled.atlas import Atlas, build_atlas
 from lungaccess.coupled.window_planner import require_phases
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.reachability.layers import LayerStore, counted_voxels, scan_layers
 from lungaccess.reachability.regions import Regions, lung_regions
+from lungaccess.uncertainty.breathing.window import require_motion
 from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED
 
 DEFAULT_SPACING_MM = 3.0

@@ -8,10 +8,6 @@ from anatomy.base.typed import Float, Labels
 from anatomy.grid import Grid
 from anatomy.motion.motion import LEFT, Motion
 from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, VESSEL
-from lungaccess.breathing.kernels import rules
-from lungaccess.breathing.kernels.rigid import Rigid
-from lungaccess.breathing.kernels.window import MOST_LEAVES, divide
-from lungaccess.breathing.window import breath_of, carrier
 from lungaccess.selftest.scenes import (
     Case,
     Random,
@@ -23,6 +19,10 @@ from lungaccess.selftest.scenes import (
     true_distances,
     unit,
 )
+from lungaccess.uncertainty.breathing.kernels import rules
+from lungaccess.uncertainty.breathing.kernels.rigid import Rigid
+from lungaccess.uncertainty.breathing.kernels.window import MOST_LEAVES, divide
+from lungaccess.uncertainty.breathing.window import breath_of, carrier
 
 NODE_MM, MASKS_PHASE = 5.0, 0.3
 TOLERANCE_MM, HOLE_MM = 1.5, 0.6

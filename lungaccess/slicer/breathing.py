@@ -18,9 +18,9 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.io.motion_files import write_vectors
 from anatomy.lung import Lung
-from lungaccess.breathing.moving import Moving
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer.scene import Item, element, scene
+from lungaccess.uncertainty.breathing.moving import Moving
 
 SCENE_FILE = "breathing.mrml"
 PHASES = 11

@@ -15,7 +15,6 @@ from anatomy.lung import Lung
 from lungaccess.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurves
 from lungaccess.plans.plan import Plan
-from lungaccess.risk import proved_body, safe_start_region, tried_body
 from lungaccess.slicer.breathing import write_breathing
 from lungaccess.slicer.custusx import route_text
 from lungaccess.slicer.markups import TARGET_COLOUR, aim_point, curve_markup, points_of_interest
@@ -23,6 +22,7 @@ from lungaccess.slicer.models import device_surface, structure_surface, write_pl
 from lungaccess.slicer.readme import readme
 from lungaccess.slicer.scene import Item, scene
 from lungaccess.slicer.segments import write_segmentation
+from lungaccess.uncertainty.risk import proved_body, safe_start_region, tried_body
 
 SCENE_FILE, README_FILE, ROUTE_FILE, PLAN_FILE = "scene.mrml", "README.txt", "route_custusx.txt", "plan.json"
 SEGMENTATION_FILE, TREE_FILE, POINTS_FILE = "anatomy.seg.nrrd", "airway_tree.vtp", "points.mrk.json"

@@ -21,9 +21,9 @@ from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
 from lungaccess.problem.task import objective_of
 from lungaccess.procedure import Procedure, load_procedure
-from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.study.patients import Patient, open_patient, patient_of
 from lungaccess.study.settings import Case, PlannerChoice, Study
+from lungaccess.uncertainty.risk import ErrorModel, load_errors
 
 OF_THEIR_OWN_CLASS = ("patient", "system", "errors", "procedure")
 """The fields of a problem that are not plain values."""

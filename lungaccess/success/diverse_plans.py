@@ -16,8 +16,8 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from lungaccess.procedure import Procedure, load_procedure
 from lungaccess.procedure.spread import Spread
-from lungaccess.risk import ErrorModel, load_errors
 from lungaccess.success.estimate import ChanceEstimator, chance_of
+from lungaccess.uncertainty.risk import ErrorModel, load_errors
 
 METHOD = "success, alternatives"
 """What the method of such plans is called."""

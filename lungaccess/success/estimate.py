@@ -10,8 +10,8 @@ from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
 from lungaccess.procedure import DEFAULT_PROCEDURE, Procedure, ProcedureReport, Simulator, simulate_procedure
-from lungaccess.risk import ErrorModel, RiskAssessor, RiskReport, Share, assess, goal_radius
-from lungaccess.risk.breathing import model_for
+from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, RiskReport, Share, assess, goal_radius
+from lungaccess.uncertainty.risk.breathing import model_for
 
 FRESH_SEED = 1 << 20
 """Added to a search's seed for the draws that it never sees."""
@@ -74,12 +74,12 @@ def estimate_success(
     Parameters
     ----------
     each_kind : bool
-        See `lungaccess.risk.assess`; of open loop alone.
+        See `lungaccess.uncertainty.risk.assess`; of open loop alone.
 
     Raises
     ------
     PlanFileError, SettingsError
-        See `lungaccess.risk.RiskAssessor`; also if there are no samples.
+        See `lungaccess.uncertainty.risk.RiskAssessor`; also if there are no samples.
     """
     if procedure.is_open_loop:
         return assess(

@@ -15,9 +15,9 @@ from lungaccess.problem.system import System, require_own_name
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from lungaccess.procedure import Procedure, ProcedureReport, load_procedure
-from lungaccess.risk import ErrorModel, RiskReport, Share, load_errors
 from lungaccess.success.estimate import ChanceEstimator, chance_of
 from lungaccess.success.search import Contender, SuccessSearch
+from lungaccess.uncertainty.risk import ErrorModel, RiskReport, Share, load_errors
 
 METHOD = "success"
 """What the method of such plans is called."""
@@ -75,7 +75,7 @@ def plan_for_success(
     procedure : Procedure, optional
         What is measured and planned again on the way; the preset `open-loop` if None.
     radius_mm : float, optional
-        Radius of the goal; see `lungaccess.risk.RiskAssessor`.
+        Radius of the goal; see `lungaccess.uncertainty.risk.RiskAssessor`.
     seed : int
         The same seed and `iterations` give the same plans.
     iterations : int, optional

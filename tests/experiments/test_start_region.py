@@ -8,8 +8,8 @@ import pytest
 import experiments.start_region as study
 import lungaccess as la
 from anatomy.lung import Lung
-from lungaccess.risk import RiskAssessor
-from lungaccess.risk.deviations import Deviations, deviated_pieces, deviated_starts
+from lungaccess.uncertainty.risk import RiskAssessor
+from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts
 
 
 @pytest.mark.slow

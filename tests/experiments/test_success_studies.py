@@ -12,7 +12,7 @@ import pytest
 from experiments import procedures, success_planning
 from experiments.run_all import STUDIES
 from lungaccess.procedure import Procedure, ProcedureReport, load_procedure, procedure_names
-from lungaccess.risk import ErrorModel, Share, error_preset_names, load_errors
+from lungaccess.uncertainty.risk import ErrorModel, Share, error_preset_names, load_errors
 
 COUNTS = {"a": 20, "b": 60, "c": 90}
 

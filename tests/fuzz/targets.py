@@ -124,7 +124,7 @@ def _read_centerlines(name: str) -> Callable[[Path], Any]:
 
 
 def _template(name: str) -> Callable[[Path], None]:
-    text = (resources.files("lungaccess") / "cli" / "templates" / name).read_bytes()
+    text = (resources.files("lungaccess.problem") / "cli" / "templates" / name).read_bytes()
     return lambda folder: (folder / name).write_bytes(text) and None
 
 
@@ -139,12 +139,12 @@ def _text_targets() -> dict[str, Target]:
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
     from lungaccess.procedure.settings import load_procedure
-    from lungaccess.risk.error_files import load_errors
     from lungaccess.study.settings import read_study
+    from lungaccess.uncertainty.risk.error_files import load_errors
     from tests.lungaccess.conftest import make_plan
 
     def preset(folder: Path) -> None:
-        text = (resources.files("lungaccess") / "presets" / "ultrathin.toml").read_bytes()
+        text = (resources.files("lungaccess.problem") / "presets" / "ultrathin.toml").read_bytes()
         (folder / "system.toml").write_bytes(text)
 
     def description(folder: Path) -> None:

@@ -10,10 +10,10 @@ import pytest
 from lungaccess.checking import CheckReport, Finding
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
-from lungaccess.risk.assessment import RiskReport
-from lungaccess.risk.error_files import load_errors
-from lungaccess.risk.errors import ErrorModel
-from lungaccess.risk.statistics import Share
+from lungaccess.uncertainty.risk.assessment import RiskReport
+from lungaccess.uncertainty.risk.error_files import load_errors
+from lungaccess.uncertainty.risk.errors import ErrorModel
+from lungaccess.uncertainty.risk.statistics import Share
 
 TOUCHES = ("vessel", "pleura", "airway", "stays in the airway")
 

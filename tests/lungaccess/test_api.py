@@ -33,7 +33,7 @@ FACADES = (
     "lungaccess.problem",
     "lungaccess.procedure",
     "lungaccess.reachability",
-    "lungaccess.risk",
+    "lungaccess.uncertainty.risk",
     "lungaccess.study",
     "stages.needle",
     "stages.needle.infeasibility.kernels",

@@ -19,11 +19,11 @@ from lungaccess.benchmark.synthetic.manifest import entries
 from lungaccess.benchmark.synthetic.phantoms import BenchmarkPhantom, phantom_named
 from lungaccess.benchmark.synthetic.submission import Submission, SubmittedAnswer, require_queries
 from lungaccess.benchmark.synthetic.tips import PublishedTips
-from lungaccess.breathing.window import with_window
 from lungaccess.checking import Checker
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.patients import load_patient
 from lungaccess.problem.system import load_system
+from lungaccess.uncertainty.breathing.window import with_window
 
 if TYPE_CHECKING:
     from lungaccess.reachability import UnreachableProof
@@ -226,7 +226,7 @@ class _Scorer:
 
     def _success(self, plan: Plan) -> float | None:
         """Return the estimated chance of success; every plan has the same luck."""
-        from lungaccess.risk import assess
+        from lungaccess.uncertainty.risk import assess
 
         if not self._samples:
             return None

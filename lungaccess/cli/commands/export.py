@@ -45,8 +45,8 @@ def export(
     from lungaccess.cli.plan_tables import show_headline
     from lungaccess.live import plan_trajectory, write_trajectory
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk import assess
     from lungaccess.slicer import export_slicer
+    from lungaccess.uncertainty.risk import assess
 
     stored = Plan.load(plan)
     lung = output.load(patient)

@@ -60,10 +60,10 @@ def plan(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
-    from lungaccess.breathing.window import require_motion
     from lungaccess.cli.no_plan_output import explain_and_report
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
+    from lungaccess.uncertainty.breathing.window import require_motion
 
     for_success, widest = search.objective == SUCCESS, search.objective == WINDOW
     phases = stated_phases(search.phases)

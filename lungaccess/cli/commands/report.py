@@ -100,10 +100,10 @@ def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple
 
     Of a patient that breathes they have their windows.
     """
-    from lungaccess.breathing.window import with_window
     from lungaccess.coupled import alternatives as find
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import Target
+    from lungaccess.uncertainty.breathing.window import with_window
 
     target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
     atlas = output.open_atlas(lung, plan.system)

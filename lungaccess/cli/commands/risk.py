@@ -16,7 +16,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.risk import RareShare, RiskReport, Tolerance
+    from lungaccess.uncertainty.risk import RareShare, RiskReport, Tolerance
 
 
 def risk(
@@ -48,8 +48,8 @@ def risk(
     from lungaccess.plans.plan import Plan
     from lungaccess.procedure import Procedure, simulate_procedure
     from lungaccess.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
-    from lungaccess.risk import assess, find_tolerances
-    from lungaccess.risk.assessment import DEFAULT_SAMPLES
+    from lungaccess.uncertainty.risk import assess, find_tolerances
+    from lungaccess.uncertainty.risk.assessment import DEFAULT_SAMPLES
 
     model, followed = errors.load(), errors.given_procedure() or Procedure()
     stored = Plan.load(plan)
@@ -199,7 +199,7 @@ def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:
 
 
 def _largest(tolerance: Tolerance) -> str:
-    from lungaccess.risk import LARGEST
+    from lungaccess.uncertainty.risk import LARGEST
 
     size = tolerance.largest
     more = "at least " if size >= LARGEST[tolerance.unit] else ""

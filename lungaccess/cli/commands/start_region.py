@@ -44,7 +44,7 @@ def start_region(
     """Tell from which poses near its start the needle of a stored plan still reaches the target, clear."""
     from lungaccess.one_stage import safe_scope_region
     from lungaccess.plans.plan import Plan
-    from lungaccess.risk import safe_start_region
+    from lungaccess.uncertainty.risk import safe_start_region
 
     stored = Plan.load(plan)
     lung = output.load(patient)

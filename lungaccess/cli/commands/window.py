@@ -16,7 +16,7 @@ from lungaccess.cli.options import PatientOfPlan, PatientOptions
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.breathing.in_tissue import CarriedNeedle
+    from lungaccess.uncertainty.breathing.in_tissue import CarriedNeedle
 
 
 def window(
@@ -39,10 +39,10 @@ def window(
     """
     from dataclasses import asdict, replace
 
-    from lungaccess.breathing.in_tissue import carried_needle
-    from lungaccess.breathing.window import breathing_window
     from lungaccess.plans.file import plain
     from lungaccess.plans.plan import Plan
+    from lungaccess.uncertainty.breathing.in_tissue import carried_needle
+    from lungaccess.uncertainty.breathing.window import breathing_window
 
     for file, suffix in ((out, ".json"), (picture, ".png")):
         if file is not None:

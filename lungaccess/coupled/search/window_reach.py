@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 
 from anatomy.base.typed import Int, UInt64
 from anatomy.lung import Lung
-from lungaccess.breathing.window import breathing_window
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search.window_search import WindowSearch
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
+from lungaccess.uncertainty.breathing.window import breathing_window
 from stages.needle import DIRECT, UNREACHED, Reached
 
 STEP_MM = 0.25

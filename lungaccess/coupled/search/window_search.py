@@ -9,8 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from anatomy.base.typed import Float, Int
-from lungaccess.breathing.aim import Aim, MovingTarget
-from lungaccess.breathing.window import TOLERANCE_MM, breathing_window, first_limit, require_motion
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.search.atlas_search import AtlasSearch
 from lungaccess.coupled.search.base import Incumbent, Step, evaluated_step
@@ -23,6 +21,13 @@ from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingWindow, WindowLimit
 from lungaccess.problem.task import Task
+from lungaccess.uncertainty.breathing.aim import Aim, MovingTarget
+from lungaccess.uncertainty.breathing.window import (
+    TOLERANCE_MM,
+    breathing_window,
+    first_limit,
+    require_motion,
+)
 from stages.needle import ArcPath, direct_path
 from stages.scope import ScopeTip
 

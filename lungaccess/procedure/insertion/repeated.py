@@ -11,7 +11,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from lungaccess.procedure.insertion.simulation import Insertion, Outcome, simulate
 from lungaccess.procedure.insertion.truth import Errors
-from lungaccess.risk import Share
+from lungaccess.uncertainty.risk import Share
 from stages.needle import ArcPath, NeedleEnvironment, Query
 
 

@@ -107,7 +107,7 @@ def _structure_meshes(lung: Lung) -> list[Packed]:
 
 def start_meshes(region: StartRegion) -> list[Packed]:
     """Return the bodies of a safe start region for a page; those that are empty are left out."""
-    from lungaccess.risk import proved_body, tried_body
+    from lungaccess.uncertainty.risk import proved_body, tried_body
 
     bodies = (proved_body(region), tried_body(region))
     return [

@@ -25,7 +25,7 @@ from lungaccess.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.report.html.risk import risk_section
 from lungaccess.report.html.trade_off import CAPTION, trade_off_svg
 from lungaccess.report.html.volumes import image_words, page_image
-from lungaccess.risk import error_preset_names, load_errors
+from lungaccess.uncertainty.risk import error_preset_names, load_errors
 
 if TYPE_CHECKING:
     from anatomy.grid import Volume
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from lungaccess.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
     from lungaccess.procedure import Procedure
-    from lungaccess.risk import ErrorModel
+    from lungaccess.uncertainty.risk import ErrorModel
     from stages.needle import StartRegion
 
 MODULES = (
@@ -171,7 +171,7 @@ def _appraiser_like(chance: Chance, lung: Lung) -> Appraiser:
 
 def start_region_of(plan: Plan, lung: Lung) -> StartRegion | str:
     """Return the safe start region of a plan, or in words why there is none."""
-    from lungaccess.risk import safe_start_region
+    from lungaccess.uncertainty.risk import safe_start_region
 
     try:
         return safe_start_region(plan, lung)

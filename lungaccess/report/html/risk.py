@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from lungaccess.plans.chance import Chance
 from lungaccess.procedure import ProcedureReport
 from lungaccess.report.html import words
-from lungaccess.risk import Share
+from lungaccess.uncertainty.risk import Share
 
 if TYPE_CHECKING:
-    from lungaccess.risk import RiskReport, Sensitivity
     from lungaccess.success import Estimate
+    from lungaccess.uncertainty.risk import RiskReport, Sensitivity
 
 FAILS = "Why procedures fail"
 

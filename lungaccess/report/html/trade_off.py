@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from lungaccess.report.html import words
-from lungaccess.risk import Share
+from lungaccess.uncertainty.risk import Share
 
 if TYPE_CHECKING:
     from lungaccess.coupled import Alternative

@@ -23,7 +23,7 @@ from lungaccess.checking import Finding
 from lungaccess.cli.plan_tables import GRADE_STYLES
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import words
-from lungaccess.risk import ErrorModel, Share, load_errors
+from lungaccess.uncertainty.risk import ErrorModel, Share, load_errors
 from tests.lungaccess.appraisals import make_check, make_risk
 
 SYSTEM = la.load_system("ultrathin")

@@ -17,11 +17,6 @@ from anatomy.motion.motion import Motion
 from anatomy.structures import LUMEN
 from experiments.support.warped_voxels import BruteForce
 from lungaccess.appraisal import Headline
-from lungaccess.breathing.aim import MovingTarget
-from lungaccess.breathing.devices import device_points
-from lungaccess.breathing.in_tissue import carried_needle
-from lungaccess.breathing.kernels.rigid import Rigid, carried, rate_bounds, turned
-from lungaccess.breathing.window import breathing_window, with_window
 from lungaccess.checking import check
 from lungaccess.checking.breath import Breath
 from lungaccess.checking.environment import Environment
@@ -29,6 +24,11 @@ from lungaccess.checking.findings import Findings
 from lungaccess.checking.window import check_window
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim, BreathingWindow
+from lungaccess.uncertainty.breathing.aim import MovingTarget
+from lungaccess.uncertainty.breathing.devices import device_points
+from lungaccess.uncertainty.breathing.in_tissue import carried_needle
+from lungaccess.uncertainty.breathing.kernels.rigid import Rigid, carried, rate_bounds, turned
+from lungaccess.uncertainty.breathing.window import breathing_window, with_window
 from tests.lungaccess.motions import motion_by
 
 PHASES = 100

@@ -19,8 +19,8 @@ from lungaccess.refinement import refine
 from lungaccess.report.html import PageOptions, plan_page
 from lungaccess.report.html.deployment import packed_plan
 from lungaccess.report.pack import unpack
-from lungaccess.risk import assess
 from lungaccess.slicer import export_slicer
+from lungaccess.uncertainty.risk import assess
 from stages.tube import ConcentricTubes, Tube
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 

@@ -13,8 +13,8 @@ from lungaccess.coupled.search.direct_candidates import reach_scan
 from lungaccess.one_stage.replan import replan_from_scope
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
-from lungaccess.risk.assessor import RiskAssessor
-from lungaccess.risk.deviations import Deviations
+from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.deviations import Deviations
 from stages.needle import DIRECT
 from stages.tube import shapes_of
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes

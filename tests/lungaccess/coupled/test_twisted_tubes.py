@@ -25,8 +25,8 @@ from lungaccess.refinement import refine
 from lungaccess.refinement.shape_model import ShapeModel, joints_of, terms
 from lungaccess.report.html.deployment import packed_plan
 from lungaccess.report.pack import unpack
-from lungaccess.risk.assessor import RiskAssessor
-from lungaccess.risk.deviations import Deviations
+from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.deviations import Deviations
 from stages.tube import DeploymentValidator, design_arrays, points_on_arcs, shapes_of
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 

@@ -22,7 +22,7 @@ from lungaccess.procedure.fusion import fused, fused_share, scope_moves, tip_mov
 from lungaccess.procedure.residuals import Residuals, fused_size
 from lungaccess.procedure.settings import ScopePlacing
 from lungaccess.procedure.truth import as_measured
-from lungaccess.risk import load_errors
+from lungaccess.uncertainty.risk import load_errors
 from stages.needle import Objective
 from stages.tube import enumerate_deployments, one_site_enumerator
 

@@ -23,8 +23,16 @@ from lungaccess.procedure.report import NO_PATH
 from lungaccess.procedure.settings import Imaging, NeedleSteering, ScopePlacing, TubesOut
 from lungaccess.procedure.simulation import ORDER, SUCCESS
 from lungaccess.procedure.truth import end_of, with_stop
-from lungaccess.risk import MISSES, AngleError, CurvatureError, ErrorModel, PositionError, assess, load_errors
-from lungaccess.risk.deviations import deviated_starts
+from lungaccess.uncertainty.risk import (
+    MISSES,
+    AngleError,
+    CurvatureError,
+    ErrorModel,
+    PositionError,
+    assess,
+    load_errors,
+)
+from lungaccess.uncertainty.risk.deviations import deviated_starts
 
 SCOPE_ONLY = ErrorModel(
     scope_position=PositionError(attempt_mm=0.4), scope_direction=AngleError(attempt_deg=1.0)
@@ -179,8 +187,8 @@ def test_a_stop_too_late_or_too_early() -> None:
 
 
 def test_the_tubes_end_where_the_plan_has_their_tip(plan: Plan, small_lung: Lung) -> None:
-    from lungaccess.risk import RiskAssessor
-    from lungaccess.risk.deviations import deviated_pieces
+    from lungaccess.uncertainty.risk import RiskAssessor
+    from lungaccess.uncertainty.risk.deviations import deviated_pieces
 
     there = RiskAssessor(plan, small_lung)
     exact = there.draws(1, 0).deviations(ErrorModel())

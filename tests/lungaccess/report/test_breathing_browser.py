@@ -7,9 +7,9 @@ import pytest
 
 from anatomy import structures
 from anatomy.lung import Lung
-from lungaccess.breathing.moving import Moving
 from lungaccess.plans.plan import Plan
 from lungaccess.report.html import volumes
+from lungaccess.uncertainty.breathing.moving import Moving
 from tests.lungaccess.report import browser
 from tests.lungaccess.report.scripts import CHOOSE, PICTURE
 

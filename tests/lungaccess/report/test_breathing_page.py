@@ -13,7 +13,6 @@ import pytest
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, point_distances_mm
 from lungaccess.appraisal.grade import Grade
-from lungaccess.breathing.moving import Moving
 from lungaccess.checking.breath import Breath
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
@@ -25,6 +24,7 @@ from lungaccess.report.html import phase as controls
 from lungaccess.report.html.deployment import CAP_MM, packed_plan, profile, profile_points
 from lungaccess.report.html.page_of_plan import summary
 from lungaccess.report.pack import unpack
+from lungaccess.uncertainty.breathing.moving import Moving
 
 
 @pytest.fixture(scope="module")

@@ -20,9 +20,9 @@ from lungaccess.plans.plan import Plan
 from lungaccess.procedure import ProcedureReport, StageReport, load_procedure
 from lungaccess.report.html import page_of_plan, trade_off_svg
 from lungaccess.report.html.risk import risk_section
-from lungaccess.risk import Share, load_errors
 from lungaccess.slicer import export
 from lungaccess.success import chance_of
+from lungaccess.uncertainty.risk import Share, load_errors
 from tests.lungaccess.appraisals import make_check, make_risk
 
 STATED = chance_of(make_risk(1200, reaches=1900, vessel=700))

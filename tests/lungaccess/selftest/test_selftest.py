@@ -33,8 +33,18 @@ WEAKENED = [
     ("no path", f"{INFEASIBLE}/cubes.py", "if above + half >=", "if above + -half >="),
     ("cost bound", "lungaccess/coupled/kernels/cost_bound.py", "max(middle + aside,", "max(0.7 * middle,"),
     ("unreachable", "lungaccess/reachability/kernels/unreachable.py", "depth + moved", "depth - 0.5 * moved"),
-    ("window", "lungaccess/breathing/kernels/rules.py", "- half * base - kept", "- 0.0 * half * base - kept"),
-    ("window", "lungaccess/breathing/kernels/window.py", "miss, stretch.half", "miss, 0.3 * stretch.half"),
+    (
+        "window",
+        "lungaccess/uncertainty/breathing/kernels/rules.py",
+        "- half * base - kept",
+        "- 0.0 * half * base - kept",
+    ),
+    (
+        "window",
+        "lungaccess/uncertainty/breathing/kernels/window.py",
+        "miss, stretch.half",
+        "miss, 0.3 * stretch.half",
+    ),
 ]
 """A kind of proof, and how a bound of it is made weaker: what is proved then need not be true."""
 

@@ -14,11 +14,11 @@ import trimesh
 
 from anatomy.io.centerlines import read_centerlines
 from anatomy.lung import Lung
-from lungaccess.breathing.moving import Moving
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer.export import PROVED_COLOUR, STEP_MM, STRUCTURES, TRIED_COLOUR
 from lungaccess.slicer.markups import TARGET_COLOUR
 from lungaccess.slicer.segments import SEGMENTS, label_map
+from lungaccess.uncertainty.breathing.moving import Moving
 from tests.lungaccess.slicer.slicer_scene import (
     SlicerScene,
     control_points_lps,

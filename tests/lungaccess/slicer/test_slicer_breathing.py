@@ -14,11 +14,11 @@ import pytest
 import SimpleITK
 
 from anatomy.lung import Lung
-from lungaccess.breathing.moving import Moving
 from lungaccess.checking import CheckReport
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer import export, export_slicer
 from lungaccess.slicer.breathing import MOVERS
+from lungaccess.uncertainty.breathing.moving import Moving
 
 PHASE = 0.3
 FILES = {"tissue": "tissue_0300.nrrd", "devices": "devices_0300.tfm"}

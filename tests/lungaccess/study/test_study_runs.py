@@ -17,7 +17,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem import peripheral
 from lungaccess.problem.system import load_system
 from lungaccess.procedure import load_procedure
-from lungaccess.risk import load_errors
 from lungaccess.study import one_run, summarise
 from lungaccess.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
 from lungaccess.study.needle_run import needle_answer
@@ -26,6 +25,7 @@ from lungaccess.study.patients import open_patient
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.runs import Run, runs_of
 from lungaccess.study.settings import PlannerChoice, study_of
+from lungaccess.uncertainty.risk import load_errors
 from tests.lungaccess.study.toys import NEAR, content
 
 

@@ -18,8 +18,8 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.procedure import load_procedure
 from lungaccess.procedure.spread import Spread
-from lungaccess.risk import ErrorModel, RiskAssessor, load_errors
 from lungaccess.success.estimate import OPEN_LOOP
+from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, load_errors
 from stages.needle import Objective
 
 SYSTEM = la.load_system("tight-inner", fissures_allowed=True)

@@ -1,0 +1,1 @@
+"""What errors and the breath do to a plan."""

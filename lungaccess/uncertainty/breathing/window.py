@@ -1,0 +1,208 @@
+"""The window of a plan: the phases of the breath in which it is proved clear and on target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from anatomy.motion.motion import Motion
+from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
+from lungaccess.plans.plan import Plan
+from lungaccess.plans.window import BreathingWindow, WindowLimit
+from lungaccess.uncertainty.breathing.devices import DevicePoints, device_points
+from lungaccess.uncertainty.breathing.kernels import rules
+from lungaccess.uncertainty.breathing.kernels.rigid import Rigid
+from lungaccess.uncertainty.breathing.kernels.window import MOST_LEAVES, divide
+
+TOLERANCE_MM = 2.0
+"""How far from the moving target the devices may end: half of the smallest nodules that are biopsied."""
+WHOLE_BREATH = (0.0, 1.0)
+TIP_BALL_MM = 10.0
+"""Radius of the tissue whose mean gradient turns the scope's tip: a segmental bronchus is about so long."""
+TIP_STEP_MM = 2.5
+"""Distance of the places in it, half of that of the motion's nodes."""
+NAMES = ((VESSEL, "vessel"), (OUTSIDE, "outside"), (FISSURE, "fissure"), (AIRWAY | LUMEN, "airway"))
+
+
+def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_MM) -> BreathingWindow:
+    """Return the phases in which tubes and needle of a plan are proved clear, and end near the moving target.
+
+    The tip of the scope goes along with the airway around it, tubes and needle are rigid from there;
+    `docs/explanation/breathing.md` says what moves with what.
+
+    Parameters
+    ----------
+    plan : Plan
+    lung : Lung
+        The patient of the plan, with a motion.
+    tolerance_mm : float
+        How far from the moving target the devices may end, at most 2 mm.
+
+    Raises
+    ------
+    AnatomyError
+        If the patient has no motion.
+    PlanFileError
+        If the plan was made for another patient.
+    SettingsError
+        If the tolerance is not from 0 to 2 mm.
+    """
+    plan.require_lung(lung)
+    motion = require_motion(lung)
+    if not 0.0 <= tolerance_mm <= TOLERANCE_MM:
+        raise SettingsError(
+            f"The tolerance of the window is {tolerance_mm} mm", expected=f"0 to {TOLERANCE_MM:g} mm"
+        )
+    leaves, devices = _leaves(plan, lung, float(tolerance_mm), WHOLE_BREATH, all_of_it=True)
+    found = _window(motion, float(tolerance_mm), leaves, devices)
+    beside = float(np.linalg.norm(plan.end_lps - plan.target_lps))
+    return replace(found, beside_target_mm=beside)
+
+
+def first_limit(plan: Plan, lung: Lung, phases: tuple[float, float]) -> WindowLimit | None:
+    """Return what ends the window of a plan first between two phases; None if it is proved in all of them.
+
+    The stretches are those of `breathing_window`, which then holds these phases, without a gap.
+    """
+    leaves, devices = _leaves(plan, lung, TOLERANCE_MM, phases, all_of_it=False)
+    last = leaves[-1]
+    return None if last[2] == rules.CLEAR else _limit(last, max(float(last[0]), phases[0]), devices)
+
+
+def _leaves(
+    plan: Plan, lung: Lung, tolerance_mm: float, phases: tuple[float, float], *, all_of_it: bool
+) -> tuple[Float, DevicePoints]:
+    """Return the stretches of `divide` between two phases, and the devices that they speak of."""
+    motion = require_motion(lung)
+    side, devices = motion.side_of(plan.target_lps), device_points(plan)
+    tip = plan.scope.lps_from_scope_tip[:3, 3]
+    leaves = np.zeros((MOST_LEAVES, 5))
+    count = divide(
+        tissue_of(plan, lung),
+        breath_of(motion, side),
+        carrier(motion, tip, side),
+        devices.points,
+        devices.arc_mm,
+        devices.sections,
+        np.array(plan.target_lps),
+        miss_allowed(motion, tolerance_mm, distance_mm(devices.points[-1], tip)),
+        devices.hole_lps,
+        miss_allowed(motion, devices.hole_mm, distance_mm(devices.hole_lps, tip)),
+        float(motion.amplitude),
+        float(motion.masks_phase),
+        phases,
+        all_of_it,
+        leaves,
+    )
+    return leaves[:count], devices
+
+
+def with_window(plan: Plan, lung: Lung) -> Plan:
+    """Return a plan with its window of breathing; itself if no breathing is known."""
+    return plan if lung.motion is None else replace(plan, window=breathing_window(plan, lung))
+
+
+def require_motion(lung: Lung) -> Motion:
+    """Return the motion of a lung, or raise AnatomyError that says how to give it one."""
+    if lung.motion is None:
+        raise AnatomyError(
+            f"Nothing is known of the breathing of {lung.name}",
+            expected="a [motion] in its patient.toml",
+            remedy='Write there [motion], file = "field.nrrd" (or landmarks.csv) and masks_phase = 0.0, or '
+            "population = true for a warning without data; docs/explanation/breathing.md says more",
+        )
+    return lung.motion
+
+
+def miss_allowed(motion: Motion, limit_mm: float, lever_mm: float) -> float:
+    """Return the distance by the motion that stays within a limit wherever tissue strays, mm.
+
+    A place of tissue so far from a point of the devices is at most `lever_mm` and this from the scope's tip.
+    """
+    return (limit_mm - motion.hysteresis * lever_mm) / (1.0 + motion.hysteresis)
+
+
+def distance_mm(point: Float, other: Float) -> float:
+    """Return the distance of two points `(3,)`."""
+    return float(np.linalg.norm(np.asarray(point) - other))
+
+
+def breath_of(motion: Motion, side: int) -> rules.Breath:
+    """Return the motion of one lung for the kernels."""
+    return rules.Breath(motion.nodes[side], motion.frame, motion.cells[side], float(motion.hysteresis))
+
+
+def carrier(motion: Motion, tip_lps: Float, side: int) -> Rigid:
+    """Return what carries the devices: the place of the scope's tip and the mean gradient about it.
+
+    The gradient is that of the least-squares affine motion of the places in a ball, which are symmetric.
+    """
+    steps = np.arange(-TIP_BALL_MM, TIP_BALL_MM + 1e-9, TIP_STEP_MM)
+    ball = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    ball = ball[(ball**2).sum(axis=1) <= TIP_BALL_MM**2]
+    moved = motion.displacements_mm(tip_lps + ball, side)
+    return Rigid(
+        centre=np.array(tip_lps, dtype=np.float64),
+        displacement=motion.displacements_mm(tip_lps[None], side)[0],
+        gradient=np.ascontiguousarray(moved.T @ ball / (ball[:, 0] ** 2).sum()),
+    )
+
+
+def tissue_of(plan: Plan, lung: Lung) -> rules.Tissue:
+    """Return what the devices of a plan collide with, for the kernels."""
+    field = lung.obstacle_field(with_fissures=plan.fissures_are_obstacles)
+    return rules.Tissue(
+        clearance=field.corners,
+        labels=lung.labels,
+        geometry=field.geometry,
+        bits=obstacle_bits(plan.fissures_are_obstacles),
+        lumen=lung.lumen_depth.corners,
+        lumen_geometry=lung.lumen_depth.geometry,
+        branch=int(plan.exemption.branch),
+    )
+
+
+def _window(motion: Motion, tolerance_mm: float, leaves: Float, devices: DevicePoints) -> BreathingWindow:
+    clear = leaves[:, 2] == rules.CLEAR
+    turns = np.diff(np.concatenate([[0], clear.astype(int), [0]]))
+    first, last = np.flatnonzero(turns == 1), np.flatnonzero(turns == -1) - 1
+    limits = []
+    for a, b in zip(first, last, strict=True):
+        limits += [_limit(leaves[a - 1], float(leaves[a, 0]), devices)] if a > 0 else []
+        limits += [_limit(leaves[b + 1], float(leaves[b, 1]), devices)] if b + 1 < len(leaves) else []
+    if not len(first):
+        nearest = int(np.abs(leaves[:, :2].mean(axis=1) - motion.masks_phase).argmin())
+        limits = [_limit(leaves[nearest], float(leaves[nearest, :2].mean()), devices)]
+    undecided = leaves[leaves[:, 2] == rules.UNDECIDED]
+    return BreathingWindow(
+        motion_key=motion.key,
+        motion_source=motion.source,
+        warning_only=motion.warning_only,
+        masks_phase=motion.masks_phase,
+        amplitude=motion.amplitude,
+        tolerance_mm=tolerance_mm,
+        phases=np.stack([leaves[first, 0], leaves[last, 1]], axis=1),
+        undecided_share=float((undecided[:, 1] - undecided[:, 0]).sum()),
+        limits=tuple(limits),
+        hysteresis=float(motion.hysteresis),
+    )
+
+
+def _limit(leaf: Float, phase: float, devices: DevicePoints) -> WindowLimit:
+    """Return what a stretch that is not clear says of the phase where it begins or ends."""
+    reason, point = int(leaf[3]), int(leaf[4])
+    arc, in_tube = float(devices.arc_mm[point]), devices.arc_mm[point] <= devices.tube_mm
+    named = {rules.TARGET_MISSED: "target", rules.LEAVES_LUMEN: "lumen", rules.HOLE_SHIFTS: "hole"}.get(
+        reason
+    )
+    return WindowLimit(
+        phase=phase,
+        reason=named or next((name for bits, name in NAMES if reason & bits), "airway"),
+        device="tube" if in_tube else "needle",
+        arc_length_mm=arc if in_tube else arc - devices.tube_mm,
+        place_lps=devices.points[point],
+    )

@@ -1,0 +1,31 @@
+"""How likely a plan succeeds if the devices deviate from it, and how large an error it survives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.uncertainty.risk.assessment import MISSES, RiskReport, assess, rare_touch, safest
+    from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
+    from lungaccess.uncertainty.risk.deviations import Deviations
+    from lungaccess.uncertainty.risk.draws import Draws
+    from lungaccess.uncertainty.risk.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
+    from lungaccess.uncertainty.risk.errors import (
+        CURVATURE,
+        UNITS,
+        AngleError,
+        BreathingError,
+        CurvatureError,
+        ErrorModel,
+        PositionError,
+    )
+    from lungaccess.uncertainty.risk.rare import RareShare, rare_share
+    from lungaccess.uncertainty.risk.sensitivity import Sensitivity, sensitivities
+    from lungaccess.uncertainty.risk.start_bodies import proved_body, tried_body
+    from lungaccess.uncertainty.risk.start_region import safe_start_region
+    from lungaccess.uncertainty.risk.statistics import Share
+    from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,0 +1,185 @@
+"""The risk of a plan: how likely it succeeds, and what it may touch, when the devices deviate from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import field
+from types import MappingProxyType
+
+import numpy as np
+
+from anatomy.base.records import frozen_value
+from anatomy.lung import Lung
+from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.breathing import model_for
+from lungaccess.uncertainty.risk.error_files import load_errors
+from lungaccess.uncertainty.risk.errors import ErrorModel
+from lungaccess.uncertainty.risk.rare import RARE, Luck, RareShare, rare_share
+from lungaccess.uncertainty.risk.sensitivity import Sensitivity, sensitivities
+from lungaccess.uncertainty.risk.statistics import Share, share_of
+
+DEFAULT_SAMPLES = 10_000
+"""A share of one half is then known to 1 % with 95 % confidence, and a report takes some seconds."""
+MISS_QUANTILES = (0.5, 0.9, 0.95)
+"""The median, and the two quantiles by which accuracy is usually stated."""
+
+
+MISSES = "misses the goal"
+"""A draw whose needle, or without one whose tubes, end outside the goal: farther than its radius."""
+
+
+@frozen_value
+class RiskReport:
+    """The risk of one plan under an error model.
+
+    Parameters
+    ----------
+    radius_mm, radius_origin : float, str
+        Radius of the goal about the target, and where the radius came from.
+    succeeds : Share
+        Ends within the radius, leaves the airway, and touches nothing that is forbidden.
+    reaches : Share
+        Ends within the radius, whatever it touches.
+    touches : mapping of str to Share
+        By the names of `STRUCTURES`; a fissure only where there is a mask of them.
+    forbidden : tuple of str
+        The names of `touches` that a success must not have.
+    miss_mm : mapping of float to float
+        Distance of the tip from the target that a share of the samples does not exceed, by the share.
+    with_needle : bool
+        Whether the plan has a needle; its tubes end at the target where it has none.
+    alone : mapping of str to Share
+        Successes if there were errors of one kind only, by kind; empty if that was not asked for.
+    sensitivity : tuple of Sensitivity
+        What each kind of error does to success, the greatest first; empty if that was not asked for.
+    rare : mapping of str to RareShare
+        Touches that happened in less than `RARE` of the draws, estimated with weights, where that is exact
+        enough; empty if that was not asked for.
+    """
+
+    model: ErrorModel
+    samples: int
+    seed: int
+    radius_mm: float
+    radius_origin: str
+    succeeds: Share
+    reaches: Share
+    touches: Mapping[str, Share]
+    forbidden: tuple[str, ...]
+    miss_mm: Mapping[float, float]
+    alone: Mapping[str, Share]
+    with_needle: bool = True
+    sensitivity: tuple[Sensitivity, ...] = ()
+    rare: Mapping[str, RareShare] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def failures(self) -> tuple[tuple[str, Share], ...]:
+        """What makes a draw fail, the most frequent first: `MISSES`, and the names of `forbidden`."""
+        misses = Share(count=self.samples - self.reaches.count, samples=self.samples)
+        shares = {MISSES: misses, **{name: self.touches[name] for name in self.forbidden}}
+        return tuple(sorted(shares.items(), key=lambda item: -item[1].count))
+
+
+def assess(
+    plan: Plan,
+    lung: Lung,
+    *,
+    model: ErrorModel | None = None,
+    samples: int = DEFAULT_SAMPLES,
+    seed: int = 0,
+    radius_mm: float | None = None,
+    each_kind: bool = True,
+) -> RiskReport:
+    """Return how likely a plan succeeds, and what it may touch, if the devices deviate from it.
+
+    The plan's own system is deployed, in the lung that the plan was made for.
+
+    Parameters
+    ----------
+    model : ErrorModel, optional
+        The preset `breath-hold` if None.  Where the patient's own breathing is known, it is that which is
+        drawn: `lungaccess.uncertainty.risk.breathing.model_for` says how.
+    samples : int
+        Number of deviated plans.
+    seed : int
+        The same seed gives the same report.
+    radius_mm : float, optional
+        Radius of the goal; see `RiskAssessor`.
+    each_kind : bool
+        Whether success under errors of one kind only, sensitivities and rare touches are estimated, too:
+        some thirty times the work.
+
+    Raises
+    ------
+    PlanFileError, SettingsError
+        See `RiskAssessor`; also if there are no samples.
+    """
+    stated = model_for(model or load_errors(), plan, lung)
+    assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
+    draws = assessor.draws(samples, seed)
+    outcomes = assessor.outcomes(draws.deviations(stated))
+    touched = {name: share_of((outcomes.touched & flag) != 0) for name, flag in assessor.structures.items()}
+    kinds = assessor.kinds if each_kind else ()
+    alone = {name: assessor.success(draws, stated.only(name)) for name in kinds}
+    seldom = [name for name, share in touched.items() if each_kind and share.value < RARE]
+    weighted = {name: rare_touch(assessor, stated, name, samples, seed) for name in seldom}
+    return RiskReport(
+        model=stated,
+        samples=samples,
+        seed=seed,
+        radius_mm=assessor.radius_mm,
+        radius_origin=assessor.radius_origin,
+        succeeds=share_of(assessor.succeeded(outcomes)),
+        reaches=share_of(outcomes.miss_mm <= assessor.radius_mm),
+        touches=MappingProxyType(touched),
+        forbidden=assessor.forbidden,
+        miss_mm=MappingProxyType({q: float(np.quantile(outcomes.miss_mm, q)) for q in MISS_QUANTILES}),
+        alone=MappingProxyType(alone),
+        with_needle=plan.needle is not None,
+        sensitivity=sensitivities(assessor, stated, samples, seed) if each_kind else (),
+        rare=MappingProxyType({name: each for name, each in weighted.items() if each.is_exact}),
+    )
+
+
+def rare_touch(
+    assessor: RiskAssessor, model: ErrorModel, structure: str, samples: int = DEFAULT_SAMPLES, seed: int = 0
+) -> RareShare:
+    """Return how likely a structure is touched, a name of `STRUCTURES`, by importance sampling.
+
+    Raises
+    ------
+    SettingsError
+        If there are no samples.
+    """
+    flag = assessor.structures[structure]
+    luck = Luck(lambda count: assessor.draws(count, seed), model)
+    happens = luck.event(lambda draws: (assessor.outcomes(draws.deviations(model)).touched & flag) != 0)
+    return rare_share(happens, luck.dimensions, samples, seed)
+
+
+def safest(
+    plans: Iterable[Plan],
+    lung: Lung,
+    *,
+    model: ErrorModel | None = None,
+    samples: int = DEFAULT_SAMPLES,
+    seed: int = 0,
+    radius_mm: float | None = None,
+) -> tuple[tuple[Plan, Share], ...]:
+    """Return plans with their shares of successes, the safest first; equal ones keep their order.
+
+    Parameters
+    ----------
+    plans : iterable of Plan
+        All for one lung, such as those that `plan` yields.
+    lung, model, samples, seed, radius_mm
+        See `assess`.
+    """
+    stated = model or load_errors()
+    assessed = []
+    for each in plans:
+        assessor = RiskAssessor(each, lung, radius_mm=radius_mm)
+        draws = assessor.draws(samples, seed)
+        assessed.append((each, assessor.success(draws, model_for(stated, each, lung))))
+    return tuple(sorted(assessed, key=lambda pair: -pair[1].value))

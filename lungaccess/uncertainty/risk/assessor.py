@@ -1,0 +1,214 @@
+"""A plan in its lung, ready to be deviated from: what becomes of many deviated plans, compiled."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
+from anatomy.lung import Lung
+from anatomy.morphology import components
+from anatomy.motion.population import share_of_motion
+from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
+from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk.breathing import PatientMotion
+from lungaccess.uncertainty.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations
+from lungaccess.uncertainty.risk.draws import Draws
+from lungaccess.uncertainty.risk.errors import OF_NEEDLE, UNITS, ErrorModel
+from lungaccess.uncertainty.risk.kernels import deviation as kernel
+from lungaccess.uncertainty.risk.kernels.chain import Devices
+from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_successes, follow_chains
+from lungaccess.uncertainty.risk.statistics import Share, share_of
+from stages.needle import Obstacles
+
+STRUCTURES: dict[str, int] = {
+    "vessel": VESSEL,
+    "pleura": OUTSIDE,
+    "fissure": FISSURE,
+    "airway": AIRWAY,
+    "stays in the airway": kernel.STAYS_INSIDE,
+}
+"""What can go wrong before the end, and the flag that the kernel sets for it."""
+
+DEFAULT_RADIUS_MM = 5.0
+"""Radius of the goal where the target is no nodule of the nodule mask: one of 10 mm."""
+THREADS = 2
+"""The kernel holds no lock, and two cores are the least that a machine of today has."""
+
+
+@frozen_record
+class Outcomes:
+    """What became of N deviated plans, `(N,)` each.
+
+    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the last tip is from the deviated target.
+    """
+
+    touched: Int
+    miss_mm: Float
+
+
+class RiskAssessor:
+    """A plan in its lung, ready to be deviated from.
+
+    Attributes
+    ----------
+    kinds : tuple of str
+        The kinds of error that the devices of the plan can have, and that of the target.
+    stretch : float
+        See `Draws`.
+
+    Parameters
+    ----------
+    radius_mm : float, optional
+        Radius of the goal; by default that of a ball of the volume of the target's nodule, or 5 mm if the
+        target lies in no nodule of the mask.
+
+    Raises
+    ------
+    PlanFileError
+        If the plan was made for another lung.
+    SettingsError
+        If the radius is not above 0 and finite, or the needle of the plan has no arc.
+    """
+
+    def __init__(self, plan: Plan, lung: Lung, *, radius_mm: float | None = None) -> None:
+        plan.require_lung(lung)
+        if plan.needle is not None and not plan.needle.arcs:
+            raise SettingsError("The needle of the plan has no arc", expected="at least one arc")
+        self.plan = plan
+        self.n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
+        self._n_twisted = 0 if plan.tube.shape is None else len(plan.system.tubes.nested)
+        self.kinds = tuple(name for name in UNITS if plan.needle is not None or name not in OF_NEEDLE)
+        tip = np.asarray(plan.scope.lps_from_scope_tip)[:3, 3]
+        heights = (lung.height_share(np.asarray(plan.target_lps)), lung.height_share(tip))
+        self.stretch = share_of_motion(heights[0]) - share_of_motion(heights[1])
+        known = lung.motion if lung.motion is not None and not lung.motion.warning_only else None
+        self._motion = None if known is None else PatientMotion(plan, known)
+        self.radius_mm, self.radius_origin = goal_radius(lung, plan.target_lps, radius_mm)
+        self._deviated, self._judging = DeviatedPlan(plan), judging(plan, lung)
+        self.structures = {
+            name: flag for name, flag in STRUCTURES.items() if flag != FISSURE or lung.has_fissures
+        }
+        self.forbidden = tuple(
+            name for name in self.structures if name != "fissure" or plan.fissures_are_obstacles
+        )
+        self._forbidden_flags = sum(self.structures[name] for name in self.forbidden)
+        bits = obstacle_bits(lung.has_fissures)
+        field = lung.obstacle_field(with_fissures=True)
+        self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
+
+    def draws(self, count: int, seed: int, *, attempt: int = 0, n_arcs: int | None = None) -> Draws:
+        """Return random numbers for `count` sets of errors, see `Draws`; the same seed gives the same.
+
+        They are for the arcs of the plan if `n_arcs` is None.
+        """
+        arcs = self.n_arcs if n_arcs is None else n_arcs
+        return Draws(
+            count, arcs, seed, self._n_twisted, stretch=self.stretch, motion=self._motion, attempt=attempt
+        )
+
+    def no_deviations(self, count: int) -> dict[str, Float]:
+        """Return the fields of `Deviations` for `count` sets without any error."""
+        return no_deviations(count, self.n_arcs, self._n_twisted)
+
+    def outcomes(self, deviations: Deviations) -> Outcomes:
+        """Follow deviated plans through all three stages."""
+        touched, miss_mm = np.zeros(deviations.count, dtype=np.int64), np.zeros(deviations.count)
+        inputs = self._inputs(deviations)
+
+        def find(part: slice) -> None:
+            find_outcomes(*inputs, part.start, touched[part], miss_mm[part])
+
+        _in_threads(find, deviations.count)
+        return Outcomes(touched=touched, miss_mm=miss_mm)
+
+    def follow(self, starts: Float, pieces: Float, n_tube: int) -> tuple[Int, Float]:
+        """Return what chains touch `(N,)` and where they end `(N, 3)`; see `kernels.deviation`."""
+        touched, ends = np.zeros(len(starts), dtype=np.int64), np.zeros((len(starts), 3))
+        follow_chains(starts, pieces, n_tube, self._obstacles, self._judging, touched, ends)
+        return touched, ends
+
+    def _inputs(self, deviations: Deviations) -> tuple[Any, ...]:
+        """Return what both kernels take first; see `find_successes`."""
+        return (*self._deviated.kernel_inputs(deviations), self._obstacles, self._judging)
+
+    def succeeded(self, outcomes: Outcomes) -> Bool:
+        """Tell which `(N,)` end within the radius, leave the airway and touch nothing forbidden."""
+        return np.asarray(
+            (outcomes.miss_mm <= self.radius_mm) & ((outcomes.touched & self._forbidden_flags) == 0)
+        )
+
+    def successes(self, deviations: Deviations) -> Bool:
+        """Tell which `(N,)` of deviated plans succeed, as `succeeded` does of their outcomes.
+
+        Those that miss the goal are not followed, and the others only up to the first forbidden touch.
+        """
+        done = np.zeros(deviations.count, dtype=bool)
+        inputs = self._inputs(deviations)
+
+        def find(part: slice) -> None:
+            find_successes(*inputs, self.radius_mm, self._forbidden_flags, part.start, done[part])
+
+        _in_threads(find, deviations.count)
+        return done
+
+    def clear(self, devices: Devices, errors: Float, least_depth_mm: float) -> Bool:
+        """Tell which `(N,)` of deviated devices touch nothing forbidden, wherever they end.
+
+        Parameters
+        ----------
+        devices : Devices
+            In place of those of the plan.
+        errors : (N, E) float64
+            See `in_rows`.
+        least_depth_mm : float
+            See `Judging`.
+        """
+        done, which = np.zeros(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
+        judged = self._judging._replace(least_depth_mm=least_depth_mm)
+        find_successes(
+            devices, errors, which, self._obstacles, judged, math.inf, self._forbidden_flags, 0, done
+        )
+        return done
+
+    def success(self, draws: Draws, model: ErrorModel) -> Share:
+        """Return the share of successes under a model."""
+        return share_of(self.successes(draws.deviations(model)))
+
+
+def _in_threads(find: Callable[[slice], None], count: int) -> None:
+    """Have parts of `count` numbers found at the same time: what is found does not depend on the parts."""
+    bounds = np.linspace(0, count, THREADS + 1).astype(int).tolist()
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(find, map(slice, bounds[:-1], bounds[1:])))
+
+
+def goal_radius(lung: Lung, target_lps: Float, radius_mm: float | None = None) -> tuple[float, str]:
+    """Return the radius of the goal about a target in mm, and its origin in words.
+
+    It is the given one, or that of the ball as large as the target's nodule; see `RiskAssessor`.
+    """
+    if radius_mm is not None:
+        if not 0.0 < radius_mm < math.inf:
+            raise SettingsError(
+                f"The radius of the goal is {radius_mm} mm",
+                expected="a finite length above 0",
+                remedy="Choose a radius in mm, such as 5",
+            )
+        return float(radius_mm), "given"
+    nodules = lung.nodules
+    inside = nodules is not None and bool(nodules.grid.contains(target_lps))
+    if nodules is not None and inside:
+        ijk = np.floor(nodules.grid.ijk(target_lps) + 0.5).astype(int)
+        if nodules.array[tuple(ijk)]:
+            voxels, part = components(nodules.array)
+            own = part[(voxels == ijk).all(axis=1)]
+            volume = float(np.count_nonzero(part == own)) * nodules.grid.voxel_volume_mm3
+            return (0.75 * volume / math.pi) ** (1.0 / 3.0), "ball of the nodule's volume"
+    return DEFAULT_RADIUS_MM, "assumed: the target lies in no nodule of a mask"

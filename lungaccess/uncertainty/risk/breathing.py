@@ -1,0 +1,110 @@
+"""Motion of the lung by breathing: how much more the target moves than the scope's tip.
+
+A place at height h of its lung (0 at the apex, 1 at the base) moves to the feet by `A g(h)` from end-exhale
+to end-inhale, A being the patient's.  Scope and target move in the same phase.  The tip of the scope goes
+along with the airway that holds it, so that only the difference of the two counts: in the frame of the
+reference image the scope stays, and the target moves by `A f (g(h_target) - g(h_scope))`.  The phase f runs
+from 0 at end-exhale, where the image was taken, to 1; the procedure is at any time of the cycle.  g is that
+of `anatomy.motion.population`.  Where the motion of the patient is known, it takes the place of this model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from anatomy.motion.motion import LEFT, Motion
+from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.breathing.window import carrier
+from lungaccess.uncertainty.risk.errors import IN_WINDOW, BreathingError, ErrorModel
+
+EXHALE_POWER = 6
+"""The phase in time is cos^6, the form that [Lujan1999] fits to quiet breathing: long at end-exhale."""
+
+BREATHS_LN = 0.36
+"""Spread of the amplitude over breaths: 4.3 of 11.9 mm below the diaphragm, within a session [Liang2018]."""
+
+
+def phase(share_of_time: Float) -> Float:
+    """Return how far between end-exhale, 0, and end-inhale, 1, the lung is at shares of the cycle, 0 to 1."""
+    return np.asarray(np.cos(np.pi * share_of_time) ** EXHALE_POWER)
+
+
+def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
+    """Return an error model with the patient's own breathing, where that is known; else the model itself.
+
+    A model of free breathing keeps any phase of the breath, one without breathing is taken to insert in the
+    plan's window, each with the patient's motion and the spread of amplitudes over breaths.
+    """
+    motion, window, stated = lung.motion, plan.window, model.breathing
+    if motion is None or motion.warning_only:
+        return model
+    gated = not stated.size or stated.distribution == IN_WINDOW
+    if gated and (window is None or not len(window.phases)):
+        return model
+    term = BreathingError(
+        distribution=IN_WINDOW if gated else BreathingError.distribution,
+        median_mm=_size_mm(motion, plan),
+        patient_ln=BREATHS_LN,
+        source=f"the patient's own: {motion.source}; spread over breaths [Liang2018]",
+    )
+    return replace(model, breathing=term)
+
+
+def _size_mm(motion: Motion, plan: Plan) -> float:
+    """Return the motion that 95 % of the points of the target's lung do not exceed."""
+    left = motion.side_of(plan.target_lps) == LEFT
+    return motion.figures["left_95_mm" if left else "right_95_mm"]
+
+
+class PatientMotion:
+    """How the target of a plan moves against its devices, by the motion of the patient.
+
+    Parameters
+    ----------
+    plan : Plan
+    motion : Motion
+    """
+
+    def __init__(self, plan: Plan, motion: Motion) -> None:
+        side = motion.side_of(plan.target_lps)
+        self._motion, self._target = motion, np.asarray(plan.target_lps)
+        self._rigid = carrier(motion, plan.scope.lps_from_scope_tip[:3, 3], side)
+        self._moves = motion.displacements_mm(self._target[None], side)[0]
+        self._size_mm = _size_mm(motion, plan)
+        self._phases = np.zeros((0, 2)) if plan.window is None else np.asarray(plan.window.phases)
+
+    @property
+    def has_window(self) -> bool:
+        """Whether the plan has a window of breathing."""
+        return bool(len(self._phases))
+
+    def shifts_mm(self, motion_mm: Float, luck: Float, *, in_window: bool) -> Float:
+        """Return the shifts of the target `(N, 3)` as the devices see it, LPS mm in the masks' frame.
+
+        Parameters
+        ----------
+        motion_mm : (N,) float64
+            Motion of 95 % of the lung's points in each breath.
+        luck : (N,) float64
+            From 0 to 1: the share of the cycle's time, or of the window's phases.
+        in_window : bool
+            Whether the phase is one of the plan's window.
+        """
+        motion, rigid = self._motion, self._rigid
+        at = _in_stretches(self._phases, luck) if in_window else phase(luck)
+        share = motion.amplitude * motion_mm / self._size_mm * (at - motion.masks_phase)
+        left, _, right = np.linalg.svd(np.eye(3) + share[:, None, None] * rigid.gradient)
+        seen = self._target - rigid.centre + share[:, None] * (self._moves - rigid.displacement)
+        return np.asarray(np.einsum("nji,nj->ni", left @ right, seen) + rigid.centre - self._target)
+
+
+def _in_stretches(stretches: Float, luck: Float) -> Float:
+    """Return phases `(N,)` at shares of the length of all stretches `(M, 2)` together."""
+    ends = np.cumsum(stretches[:, 1] - stretches[:, 0])
+    along = luck * ends[-1]
+    which = np.minimum(np.searchsorted(ends, along), len(ends) - 1)
+    return np.asarray(stretches[which, 1] - (ends[which] - along))

@@ -1,0 +1,227 @@
+"""Deviations from a plan, and the deviated devices as arcs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float, Int
+from anatomy.lung import Lung
+from lungaccess.plans.parts import TubeDeployment
+from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk.kernels import deviation as kernel
+from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES, Devices
+from lungaccess.uncertainty.risk.kernels.outcomes import N_START, Judging, find_pieces, find_starts
+from lungaccess.uncertainty.risk.twisted import twisted_shapes
+from stages.tube import ConcentricTubes
+
+ROUNDING_MM = 1e-9
+"""The planned tip itself stands in the lumen, however its depth is rounded."""
+COLUMNS = (
+    "scope_mm",
+    "tilt_rad",
+    "rotation_rad",
+    "factor",
+    "target_mm",
+    "insertion_mm",
+    "roll_rad",
+    "stop_mm",
+)
+"""The fields of `Deviations` that become the row of a draw, in the order of `kernels.chain`."""
+
+
+@frozen_record
+class Deviations:
+    """N sets of errors of a plan whose needle has A arcs, 0 where there is none.
+
+    Parameters
+    ----------
+    scope_mm : (N, 3) float64, LPS mm
+        Shift of the scope tip.
+    tilt_rad : (N, 2) float64
+        Rotation vector of the scope tip's tilt, along +x and +y of its frame.
+    rotation_rad : (N,) float64
+        Added to the rotation of all tubes; it leaves the roll of the needle where it is.
+    relative_rad : (N, n) float64
+        Added to the rotation of each of n tubes that are not planar, the outermost first; n is 0 for planar.
+    insertion_mm : (N, 2 or n) float64
+        Added to the insertions of outer and inner tube, or of n tubes that are not planar.
+    factor : (N,) float64
+        Multiplies the curvature of all arcs.
+    roll_rad, stop_mm : (N, A) float64
+        Added to the needle's angle in each arc, and to its insertion where the arc ends.
+    target_mm : (N, 3) float64, LPS mm
+        Shift of the target.
+    """
+
+    scope_mm: Float
+    tilt_rad: Float
+    rotation_rad: Float
+    relative_rad: Float
+    insertion_mm: Float
+    factor: Float
+    roll_rad: Float
+    stop_mm: Float
+    target_mm: Float
+
+    @property
+    def count(self) -> int:
+        """Number of sets, N."""
+        return len(self.factor)
+
+
+def no_deviations(count: int, n_arcs: int, n_twisted: int = 0) -> dict[str, Float]:
+    """Return the fields of `Deviations` for `count` sets without any error.
+
+    Parameters
+    ----------
+    n_twisted : int
+        Number of tubes if they are not planar, else 0.
+    """
+    return {
+        "scope_mm": np.zeros((count, 3)),
+        "tilt_rad": np.zeros((count, 2)),
+        "rotation_rad": np.zeros(count),
+        "relative_rad": np.zeros((count, n_twisted)),
+        "insertion_mm": np.zeros((count, n_twisted or 2)),
+        "factor": np.ones(count),
+        "roll_rad": np.zeros((count, n_arcs)),
+        "stop_mm": np.zeros((count, n_arcs)),
+        "target_mm": np.zeros((count, 3)),
+    }
+
+
+FIELD_OF: dict[str, str] = {
+    "scope_position": "scope_mm",
+    "scope_direction": "tilt_rad",
+    "tube_rotation": "rotation_rad",
+    "tube_insertion": "insertion_mm",
+    "needle_roll": "roll_rad",
+    "needle_insertion": "stop_mm",
+    "target_position": "target_mm",
+}
+"""The field of `Deviations` that holds each kind of error."""
+
+
+def deviated_starts(plan: Plan, lung: Lung, deviations: Deviations) -> Float:
+    """Return point, tangent and +x axis `(N, 9)` of the deviated scope tips, LPS mm.
+
+    The scope tip stands where the lumen is as deep as the scope's radius, or as deep as at the planned tip if
+    that is less: a shift ends where it would come out of that.
+    """
+    devices, errors, _which = DeviatedPlan(plan).kernel_inputs(deviations)
+    starts = np.zeros((deviations.count, N_START))
+    find_starts(devices, errors, judging(plan, lung), starts)
+    return starts
+
+
+def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
+    """Return the arcs `(N, T + A, 4)` of tubes and needle, as `kernels.deviation` makes them.
+
+    Planar tubes have T = 4 arcs.  The radius of the tubes includes the sideways sweep of the plan.  No tube
+    goes back behind the scope tip, nor one behind that around it, nor the needle behind the end of an arc;
+    and nothing goes farther than the device can.
+    """
+    devices, errors, which = DeviatedPlan(plan).kernel_inputs(deviations)
+    n_pieces = devices.n_tube + devices.needle.shape[0]
+    pieces = np.zeros((deviations.count, n_pieces, kernel.N_PIECE))
+    find_pieces(devices, errors, which, pieces)
+    return pieces
+
+
+def judging(plan: Plan, lung: Lung) -> Judging:
+    """Return what decides about a deviated plan in its lung."""
+    depth = lung.lumen_depth
+    planned = float(depth.lower_bound_mm(np.asarray(plan.scope.lps_from_scope_tip)[:3, 3])[0])
+    return Judging(
+        depth.corners,
+        depth.geometry,
+        min(plan.system.scope.radius_mm, planned) - ROUNDING_MM,
+        lung.tree.mediastinal,
+        float(plan.exemption.needle_length_mm),
+        np.array(plan.target_lps),
+    )
+
+
+class DeviatedPlan:
+    """A plan as kernels take it that deviate from it."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self._frame = np.array(plan.scope.lps_from_scope_tip)
+        arcs = () if plan.needle is None else plan.needle.arcs
+        self._needle = np.zeros((len(arcs), kernel.N_PIECE))
+        self._needle[:, 0] = np.cumsum([arc.length_mm for arc in arcs])
+        self._needle[:, 1] = np.cumsum([arc.roll_rad for arc in arcs])
+        self._needle[:, 2] = [arc.curvature_per_mm for arc in arcs]
+        self._needle[:, 3] = plan.system.track_radius_mm
+        twisted, tubes = plan.tube.shape is not None, plan.system.tubes
+        self._tubes = np.zeros(0) if twisted else _tube_values(tubes, plan.tube)
+
+    def kernel_inputs(self, deviations: Deviations) -> tuple[Devices, Float, Int]:
+        """Return the devices, the errors in rows, and the number of each draw's shape; see `Devices`."""
+        which, n_tube = np.zeros(deviations.count, dtype=np.int64), TUBE_PIECES
+        shapes, rolled = np.zeros((0, 0, kernel.N_PIECE)), np.zeros(0)
+        if self.plan.tube.shape is not None:
+            shapes, rolled, which = twisted_shapes(
+                self.plan, deviations.insertion_mm, deviations.relative_rad
+            )
+            n_tube = shapes.shape[1]
+        needle = self.plan.system.needle
+        longest = 0.0 if needle is None else needle.max_length_mm
+        devices = Devices(self._frame, self._tubes, self._needle, shapes, rolled, n_tube, longest)
+        return devices, in_rows(deviations), which
+
+
+def in_rows(deviations: Deviations) -> Float:
+    """Return deviations as the kernels take them, `(N, E)`."""
+    return np.column_stack([getattr(deviations, name) for name in COLUMNS])
+
+
+def tubes_alone(
+    tubes: ConcentricTubes, lps_from_scope_tip: Float, choice: tuple[float, float, float]
+) -> Devices:
+    """Return planar tubes without a needle as kernels take them.
+
+    Parameters
+    ----------
+    choice : (float, float, float)
+        Rotation in rad and insertions of outer and inner tube in mm; nothing is swept sideways.
+    """
+    turned, outer, inner = choice
+    tube = Deployed(turned, 0.0 if tubes.outer is None else outer, inner, 0.0)
+    # A copy, which can be written, as of a plan's frame: for one kind of array kernels are compiled once.
+    frame, empty = np.array(lps_from_scope_tip), np.zeros((0, kernel.N_PIECE))
+    return Devices(frame, _tube_values(tubes, tube), empty, empty[None][:0], np.zeros(0), TUBE_PIECES, 0.0)
+
+
+class Deployed(NamedTuple):
+    """Rotation, insertions and sideways sweep of planar tubes, as those of a `TubeDeployment`."""
+
+    rotation_rad: float
+    outer_insertion_mm: float
+    inner_insertion_mm: float
+    lateral_sweep_mm: float
+
+
+def _tube_values(tubes: ConcentricTubes, tube: TubeDeployment | Deployed) -> Float:
+    """Return what a kernel has to know of planar tubes `(11,)`, see `chain.Devices`."""
+    longest = tubes.max_extension_mm
+    outer_longest = longest if tubes.outer is None else min(longest, tubes.outer.length_mm)
+    return np.array(
+        [
+            tube.rotation_rad,
+            tube.outer_insertion_mm,
+            tube.inner_insertion_mm,
+            longest,
+            tubes.max_inner_protrusion_mm,
+            tubes.inner.curved_length_mm,
+            tubes.overlap_curvature_per_mm,
+            tubes.inner.precurvature_per_mm,
+            tubes.outermost.radius_mm + tube.lateral_sweep_mm,
+            tubes.inner.radius_mm + tube.lateral_sweep_mm,
+            outer_longest,
+        ]
+    )

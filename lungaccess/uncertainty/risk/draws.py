@@ -1,0 +1,160 @@
+"""Random numbers drawn once and scaled to any error model: the same luck for every plan and every model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
+from lungaccess.uncertainty.risk.breathing import PatientMotion, phase
+from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, no_deviations
+from lungaccess.uncertainty.risk.errors import BOUNDED, BREATHING, CURVATURE, IN_WINDOW, UNITS, ErrorModel
+
+PATIENT, ATTEMPT = 0, 1
+"""Levels at which errors are drawn."""
+_STRAIGHT = 2
+"""Stream of the numbers that decide which needles go straight."""
+DOWN = np.array([0.0, 0.0, -1.0])
+"""Towards the feet, LPS."""
+
+
+class Draws:
+    """Standard normal numbers for N attempts, made where a model needs them.
+
+    Each kind of error has two streams of its own, one number for each patient and one for each attempt, so
+    that neither the model nor what was asked before changes a number.  Errors of the needle that are drawn
+    for each patient are the same in all its arcs.
+
+    Parameters
+    ----------
+    count, n_arcs : int
+        N and A of `Deviations`.
+    seed : int
+        The same seed gives the same numbers.
+    n_twisted : int
+        See `no_deviations`.
+    stretch : float
+        By how much of the patient's motion by breathing the target moves farther than the scope's tip, where
+        the patient's own motion is not known.
+    motion : PatientMotion, optional
+        The patient's own.
+    attempt : int
+        Number of the attempt on the same N patients: what is drawn for each attempt has other numbers.
+
+    Raises
+    ------
+    SettingsError
+        If there are to be none.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        n_arcs: int,
+        seed: int,
+        n_twisted: int = 0,
+        *,
+        stretch: float = 0.0,
+        motion: PatientMotion | None = None,
+        attempt: int = 0,
+    ) -> None:
+        if count < 1:
+            raise SettingsError(
+                f"The number of samples is {count}",
+                expected="at least 1",
+                remedy="Choose a count such as 10000",
+            )
+        self.count = count
+        self._seed, self._n_arcs, self._n_twisted = seed, n_arcs, n_twisted
+        self._stretch, self._motion, self._attempt = stretch, motion, attempt
+        self._made: dict[tuple[str, int], Float] = {}
+
+    def deviations(self, model: ErrorModel) -> Deviations:
+        """Return the deviations of all attempts under a model."""
+        values = no_deviations(self.count, self._n_arcs, self._n_twisted)
+        for kind, field in FIELD_OF.items():
+            # Each tube that is not planar is held by itself: none turns with another.
+            own = "relative_rad" if kind == "tube_rotation" and self._n_twisted else field
+            term = model.term(kind)
+            if term.size and values[own].size:
+                error = self._error(kind, values[own].shape, term.distribution, term.patient, term.attempt)
+                values[own] = np.radians(error) if UNITS[kind] == "deg" else error
+        values["factor"] = self._factors(model)
+        if model.breathing.size and (self._motion or self._stretch):
+            values["target_mm"] = values["target_mm"] + self._breathed_mm(model)
+        return Deviations(**values)
+
+    def numbers(self, model: ErrorModel) -> dict[tuple[str, int], Float]:
+        """Return the standard normal numbers `(N, ...)` that a model uses, by kind and level."""
+        own = self._again()
+        own.deviations(model)
+        return own._made
+
+    def with_numbers(self, made: dict[tuple[str, int], Float]) -> Draws:
+        """Return draws with other numbers, by kind and level as `numbers` returns them."""
+        own = self._again()
+        own._made = made
+        return own
+
+    def _again(self) -> Draws:
+        return Draws(
+            self.count, self._n_arcs, self._seed, self._n_twisted, stretch=self._stretch, motion=self._motion
+        )
+
+    def _error(
+        self, kind: str, shape: tuple[int, ...], distribution: str, patient: float, attempt: float
+    ) -> Float:
+        # One number for all arcs of a patient: what is wrong with tissue or drive stays wrong.
+        shared = (len(shape) > 1) and kind.startswith("needle")
+        total = np.zeros(shape)
+        for level, size in ((PATIENT, patient), (ATTEMPT, attempt)):
+            if size:
+                drawn = self._normal(kind, level, (shape[0], 1) if shared and level == PATIENT else shape)
+                total += size * (drawn if distribution != BOUNDED else 2.0 * _uniform(drawn) - 1.0)
+        return total
+
+    def _factors(self, model: ErrorModel) -> Float:
+        """Return the factors of the curvature, `(N,)`."""
+        term = model.needle_curvature
+        error = self._error(CURVATURE, (self.count,), term.distribution, term.patient, term.attempt)
+        factors = term.median * np.exp(error)
+        if term.straight_share:
+            straight = _uniform(self._normal(CURVATURE, _STRAIGHT, (self.count,))) < term.straight_share
+            factors[straight] = 0.0
+        return factors
+
+    def _breathed_mm(self, model: ErrorModel) -> Float:
+        """Return how the target moves away from the scope, `(N, 3)`."""
+        term, shape = model.breathing, (self.count,)
+        motion_mm = term.median_mm * np.exp(term.patient_ln * self._normal(BREATHING, PATIENT, shape))
+        luck, in_window = _uniform(self._normal(BREATHING, ATTEMPT, shape)), term.distribution == IN_WINDOW
+        if self._motion is not None and (self._motion.has_window or not in_window):
+            return self._motion.shifts_mm(motion_mm, luck, in_window=in_window)
+        if in_window:
+            raise SettingsError(
+                f"Errors of breathing are {IN_WINDOW!r}, but no motion of the patient or no window is known",
+                expected="a plan with a window of breathing",
+                remedy="Give the patient a [motion], or write distribution = 'lognormal'",
+            )
+        return np.asarray((self._stretch * motion_mm * phase(luck))[:, None] * DOWN)
+
+    def _normal(self, kind: str, level: int, shape: tuple[int, ...]) -> Float:
+        """Return the numbers of a kind at a level, the same at each call."""
+        if (kind, level) not in self._made:
+            attempt = 0 if level == PATIENT else self._attempt
+            key = (list(UNITS).index(kind), level, attempt)
+            rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self._seed, spawn_key=key)))
+            self._made[kind, level] = _columns(rng, self.count, shape[1:])
+        return self._made[kind, level]
+
+
+def _columns(rng: np.random.Generator, count: int, columns: tuple[int, ...]) -> Float:
+    """Return normal numbers `(count, *columns)`, by columns: a further arc leaves those before alone."""
+    return np.asarray(np.moveaxis(rng.standard_normal((*columns, count)), -1, 0))
+
+
+def _uniform(normal: Float) -> Float:
+    """Return standard normal numbers as numbers uniform from 0 to 1."""
+    from scipy.special import ndtr
+
+    return np.asarray(ndtr(normal))

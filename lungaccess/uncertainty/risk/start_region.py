@@ -1,0 +1,98 @@
+"""The safe start region of a plan: from which poses of the tubes' tip its needle still reaches the target."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.base.errors import SettingsError
+from anatomy.lung import Lung
+from lungaccess.plans.curves import needle_pieces
+from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk.assessor import goal_radius
+from stages.needle import ArcPath, Query, StartRegion, needle_environment, prove_starts, try_starts
+
+OFFSET_MM, TILT_DEG = 5.0, 15.0
+"""Poses tried: published errors of a scope's tip are 1.3 to 2.1 mm an axis and 1 to 7 degrees."""
+POSES = 10_000
+ITERATIONS = 100
+"""Of the RRT from a pose that nothing simpler leads from: all of them together take half a second."""
+
+
+def safe_start_region(
+    plan: Plan,
+    lung: Lung,
+    *,
+    radius_mm: float | None = None,
+    offset_mm: float = OFFSET_MM,
+    tilt_deg: float = TILT_DEG,
+    poses: int = POSES,
+    iterations: int = ITERATIONS,
+    seed: int = 0,
+) -> StartRegion:
+    """Return from which start poses near the planned one the needle still reaches the target.
+
+    A needle steered anew from each pose is meant, clear of obstacles and within all its limits; what is
+    proved holds for every pose of a ball of places times a cone of directions.  The same input and seed give
+    the same region.
+
+    Parameters
+    ----------
+    lung : Lung
+        The patient that the plan was made for.
+    radius_mm : float, optional
+        How far from the target a path may end; by default the radius of the goal of `assess`, 0 for exactly
+        at the target.
+    offset_mm, tilt_deg : float
+        Largest distance and angle from the planned start of the poses that are tried.
+    poses : int
+        About how many are tried.
+    iterations : int
+        Of the search from a pose from which no simple path is clear.
+
+    Raises
+    ------
+    PlanFileError
+        If the plan was made for another lung.
+    SettingsError
+        If the plan has no needle, a number is out of its range, or a cost map forbids voxels.
+    """
+    plan.require_lung(lung)
+    needle = plan.system.require_needle("A safe start region")
+    if plan.needle is None or not plan.needle.arcs:
+        raise SettingsError(
+            "The needle of the plan has no arc",
+            expected="a needle that starts away from its target",
+            remedy="Choose a plan whose needle leaves the tubes",
+        )
+    if lung.cost is not None and not np.isfinite(lung.cost.array).all():
+        raise SettingsError(
+            "The cost map forbids voxels, of which the proof knows nothing",
+            expected="a patient whose cost map is finite, or without one",
+            remedy="Give the voxels that must not be entered as vessels",
+        )
+    radius = goal_radius(lung, plan.target_lps)[0] if radius_mm is None else float(radius_mm)
+    environment = needle_environment(
+        lung, needle, plan.system.margins, with_fissures=plan.fissures_are_obstacles, goal_tolerance_mm=radius
+    )
+    start = plan.needle.lps_from_start
+    query = Query(lps_from_start=start, target=plan.target_lps, branch=plan.exemption.branch)
+    path = ArcPath(lps_from_start=start, arcs=needle_pieces(plan.needle))
+    return StartRegion(
+        lps_from_start=start,
+        target=plan.target_lps,
+        radius_mm=radius,
+        max_curvature_per_mm=environment.limits.kappa,
+        proved=prove_starts(environment, query, path),
+        tried=try_starts(
+            environment,
+            query,
+            path,
+            offset_mm=offset_mm,
+            tilt_rad=math.radians(tilt_deg),
+            poses=poses,
+            iterations=iterations,
+            seed=seed,
+        ),
+    )

@@ -1,0 +1,210 @@
+"""How large the errors of each kind may be, all others being 0, before a plan fails."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
+from lungaccess.uncertainty.risk.draws import Draws
+from lungaccess.uncertainty.risk.error_files import load_errors
+from lungaccess.uncertainty.risk.errors import BREATHING, CURVATURE, UNITS, ErrorModel
+from lungaccess.uncertainty.risk.statistics import Share
+
+DEFAULT_PROBABILITY = 0.95
+"""The usual level of confidence."""
+DEFAULT_SAMPLES = 2000
+"""A share of 0.95 is then known to 1 % with 95 % confidence, at every size that is tried."""
+LARGEST = {"mm": 20.0, "deg": 90.0, "ln": 1.0}
+"""Sizes beyond which no tolerance is looked for."""
+LARGEST_FACTOR = 3.0
+"""Factor of the curvature beyond which no margin is looked for."""
+BISECTIONS = 10
+"""A tolerance is then known to a thousandth of the largest size."""
+LADDER = 64
+"""Sizes tried at once for a margin, and again between the last that holds and the first that fails."""
+AZIMUTHS = 16
+"""Directions in which a tilt is tried: one every 22.5 degrees."""
+
+
+@frozen_value
+class Tolerance:
+    """How large errors of one kind may be, all others being 0.
+
+    Parameters
+    ----------
+    kind, unit : str
+        See `lungaccess.uncertainty.risk.errors.UNITS`.
+    stated : float
+        The size in the error model, of patient and attempt together; see
+        `lungaccess.uncertainty.risk.errors.Term`.
+    largest : float
+        The largest size at which successes are that probable, at most `LARGEST`; 0 if none was found.
+    margin : (float, float)
+        Errors up to this size never fail: (below 0, above 0) for errors with a sign, the same twice for
+        errors with directions; factors for the curvature.  Tried at steps and in some directions, not
+        proved.
+    alone : Share
+        Successes at the stated size.
+    """
+
+    kind: str
+    unit: str
+    stated: float
+    probability: float
+    largest: float
+    margin: tuple[float, float]
+    alone: Share
+
+
+def find_tolerances(
+    plan: Plan,
+    lung: Lung,
+    *,
+    model: ErrorModel | None = None,
+    probability: float = DEFAULT_PROBABILITY,
+    samples: int = DEFAULT_SAMPLES,
+    seed: int = 0,
+    radius_mm: float | None = None,
+) -> tuple[Tolerance, ...]:
+    """Return the tolerance of a plan to each kind of error alone.
+
+    The largest size is found by bisection over a scale, every size with the same draws.  Breathing is left
+    out: it is an error of the target in one direction.
+
+    Parameters
+    ----------
+    plan, lung, radius_mm
+        See `RiskAssessor`.
+    model : ErrorModel, optional
+        States the sizes to compare with.
+    probability : float
+        Probability of success that is asked for, above 0 and below 1.
+    samples, seed : int
+        Draws for each size.
+
+    Raises
+    ------
+    PlanFileError, SettingsError
+        See `RiskAssessor`; also if the probability is not between 0 and 1.
+    """
+    if not 0.0 < probability < 1.0:
+        raise SettingsError(
+            f"The probability is {probability}",
+            expected="above 0 and below 1",
+            remedy="Choose a share such as 0.95",
+        )
+    stated = model or load_errors()
+    assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
+    draws = assessor.draws(samples, seed)
+    kinds = (kind for kind in assessor.kinds if kind != BREATHING)
+    return tuple(_tolerance(assessor, draws, stated, kind, probability) for kind in kinds)
+
+
+def _tolerance(
+    assessor: RiskAssessor, draws: Draws, model: ErrorModel, name: str, probability: float
+) -> Tolerance:
+    unit = UNITS[name]
+
+    def holds(size: float) -> bool:
+        return assessor.success(draws, model.only(name, size)).value >= probability
+
+    return Tolerance(
+        kind=name,
+        unit=unit,
+        stated=model.term(name).size,
+        probability=probability,
+        largest=_largest(holds, LARGEST[unit]),
+        margin=_curvature_margin(assessor) if name == CURVATURE else _margin(assessor, name),
+        alone=assessor.success(draws, model.only(name)),
+    )
+
+
+def _largest(holds: Callable[[float], bool], most: float) -> float:
+    """Return the largest size up to another that holds; 0 if none does."""
+    if holds(most):
+        return most
+    low, high = 0.0, most
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if holds(middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _margin(assessor: RiskAssessor, name: str) -> tuple[float, float]:
+    """Return the sizes up to which errors of a kind never fail: of both signs, or of all directions."""
+    field = FIELD_OF[name]
+    shape = assessor.no_deviations(1)[field].shape[1:]
+    directions = _directions(name, shape[0] if shape else 1)
+
+    def made(sizes: Float, chosen: Float) -> Deviations:
+        scaled = np.radians(sizes) if UNITS[name] == "deg" else sizes
+        errors = (scaled[:, None, None] * chosen).reshape(-1, *shape)
+        return Deviations(**{**assessor.no_deviations(len(errors)), field: errors})
+
+    if not shape or shape == (1,):
+        low, high = (_unfailing(assessor, made, directions[[n]], LARGEST[UNITS[name]]) for n in (0, 1))
+        return low, high
+    size = _unfailing(assessor, made, directions, LARGEST[UNITS[name]])
+    return size, size
+
+
+def _curvature_margin(assessor: RiskAssessor) -> tuple[float, float]:
+    """Return the factors of curvature down to which, and up to which, nothing fails."""
+
+    def made(sizes: Float, chosen: Float) -> Deviations:
+        factors = np.maximum(1.0 + (sizes[:, None] * chosen[None, :, 0]).ravel(), 0.0)
+        return Deviations(**{**assessor.no_deviations(len(factors)), "factor": factors})
+
+    below = _unfailing(assessor, made, np.array([[-1.0]]), 1.0)
+    above = _unfailing(assessor, made, np.array([[1.0]]), LARGEST_FACTOR - 1.0)
+    return 1.0 - below, 1.0 + above
+
+
+def _unfailing(
+    assessor: RiskAssessor, made: Callable[[Float, Float], Deviations], directions: Float, most: float
+) -> float:
+    """Return the size up to which no step of a ladder fails in any direction, refined once."""
+
+    def first_failure(sizes: Float) -> int:
+        done = assessor.successes(made(sizes, directions))
+        failed = ~done.reshape(len(sizes), len(directions)).all(axis=1)
+        return int(np.argmax(failed)) if failed.any() else len(sizes)
+
+    # Squares: small sizes matter most.
+    sizes = np.concatenate([[0.0], most * (np.arange(1, LADDER + 1) / LADDER) ** 2])
+    first = first_failure(sizes)
+    if first == 0:
+        return 0.0
+    if first == len(sizes):
+        return most
+    between = np.linspace(sizes[first - 1], sizes[first], LADDER)
+    return float(between[max(first_failure(between) - 1, 0)])
+
+
+def _directions(name: str, n: int) -> Float:
+    """Return the unit errors `(D, n)` of a kind that are tried."""
+    if name in ("scope_position", "target_position"):
+        steps = np.array([step for step in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(step)])
+        return np.asarray(steps / np.linalg.norm(steps, axis=1)[:, None])
+    if name == "scope_direction":
+        turns = 2.0 * math.pi * np.arange(AZIMUTHS) / AZIMUTHS
+        return np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    if name == "tube_rotation":
+        return np.array([[-1.0], [1.0]])
+    signs = (-1.0, 1.0)
+    single = [sign * row for row in np.eye(n) for sign in signs]
+    joint = [sign * np.ones(n) for sign in signs]
+    return np.array(single + (joint if n > 1 else []))

@@ -22,7 +22,7 @@ from experiments.support.anatomies import PATIENTS, anatomy, require_data
 from experiments.support.borrowed_motion import borrowed_motion
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.warped_voxels import BruteForce
-from lungaccess.checking import Checker
+from lungaccess.judging.checking import Checker
 from lungaccess.plans.window import BreathingWindow
 from lungaccess.problem import point_target
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
     from anatomy.base.errors import LungaccessError
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal, appraise
-    from lungaccess.checking import CheckReport, check
     from lungaccess.coupled import (
         Alternative,
         Atlas,
@@ -35,9 +33,11 @@ if TYPE_CHECKING:
         open_atlas,
         plan,
         plan_for_window,
-        plan_with_presets,
     )
-    from lungaccess.explanation import Explanation, explain_no_plan, save_explanation
+    from lungaccess.judging import plan_with_presets
+    from lungaccess.judging.appraisal import Appraisal, appraise
+    from lungaccess.judging.checking import CheckReport, check
+    from lungaccess.judging.explanation import Explanation, explain_no_plan, save_explanation
     from lungaccess.one_stage import (
         advise_scope,
         deploy_tubes,

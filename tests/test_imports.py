@@ -23,7 +23,7 @@ CHECK_MAY_USE = (
     "lungaccess.plans.plan",
     "lungaccess.plans.version",
     "lungaccess.problem.system",
-    "lungaccess.checking*",
+    "lungaccess.judging.checking*",
     "stages.tube.casadi_shape",
 )
 SECOND_OPINION = {
@@ -86,7 +86,7 @@ def test_what_is_installed_uses_nothing_that_is_not(graph: grimp.ImportGraph, ou
 
 
 def test_check_uses_only_data_types_and_anatomy(graph: grimp.ImportGraph) -> None:
-    rooms = {"lungaccess.checking"} | graph.find_descendants("lungaccess.checking")
+    rooms = {"lungaccess.judging.checking"} | graph.find_descendants("lungaccess.judging.checking")
     used = set().union(*(graph.find_modules_directly_imported_by(module) for module in rooms))
     ours = {module for module in used if module.split(".")[0] in OURS}
     assert ours
@@ -97,8 +97,8 @@ def test_check_uses_only_data_types_and_anatomy(graph: grimp.ImportGraph) -> Non
 def test_the_product_uses_the_stages_through_their_facades(graph: grimp.ImportGraph) -> None:
     """What the check reaches takes devices and what shares nothing with planners, so it meets no facade."""
     packages = {m for m in graph.modules if m.startswith("stages") and graph.find_children(m)}
-    reached = graph.find_upstream_modules("lungaccess.checking", as_package=True)
-    reached |= {"lungaccess.checking"} | graph.find_descendants("lungaccess.checking")
+    reached = graph.find_upstream_modules("lungaccess.judging.checking", as_package=True)
+    reached |= {"lungaccess.judging.checking"} | graph.find_descendants("lungaccess.judging.checking")
     wrong = [
         (module, used)
         for module in graph.find_descendants("lungaccess")
@@ -121,7 +121,7 @@ def test_no_modules_of_the_product_import_each_other_in_a_circle(graph: grimp.Im
 
 
 def test_nothing_that_check_uses_leads_to_a_planner(graph: grimp.ImportGraph) -> None:
-    reached = graph.find_upstream_modules("lungaccess.checking", as_package=True)
+    reached = graph.find_upstream_modules("lungaccess.judging.checking", as_package=True)
     stages = {module for module in reached if module.startswith("stages.")}
     assert stages
     settings = {module for module in stages if fnmatch(module, "stages.*.device")}

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.cli.plan_search import PlanRequest
     from lungaccess.coupled import Atlas
-    from lungaccess.explanation import Explanation
+    from lungaccess.judging.explanation import Explanation
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.system import System
 
@@ -37,7 +37,7 @@ def explain_and_report(
     time_s : float or None
         Processor time for the explanation; the default of `explain_no_plan` if None.
     """
-    from lungaccess.explanation import explanation_record, save_explanation
+    from lungaccess.judging.explanation import explanation_record, save_explanation
 
     explanation = _explained(lung, request, failure, time_s)
     written = save_explanation(explanation, request.out)
@@ -56,7 +56,7 @@ def explain_and_report(
 
 def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float | None) -> Explanation:
     from lungaccess.coupled import atlas_is_kept, open_atlas
-    from lungaccess.explanation import DEFAULT_TIME_S, explain_no_plan
+    from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan
 
     system, cache = request.systems[0], request.output.cache
 
@@ -96,7 +96,7 @@ def _drawn(lung: Lung, request: PlanRequest, explanation: Explanation) -> tuple[
 
 def show_explanation(explanation: Explanation) -> None:
     """Print the headline, then what was learned, the most useful first, then the counted reasons."""
-    from lungaccess.explanation import sections
+    from lungaccess.judging.explanation import sections
 
     terminal.console.print(
         Panel(explanation.headline, title="no plan", title_align="left", border_style="yellow")

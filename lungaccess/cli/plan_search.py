@@ -18,8 +18,8 @@ from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal
     from lungaccess.coupled import Atlas, ProgressEvent
+    from lungaccess.judging.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
@@ -158,7 +158,8 @@ def run_search(
 
 def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Found]:
     """Yield better and better plans with the request's system, or with the one that is chosen of several."""
-    from lungaccess.coupled import atlas_event, open_atlas, plan, plan_for_window, plan_with_presets
+    from lungaccess.coupled import atlas_event, open_atlas, plan, plan_for_window
+    from lungaccess.judging import plan_with_presets
     from lungaccess.one_stage import plan_near_exit, plan_near_scope_tip
     from lungaccess.success import plan_for_success
 
@@ -225,7 +226,7 @@ def plan_and_report(lung: Lung, request: PlanRequest) -> ExitCode:
     display = SearchDisplay(search.time_s, search.iterations, request.made_small or "cost")
     best, history = run_search(lung, target, request, display)
     # After the search: the first plan does not wait for these.
-    from lungaccess.appraisal import appraise, plan_record
+    from lungaccess.judging.appraisal import appraise, plan_record
     from lungaccess.uncertainty.breathing.window import with_window
 
     found = best.plan if best.plan.window is not None else with_window(best.plan, lung)

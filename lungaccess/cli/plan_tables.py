@@ -10,14 +10,14 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from lungaccess.appraisal.grade import Grade
 from lungaccess.cli import terminal
+from lungaccess.judging.appraisal.grade import Grade
 from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal, Headline
-    from lungaccess.checking import CheckReport, Finding
+    from lungaccess.judging.appraisal import Appraisal, Headline
+    from lungaccess.judging.checking import CheckReport, Finding
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
 
@@ -123,7 +123,7 @@ def show_headline(headline: Headline) -> None:
 
 def limits_table(appraisal: Appraisal) -> Table:
     """Return the limits that the plan comes nearest to; broken ones come first."""
-    from lungaccess.appraisal import LIMITS_TITLE, SHOWN_LIMITS
+    from lungaccess.judging.appraisal import LIMITS_TITLE, SHOWN_LIMITS
 
     rows = [
         (each.what, each.found_words, each.bound_words, each.used_words if each.ok else "BROKEN")

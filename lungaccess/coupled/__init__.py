@@ -29,13 +29,6 @@ if TYPE_CHECKING:
     from lungaccess.coupled.explanation import explain
     from lungaccess.coupled.kuntz2015_fcl.search import ReferenceSearch
     from lungaccess.coupled.planner import METHODS, ProgressEvent, atlas_event, plan
-    from lungaccess.coupled.presets import (
-        Attempt,
-        choice_in_words,
-        first_attempt,
-        none_reaches,
-        plan_with_presets,
-    )
     from lungaccess.coupled.search.aimed_tubes import AimedTubes
     from lungaccess.coupled.search.atlas_search import AtlasSearch
     from lungaccess.coupled.search.base import Incumbent, ParallelSearch, PlanSearch, Step, evaluated_step

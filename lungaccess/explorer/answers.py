@@ -253,7 +253,7 @@ class Answers:
         yield from reach_parts(self.lung, system, atlas, asked.question.around, self._reached, turn)
 
     def _appraise(self, asked: Asked, turn: Turn) -> Iterator[Part]:
-        from lungaccess.appraisal import Appraiser
+        from lungaccess.judging.appraisal import Appraiser
 
         found = self._plan_asked(asked)
         if self._appraiser is None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from anatomy.base.files import write_json, write_text
 from anatomy.base.settings_file import settings_toml
 from anatomy.lung import Lung
-from lungaccess.appraisal import appraise, plan_record
+from lungaccess.judging.appraisal import appraise, plan_record
 from lungaccess.plans.plan import Plan
 from lungaccess.report import CostPoint, cost_over_time_csv, cost_over_time_png, overview_png, tree_png
 from lungaccess.report.html import PageOptions, plan_page

@@ -74,7 +74,7 @@ class Plan(Record):
         The planner of the needle that the search was told to use; "" for the method's own.
     system_choice : tuple of str
         Where the system was chosen among several: in sentences, which were tried, why each failed, and why
-        this one was chosen; see `lungaccess.coupled.presets`.  Empty otherwise.
+        this one was chosen; see `lungaccess.judging.presets_in_turn`.  Empty otherwise.
     timing : mapping of str to float
         Seconds; the only values that differ between two equal runs.
     chance : Chance or None

@@ -34,4 +34,4 @@ START_COLOURS = MappingProxyType(
         "out of reach": "#B0B0B0",
     }
 )
-"""By the keys of `lungaccess.explanation.FAILS`; those of structures are theirs in the charts of a page."""
+"""The colours by the keys of `FAILS`; those of structures are theirs in the charts of a page."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from anatomy.base.words import plural
-from lungaccess.appraisal.limits import SHOWN_LIMITS
+from lungaccess.judging.appraisal.limits import SHOWN_LIMITS
 from lungaccess.plans.costs import costs_in_words, known_costs
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal
+    from lungaccess.judging.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
 
 STRUCTURES = {"airway": "airway wall", "outside": "outside of the lung"}

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from anatomy.base.typed import Float
-from lungaccess.explanation import FAILS
+from lungaccess.judging.explanation import FAILS
 from lungaccess.report import drawing, style
 from lungaccess.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.report.layers import Layers
@@ -21,7 +21,7 @@ from lungaccess.report.zoom import paint_cut
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.explanation import Explanation
+    from lungaccess.judging.explanation import Explanation
 
 WIDTH_IN, HEIGHT_IN = 17.0, 7.4
 PANELS_IN = ((0.5, 1.0, 5.0, 5.3), (5.9, 1.0, 5.0, 5.3), (11.4, 1.0, 5.3, 5.3))

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from anatomy.base.typed import Float
-from lungaccess.appraisal.headline import Headline
+from lungaccess.judging.appraisal.headline import Headline
 from lungaccess.report import drawing, panels, style, zoom
 from lungaccess.report.layers import Layers
 from lungaccess.report.views import STANDARD, View
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal
+    from lungaccess.judging.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
 
 

@@ -13,7 +13,7 @@ from lungaccess.report.key_numbers import key_numbers
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal
+    from lungaccess.judging.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
 
 

@@ -12,8 +12,8 @@ from anatomy.base.typed import Float
 from anatomy.io.markups import Markup
 from anatomy.lung import Lung
 from anatomy.structures import BITS
-from lungaccess.checking import CheckReport, Finding, check
-from lungaccess.checking.findings import Findings
+from lungaccess.judging.checking import CheckReport, Finding, check
+from lungaccess.judging.checking.findings import Findings
 from lungaccess.one_stage import RestOfPlan
 from lungaccess.plans.assemble import SAMPLE_MM
 from lungaccess.plans.curves import DeviceCurve, arc_lengths

@@ -12,7 +12,7 @@ from anatomy.base.files import require_writable_folder, write_text
 from anatomy.base.records import frozen_value
 from anatomy.io.centerlines import write_centerlines
 from anatomy.lung import Lung
-from lungaccess.checking import CheckReport, check
+from lungaccess.judging.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurves
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer.breathing import write_breathing

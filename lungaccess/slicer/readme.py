@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 
-from lungaccess.checking import CheckReport
+from lungaccess.judging.checking import CheckReport
 from lungaccess.plans.plan import Plan
 
 _MEANING = {

@@ -68,7 +68,7 @@ class Answer:
     costs : mapping of str to float
         "inverse_clearance", "cost_map", "voxel_sum", "length_mm".
     findings : tuple of mapping
-        What the check looked at; see `lungaccess.checking.findings.Finding.to_mapping`.
+        What the check looked at; see `lungaccess.judging.checking.findings.Finding.to_mapping`.
     rejections : mapping of str to int
         The reasons of `NoPlan`, counted.
     plan : str

@@ -23,10 +23,10 @@ import psutil
 from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
-from lungaccess.checking import Checker
 from lungaccess.coupled.atlas import Atlas
 from lungaccess.coupled.atlas_store import open_atlas
 from lungaccess.coupled.planner import plan
+from lungaccess.judging.checking import Checker
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from lungaccess.checking import CheckReport, Finding
+from lungaccess.judging.checking import CheckReport, Finding
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.uncertainty.risk.assessment import RiskReport
@@ -71,6 +71,6 @@ def appraise_as_told(monkeypatch: pytest.MonkeyPatch, seen: dict[str, Any]) -> N
         seen["errors"] = errors
         return seen["risk"]
 
-    monkeypatch.setattr("lungaccess.checking.checker.Checker.__init__", lambda *_: None)
-    monkeypatch.setattr("lungaccess.checking.checker.Checker.check", judge)
-    monkeypatch.setattr("lungaccess.appraisal.appraiser.estimate_success", estimate)
+    monkeypatch.setattr("lungaccess.judging.checking.checker.Checker.__init__", lambda *_: None)
+    monkeypatch.setattr("lungaccess.judging.checking.checker.Checker.check", judge)
+    monkeypatch.setattr("lungaccess.judging.appraisal.appraiser.estimate_success", estimate)

@@ -24,9 +24,9 @@ FACADES = (
     "anatomy.segmentation",
     "anatomy.tree",
     "lungaccess",
-    "lungaccess.appraisal",
+    "lungaccess.judging.appraisal",
     "lungaccess.benchmark",
-    "lungaccess.checking",
+    "lungaccess.judging.checking",
     "lungaccess.coupled",
     "lungaccess.one_stage",
     "lungaccess.plans",
@@ -74,8 +74,8 @@ def test_facades_hold_every_name_they_state(package: str) -> None:
 def test_modules_do_not_hide_functions() -> None:
     """`la.plan` and `la.check` stay functions whatever has been imported before."""
     code = (
-        "import lungaccess.coupled.planner, lungaccess.plans.plan, lungaccess.checking, lungaccess.cli.app\n"
-        "import lungaccess as la\n"
+        "import lungaccess.coupled.planner, lungaccess.plans.plan, lungaccess.judging.checking\n"
+        "import lungaccess.cli.app, lungaccess as la\n"
         "print(callable(la.plan) and callable(la.check))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -18,7 +18,7 @@ import pytest
 
 from anatomy.display import AXIAL, CORONAL, Drawing
 from anatomy.lung import Lung
-from lungaccess.checking import CheckReport, Finding
+from lungaccess.judging.checking import CheckReport, Finding
 from lungaccess.plans.plan import Plan
 
 TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "tutorial.ipynb"
@@ -127,7 +127,7 @@ def test_an_empty_drawing_is_a_drawing(view: str) -> None:
 
 def test_showing_needs_no_plotting_library() -> None:
     code = (
-        "import sys, lungaccess as la; from lungaccess.checking import CheckReport;"
+        "import sys, lungaccess as la; from lungaccess.judging.checking import CheckReport;"
         "CheckReport(accepted=True, findings=())._repr_html_(); la.Plan._repr_html_; la.Lung; la.AirwayTree;"
         "import anatomy.display, lungaccess.plans.display;"
         "sys.exit(int(bool({'matplotlib', 'IPython'} & set(sys.modules))))"

@@ -13,7 +13,7 @@ import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
-from lungaccess.checking import Checker
+from lungaccess.judging.checking import Checker
 from lungaccess.problem.system import System
 from tests.scenarios.cases import Anatomy, Case
 

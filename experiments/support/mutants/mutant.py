@@ -16,7 +16,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from experiments.support.mutants.draws import Rng
-from lungaccess.checking import CheckReport
+from lungaccess.judging.checking import CheckReport
 from lungaccess.plans.assemble import required_clearance_mm
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, system_fingerprint

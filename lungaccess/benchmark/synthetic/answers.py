@@ -17,7 +17,7 @@ from lungaccess.benchmark.synthetic.submission import (
     TubesAnswer,
 )
 from lungaccess.benchmark.synthetic.tips import PublishedTips
-from lungaccess.checking.completion import Motions
+from lungaccess.judging.checking.completion import Motions
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 

@@ -19,7 +19,7 @@ from lungaccess.benchmark.synthetic.manifest import entries
 from lungaccess.benchmark.synthetic.phantoms import BenchmarkPhantom, phantom_named
 from lungaccess.benchmark.synthetic.submission import Submission, SubmittedAnswer, require_queries
 from lungaccess.benchmark.synthetic.tips import PublishedTips
-from lungaccess.checking import Checker
+from lungaccess.judging.checking import Checker
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.patients import load_patient
 from lungaccess.problem.system import load_system

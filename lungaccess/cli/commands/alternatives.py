@@ -33,8 +33,8 @@ from stages.needle import DEFAULT, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal
     from lungaccess.coupled import Alternative
+    from lungaccess.judging.appraisal import Appraisal
     from lungaccess.problem.system import System
 
 PICTURE = "trade_off.svg"
@@ -81,9 +81,9 @@ def alternatives(
     Those that no other beats in success, length and clearance together are marked: the Pareto front.
     """
     from anatomy.base.files import write_text
-    from lungaccess.appraisal import Appraiser
     from lungaccess.coupled import alternatives as find_alternatives
     from lungaccess.coupled import with_front
+    from lungaccess.judging.appraisal import Appraiser
     from lungaccess.report.html import trade_off_svg
     from lungaccess.success import alternatives_for_success
 
@@ -145,8 +145,8 @@ def _of_the_least_invasive(
     lung: Lung, systems: Sequence[System], search: Callable[[System], tuple[Alternative, ...]]
 ) -> tuple[Alternative, ...]:
     """Return the plans of the first system whose cheapest plan the check accepts, with the reasons."""
-    from lungaccess.checking import Checker
-    from lungaccess.coupled import Attempt, choice_in_words, none_reaches
+    from lungaccess.judging import Attempt, choice_in_words, none_reaches
+    from lungaccess.judging.checking import Checker
     from lungaccess.plans.no_plan import NoPlan
 
     checker = Checker(lung)
@@ -213,7 +213,7 @@ def _records(
 
 
 def _row(number: int, each: Alternative, appraisal: Appraisal, has_map: bool) -> tuple[str, ...]:
-    from lungaccess.appraisal.headline import of_hundred
+    from lungaccess.judging.appraisal.headline import of_hundred
 
     success = appraisal.headline.success
     return (

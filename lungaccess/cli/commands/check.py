@@ -38,7 +38,7 @@ def check(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused."""
-    from lungaccess.appraisal import appraise
+    from lungaccess.judging.appraisal import appraise
 
     if curve is not None:
         if system or errors.errors or errors.procedure:
@@ -77,8 +77,8 @@ def _check_curve(
 ) -> ExitCode:
     """Check a plan with an edited curve, and save it if it is accepted."""
     from anatomy.io.markups import parse_reference, read_named_curve
-    from lungaccess.appraisal import Headline
     from lungaccess.cli.plan_tables import check_tables, show_headline
+    from lungaccess.judging.appraisal import Headline
     from lungaccess.plans.plan import Plan
     from lungaccess.slicer import check_curve
 

@@ -40,9 +40,9 @@ def export(
             expected="a folder for 3D Slicer, one for the motion in time, or both",
             remedy="Add --slicer DIR",
         )
-    from lungaccess.appraisal import DRAWS, SEED, Headline
-    from lungaccess.checking import check
     from lungaccess.cli.plan_tables import show_headline
+    from lungaccess.judging.appraisal import DRAWS, SEED, Headline
+    from lungaccess.judging.checking import check
     from lungaccess.live import plan_trajectory, write_trajectory
     from lungaccess.plans.plan import Plan
     from lungaccess.slicer import export_slicer

@@ -51,7 +51,7 @@ def insert(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees."""
-    from lungaccess.checking import check
+    from lungaccess.judging.checking import check
     from lungaccess.plans.plan import Plan
     from lungaccess.procedure.insertion import TrackerModel, insert_plan
     from lungaccess.report.insertion import insertion_webp, insertions_png

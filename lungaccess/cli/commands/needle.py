@@ -90,7 +90,7 @@ def needle(
         )
     checked = None
     if answer.path is not None and isinstance(lung, Lung):
-        from lungaccess.checking import check_needle_alone
+        from lungaccess.judging.checking import check_needle_alone
 
         checked = check_needle_alone(
             lung, device, pose, answer.path.arcs, aim.lps_mm, branches=answer.branches, at_wall=answer.at_wall

@@ -44,7 +44,7 @@ def risk(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it."""
-    from lungaccess.appraisal import Headline
+    from lungaccess.judging.appraisal import Headline
     from lungaccess.plans.plan import Plan
     from lungaccess.procedure import Procedure, simulate_procedure
     from lungaccess.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES

@@ -13,7 +13,7 @@ from lungaccess.cli.options import OutputOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from lungaccess.selftest import Failure, Outcome
+    from lungaccess.judging.selftest import Failure, Outcome
 
 
 def selftest(
@@ -28,7 +28,7 @@ def selftest(
     kind : str
         Kinds of proofs, as the table names them; all of them if not given.
     """
-    from lungaccess.selftest import self_test
+    from lungaccess.judging.selftest import self_test
 
     with progress("proofs") as shown:
         outcomes = self_test(kind, progress=shown.step)

@@ -44,9 +44,9 @@ def stream(
 
     A plan that the check refuses is not sent: exit code 1.
     """
-    from lungaccess.appraisal import Headline
-    from lungaccess.checking import check
     from lungaccess.cli.plan_tables import show_headline
+    from lungaccess.judging.appraisal import Headline
+    from lungaccess.judging.checking import check
     from lungaccess.live import Link, LiveSession
     from lungaccess.plans.plan import Plan
 

@@ -11,8 +11,8 @@ import numpy as np
 from anatomy.base.typed import Bool, Float
 from anatomy.meshes import point_distances_mm
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from lungaccess.checking.environment import Environment
-from lungaccess.checking.space import airway_except, has, labels_at
+from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.checking.space import airway_except, has, labels_at
 from lungaccess.report.html.deployment import CAP_MM, NOT_MEASURED, profile_points, required_mm
 from lungaccess.report.pack import Packed, pack
 from lungaccess.uncertainty.breathing.moving import Moving
@@ -20,7 +20,7 @@ from lungaccess.uncertainty.breathing.window import TOLERANCE_MM, miss_allowed
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.checking.space import Select
+    from lungaccess.judging.checking.space import Select
     from lungaccess.plans.plan import Plan
     from lungaccess.plans.window import BreathingWindow
 

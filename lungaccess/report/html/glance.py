@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lungaccess.appraisal.grade import Grade, grade_of_chance
-from lungaccess.appraisal.headline import Geometry, of_hundred
+from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+from lungaccess.judging.appraisal.headline import Geometry, of_hundred
 from lungaccess.report.html import words
 
 if TYPE_CHECKING:
-    from lungaccess.appraisal import Appraisal, Headline, Limit
+    from lungaccess.judging.appraisal import Appraisal, Headline, Limit
 
 
 def glance_section(appraisal: Appraisal) -> str:

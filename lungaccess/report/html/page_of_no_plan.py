@@ -19,7 +19,7 @@ from lungaccess.report.pack import Packed, pack
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.explanation import Explanation
+    from lungaccess.judging.explanation import Explanation
     from lungaccess.plans.plan import Plan
 
 MODULES = ("no_plan.js",)
@@ -74,7 +74,7 @@ def page_data(explanation: Explanation, lung: Lung) -> dict[str, Any]:
 
 def sections_html(explanation: Explanation) -> str:
     """Return the sections of an explanation as tables."""
-    from lungaccess.explanation import sections
+    from lungaccess.judging.explanation import sections
 
     return "".join(
         words.table(each.title, each.headings, [[words.text(cell) for cell in row] for row in each.rows])
@@ -89,7 +89,7 @@ def _reasons(explanation: Explanation) -> str:
 
 def _starts(explanation: Explanation) -> list[Packed]:
     """Return the cells of starts, a group for each reason, the nearest to success first."""
-    from lungaccess.explanation import FAILS
+    from lungaccess.judging.explanation import FAILS
 
     starts = explanation.starts
     if starts is None:

@@ -13,8 +13,8 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.words import plural
-from lungaccess.appraisal import Appraiser
 from lungaccess.coupled import with_front
+from lungaccess.judging.appraisal import Appraiser
 from lungaccess.plans.chance import Chance
 from lungaccess.procedure import load_procedure, procedure_names
 from lungaccess.report.html import breathing, phase, tables, words
@@ -30,7 +30,7 @@ from lungaccess.uncertainty.risk import error_preset_names, load_errors
 if TYPE_CHECKING:
     from anatomy.grid import Volume
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal
+    from lungaccess.judging.appraisal import Appraisal
     from lungaccess.plans.plan import Plan
     from lungaccess.procedure import Procedure
     from lungaccess.uncertainty.risk import ErrorModel
@@ -61,8 +61,8 @@ class PageOptions:
     cost_over_time : path or None
         CSV that `lungaccess plan` wrote beside the plan.
     errors, procedure, risk_samples, risk_seed
-        Of the estimate of success, see `lungaccess.appraisal.Appraiser`: 0 samples for none.  If all are
-        None, a plan that states its chance shows that, and its alternatives are estimated as it was.
+        Of the estimate of success, see `lungaccess.judging.appraisal.Appraiser`: 0 samples for none.  If all
+        are None, a plan that states its chance shows that, and its alternatives are estimated as it was.
     instructions : bool
         Whether the steps that bring the scope to its place are listed.
     """

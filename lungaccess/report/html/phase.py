@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lungaccess.appraisal.grade import Grade
+from lungaccess.judging.appraisal.grade import Grade
 from lungaccess.report.clock import PROVED, limit_names, on_rim, sectors
 from lungaccess.report.html import words
 from lungaccess.report.html.breathing import SAMPLES

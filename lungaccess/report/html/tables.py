@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from anatomy.base.words import plural
-from lungaccess.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
+from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
 from lungaccess.report.html import words
 from lungaccess.report.key_numbers import figures_of_plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.appraisal import Appraisal, Limit
-    from lungaccess.checking import CheckReport
-    from lungaccess.checking.findings import Finding
     from lungaccess.coupled import Alternative
+    from lungaccess.judging.appraisal import Appraisal, Limit
+    from lungaccess.judging.checking import CheckReport
+    from lungaccess.judging.checking.findings import Finding
     from lungaccess.plans.plan import Plan
 
 TIGHT_FROM = 0.9

@@ -8,7 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lungaccess.appraisal import Grade, Headline
+    from lungaccess.judging.appraisal import Grade, Headline
 
 Cell = str
 

@@ -34,7 +34,7 @@ def searched(toy_plan: Plan, monkeypatch: pytest.MonkeyPatch, accepted: set[str]
         made = replace(toy_plan, method=system.name)
         return (Alternative(plan=made, criteria={}, on_front=True),) * 2
 
-    monkeypatch.setattr("lungaccess.checking.Checker", Checker, raising=False)
+    monkeypatch.setattr("lungaccess.judging.checking.Checker", Checker, raising=False)
     return _of_the_least_invasive(None, SYSTEMS, search)  # type: ignore[arg-type]
 
 

@@ -15,10 +15,10 @@ from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from lungaccess.checking import check_needle_alone
 from lungaccess.cli.app import main
 from lungaccess.cli.commands import needle
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.judging.checking import check_needle_alone
 from lungaccess.one_stage import pierced_branches, plan_needle, reason_in_words
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, nodule_target

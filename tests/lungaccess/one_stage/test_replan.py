@@ -14,9 +14,9 @@ from anatomy.base.errors import FrameError, TargetError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OUTSIDE, VESSEL
-from lungaccess.checking import check_needle_alone
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.judging.checking import check_needle_alone
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target

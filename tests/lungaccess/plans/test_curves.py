@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lungaccess.checking import shapes
+from lungaccess.judging.checking import shapes
 from lungaccess.plans.curves import STEP_MM
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan

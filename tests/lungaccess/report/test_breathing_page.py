@@ -12,10 +12,10 @@ import pytest
 
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, point_distances_mm
-from lungaccess.appraisal.grade import Grade
-from lungaccess.checking.breath import Breath
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.judging.appraisal.grade import Grade
+from lungaccess.judging.checking.breath import Breath
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim, BreathingWindow
 from lungaccess.report.clock import PROVED, sectors, window_png

@@ -18,7 +18,7 @@ from anatomy.base.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.store import open_lung
 from lungaccess import report
-from lungaccess.appraisal import Appraisal, limits_of
+from lungaccess.judging.appraisal import Appraisal, limits_of
 from lungaccess.report import views
 from lungaccess.report.key_numbers import key_numbers
 from lungaccess.report.layers import Footprint, Layers

@@ -15,10 +15,10 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import VESSEL
-from lungaccess.appraisal import SHOWN_LIMITS
-from lungaccess.appraisal.headline import of_hundred
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.judging.appraisal import SHOWN_LIMITS
+from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.plans.curves import arc_lengths
 from lungaccess.plans.plan import Plan
 from lungaccess.report import pack

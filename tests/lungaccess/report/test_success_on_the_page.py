@@ -14,8 +14,8 @@ import pytest
 from anatomy.base.errors import PlanFileError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
-from lungaccess.appraisal import Headline
 from lungaccess.coupled import Alternative, with_front
+from lungaccess.judging.appraisal import Headline
 from lungaccess.plans.plan import Plan
 from lungaccess.procedure import ProcedureReport, StageReport, load_procedure
 from lungaccess.report.html import page_of_plan, trade_off_svg

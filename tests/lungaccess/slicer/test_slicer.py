@@ -21,8 +21,8 @@ from anatomy.io.centerlines import read_centerlines
 from anatomy.io.images import read_labels, write_volume
 from anatomy.lung import Lung
 from anatomy.phantom import LOBES, Phantom
-from lungaccess.checking import CheckReport
 from lungaccess.cli import app as cli
+from lungaccess.judging.checking import CheckReport
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer import Exported, export, export_slicer
 from lungaccess.slicer.segments import SEGMENTS, label_map

@@ -14,7 +14,7 @@ import pytest
 import SimpleITK
 
 from anatomy.lung import Lung
-from lungaccess.checking import CheckReport
+from lungaccess.judging.checking import CheckReport
 from lungaccess.plans.plan import Plan
 from lungaccess.slicer import export, export_slicer
 from lungaccess.slicer.breathing import MOVERS

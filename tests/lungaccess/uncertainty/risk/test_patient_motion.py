@@ -12,7 +12,7 @@ import pytest
 from anatomy.base.errors import SettingsError
 from anatomy.grid import Grid
 from anatomy.motion.motion import Motion
-from lungaccess.checking.breath import Breath
+from lungaccess.judging.checking.breath import Breath
 from lungaccess.uncertainty.risk.breathing import BREATHS_LN, PatientMotion, model_for, phase
 from lungaccess.uncertainty.risk.draws import Draws
 from lungaccess.uncertainty.risk.error_files import load_errors

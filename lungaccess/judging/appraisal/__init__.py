@@ -1,0 +1,23 @@
+"""What is said first of a plan: verdict of the check, chance of success, and how near its limits are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.judging.appraisal.appraiser import (
+        DRAWS,
+        MEASURED_DRAWS,
+        SEED,
+        Appraisal,
+        Appraiser,
+        appraise,
+    )
+    from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+    from lungaccess.judging.appraisal.headline import Geometry, Headline
+    from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
+    from lungaccess.judging.appraisal.record import plan_record
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,0 +1,262 @@
+"""The headline of a plan: how likely it succeeds, and whether its geometry was accepted, always together."""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from anatomy.base.records import frozen_value
+from anatomy.base.words import plural
+from anatomy.lobes import FISSURES_UNKNOWN
+from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+from lungaccess.plans.chance import Chance
+from lungaccess.procedure.report import NO_PATH
+from lungaccess.success.estimate import Estimate, chance_of
+from lungaccess.uncertainty.risk.assessment import MISSES
+from lungaccess.uncertainty.risk.statistics import Share
+
+if TYPE_CHECKING:
+    from lungaccess.judging.checking import CheckReport
+
+FAILURES = {
+    "vessel": "touches a vessel",
+    "pleura": "touches the pleura",
+    "fissure": "touches a fissure",
+    "airway": "touches an airway",
+    "stays in the airway": "stays in the airway",
+    NO_PATH: "has no path left",
+}
+"""What a failed procedure does, by the names of `lungaccess.uncertainty.risk.STRUCTURES` and `NO_PATH`."""
+
+BESIDE_TARGET = (
+    "The plan was made for a window of the breath: in the phase of the masks it ends beside the target."
+)
+
+
+class Geometry(StrEnum):
+    """What is known of the geometry of a plan."""
+
+    PROVED = "proved and checked"
+    """The planner proved it, and the independent check accepts it."""
+    REFUSED = "refused"
+    """The independent check refuses it."""
+    UNCHECKED = "not checked"
+
+
+@frozen_value
+class Headline:
+    """The verdict of the check and the chance of success of one plan.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    refusals : int
+        Findings of the check that are not ok.
+    estimate : RiskReport, ProcedureReport, Chance or None
+        The estimate of success, or what the plan states of one; None if there is none, as for a refused plan.
+    fissures_unknown : bool
+        Whether fissures must not be crossed, and the patient has no mask of them.
+    has_aim : bool
+        Whether the plan was made for a window of the breath, and ends beside the target of the masks' phase.
+    """
+
+    geometry: Geometry
+    refusals: int = 0
+    estimate: Estimate | None = None
+    fissures_unknown: bool = False
+    has_aim: bool = False
+
+    @classmethod
+    def of(cls, report: CheckReport | None, estimate: Estimate | None) -> Headline:
+        """Return the headline of a check, or of none, and of an estimate, or of none."""
+        if report is None:
+            return cls(geometry=Geometry.UNCHECKED, estimate=estimate)
+        geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
+        unknown = any(each.name == "patient.fissures" for each in report.unchecked)
+        has_aim = any(each.name == "target.aim" for each in report.findings)
+        return cls(
+            geometry=geometry,
+            refusals=len(report.refusals),
+            estimate=estimate,
+            fissures_unknown=unknown,
+            has_aim=has_aim,
+        )
+
+    @property
+    def chance(self) -> Chance | None:
+        """What was counted; None where nothing was."""
+        return None if self.estimate is None else chance_of(self.estimate)
+
+    @property
+    def success(self) -> Share | None:
+        """The chance of success; None where it was not computed."""
+        chance = self.chance
+        return None if chance is None else Share(count=chance.successes, samples=chance.samples)
+
+    @property
+    def grade(self) -> Grade:
+        """The worse of geometry and chance of success: accepted geometry alone is never good."""
+        of_geometry = {
+            Geometry.PROVED: Grade.UNKNOWN if self.fissures_unknown else Grade.GOOD,
+            Geometry.UNCHECKED: Grade.UNKNOWN,
+            Geometry.REFUSED: Grade.POOR,
+        }[self.geometry]
+        return max(of_geometry, grade_of_chance(self.success))
+
+    @property
+    def verdict(self) -> str:
+        """The grade in words."""
+        if self.geometry == Geometry.REFUSED:
+            return "refused: do not use"
+        if self.grade == Grade.UNKNOWN:
+            return "not known to succeed"
+        return {Grade.GOOD: "likely to succeed", Grade.FAIR: "may fail", Grade.POOR: "likely to fail"}[
+            self.grade
+        ]
+
+    @property
+    def all_failures(self) -> dict[str, Share]:
+        """Everything that made procedures fail, by its name, the most frequent first."""
+        chance = self.chance
+        if chance is None:
+            return {}
+        counts = sorted(chance.failures.items(), key=lambda item: (-item[1], item[0] != MISSES))
+        return {name: Share(count=count, samples=chance.samples) for name, count in counts}
+
+    @property
+    def failures(self) -> tuple[tuple[str, Share], ...]:
+        """The most frequent failure in words, and the most frequent touch if that is another one."""
+        happened = [(name, share) for name, share in self.all_failures.items() if share.count]
+        touches = [each for each in happened if each[0] != MISSES]
+        first = happened[:1]
+        chosen = first + ([touches[0]] if touches and first[0][0] == MISSES else [])
+        return tuple((self._failure(name), share) for name, share in chosen)
+
+    def _failure(self, name: str) -> str:
+        chance = self.chance
+        if name == MISSES and chance is not None:
+            return f"ends more than {chance.radius_mm:.1f} mm from the target"
+        return FAILURES[name]
+
+    @property
+    def text(self) -> str:
+        """The headline in sentences: how often it succeeds and why it fails, and its geometry.
+
+        A refusal stands first: such a plan has no chance.
+        """
+        parts = [self.chance_text, self._geometry()]
+        return " ".join(reversed(parts) if self.geometry == Geometry.REFUSED else parts)
+
+    def _geometry(self) -> str:
+        if self.geometry == Geometry.REFUSED:
+            return f"Refused by the independent check ({plural(self.refusals, 'finding')})."
+        return f"{self.geometry_words.capitalize()}."
+
+    @property
+    def geometry_words(self) -> str:
+        """What is known of the geometry, and that fissures are not checked where they are not known."""
+        missing = f", fissures not checked: {FISSURES_UNKNOWN}" if self.fissures_unknown else ""
+        return f"geometry {self.geometry}{missing}"
+
+    @property
+    def chance_text(self) -> str:
+        """How often the plan succeeds, why it fails, and under what, in sentences."""
+        chance, success = self.chance, self.success
+        if chance is None or success is None:
+            return "Chance of success not computed."
+        low, high = success.interval
+        failures = " and ".join(
+            f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in self.failures
+        )
+        why = f"fails most because it {failures}" if failures else "none of them failed"
+        return (
+            f"Estimated to succeed in {of_hundred(success.value)} of 100 procedures (95 % interval "
+            f"{of_hundred(low)} to {of_hundred(high, up=True)}); {why}. "
+            f"Procedure '{chance.procedure}', errors of '{chance.errors}'."
+        )
+
+    @property
+    def chance_words(self) -> str:
+        """The chance of success alone, for the cell of a table."""
+        if self.success is None:
+            return "not computed"
+        low, high = self.success.interval
+        interval = f"{of_hundred(low)} to {of_hundred(high, up=True)}"
+        return f"{of_hundred(self.success.value)} of 100 ({interval})"
+
+    @property
+    def details(self) -> tuple[str, ...]:
+        """What the estimate rests on, in sentences: draws, what counts as success, and the errors' sizes."""
+        chance = self.chance
+        if chance is None:
+            return ()
+        drawn = f"{plural(chance.samples, 'draw')}, seed {chance.seed}"
+        if self.is_stated:
+            drawn += ", which its search never saw; as the plan states, not computed again"
+        last = "needle ends" if chance.with_needle else "tubes end"
+        assumed = ", ".join(kind.replace("_", " ") for kind in chance.assumed)
+        return (
+            f"{drawn}. {chance.corrections}",
+            f"Success: the {last} within {chance.radius_mm:.1f} mm of the target "
+            f"({chance.radius_origin}) and nothing forbidden is touched.",
+            *((BESIDE_TARGET,) if self.has_aim else ()),
+            f"Errors of '{chance.errors}': {chance.sizes}. Assumed, with no published source: "
+            f"{assumed or 'none'}.",
+        )
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether the chance is that which the plan states."""
+        return isinstance(self.estimate, Chance)
+
+    def to_mapping(self) -> dict[str, object]:
+        """Return the headline as plain JSON values; None where something was not computed."""
+        chance, first = self.chance, self.failures[:1]
+        counted = {name: _share(share) for name, share in self.all_failures.items()}
+        return {
+            "text": self.text,
+            "grade": self.grade.key,
+            "verdict": self.verdict,
+            "geometry": str(self.geometry),
+            "fissures_unknown": self.fissures_unknown,
+            "success": None if self.success is None else _share(self.success),
+            "stated_by_plan": self.is_stated,
+            "most_frequent_failure": {"what": first[0][0], **_share(first[0][1])} if first else None,
+            "failures": None if chance is None else counted,
+            "draws": None if chance is None else chance.samples,
+            "seed": None if chance is None else chance.seed,
+            "goal_radius_mm": None if chance is None else chance.radius_mm,
+            "goal_radius_origin": None if chance is None else chance.radius_origin,
+            "procedure": None if chance is None else chance.procedure,
+            "errors": None if chance is None else _errors(chance, self.estimate),
+            "errors_assumed": None if chance is None else list(chance.assumed),
+        }
+
+
+def _errors(chance: Chance, estimate: Estimate | None) -> dict[str, object]:
+    """Return the error model by its keys, or of what a plan states its name and sizes."""
+    from anatomy.base.settings import to_mapping
+
+    if estimate is None or isinstance(estimate, Chance):
+        return {"name": chance.errors, "sizes": chance.sizes}
+    return {**to_mapping(estimate.model), "name": chance.errors}
+
+
+def _share(share: Share) -> dict[str, object]:
+    return {"probability": share.value, "interval_95": list(share.interval)}
+
+
+def of_hundred(probability: float, *, up: bool = False) -> str:
+    """Return a probability as a number of 100, rounded down, or up where the greater number is the worse.
+
+    Near 0 and 100 it has one decimal, so that neither is stated where it does not hold.
+
+    Examples
+    --------
+    >>> of_hundred(0.0065), of_hundred(0.428), of_hundred(0.9996), of_hundred(0.428, up=True)
+    ('0.6', '42', '99.9', '43')
+    """
+    steps = 1.0 if 0.1 <= probability <= 0.9 else 10.0
+    exact = round(100.0 * steps * probability, 6)
+    return f"{(math.ceil(exact) if up else math.floor(exact)) / steps:g}"

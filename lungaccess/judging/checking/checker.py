@@ -1,0 +1,85 @@
+"""The independent check: it computes everything in a finished plan anew and accepts or refuses the plan."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lungaccess.judging.checking.completion import Motions, completed_plan
+from lungaccess.judging.checking.deployment import check_deployment
+from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.checking.findings import CheckReport, Findings
+from lungaccess.judging.checking.outcome import check_tubes_at_target
+from lungaccess.judging.checking.record import check_record
+from lungaccess.judging.checking.scope import check_scope
+from lungaccess.judging.checking.steering import check_needle
+from lungaccess.judging.checking.window import check_window
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+
+class Checker:
+    """Checks many plans of one lung: what follows from the lung alone is computed once.
+
+    Parameters
+    ----------
+    lung : Lung
+        The patient that the plans are for; its arrays must not change while the checker is used.
+    """
+
+    def __init__(self, lung: Lung) -> None:
+        self._environment = Environment(lung)
+
+    def check(
+        self, plan: Plan, system: System | None = None, *, target_lps: ArrayLike | None = None
+    ) -> CheckReport:
+        """Check one plan; see `lungaccess.judging.checking.check`."""
+        found = Findings()
+        target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
+        if check_record(plan, self._environment.lung, found, system, target):
+            check_scope(plan.scope, plan.system, self._environment, found)
+            tube_tip = check_deployment(plan, self._environment, found)
+            needle, device = plan.needle, plan.system.needle
+            if needle is None or device is None:
+                check_tubes_at_target(plan, self._environment, tube_tip, found)
+            else:
+                check_needle(plan, needle, device, self._environment, tube_tip, found)
+            check_window(plan, self._environment, found)
+        return found.report()
+
+    def completed(self, motions: Motions, system: System, target_lps: ArrayLike, *, method: str) -> Plan:
+        """Return the plan that bare motions make; see `completion.completed_plan`."""
+        target = np.asarray(target_lps, dtype=np.float64)
+        return completed_plan(motions, self._environment, system, target, method=method)
+
+
+def check(
+    plan: Plan, lung: Lung, system: System | None = None, *, target_lps: ArrayLike | None = None
+) -> CheckReport:
+    """Check a plan against the masks of a patient, independently of how it was made.
+
+    The kinematics are re-integrated, clearances are measured with FCL to the exact surface of the voxel
+    boxes, containment is looked up in the label volume, and every stated value is recomputed.  Nothing
+    of the planners' arithmetic is used, nor the clearance fields.  `docs/explanation/check.md` explains every
+    finding.  For many plans of one lung use `Checker`.
+
+    Parameters
+    ----------
+    lung : Lung
+        The patient that the plan is for.
+    system : System, optional
+        The devices that will be used; the plan's must be the same.  Without it only a plan whose system has
+        the name of a preset is compared with something.
+    target_lps : (3,) array_like, optional
+        The target that was asked for, LPS mm; the plan's must be the same.
+
+    Returns
+    -------
+    CheckReport
+    """
+    return Checker(lung).check(plan, system, target_lps=target_lps)

@@ -1,0 +1,194 @@
+"""What the check found: one line for each thing it looked at."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.base.records import frozen_value
+
+Side = Literal["at least", "at most"]
+
+
+@frozen_value
+class Finding:
+    """One thing that was checked.
+
+    Parameters
+    ----------
+    name : str
+        Stage and property, such as "needle.clearance.vessel".
+    ok : bool or None
+        None for what could not be checked.
+    value, limit : float or None
+        What was found and the bound it had to keep; None for what is not a number.
+    side : str or None
+        Whether the value must be "at least" or "at most" the limit; None without a limit.
+    tolerance : float
+        It is ok if it misses the limit by no more than this.
+    detail : str
+        What was compared, in words.
+    """
+
+    name: str
+    ok: bool | None
+    value: float | None = None
+    limit: float | None = None
+    side: Side | None = None
+    tolerance: float = 0.0
+    unit: str = ""
+    detail: str = ""
+
+    @property
+    def margin(self) -> float | None:
+        """Distance of the value from its limit, positive inside; None for what has no limit."""
+        if self.value is None or self.limit is None:
+            return None
+        return self.value - self.limit if self.side == "at least" else self.limit - self.value
+
+    @property
+    def stage(self) -> str:
+        """First word of the name: what it is about."""
+        return self.name.split(".")[0]
+
+    @property
+    def verdict(self) -> str:
+        """What the check says in a word or two: "ok", "REFUSED" or "not checked"."""
+        return "not checked" if self.ok is None else "ok" if self.ok else "REFUSED"
+
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        number = "" if self.value is None else f" {self.value:.6g}{unit}"
+        spare = f", tolerance {self.tolerance:.3g}" if self.tolerance else ""
+        bound = f" ({self.side} {self.limit:.6g}, margin {self.margin:.3g}{spare})" if self.side else ""
+        detail = f": {self.detail}" if self.detail else ""
+        return f"{self.verdict:7} {self.name}{number}{bound}{detail}"
+
+    def cells(self) -> tuple[str, ...]:
+        """Return what a row of a table says: verdict, name, value, limit, margin and detail."""
+        unit = f" {self.unit}" if self.unit else ""
+        return (
+            self.verdict,
+            self.name,
+            "" if self.value is None else f"{self.value:.4g}{unit}",
+            "" if self.side is None else f"{self.side} {self.limit:.4g}",
+            "" if self.margin is None else f"{self.margin:.3g}",
+            self.detail,
+        )
+
+    def to_mapping(self) -> dict[str, object]:
+        """Return plain JSON values; a number that is not finite becomes None."""
+        numbers = {"value": self.value, "limit": self.limit, "margin": self.margin}
+        finite = {key: n if n is not None and math.isfinite(n) else None for key, n in numbers.items()}
+        words = {"name": self.name, "stage": self.stage, "ok": self.ok, "side": self.side}
+        return {**words, **finite, "tolerance": self.tolerance, "unit": self.unit, "detail": self.detail}
+
+
+@frozen_value
+class CheckReport:
+    """The verdict of the check: accepted only if no finding is refused; what is not checked is listed."""
+
+    accepted: bool
+    findings: tuple[Finding, ...]
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows."""
+        from lungaccess.judging.checking.display import report_html
+
+        rows, refused = ([each.cells() for each in some] for some in (self.findings, self.refusals))
+        return report_html(rows, refused, accepted=self.accepted)
+
+    @property
+    def refusals(self) -> tuple[Finding, ...]:
+        """The findings that are not ok."""
+        return tuple(finding for finding in self.findings if finding.ok is False)
+
+    @property
+    def unchecked(self) -> tuple[Finding, ...]:
+        """What could not be checked."""
+        return tuple(finding for finding in self.findings if finding.ok is None)
+
+    def to_mapping(self) -> dict[str, object]:
+        """Return the report as plain JSON values."""
+        findings = [each.to_mapping() for each in self.findings]
+        unchecked = [each.name for each in self.unchecked]
+        return {"accepted": self.accepted, "not_checked": unchecked, "findings": findings}
+
+    def __str__(self) -> str:
+        verdict = "accepted" if self.accepted else f"REFUSED ({len(self.refusals)} findings)"
+        return "\n".join([verdict, *(str(finding) for finding in self.findings)])
+
+
+class Findings:
+    """Collects findings."""
+
+    def __init__(self) -> None:
+        self._all: list[Finding] = []
+
+    def true(self, name: str, ok: bool | np.bool_, detail: str = "") -> bool:
+        """Record a statement that must be true, and return it."""
+        self._all.append(Finding(name=name, ok=bool(ok), detail=detail))
+        return bool(ok)
+
+    def unchecked(self, name: str, detail: str) -> None:
+        """Record what could not be checked, and why."""
+        self._all.append(Finding(name=name, ok=None, detail=detail))
+
+    def measured(self, name: str, value: float, unit: str, detail: str) -> None:
+        """Record what was measured where nothing limits it."""
+        self._all.append(Finding(name=name, ok=True, value=float(value), unit=unit, detail=detail))
+
+    def at_least(
+        self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
+    ) -> bool:
+        """Record a value that must not be below `limit` by more than `tolerance`."""
+        return self._number(
+            name, value >= limit - tolerance, value, limit, "at least", tolerance, unit, detail
+        )
+
+    def at_most(
+        self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
+    ) -> bool:
+        """Record a value that must not be above `limit` by more than `tolerance`."""
+        return self._number(
+            name, value <= limit + tolerance, value, limit, "at most", tolerance, unit, detail
+        )
+
+    def agrees(self, name: str, stated: ArrayLike, found: ArrayLike, largest: float, unit: str) -> bool:
+        """Record the largest difference between a stated and a recomputed value (or array)."""
+        a, b = np.asarray(stated, dtype=np.float64), np.asarray(found, dtype=np.float64)
+        gap = float(np.abs(a - b).max(initial=0.0)) if a.shape == b.shape else math.inf
+        detail = f"stated {float(a):.6g}, recomputed {float(b):.6g}" if a.shape == b.shape == () else ""
+        return self.at_most(name, gap, largest, unit, detail or "largest difference of stated and recomputed")
+
+    def _number(
+        self,
+        name: str,
+        ok: bool,
+        value: float,
+        limit: float,
+        side: Side,
+        tolerance: float,
+        unit: str,
+        detail: str,
+    ) -> bool:
+        made = Finding(
+            name=name,
+            ok=bool(ok),
+            value=float(value),
+            limit=float(limit),
+            side=side,
+            tolerance=tolerance,
+            unit=unit,
+            detail=detail,
+        )
+        self._all.append(made)
+        return bool(ok)
+
+    def report(self) -> CheckReport:
+        """Return what was collected; nothing collected is not accepted."""
+        accepted = any(each.ok for each in self._all) and all(each.ok is not False for each in self._all)
+        return CheckReport(accepted=accepted, findings=tuple(self._all))

@@ -1,0 +1,181 @@
+"""Last part of the check: the devices end at the target, and cost what the plan states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from anatomy import structures
+from anatomy.base.typed import Float
+from lungaccess.judging.checking.clearances import REACH_MM
+from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.checking.findings import Findings
+from lungaccess.judging.checking.poses import LENGTH_TOLERANCE_MM, POSITION_TOLERANCE_MM
+from lungaccess.judging.checking.shapes import Curve, beyond, integrate, tube_pieces
+from lungaccess.judging.checking.space import has, labels_at
+from lungaccess.plans.plan import Plan
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+
+COST_TOLERANCE = 0.02
+"""Share by which a planner's sampled integral may differ from the finer one of the check."""
+COST_STEP_MM = 0.1
+"""Step of the integral: small against the distances over which a clearance changes."""
+COST_REACH_MM = 100.0
+"""No point of a lung is farther than this from the pleura, so that every clearance is found."""
+CLEARANCE_FLOOR_MM = 0.1
+"""1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1]."""
+GREATEST_VOXEL_COST = 1.0
+"""Of one voxel: so much may two sums differ because one grazes a voxel that the other does not."""
+GRAZED_MM = 1e-9
+"""A voxel that is crossed for less than this is met at an edge only, by rounding."""
+COSTS = ("inverse_clearance", "cost_map", "voxel_sum", "length_mm")
+ROUNDING = 1e-12
+"""Sums of four numbers agree to this share of them, whatever the order."""
+
+
+def check_tubes_at_target(
+    plan: Plan, environment: Environment, tube_tip: Float | None, found: Findings
+) -> None:
+    """Without a needle the tip of the tubes is at the target; they are what the plan's costs are of.
+
+    The costs count from where the axis leaves the lumen, those of the map from behind the wall.
+    """
+    found.at_most("exemption.length", plan.exemption.needle_length_mm, 0.0, "mm", "there is no needle")
+    if tube_tip is None:
+        return
+    check_target(plan, environment.lung, tube_tip[:3, 3], found)
+    miss, detail = float(np.linalg.norm(tube_tip[:3, 3] - plan.end_lps)), "tip of the tubes to the target"
+    found.at_most("tube.at_target", miss, POSITION_TOLERANCE_MM, "mm", detail)
+    curve = integrate(plan.scope.lps_from_scope_tip, tube_pieces(plan))
+    way_out = plan.tube.exit
+    in_tissue = beyond(curve, way_out.arc_length_mm)
+    check_costs(plan, environment, in_tissue, found, beyond(in_tissue, way_out.wall_run_mm))
+
+
+def check_target(plan: Plan, lung: Lung, end: Float, found: Findings) -> None:
+    """The needle, or the tubes, end at the target, which lies in the lung and in no obstacle.
+
+    Devices with an aim end there instead: how near that is to the target, its window says.
+    """
+    miss = float(np.linalg.norm(end - plan.end_lps))
+    if plan.aim is not None:
+        found.at_most("target.aim", miss, POSITION_TOLERANCE_MM, "mm", "end of the devices to the aim")
+        if plan.target_origin.startswith("nodule"):
+            found.true("target.in_nodule", _in_nodule(lung, plan.target_lps[None]), "the target is nodule")
+    elif plan.target_origin.startswith("nodule"):
+        ends = np.stack([end, plan.target_lps])
+        found.true("target.in_nodule", _in_nodule(lung, ends), "end of the devices and target are nodule")
+    else:
+        found.at_most("target.reached", miss, POSITION_TOLERANCE_MM, "mm", "end of the devices to the target")
+    label = int(labels_at(lung, plan.target_lps)[0])
+    found.true("target.in_lung", not label & structures.OUTSIDE, "the target is lung")
+    forbidden = forbidden_bits(plan)
+    found.true("target.free", not label & forbidden, "the target lies in no obstacle")
+
+
+def _in_nodule(lung: Lung, points: Float) -> bool:
+    if lung.nodules is None:
+        return False
+    index = np.rint(lung.nodules.grid.ijk(points)).astype(np.int64)
+    if ((index < 0) | (index >= np.asarray(lung.nodules.grid.shape))).any():
+        return False
+    return bool(lung.nodules.array[tuple(index.T)].all())
+
+
+def forbidden_bits(plan: Plan) -> int:
+    """Return the structures that the needle must stay clear of."""
+    return structures.obstacle_bits(plan.fissures_are_obstacles)
+
+
+def check_costs(
+    plan: Plan, environment: Environment, curve: Curve, found: Findings, mapped_curve: Curve | None = None
+) -> None:
+    """The stated costs are those of a re-integrated curve, those of the map of another if there is one."""
+    stated: Mapping[str, float] = plan.costs
+    required = set(COSTS) - {"voxel_sum"}
+    named = required <= set(stated) <= {*COSTS, plan.objective}
+    if not found.true("costs.names", named, ", ".join(stated)):
+        return
+    weights = objective_weights(plan.objective)
+    known = plan.objective in stated and weights is not None and set(weights) <= set(stated)
+    is_sum = plan.objective not in COSTS
+    if found.true("costs.objective", known, plan.objective) and is_sum and weights is not None:
+        total = sum(weight * stated[name] for name, weight in weights.items())
+        tolerance = ROUNDING * abs(total)
+        found.agrees("costs.objective.sum", stated[plan.objective], total, tolerance, "")
+    found.agrees("costs.length_mm", stated["length_mm"], curve.arc_mm[-1], LENGTH_TOLERANCE_MM, "mm")
+    recomputed = inverse_clearance(plan, environment, curve)
+    tolerance = COST_TOLERANCE * recomputed
+    found.agrees("costs.inverse_clearance", stated["inverse_clearance"], recomputed, tolerance, "")
+    mapped, summed = cost_map_integral_and_sum(environment.lung, mapped_curve or curve)
+    found.agrees("costs.cost_map", stated["cost_map"], mapped, COST_TOLERANCE * mapped + 1e-6, "mm")
+    if "voxel_sum" in stated:
+        tolerance = COST_TOLERANCE * summed + GREATEST_VOXEL_COST
+        found.agrees("costs.voxel_sum", stated["voxel_sum"], summed, tolerance, "")
+
+
+def objective_weights(objective: str) -> dict[str, float] | None:
+    """Return the weights of an objective by the names of costs; None if its text is not one.
+
+    The text is the name of a cost, or a sum such as "cost_map=0.5,length_mm=1".
+    """
+    weights: dict[str, float] = {}
+    for part in objective.split(","):
+        name, equals, weight = part.partition("=")
+        try:
+            weights[name] = float(weight) if equals else 1.0
+        except ValueError:
+            return None
+    in_range = all(0.0 < weight < np.inf for weight in weights.values())
+    return weights if in_range and set(weights) <= set(COSTS) else None
+
+
+def inverse_clearance(plan: Plan, environment: Environment, curve: Curve) -> float:
+    """Return the integral of 1 / clearance over the length of a curve [Kuntz2015], by the trapezoid rule.
+
+    The clearance to the nearest obstacle, voxels as solid boxes, is not taken below 0.1 mm nor above
+    `COST_REACH_MM`, which is farther than any point of a lung lies from its pleura.
+    """
+    length = float(curve.arc_mm[-1])
+    arc = np.linspace(0.0, length, max(int(np.ceil(length / COST_STEP_MM)), 1) + 1)
+    points = np.stack([np.interp(arc, curve.arc_mm, curve.points[:, axis]) for axis in range(3)], axis=1)
+    obstacles = has(forbidden_bits(plan))
+    clearance = environment.boxes(obstacles, REACH_MM).distance_mm(points)
+    far = clearance >= REACH_MM
+    if far.any():
+        clearance[far] = environment.boxes(obstacles, COST_REACH_MM).distance_mm(points[far])
+    return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
+
+
+def cost_map_integral_and_sum(lung: Lung, curve: Curve) -> tuple[float, float]:
+    """Return the line integral of the cost map in mm, and its sum over the set of voxels crossed.
+
+    The chords of the curve, shorter than a voxel, are cut at the faces of voxels.  Without a map both are
+    0; both are infinite off the grid and in voxels of infinite cost.
+    """
+    if lung.cost is None:
+        return 0.0, 0.0
+    place = lung.cost.grid.ijk(curve.points) + 0.5
+    cell = np.floor(place)
+    cuts = [curve.arc_mm]
+    for axis in range(3):
+        step = np.flatnonzero(cell[1:, axis] != cell[:-1, axis])
+        begin, end = place[step, axis], place[step + 1, axis]
+        share = (np.maximum(cell[step, axis], cell[step + 1, axis]) - begin) / (end - begin)
+        cuts.append(curve.arc_mm[step] + share * np.diff(curve.arc_mm)[step])
+    arc = np.sort(np.concatenate(cuts))
+    length = np.diff(arc)
+    middle = 0.5 * (arc[1:] + arc[:-1])[length > GRAZED_MM]
+    index = np.stack([np.floor(np.interp(middle, curve.arc_mm, place[:, n])) for n in range(3)], axis=1)
+    inside = ((index >= 0) & (index < np.asarray(lung.cost.grid.shape))).all(axis=1)
+    if not inside.all():
+        return float("inf"), float("inf")
+    voxels, which = np.unique(index.astype(np.int64), axis=0, return_inverse=True)
+    values = lung.cost.array[tuple(voxels.T)].astype(np.float64)
+    if not np.isfinite(values).all():
+        return float("inf"), float("inf")
+    return float((values[which.ravel()] * length[length > GRAZED_MM]).sum()), float(values.sum())

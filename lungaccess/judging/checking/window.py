@@ -1,0 +1,326 @@
+"""Last part of the check: in the phases of its window a plan is clear and on target, on deformed meshes.
+
+The surfaces of the voxels near the devices are deformed as the lung is in a phase, and FCL measures from the
+carried devices to them.  What holds between the phases that are looked at rests on the planner's proof.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy import structures
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
+from anatomy.meshes import MeshDistance, SurfaceMesh
+from lungaccess.judging.checking import shapes
+from lungaccess.judging.checking.breath import Breath
+from lungaccess.judging.checking.deployment import OUT_OF_LUMEN_MM, RIM_POINTS, WALL_ZONE_MM
+from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.checking.findings import Findings
+from lungaccess.judging.checking.outcome import forbidden_bits
+from lungaccess.judging.checking.shapes import Curve, Piece, cut_at, integrate
+from lungaccess.judging.checking.space import Select, airway_except, has, labels_at, not_lumen
+from lungaccess.plans.plan import Plan
+
+LARGEST_TOLERANCE_MM = 2.0
+"""The promise of a window is an end within this of the moving target."""
+PHASE_STEP = 0.05
+"""Between two phases that are looked at a device moves against tissue by less than a millimetre, mostly."""
+TARGET_STEPS = 200
+"""Phases at which the distance to the target is looked at, which costs nothing."""
+MESH_TOLERANCE_MM = 0.005
+"""A deformed face is flat here: off by a voxel's edge times what the gradient changes on it."""
+NEAR_MM = 0.5
+"""Voxels are meshed that come nearer than what is required and this in any phase."""
+CORNER_MM = 0.06
+"""An axis in the airway cuts corners by 0.05 mm; a sample may see a little more."""
+FLATTEST_DEG = 10.0
+"""A wall that is pierced at less counts as pierced at this angle."""
+HOLE_TOLERANCE_MM = 0.02
+"""The point of the exit is known to this."""
+VARIES_MM = 0.01
+"""What is to be kept from straying tissue is taken as equal along pieces over which it varies by this."""
+ROUNDING = 1e-9
+
+
+@frozen_record
+class Part:
+    """A stretch of the devices `(N, 3)` as planned, what it is to be clear of, and by how much."""
+
+    name: str
+    points: Float
+    select: Select
+    required_mm: float
+
+
+def check_window(plan: Plan, environment: Environment, found: Findings) -> None:
+    """Record whether the stated window holds; a patient without motion has none, and needs none."""
+    window, motion = plan.window, environment.lung.motion
+    if plan.aim is not None:
+        _check_aim(plan, found)
+    if window is None and motion is None:
+        return
+    if window is None or motion is None:
+        what = "a window, but no motion of the patient is known" if window else "no window of breathing"
+        if window is not None:
+            found.true("window.motion", False, f"the plan states {what}")
+        else:
+            found.unchecked("window", f"the plan states {what}")
+        return
+    found.true("window.motion", window.motion_key == motion.key, "the motion is that of the patient")
+    beside = float(np.linalg.norm(np.asarray(plan.end_lps) - np.asarray(plan.target_lps)))
+    found.agrees("window.beside_target", window.beside_target_mm, beside, ROUNDING, "mm")
+    names = ("masks_phase", "amplitude", "warning_only", "hysteresis")
+    same = (window.motion_source, *(getattr(window, name) for name in names))
+    own = (motion.source, *(getattr(motion, name) for name in names))
+    detail = f"{window.motion_source}; phase of the masks {window.masks_phase:g}"
+    found.true("window.source", same == own, detail)
+    detail = "largest distance to the moving target that is promised"
+    found.at_most("window.tolerance", window.tolerance_mm, LARGEST_TOLERANCE_MM, "mm", detail)
+    if window.warning_only:
+        found.unchecked("window.model", "the motion is that of other people's lungs: a warning, no promise")
+    _check_ends(plan, found)
+    breath = Breath(motion, np.asarray(plan.target_lps), np.asarray(plan.scope.lps_from_scope_tip[:3, 3]))
+    devices = _Devices(plan, environment)
+    _check_target(plan, breath, devices, found)
+    _check_clear(plan, environment, breath, devices, found)
+
+
+class _Devices:
+    """Tubes and needle, integrated anew, with the parts that have a rule of their own."""
+
+    def __init__(self, plan: Plan, environment: Environment) -> None:
+        self._plan, self._has_fissures = plan, environment.lung.has_fissures
+        way_out = plan.tube.exit.arc_length_mm
+        pieces = shapes.tube_pieces(plan)
+        self.hole_mm = float(shapes.radius_at(plan, np.array([way_out]))[0])
+        angle = max(plan.tube.exit.wall_angle_rad, np.deg2rad(FLATTEST_DEG))
+        self.zone_mm = WALL_ZONE_MM + self.hole_mm / float(np.sin(angle))
+        for at in (way_out, way_out + self.zone_mm, *plan.tube.insertions_mm(plan.system.tubes)):
+            pieces = cut_at(pieces, at)
+        self.tube: Curve = integrate(plan.scope.lps_from_scope_tip, pieces)
+        self.needle: Curve | None = None
+        if plan.needle is not None:
+            arcs = [
+                Piece(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
+                for arc in plan.needle.arcs
+            ]
+            cut = cut_at(arcs, plan.exemption.needle_length_mm)
+            self.needle = integrate(plan.needle.lps_from_start, cut)
+
+    @property
+    def end(self) -> Float:
+        """Where the devices end, `(3,)`."""
+        return np.asarray((self.needle or self.tube).end[:3, 3])
+
+    def from_tip_mm(self, points: Float) -> Float:
+        """Return the distances of points from the tip of the scope."""
+        return np.asarray(np.linalg.norm(points - self._plan.scope.lps_from_scope_tip[:3, 3], axis=-1))
+
+    def in_airway(self) -> Curve:
+        """Return the tubes up to their exit."""
+        keep = self.tube.arc_mm <= self._plan.tube.exit.arc_length_mm + ROUNDING
+        return replace(self.tube, frames=self.tube.frames[keep], arc_mm=self.tube.arc_mm[keep])
+
+    def parts(self) -> Iterator[Part]:
+        """Yield what the devices beyond the exit must be clear of."""
+        plan, bits = self._plan, forbidden_bits(self._plan)
+        others, not_own = has(bits & ~structures.AIRWAY), airway_except(plan.exemption.branch)
+        extra = plan.system.margins.total_mm + plan.tube.clearance_loss_mm
+        way_out, begin = plan.tube.exit.arc_length_mm, plan.tube.exit.arc_length_mm
+        for (name, tube), end in zip(
+            plan.system.tubes.named, plan.tube.insertions_mm(plan.system.tubes), strict=True
+        ):
+            points = _between(self.tube, begin, end)
+            begin = max(begin, end)
+            if len(points) > 1:
+                required = 0.5 * tube.outer_diameter_mm + extra
+                yield Part(name=f"{name}_tube", points=points, select=others, required_mm=required)
+                yield Part(name=f"{name}_tube", points=points, select=not_own, required_mm=required)
+        beyond = _between(self.tube, way_out + self.zone_mm, float(self.tube.arc_mm[-1]))
+        if len(beyond) > 1:
+            lumen = has(structures.LUMEN)
+            yield Part(name="beyond_wall", points=beyond, select=lumen, required_mm=OUT_OF_LUMEN_MM)
+        yield from self._needle_parts(others, not_own)
+
+    def _needle_parts(self, others: Select, not_own: Select) -> Iterator[Part]:
+        needle, device = self.needle, self._plan.system.needle
+        if needle is None or device is None:
+            return
+        radius = 0.5 * device.diameter_mm
+        required, exempt = radius + self._plan.system.margins.total_mm, self._plan.exemption.needle_length_mm
+        near, far = _between(needle, 0.0, exempt), _between(needle, exempt, float(needle.arc_mm[-1]))
+        cases = [
+            (needle.points, others, required), (near, not_own, required),
+            (near, has(structures.LUMEN), radius), (far, has(structures.AIRWAY), required),
+        ]  # fmt: skip
+        for points, select, least in cases:
+            if len(points) > 1:
+                yield Part(name="needle", points=points, select=select, required_mm=least)
+
+
+def _between(curve: Curve, begin: float, end: float) -> Float:
+    inside = (curve.arc_mm >= begin - ROUNDING) & (curve.arc_mm <= end + ROUNDING)
+    return curve.points[inside]
+
+
+def _check_aim(plan: Plan, found: Findings) -> None:
+    """Devices may end beside the target only if a window holds, without a gap, what was asked for."""
+    held = np.zeros((0, 2)) if plan.window is None else plan.window.phases
+    asked = np.zeros((0, 2)) if plan.aim is None else plan.aim.phases
+    found.true("window.of_aim", len(held) > 0, "a plan that ends at an aim has a window")
+    for begin, end in asked:
+        whole = bool(((held[:, 0] <= begin) & (held[:, 1] >= end)).any())
+        found.true("window.asked", whole, f"the window holds the phases {begin:g} to {end:g}")
+
+
+def _check_ends(plan: Plan, found: Findings) -> None:
+    """Every end of the window within the breath has a limit, in order; without a window one says why."""
+    window = plan.window
+    if window is None:
+        return
+    ends = [float(each) for each in window.phases.ravel() if 0.0 < each < 1.0]
+    stated = [each.phase for each in window.limits]
+    known = stated == ends if len(window.phases) else len(stated) == 1
+    found.true("window.limits", known, f"{len(stated)} limits of {len(ends)} ends within the breath")
+    detail = "share of the breath that is not decided"
+    found.at_most("window.undecided", window.undecided_share, 1.0 - window.share, "", detail, ROUNDING)
+
+
+def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings) -> None:
+    window = plan.window
+    if window is None or not len(window.phases):
+        return
+    phases = np.concatenate([np.linspace(a, b, TARGET_STEPS) for a, b in window.phases])
+    most = max(_miss(plan, breath, devices, float(phase)) for phase in phases)
+    detail = f"end of the devices to the moving target, at {len(phases)} phases of the window"
+    most += window.hysteresis * (float(devices.from_tip_mm(devices.end)) + most)
+    found.at_most("window.target", most, window.tolerance_mm, "mm", detail, ROUNDING)
+    hole = np.asarray(plan.tube.exit.point_lps)[None]
+    shifts = [breath.carried(hole, float(phase)) - breath.moved(hole, float(phase)) for phase in phases]
+    most = float(np.linalg.norm(np.concatenate(shifts), axis=1).max())
+    detail = "shift of the tubes in the hole in the airway wall; at most their radius"
+    most += window.hysteresis * (float(devices.from_tip_mm(hole[0])) + most)
+    found.at_most("window.hole", most, devices.hole_mm, "mm", detail, HOLE_TOLERANCE_MM)
+
+
+def _miss(plan: Plan, breath: Breath, devices: _Devices, phase: float) -> float:
+    end = breath.carried(devices.end[None], phase)
+    return float(np.linalg.norm(end - breath.moved(np.asarray(plan.target_lps)[None], phase)))
+
+
+def _check_clear(
+    plan: Plan, environment: Environment, breath: Breath, devices: _Devices, found: Findings
+) -> None:
+    """At phases of the window every part keeps its distance; the tubes stay in the airway up to the exit."""
+    window = plan.window
+    if window is None or not len(window.phases):
+        return
+    phases = [
+        float(phase)
+        for a, b in window.phases
+        for phase in np.linspace(a, b, max(int(np.ceil((b - a) / PHASE_STEP)), 1) + 1)
+    ]
+    spare, worst, inside, airway = np.inf, "", 0, 0
+    for part in devices.parts():
+        lever = devices.from_tip_mm(part.points)
+        kept = _kept_mm(part.required_mm, window.hysteresis, lever)
+        mesh = _surface(part, environment, breath, phases, float(np.max(kept)))
+        for phase in phases:
+            points = breath.carried(part.points, phase)
+            within = part.select(labels_at(environment.lung, breath.pulled_back(points, phase)))
+            inside += int(within.sum())
+            left = _least_spare(_deformed(mesh, breath, phase), points, kept)
+            if left < spare:
+                spare, worst = left, f"{part.name} at phase {phase:.3f}"
+    for phase in phases:
+        airway += _out_of_airway(plan, environment, breath, devices, phase)
+    found.true("window.containment", inside == 0, f"{inside} samples in an obstacle, at {len(phases)} phases")
+    detail = f"least to spare beside radius and margins, at {len(phases)} phases: {worst}"
+    found.at_least("window.clearance", spare, 0.0, "mm", detail, MESH_TOLERANCE_MM)
+    found.true(
+        "window.in_airway", airway == 0, f"{airway} samples of the tubes before their exit break the rule"
+    )
+
+
+def _deformed(mesh: SurfaceMesh, breath: Breath, phase: float) -> MeshDistance:
+    """Return a surface of the masks as it is in a phase."""
+    if not len(mesh.faces):
+        return MeshDistance(mesh)
+    return MeshDistance(replace(mesh, vertices_lps=breath.moved(mesh.vertices_lps, phase)))
+
+
+def _surface(
+    part: Part, environment: Environment, breath: Breath, phases: list[float], required: float
+) -> SurfaceMesh:
+    """Return the surface of the voxels that come near a part in any of the phases, as in the masks."""
+    spread = [min(phases), max(phases), 0.5 * (min(phases) + max(phases))]
+    places = [breath.pulled_back(breath.carried(part.points, phase), phase) for phase in spread]
+    slack = max(float(np.linalg.norm(each - places[2], axis=1).max()) for each in places[:2])
+    boxes = environment.boxes(part.select, required)
+    return boxes.surface_near(np.concatenate(places), 1.5 * (required + NEAR_MM) + 0.3 * slack)
+
+
+def _out_of_airway(
+    plan: Plan, environment: Environment, breath: Breath, devices: _Devices, phase: float
+) -> int:
+    """Return how many samples before the exit leave the lumen, or touch its wall with something behind it."""
+    curve, share = devices.in_airway(), plan.window.hysteresis if plan.window else 0.0
+    points = breath.carried(curve.points, phase)
+    strays = _kept_mm(np.zeros(len(points)), share, devices.from_tip_mm(curve.points))
+    before = curve.arc_mm <= plan.tube.exit.arc_length_mm - devices.zone_mm
+    places = breath.pulled_back(points, phase)[before]
+    out = environment.boxes(has(structures.LUMEN), 1.0).distance_mm(places)
+    broken = int((out > CORNER_MM).sum()) + _touching(plan, environment, breath, curve, phase, strays)
+    if share and len(places):
+        most = float(strays.max())
+        wall = environment.boxes(not_lumen, most).surface_near(places, 1.5 * (most + NEAR_MM))
+        depth = _gaps(_deformed(wall, breath, phase), points[before])
+        broken += int((depth < strays[before] - CORNER_MM).sum())
+    return broken
+
+
+def _kept_mm(required: Float | float, share: float, lever_mm: Float) -> Float:
+    """Return the clearances by the motion `(N,)` that leave what is required wherever tissue strays.
+
+    What is c mm from a point is at most `lever + c` from the tip of the scope, and strays by a share of this.
+    """
+    return np.asarray((required + share * lever_mm) / (1.0 - share))
+
+
+def _least_spare(mesh: MeshDistance, points: Float, kept: Float) -> float:
+    """Return the least of distance less `kept` `(N,)` along points, by pieces over which it hardly varies."""
+    pieces = 1 + int(np.ptp(kept) / VARIES_MM)
+    ends = np.linspace(0, len(points) - 1, pieces + 1).astype(int)
+    return min(
+        mesh.polyline_distance_mm(points[a : b + 1]) - float(kept[a : b + 1].min())
+        for a, b in zip(ends[:-1], ends[1:], strict=True)
+    )
+
+
+def _gaps(mesh: MeshDistance, points: Float) -> Float:
+    return np.array([mesh.polyline_distance_mm(point[None]) for point in points])
+
+
+def _touching(
+    plan: Plan, environment: Environment, breath: Breath, curve: Curve, phase: float, strays: Float
+) -> int:
+    """Return how many samples from the last contact with the wall on have an obstacle behind it too near."""
+    phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
+    radius = shapes.radius_at(plan, curve.arc_mm)
+    frames = curve.frames[:, None, :3]
+    across = np.cos(phi)[:, None] * frames[..., 0] + np.sin(phi)[:, None] * frames[..., 1]
+    rim = (frames[..., 3] + (radius + strays)[:, None, None] * across).reshape(-1, 3)
+    labels = labels_at(environment.lung, breath.pulled_back(breath.carried(rim, phase), phase))
+    wet = ((labels & structures.LUMEN) != 0).reshape(len(radius), RIM_POINTS).all(axis=1)
+    first = int(np.flatnonzero(wet)[-1]) if wet.any() else 0
+    points = breath.carried(curve.points[first:], phase)
+    needed = radius[first:] + plan.system.margins.total_mm + plan.tube.clearance_loss_mm + strays[first:]
+    boxes = environment.boxes(has(forbidden_bits(plan) & ~structures.AIRWAY), float(needed.max()))
+    places = breath.pulled_back(points, phase)
+    mesh = boxes.surface_near(places, 1.5 * (float(needed.max()) + NEAR_MM))
+    gap = _gaps(_deformed(mesh, breath, phase), points)
+    return int((gap < needed - MESH_TOLERANCE_MM).sum())

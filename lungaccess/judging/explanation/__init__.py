@@ -1,0 +1,18 @@
+"""What one learns from a `NoPlan`: the nearest misses, what blocks, which system would do, what is proved."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, Structure
+    from lungaccess.judging.explanation.explain import DEFAULT_TIME_S, explain_no_plan
+    from lungaccess.judging.explanation.explanation import Change, Explanation, Part
+    from lungaccess.judging.explanation.neighbours import Neighbour, ReachedShare
+    from lungaccess.judging.explanation.record import explanation_record, save_explanation
+    from lungaccess.judging.explanation.starts import FAILS, StartMap
+    from lungaccess.judging.explanation.words import Section, place, sections
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

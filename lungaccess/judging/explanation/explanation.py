@@ -1,0 +1,209 @@
+"""`Explanation`: what was learned from a search that found no plan, and what was not tried."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import field
+
+from anatomy.base.records import frozen_record, frozen_value
+from lungaccess.coupled import Counterfactual
+from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking
+from lungaccess.judging.explanation.neighbours import Neighbour, ReachedShare
+from lungaccess.judging.explanation.starts import StartMap
+from lungaccess.judging.presets_in_turn import Attempt
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.preset_order import presets_by_invasiveness
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target
+from lungaccess.reachability import ReachVerdict
+from lungaccess.uncertainty.risk import Share
+
+DONE, NOT_TRIED = "done", "not tried"
+TIME_IS_UP = "the time was up"
+
+
+@frozen_value
+class Part:
+    """One part of an explanation: whether it was tried, and why not."""
+
+    name: str
+    outcome: str
+    why: str = ""
+
+
+@frozen_record
+class Change:
+    """A change of one device parameter with which the target is reached, and whether the check accepts it."""
+
+    change: Counterfactual
+    accepted: bool
+
+
+@frozen_record
+class Explanation:
+    """What was learned from a search that found no plan.
+
+    What is None or empty was looked for and not found, or was not tried: `parts` tells which.
+
+    Parameters
+    ----------
+    with_fissures : bool
+        Whether fissures are obstacles.
+    failure : NoPlan
+        The answer of the search, with its reasons counted.
+    starts : StartMap or None
+        Where needles can start, and why each start fails.
+    blocking : tuple of Blocking
+        What stops the direct arcs, most first.
+    blocked_arc : BlockedArc or None
+        The arc to the target that violates least, of those within the needle's limits.
+    arc_beyond_limits : ArcBeyondLimits or None
+        Where there is no such arc: the one that exceeds the limits least.
+    neighbour : Neighbour or None
+        The nearest point to the target that was found to be reached, with its plan.
+    attempts : tuple of Attempt
+        The presets that were tried, the least invasive first.
+    untried : tuple of str
+        Presets that were not tried.
+    changes : tuple of Change
+        Changes of one device parameter that reach the target, the smallest first.
+    through_fissures : bool or None
+        Whether a single arc reaches the target if fissures may be crossed; None if they may be or there are
+        none.
+    shares : tuple of ReachedShare
+        How much of the surroundings is reached.
+    chances : mapping of str to Share
+        How many of the simulated procedures succeed with each of `plans`, by the names of their files, under
+        the default errors.
+    verdict : ReachVerdict or None
+        Whether the target is proved unreachable.
+    parts : tuple of Part
+        What was done and what was not, in the order of doing.
+    time_s : float
+        Seconds of processor time that it took, without getting kernels.
+    """
+
+    patient_name: str
+    system: System
+    target: Target
+    with_fissures: bool
+    failure: NoPlan
+    starts: StartMap | None = None
+    blocking: tuple[Blocking, ...] = ()
+    blocked_arc: BlockedArc | None = None
+    arc_beyond_limits: ArcBeyondLimits | None = None
+    neighbour: Neighbour | None = None
+    attempts: tuple[Attempt, ...] = ()
+    untried: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
+    through_fissures: bool | None = None
+    shares: tuple[ReachedShare, ...] = ()
+    chances: Mapping[str, Share] = field(default_factory=dict)
+    verdict: ReachVerdict | None = None
+    parts: tuple[Part, ...] = ()
+    time_s: float = 0.0
+
+    @property
+    def headline(self) -> str:
+        """One sentence: that there is no plan, the main reason, and the preset that would do."""
+        name, attempts = self.system.name, self.failure.attempts
+        if not attempts:
+            return f"No plan found with {name}: {self.failure.main_reason}; {self._way_on}"
+        why = attempts.get(name, "").removeprefix("no plan: ")
+        change = f"; {self._change} would reach it" if self._change else ""
+        return f"No plan found with any of {len(attempts)} systems; with {name}: {why}{change}"
+
+    @property
+    def _change(self) -> str:
+        """The smallest change of the device whose plan the check accepts, and how often it succeeds."""
+        accepted = (each.change for each in self.changes if each.accepted)
+        return next((f"{change}{self._how_often(change.plan)}" for change in accepted), "")
+
+    @property
+    def advice(self) -> str:
+        """What would reach the target, in one sentence; empty if nothing that was tried does."""
+        systems = [
+            f"--system {attempt.system.name}{self._how_often(attempt.plan)}"
+            for attempt in self.attempts
+            if attempt.succeeded
+        ]
+        changes = [
+            f"{each.change}{self._how_often(each.change.plan)}" for each in self.changes if each.accepted
+        ]
+        fissures = ["crossing a fissure (--allow-fissures; not planned)"] if self.through_fissures else []
+        helps = [*systems, *changes, *fissures]
+        return f"It is reached with {', or with '.join(helps)}" if helps else ""
+
+    def _how_often(self, plan: Plan | None) -> str:
+        """Say how often a plan succeeds: that it exists says too little."""
+        chance = self.chances.get(self.file_of(plan) or "")
+        return "" if chance is None else f" (succeeds in {100.0 * chance.value:.0f} of 100)"
+
+    @property
+    def _way_on(self) -> str:
+        names = list(self.presets)
+        reach = next((name for name, each in self.presets.items() if each and each.succeeded), "")
+        less = {name for name in self.untried if reach and names.index(name) < names.index(reach)}
+        untried = ", ".join(f"{name} (less invasive)" if name in less else name for name in self.untried)
+        tried = f"{len(self.attempts)} of {len(names)} other presets tried"
+        tried += f"; not tried: {untried}" if untried else ""
+        if reach:
+            least = "" if less else ", the least invasive other preset with a plan"
+            plan = next(each.plan for each in self.attempts if each.system.name == reach)
+            return f"{reach} would reach it{self._how_often(plan)}{least} ({tried})"
+        if self.verdict is not None and self.verdict.proved:
+            return "this system is proved not to reach it"
+        change = f", but {self._change} would reach it" if self._change else ""
+        if not self.untried:
+            return f"with no other preset was a plan found ({tried}){change}"
+        failed = ", ".join(f"no plan with {each.system.name}" for each in self.attempts)
+        return f"{failed} ({tried}){change}" if failed else f"{tried}{change}"
+
+    @property
+    def presets(self) -> Mapping[str, Attempt | None]:
+        """The other presets, the least invasive first, and what became of each; None if it was not tried."""
+        tried = {attempt.system.name: attempt for attempt in self.attempts}
+        names = (each.name for each in presets_by_invasiveness())
+        return {name: tried.get(name) for name in names if name in tried or name in self.untried}
+
+    @property
+    def plans(self) -> Mapping[str, Plan]:
+        """The plans that came about, by the names of their files: each is one that the check accepts."""
+        found = {
+            f"plan-{_file_stem(attempt.system.name)}.json": attempt.plan
+            for attempt in self.attempts
+            if attempt.succeeded and attempt.plan is not None
+        }
+        if self.neighbour is not None:
+            found["plan-nearest.json"] = self.neighbour.plan
+        found |= {
+            f"plan-change-{number}.json": each.change.plan
+            for number, each in enumerate(self.changes, start=1)
+            if each.accepted
+        }
+        return found
+
+    @property
+    def miss(self) -> BlockedArc | ArcBeyondLimits | None:
+        """The path to the target that violates least: within the needle's limits if there is one."""
+        return self.blocked_arc or self.arc_beyond_limits
+
+    def file_of(self, plan: object) -> str | None:
+        """Return the name of the file of a plan, None if it has none."""
+        return next((name for name, each in self.plans.items() if each is plan), None)
+
+    @property
+    def not_tried(self) -> tuple[Part, ...]:
+        """The parts that were not done: nothing follows from them."""
+        return tuple(part for part in self.parts if part.outcome == NOT_TRIED)
+
+    @property
+    def ran_out_of_time(self) -> bool:
+        """Whether more time would have let something be tried."""
+        return any(part.why == TIME_IS_UP for part in self.parts)
+
+
+def _file_stem(name: str) -> str:
+    """Return a name without what the name of a file may not hold."""
+    return "".join(c if c.isalnum() or c in "-_" else "-" for c in name)

@@ -1,0 +1,133 @@
+"""An explanation in words: sections of rows, for the terminal and the page alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
+from lungaccess.judging.explanation.explanation import Explanation
+from lungaccess.judging.explanation.record import point
+
+Row = tuple[str, ...]
+
+
+@frozen_value
+class Section:
+    """A table: its title, the headings of its columns, its rows."""
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[Row, ...]
+
+
+def sections(explanation: Explanation) -> tuple[Section, ...]:
+    """Return the sections of an explanation that have something to say, the most useful first."""
+    e = explanation
+    made = (
+        Section(title="What would reach it", headings=("what", "how", "plan"), rows=tuple(_helps(e))),
+        Section(title="Nearest miss", headings=("what", "how near", "where"), rows=tuple(_misses(e))),
+        Section(
+            title="What blocks the direct arcs within the needle's limits",
+            headings=("structure", "arcs that it stops first", "where most of them are stopped"),
+            rows=tuple(_blocks(e)),
+        ),
+        Section(
+            title=f"Other presets, the least invasive first: {len(e.attempts)} of {len(e.presets)} tried",
+            headings=("preset", "outcome", "plan"),
+            rows=tuple(_presets(e)),
+        ),
+        Section(
+            title="Where the needle can start, and why each start fails",
+            headings=("starts", "count"),
+            rows=() if e.starts is None else tuple((why, str(n)) for why, n in e.starts.counts.items() if n),
+        ),
+        Section(
+            title=f"What {_by(e)} nearby",
+            headings=("where", "how much"),
+            rows=tuple((share.region, share.words) for share in e.shares),
+        ),
+        Section(title="Proof", headings=("question", "answer"), rows=tuple(_proof(e))),
+        Section(
+            title="Not tried: nothing follows from these",
+            headings=("what", "why"),
+            rows=tuple((part.name, part.why) for part in e.not_tried),
+        ),
+    )
+    return tuple(section for section in made if section.rows)
+
+
+def place(lps_mm: Float) -> str:
+    """Return a point (3,) LPS mm in words, in both frames."""
+    frames = point(lps_mm)
+    lps, ras = (", ".join(f"{c:.1f}" for c in frames[key]) for key in ("lps_mm", "ras_mm"))
+    return f"LPS ({lps}), RAS ({ras}) mm"
+
+
+def _helps(e: Explanation) -> Iterator[Row]:
+    for attempt in e.attempts:
+        if attempt.succeeded:
+            name = _file(e, attempt.plan)
+            yield f"preset {attempt.system.name}", _accepted(e, name), name
+    for each in e.changes:
+        name = _file(e, each.change.plan)
+        yield str(each.change), _accepted(e, name) if name else "a plan that the check REFUSES", name
+    if e.through_fissures:
+        how = "a single arc, at the price of piercing the pleura twice; not planned, not checked"
+        yield "crossing a fissure (--allow-fissures)", how, ""
+
+
+def _accepted(e: Explanation, name: str) -> str:
+    """Say that the check accepts a plan, and how often it succeeds: one without the other says too much."""
+    chance = e.chances.get(name)
+    how_often = "chance of success not estimated"
+    if chance is not None:
+        how_often = f"succeeds in {100.0 * chance.value:.0f} of 100 procedures under the default errors"
+    return f"a plan that the check accepts; {how_often}"
+
+
+def _by(e: Explanation) -> str:
+    """Return what reaches the points around a target, with its verb."""
+    return "aimed tubes reach" if e.system.needle is None else "a single arc reaches"
+
+
+def _misses(e: Explanation) -> Iterator[Row]:
+    arc, beyond, neighbour = e.blocked_arc, e.arc_beyond_limits, e.neighbour
+    if arc is not None:
+        yield "path to the target that violates least", arc.violation, str(arc.structure)
+    if beyond is not None:
+        yield "path to the target that exceeds the needle's limits least", beyond.needs, "obstacles ignored"
+    if neighbour is not None:
+        near = f"ends {neighbour.from_target_mm:.1f} mm from the target; {_file(e, neighbour.plan)}"
+        yield f"nearest point found that {_by(e)}", near, place(neighbour.plan.target_lps)
+
+
+def _blocks(e: Explanation) -> Iterator[Row]:
+    for each in e.blocking:
+        spot, near = each.place, f"{each.arcs_at_place} within 5 mm of {place(each.place.lps_mm)}"
+        yield (
+            f"{spot.kind} {spot.name}",
+            f"{each.arcs} of {each.of} ({100.0 * each.arcs / each.of:.0f} %)",
+            f"{near}, {spot.from_target_mm:.1f} mm from the target",
+        )
+
+
+def _presets(e: Explanation) -> Iterator[Row]:
+    for name, attempt in e.presets.items():
+        yield (name, "not tried", "") if attempt is None else (name, attempt.why, _file(e, attempt.plan))
+
+
+def _proof(e: Explanation) -> Iterator[Row]:
+    if e.verdict is None:
+        return
+    if e.verdict.proved:
+        answer = "yes: no deployment has the target in its needle's workspace"
+    elif e.verdict.boxes:
+        answer = "not proved: it may be reachable or not"
+    else:
+        answer = "cannot be proved this way: some deployments have it in their needle's workspace"
+    yield f"Is the target out of the reach of {e.system.name}?", answer
+
+
+def _file(e: Explanation, plan: object) -> str:
+    return e.file_of(plan) or ""

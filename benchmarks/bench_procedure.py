@@ -7,7 +7,7 @@ import time
 import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
-from lungaccess.procedure import Simulator
+from lungaccess.planning.procedure import Simulator
 from lungaccess.uncertainty.risk import RiskAssessor
 
 DEVIATED = 1_000_000

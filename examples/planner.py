@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import lungaccess as la
-from lungaccess.coupled import METHODS, DirectArcs, Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled import METHODS, DirectArcs, Incumbent, Step, evaluated_step
 
 
 class RandomArcs:

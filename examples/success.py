@@ -9,8 +9,8 @@ other beats in all three.
 import matplotlib.pyplot as plt
 
 import lungaccess as la
-from lungaccess.coupled import with_front
-from lungaccess.success import chance_of, estimate_success
+from lungaccess.planning.coupled import with_front
+from lungaccess.planning.success import chance_of, estimate_success
 
 lung = la.load_patient("phantom-3")
 system = la.load_system("ultrathin", fissures_allowed=True)

@@ -34,8 +34,8 @@ from anatomy.phantom import make_phantom
 from experiments.support.mutants.all import mutate
 from experiments.support.mutants.mutant import Case, Mutant
 from experiments.support.mutants.random_plans import plans_of_batch
-from lungaccess.coupled import explanation
 from lungaccess.judging.checking import Checker, CheckReport
+from lungaccess.planning.coupled import explanation
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 

@@ -24,9 +24,7 @@ from anatomy.lung import Lung
 from experiments.support.anatomies import PHANTOM, anatomy, default_anatomies
 from experiments.support.insertion.figure import draw_insertions
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.problem.peripheral import peripheral_targets
-from lungaccess.problem.target import point_target
-from lungaccess.procedure.insertion import (
+from lungaccess.planning.procedure.insertion import (
     TOLERANCE_MM,
     Errors,
     Outcome,
@@ -36,6 +34,8 @@ from lungaccess.procedure.insertion import (
     study,
     summary,
 )
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.target import point_target
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform

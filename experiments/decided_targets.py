@@ -23,10 +23,10 @@ from anatomy.base.files import write_text
 from anatomy.base.typed import Float
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
+from lungaccess.planning.reachability import UnreachableProof
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.target import point_target
-from lungaccess.reachability import UnreachableProof
 
 RADII_MM = (121.0, 50.0)
 """Of the needle."""

@@ -16,9 +16,9 @@ import lungaccess as la
 from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
+from lungaccess.planning.procedure import ProcedureReport, load_procedure, procedure_names, simulate_procedure
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
-from lungaccess.procedure import ProcedureReport, load_procedure, procedure_names, simulate_procedure
 from lungaccess.uncertainty.risk import error_preset_names, load_errors
 
 SIZES = {"quick": (2, 20), "full": (8, 100)}

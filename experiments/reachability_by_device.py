@@ -21,8 +21,8 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
+from lungaccess.planning.reachability import map_reach
 from lungaccess.problem.system import System
-from lungaccess.reachability import map_reach
 from lungaccess.report import style
 
 

@@ -26,7 +26,7 @@ from anatomy.segmentation.request import SegmentationRequest
 from experiments.support.anatomies import PHANTOM, data_folder, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.segmentation.slices import thickened
-from lungaccess.coupled.atlas import build_atlas
+from lungaccess.planning.coupled.atlas import build_atlas
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target

@@ -23,7 +23,11 @@ if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
     from anatomy.base.errors import LungaccessError
     from anatomy.lung import Lung
-    from lungaccess.coupled import (
+    from lungaccess.judging import plan_with_presets
+    from lungaccess.judging.appraisal import Appraisal, appraise
+    from lungaccess.judging.checking import CheckReport, check
+    from lungaccess.judging.explanation import Explanation, explain_no_plan, save_explanation
+    from lungaccess.planning.coupled import (
         Alternative,
         Atlas,
         FeasibleExits,
@@ -34,11 +38,7 @@ if TYPE_CHECKING:
         plan,
         plan_for_window,
     )
-    from lungaccess.judging import plan_with_presets
-    from lungaccess.judging.appraisal import Appraisal, appraise
-    from lungaccess.judging.checking import CheckReport, check
-    from lungaccess.judging.explanation import Explanation, explain_no_plan, save_explanation
-    from lungaccess.one_stage import (
+    from lungaccess.planning.one_stage import (
         advise_scope,
         deploy_tubes,
         plan_near_exit,
@@ -49,6 +49,9 @@ if TYPE_CHECKING:
         replan_from_tube,
         safe_scope_region,
     )
+    from lungaccess.planning.procedure import Procedure, load_procedure, simulate_procedure
+    from lungaccess.planning.reachability import UnreachableProof, compare_reach, map_reach, plan_to_voxel
+    from lungaccess.planning.success import PlannedSuccess, alternatives_for_success, plan_for_success
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
     from lungaccess.plans.window import BreathingWindow
@@ -65,12 +68,9 @@ if TYPE_CHECKING:
         presets_by_invasiveness,
         resolve_target,
     )
-    from lungaccess.procedure import Procedure, load_procedure, simulate_procedure
-    from lungaccess.reachability import UnreachableProof, compare_reach, map_reach, plan_to_voxel
     from lungaccess.report.html import plan_page
     from lungaccess.slicer import export_slicer
     from lungaccess.study import read_study, run_study
-    from lungaccess.success import PlannedSuccess, alternatives_for_success, plan_for_success
     from lungaccess.uncertainty.breathing.window import breathing_window
     from lungaccess.uncertainty.risk import (
         ErrorModel,

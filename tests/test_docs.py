@@ -19,7 +19,7 @@ from anatomy.segmentation.learned import NetworkSettings
 from lungaccess.cli.app import app
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.usage import with_nodule_number
-from lungaccess.one_stage import load_tubes
+from lungaccess.planning.one_stage import load_tubes
 from lungaccess.problem.system import load_system
 from lungaccess.study import read_study
 from lungaccess.uncertainty.risk import load_errors

@@ -12,7 +12,7 @@ from anatomy.base.files import write_text
 from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.coupled.atlas import require_same
+from lungaccess.planning.coupled.atlas import require_same
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, system_fingerprint
 from stages.needle import direct_arcs, needle_environment

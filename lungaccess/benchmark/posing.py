@@ -10,7 +10,7 @@ from anatomy.organ import Organ
 from anatomy.patient import PatientImages
 from lungaccess.benchmark.published import PublishedQuery
 from lungaccess.benchmark.unc_rules import unc_needle, unc_obstacles
-from lungaccess.one_stage import needle_question
+from lungaccess.planning.one_stage import needle_question
 from lungaccess.problem.system import System
 from stages.needle import NeedleEnvironment, Query
 

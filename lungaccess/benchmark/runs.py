@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.base.kernel_clock import working_cpu_s
 from anatomy.base.records import frozen_value
 from lungaccess.benchmark.published import PublishedQuery
-from lungaccess.one_stage import PathSearch, reason_in_words, search_path
+from lungaccess.planning.one_stage import PathSearch, reason_in_words, search_path
 from stages.needle import OMPL_PLANNERS, ArcPath, NeedleEnvironment, Query, obstacle_clearance_mm
 
 SLICE = 200

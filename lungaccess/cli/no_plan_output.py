@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from anatomy.lung import Lung
     from lungaccess.cli.plan_search import PlanRequest
-    from lungaccess.coupled import Atlas
     from lungaccess.judging.explanation import Explanation
+    from lungaccess.planning.coupled import Atlas
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.system import System
 
@@ -55,8 +55,8 @@ def explain_and_report(
 
 
 def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float | None) -> Explanation:
-    from lungaccess.coupled import atlas_is_kept, open_atlas
     from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan
+    from lungaccess.planning.coupled import atlas_is_kept, open_atlas
 
     system, cache = request.systems[0], request.output.cache
 

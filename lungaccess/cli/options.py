@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from anatomy.base.typed import Float
     from anatomy.lung import Lung
     from anatomy.organ import Organ
-    from lungaccess.coupled.atlas import Atlas
+    from lungaccess.planning.coupled.atlas import Atlas
+    from lungaccess.planning.procedure import Procedure
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget
-    from lungaccess.procedure import Procedure
     from lungaccess.uncertainty.risk import ErrorModel
 
     ObjectiveText = str
@@ -99,7 +99,7 @@ class PatientOptions(OutputOptions):
 
     def open_atlas(self, lung: Lung, system: System) -> Atlas:
         """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
-        from lungaccess.coupled import open_atlas
+        from lungaccess.planning.coupled import open_atlas
 
         with progress("enumerating what scope and tubes can do") as shown:
             return open_atlas(lung, system, cache=self.cache, progress=shown.share)
@@ -277,7 +277,7 @@ class ErrorOptions:
 
     def given_procedure(self) -> Procedure | None:
         """Return the procedure, None if none is given."""
-        from lungaccess.procedure import load_procedure
+        from lungaccess.planning.procedure import load_procedure
 
         return None if self.procedure is None else load_procedure(self.procedure)
 
@@ -352,7 +352,7 @@ def stated_phases(text: str | None) -> tuple[float, float] | None:
     SettingsError
         If it is not two phases from 0 to 1 in order.
     """
-    from lungaccess.coupled.window_planner import require_phases
+    from lungaccess.planning.coupled.window_planner import require_phases
 
     if text is None:
         return None

@@ -18,12 +18,12 @@ from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.coupled import Atlas, ProgressEvent
     from lungaccess.judging.appraisal import Appraisal
+    from lungaccess.planning.coupled import Atlas, ProgressEvent
+    from lungaccess.planning.procedure import Procedure
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
-    from lungaccess.procedure import Procedure
     from lungaccess.report import CostPoint
     from lungaccess.uncertainty.risk import ErrorModel
 
@@ -158,10 +158,10 @@ def run_search(
 
 def _plans(lung: Lung, target: Target, request: PlanRequest, history: CostHistory) -> Iterator[Found]:
     """Yield better and better plans with the request's system, or with the one that is chosen of several."""
-    from lungaccess.coupled import atlas_event, open_atlas, plan, plan_for_window
     from lungaccess.judging import plan_with_presets
-    from lungaccess.one_stage import plan_near_exit, plan_near_scope_tip
-    from lungaccess.success import plan_for_success
+    from lungaccess.planning.coupled import atlas_event, open_atlas, plan, plan_for_window
+    from lungaccess.planning.one_stage import plan_near_exit, plan_near_scope_tip
+    from lungaccess.planning.success import plan_for_success
 
     def atlas_of(system: System) -> Atlas:
         def on_share(share: float) -> None:

@@ -11,7 +11,7 @@ from lungaccess.uncertainty.risk.statistics import Share
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.procedure import ProcedureReport
+    from lungaccess.planning.procedure import ProcedureReport
 
 
 def plain_share(share: Share) -> dict[str, object]:

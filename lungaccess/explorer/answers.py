@@ -15,14 +15,14 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.settings_file import settings_toml
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from lungaccess.coupled import Atlas, ProgressEvent, atlas_is_kept, feasible_exits, open_atlas, plan
 from lungaccess.explorer import questions as ask
 from lungaccess.explorer.changed_system import plan_command, system_of
 from lungaccess.explorer.chosen_place import ChosenPlace
 from lungaccess.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
 from lungaccess.explorer.questions import WhatIf
 from lungaccess.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
-from lungaccess.one_stage import tips_near
+from lungaccess.planning.coupled import Atlas, ProgressEvent, atlas_is_kept, feasible_exits, open_atlas, plan
+from lungaccess.planning.one_stage import tips_near
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
-from lungaccess.coupled.exits import PLACE_MM
-from lungaccess.one_stage import TIP_WITHIN_MM, plan_near_exit, plan_near_scope_tip
+from lungaccess.planning.coupled.exits import PLACE_MM
+from lungaccess.planning.one_stage import TIP_WITHIN_MM, plan_near_exit, plan_near_scope_tip
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target
 
@@ -45,7 +45,7 @@ class ChosenPlace:
         return PLACE_MM if self.kind == "exit" else TIP_WITHIN_MM
 
     def search(self, lung: Lung, system: System, target: Target, **options: Any) -> Iterator[Plan]:
-        """Search as `lungaccess.plan` does; errors as `lungaccess.one_stage.plan_near_exit`."""
+        """Search as `lungaccess.plan` does; errors as `lungaccess.planning.one_stage.plan_near_exit`."""
         near = plan_near_exit if self.kind == "exit" else plan_near_scope_tip
         return near(lung, system, target, self.lps_mm, within_mm=self.within_mm, **options)
 

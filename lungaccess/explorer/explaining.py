@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
-from lungaccess.coupled import Atlas, plan
 from lungaccess.explorer.questions import ExplainQuestion
 from lungaccess.explorer.worker import Part, Turn
 from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan, sections
+from lungaccess.planning.coupled import Atlas, plan
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem import System, Target
 

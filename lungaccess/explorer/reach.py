@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from anatomy.base.typed import Int
 from anatomy.lung import Lung
-from lungaccess.coupled import Atlas
 from lungaccess.explorer.worker import Part, Turn
+from lungaccess.planning.coupled import Atlas
+from lungaccess.planning.reachability import KINDS, ReachStream
 from lungaccess.problem import System
-from lungaccess.reachability import KINDS, ReachStream
 
 Reached = MutableMapping[tuple[Any, ...], Int]
 """By scope, tubes, margins and rule for fissures: the deployment that reached each voxel."""

@@ -11,9 +11,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.kernel_clock import working_s
 from anatomy.base.records import frozen_record
 from anatomy.lung import Lung
-from lungaccess.coupled.atlas import Atlas, build_atlas
-from lungaccess.coupled.planner import plan
 from lungaccess.judging.checking import Checker, CheckReport
+from lungaccess.planning.coupled.atlas import Atlas, build_atlas
+from lungaccess.planning.coupled.planner import plan
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
@@ -87,7 +87,8 @@ def plan_with_presets(
     on_attempt : callable, optional
         Told each system before it is tried.
     options
-        Those of `lungaccess.coupled.planner.plan`; with `iterations` the same input gives the same plans.
+        Those of `lungaccess.planning.coupled.planner.plan`; with `iterations` the same input gives the same
+        plans.
 
     Raises
     ------

@@ -13,7 +13,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_pieces
-from lungaccess.one_stage import RestOfPlan, ScopeReplanner, measured_pose, replan_from_tube
+from lungaccess.planning.one_stage import RestOfPlan, ScopeReplanner, measured_pose, replan_from_tube
 from lungaccess.plans.curves import STEP_MM, needle_pieces, tube_pieces
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target, point_target

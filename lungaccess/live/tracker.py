@@ -5,11 +5,11 @@ from __future__ import annotations
 from anatomy.base.typed import Float
 from lungaccess.live.link import Link
 from lungaccess.live.replanning import NEEDLE_TIP, TARGET
-from lungaccess.procedure.tracker import Measured
+from lungaccess.planning.procedure.tracker import Measured
 
 
 class LinkTracker:
-    """Reads the newest tracked pose of a needle's tip from a link; a `lungaccess.procedure.Tracker`.
+    """Reads the newest tracked pose of a needle's tip from a link; a `lungaccess.planning.procedure.Tracker`.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from lungaccess.report import style
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.procedure.insertion import Insertion, InsertionStudy, Study
+    from lungaccess.planning.procedure.insertion import Insertion, InsertionStudy, Study
     from stages.needle import ArcPath, Query
 
 OPEN, CLOSED = style.TUBE, style.SCOPE
@@ -54,7 +54,7 @@ class Plane:
 
 def draw_paths(axes: Any, lung: Lung, query: Query, plan: ArcPath, made: Study) -> None:
     """Draw true paths in the plane of the plan, with what the plane cuts in grey."""
-    from lungaccess.procedure.insertion import Outcome
+    from lungaccess.planning.procedure.insertion import Outcome
 
     plane = Plane(query)
     plane.show_obstacles(axes, lung)

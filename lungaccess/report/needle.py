@@ -19,7 +19,7 @@ from lungaccess.report.zoom import paint_cut
 
 if TYPE_CHECKING:
     from anatomy.organ import Organ
-    from lungaccess.one_stage import NeedleAnswer
+    from lungaccess.planning.one_stage import NeedleAnswer
     from stages.needle import Query
 
 WIDTH_IN, HEIGHT_IN = 12.4, 6.9
@@ -43,7 +43,7 @@ def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) 
     FileError
         If the file cannot be written.
     """
-    from lungaccess.one_stage import reason_in_words
+    from lungaccess.planning.one_stage import reason_in_words
 
     query = answer.query
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)

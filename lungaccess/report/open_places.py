@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from anatomy.lung import Lung
-    from lungaccess.reachability import ReachVerdict, UnreachableProof
+    from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 
 WIDTH_IN, HEIGHT_IN = 12.4, 7.2
 PANELS_IN = ((0.6, 1.0, 5.3, 5.3), (6.6, 1.0, 5.3, 5.3))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from anatomy.grid import Volume
     from anatomy.lung import Lung
-    from lungaccess.reachability import ReachMap
+    from lungaccess.planning.reachability import ReachMap
 
 
 WIDTH_IN, HEIGHT_IN = 18.0, 11.0
@@ -112,7 +112,7 @@ def _values(volume: Volume, lps: Float) -> Float:
 
 
 def _kind_colours(reach: ReachMap, lps: Float) -> Float:
-    from lungaccess.reachability import KINDS
+    from lungaccess.planning.reachability import KINDS
 
     kinds = _values(reach.kinds, lps)
     image = np.zeros((*kinds.shape, 4))
@@ -122,7 +122,7 @@ def _kind_colours(reach: ReachMap, lps: Float) -> Float:
 
 
 def _clearance_colours(reach: ReachMap, lps: Float) -> Float:
-    from lungaccess.reachability import KINDS
+    from lungaccess.planning.reachability import KINDS
 
     kinds = _values(reach.kinds, lps)
     reached = (kinds == KINDS["direct arc"]) | (kinds == KINDS["search"])
@@ -155,7 +155,7 @@ def _bar(figure: Figure) -> None:
 
 
 def _text(figure: Figure, reach: ReachMap) -> None:
-    from lungaccess.reachability import KINDS, STATES
+    from lungaccess.planning.reachability import KINDS, STATES
 
     system = reach.system
     style.heading(figure, reach.words, size=15)

@@ -14,7 +14,7 @@ from anatomy.lung import Lung
 from anatomy.structures import BITS
 from lungaccess.judging.checking import CheckReport, Finding, check
 from lungaccess.judging.checking.findings import Findings
-from lungaccess.one_stage import RestOfPlan
+from lungaccess.planning.one_stage import RestOfPlan
 from lungaccess.plans.assemble import SAMPLE_MM
 from lungaccess.plans.curves import DeviceCurve, arc_lengths
 from lungaccess.plans.plan import Plan

@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
-from lungaccess.one_stage import plan_needle
+from lungaccess.planning.one_stage import plan_needle
 from lungaccess.problem.target import point_target
 from lungaccess.study.answers import EXACT, NO_PLAN, PATH, TIMEOUT, Answer, Improvement
 from lungaccess.study.runs import Run

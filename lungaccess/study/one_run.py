@@ -23,10 +23,12 @@ import psutil
 from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
-from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.atlas_store import open_atlas
-from lungaccess.coupled.planner import plan
 from lungaccess.judging.checking import Checker
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.atlas_store import open_atlas
+from lungaccess.planning.coupled.planner import plan
+from lungaccess.planning.success import plan_for_success
+from lungaccess.planning.success.estimate import FRESH_SEED, MEASURED, OPEN_LOOP, chance_of, estimate_success
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
@@ -37,8 +39,6 @@ from lungaccess.study.needle_run import needle_answer
 from lungaccess.study.patients import Patient, open_patient
 from lungaccess.study.runs import Problem, Run
 from lungaccess.study.settings import SUCCESS, StudyError
-from lungaccess.success import plan_for_success
-from lungaccess.success.estimate import FRESH_SEED, MEASURED, OPEN_LOOP, chance_of, estimate_success
 
 KEPT_PATIENTS = 2
 """Runs come case by case, so that a worker needs the last patient and sometimes the next."""

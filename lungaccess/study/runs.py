@@ -15,12 +15,12 @@ from anatomy.base.records import frozen_value
 from anatomy.base.settings import to_mapping
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
+from lungaccess.planning.procedure import Procedure, load_procedure
 from lungaccess.plans.version import software_version
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
 from lungaccess.problem.task import objective_of
-from lungaccess.procedure import Procedure, load_procedure
 from lungaccess.study.patients import Patient, open_patient, patient_of
 from lungaccess.study.settings import Case, PlannerChoice, Study
 from lungaccess.uncertainty.risk import ErrorModel, load_errors

@@ -104,8 +104,9 @@ class PlannerChoice:
     kind : str
         "plan" for all three stages, "needle" for the needle alone from the case's start poses.
     method : str
-        One of `lungaccess.coupled.planner.METHODS`, or "success", see `lungaccess.success.plan_for_success`;
-        for the needle, one of `stages.needle.NEEDLE_PLANNERS`.
+        One of `lungaccess.planning.coupled.planner.METHODS`, or "success", see
+        `lungaccess.planning.success.plan_for_success`; for the needle, one of
+        `stages.needle.NEEDLE_PLANNERS`.
     needle_planner : str
         For "plan", one of the latter instead of the method's own.
     iterations : int or None
@@ -149,7 +150,7 @@ class PlannerChoice:
     @property
     def needs_a_needle(self) -> bool:
         """Whether it plans for no system that has none."""
-        from lungaccess.coupled.planner import NEED_A_NEEDLE
+        from lungaccess.planning.coupled.planner import NEED_A_NEEDLE
 
         need = (*NEED_A_NEEDLE, SUCCESS)
         return self.kind == "needle" or bool(self.needle_planner) or self.method in need
@@ -173,7 +174,7 @@ class Budget:
 
 @settings
 class AtlasGrid:
-    """How densely deployments are enumerated; see `lungaccess.coupled.atlas.build_atlas`."""
+    """How densely deployments are enumerated; see `lungaccess.planning.coupled.atlas.build_atlas`."""
 
     rotations: Annotated[int, Field(strict=True, ge=1, description="rotations of the tubes")] = (
         DEFAULT_ROTATIONS
@@ -223,7 +224,7 @@ def methods(kind: str) -> tuple[str, ...]:
     """Return the names of the planners of a kind, "plan" or "needle"."""
     if kind == "needle":
         return NEEDLE_PLANNERS
-    from lungaccess.coupled.planner import METHODS
+    from lungaccess.planning.coupled.planner import METHODS
 
     return (*METHODS, SUCCESS)
 

@@ -16,7 +16,16 @@ from anatomy.base.errors import SettingsError
 from anatomy.margins import Margins
 from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL
-from lungaccess.procedure.insertion import Errors, Insertion, Outcome, Study, Truth, simulate, study, summary
+from lungaccess.planning.procedure.insertion import (
+    Errors,
+    Insertion,
+    Outcome,
+    Study,
+    Truth,
+    simulate,
+    study,
+    summary,
+)
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.path import ArcPath, arc_transform, direct_path

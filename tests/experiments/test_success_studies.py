@@ -11,7 +11,7 @@ import pytest
 
 from experiments import procedures, success_planning
 from experiments.run_all import STUDIES
-from lungaccess.procedure import Procedure, ProcedureReport, load_procedure, procedure_names
+from lungaccess.planning.procedure import Procedure, ProcedureReport, load_procedure, procedure_names
 from lungaccess.uncertainty.risk import ErrorModel, Share, error_preset_names, load_errors
 
 COUNTS = {"a": 20, "b": 60, "c": 90}

@@ -27,12 +27,12 @@ FACADES = (
     "lungaccess.judging.appraisal",
     "lungaccess.benchmark",
     "lungaccess.judging.checking",
-    "lungaccess.coupled",
-    "lungaccess.one_stage",
+    "lungaccess.planning.coupled",
+    "lungaccess.planning.one_stage",
     "lungaccess.plans",
     "lungaccess.problem",
-    "lungaccess.procedure",
-    "lungaccess.reachability",
+    "lungaccess.planning.procedure",
+    "lungaccess.planning.reachability",
     "lungaccess.uncertainty.risk",
     "lungaccess.study",
     "stages.needle",
@@ -74,7 +74,7 @@ def test_facades_hold_every_name_they_state(package: str) -> None:
 def test_modules_do_not_hide_functions() -> None:
     """`la.plan` and `la.check` stay functions whatever has been imported before."""
     code = (
-        "import lungaccess.coupled.planner, lungaccess.plans.plan, lungaccess.judging.checking\n"
+        "import lungaccess.planning.coupled.planner, lungaccess.plans.plan, lungaccess.judging.checking\n"
         "import lungaccess.cli.app, lungaccess as la\n"
         "print(callable(la.plan) and callable(la.check))"
     )

@@ -10,7 +10,7 @@ import numpy as np
 import lungaccess as la
 from anatomy.base.records import frozen_value
 from anatomy.poses import pose
-from lungaccess.one_stage.needle import plan_needle
+from lungaccess.planning.one_stage.needle import plan_needle
 from lungaccess.problem.target import point_target
 from stages.needle.query import Query
 from stages.needle.violations import violation

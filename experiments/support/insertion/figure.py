@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from anatomy.lung import Lung
-from lungaccess.procedure.insertion import TOLERANCE_MM, Study
+from lungaccess.planning.procedure.insertion import TOLERANCE_MM, Study
 from lungaccess.report import style
 from lungaccess.report.insertion import draw_paths
 from stages.needle.path import ArcPath

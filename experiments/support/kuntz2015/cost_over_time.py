@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.base.typed import Float
-from lungaccess.coupled import AtlasSearch, Step
-from lungaccess.coupled.atlas import Atlas
+from lungaccess.planning.coupled import AtlasSearch, Step
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.refinement import refine
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
-from lungaccess.refinement import refine
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,10 +6,10 @@ import time
 from typing import Any
 
 from anatomy.base.typed import Float
-from lungaccess.coupled import ReferenceSearch
-from lungaccess.coupled.atlas import Atlas
-from lungaccess.coupled.kuntz2015_fcl.needle import NeedleRRT
-from lungaccess.coupled.kuntz2015_fcl.obstacles import Obstacles
+from lungaccess.planning.coupled import ReferenceSearch
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT
+from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.task import Task
 from stages.needle.path import ArcPath

@@ -16,8 +16,8 @@ from anatomy.base.settings import override
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from experiments.support.mutants.draws import Rng
-from lungaccess.coupled import DirectArcs, alternatives
-from lungaccess.coupled.atlas import Atlas
+from lungaccess.planning.coupled import DirectArcs, alternatives
+from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan

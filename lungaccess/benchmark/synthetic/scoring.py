@@ -26,7 +26,7 @@ from lungaccess.problem.system import load_system
 from lungaccess.uncertainty.breathing.window import with_window
 
 if TYPE_CHECKING:
-    from lungaccess.reachability import UnreachableProof
+    from lungaccess.planning.reachability import UnreachableProof
 
 SOLVED, REFUSED, NONE, CLAIMED, CERTIFIED, MISSING = (
     "solved", "refused", "no plan", "claimed unreachable", "proved unreachable", "no answer",
@@ -234,7 +234,7 @@ class _Scorer:
         return report.succeeds.value
 
     def _is_proved(self, query: BenchmarkQuery) -> bool:
-        from lungaccess.reachability import UnreachableProof
+        from lungaccess.planning.reachability import UnreachableProof
 
         if query.system not in self._proofs:
             system = load_system(query.system)

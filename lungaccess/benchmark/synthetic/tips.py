@@ -12,7 +12,7 @@ from typing import Any
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import read_json
 from anatomy.lung import Lung
-from lungaccess.coupled.atlas import motions_of
+from lungaccess.planning.coupled.atlas import motions_of
 from lungaccess.problem.system import load_system
 
 SPACING_MM = 5.0

@@ -15,7 +15,7 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from lungaccess.one_stage import ScopeAdvice
+    from lungaccess.planning.one_stage import ScopeAdvice
 
 
 def advise(
@@ -36,7 +36,7 @@ def advise(
     The goal is the airway voxel nearest to the lesion's centre, if possible one in the lesion where the scope
     fits.  Exit code 0 if the scope reaches it, 1 if it stops before.
     """
-    from lungaccess.one_stage import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
+    from lungaccess.planning.one_stage import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
     from lungaccess.problem.system import load_system
 
     stated = target.stated()

@@ -33,8 +33,8 @@ from stages.needle import DEFAULT, Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.coupled import Alternative
     from lungaccess.judging.appraisal import Appraisal
+    from lungaccess.planning.coupled import Alternative
     from lungaccess.problem.system import System
 
 PICTURE = "trade_off.svg"
@@ -81,11 +81,11 @@ def alternatives(
     Those that no other beats in success, length and clearance together are marked: the Pareto front.
     """
     from anatomy.base.files import write_text
-    from lungaccess.coupled import alternatives as find_alternatives
-    from lungaccess.coupled import with_front
     from lungaccess.judging.appraisal import Appraiser
+    from lungaccess.planning.coupled import alternatives as find_alternatives
+    from lungaccess.planning.coupled import with_front
+    from lungaccess.planning.success import alternatives_for_success
     from lungaccess.report.html import trade_off_svg
-    from lungaccess.success import alternatives_for_success
 
     for_success, widest, asked = objective == SUCCESS, objective == WINDOW, stated_phases(phases)
     if for_success and asked is not None:

@@ -74,7 +74,7 @@ def clear(*, output: PatientOptions = PatientOptions()) -> ExitCode:
 def _entries(folder: Path) -> tuple[CacheEntry, ...]:
     from anatomy.base.cache_entries import cache_entries
     from anatomy.store import stored_format
-    from lungaccess.coupled.atlas_store import atlas_format
+    from lungaccess.planning.coupled.atlas_store import atlas_format
     from stages.tube import shapes_format
 
     return cache_entries(

@@ -21,7 +21,7 @@ from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
     from anatomy.base.typed import Float
-    from lungaccess.reachability import OpenPlace, ReachVerdict
+    from lungaccess.planning.reachability import OpenPlace, ReachVerdict
 
 SHOWN = 8
 """Open places that the table names."""
@@ -51,8 +51,8 @@ def certify(
     out : Path
         PNG file that shows what is ruled out and what is open.
     """
+    from lungaccess.planning.reachability import MOST_BOXES, UnreachableProof
     from lungaccess.plans.version import made_by
-    from lungaccess.reachability import MOST_BOXES, UnreachableProof
 
     if out is not None:
         require_picture(out)

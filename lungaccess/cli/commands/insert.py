@@ -17,7 +17,7 @@ from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile, requ
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from lungaccess.procedure.insertion import InsertionStudy
+    from lungaccess.planning.procedure.insertion import InsertionStudy
 
 
 def insert(
@@ -52,8 +52,8 @@ def insert(
 ) -> ExitCode:
     """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees."""
     from lungaccess.judging.checking import check
+    from lungaccess.planning.procedure.insertion import TrackerModel, insert_plan
     from lungaccess.plans.plan import Plan
-    from lungaccess.procedure.insertion import TrackerModel, insert_plan
     from lungaccess.report.insertion import insertion_webp, insertions_png
 
     stored = Plan.load(plan)

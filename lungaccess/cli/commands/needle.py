@@ -29,7 +29,7 @@ from stages.needle import Objective
 if TYPE_CHECKING:
     from anatomy.base.typed import Float
     from anatomy.organ import Organ
-    from lungaccess.one_stage import NeedleAnswer
+    from lungaccess.planning.one_stage import NeedleAnswer
 
 
 def needle(
@@ -67,7 +67,7 @@ def needle(
 ) -> ExitCode:
     """Plan the needle alone from a given pose, or prove that no path exists and say what is blocked."""
     from anatomy.lung import Lung
-    from lungaccess.one_stage import plan_needle
+    from lungaccess.planning.one_stage import plan_needle
 
     if out is not None:
         require_picture(out)
@@ -118,7 +118,7 @@ def needle(
 def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
     """Return what a needle planner found: the outcome, and the path arc by arc."""
     from lungaccess.cli.plan_tables import arcs_table
-    from lungaccess.one_stage import obstruction_rows
+    from lungaccess.planning.one_stage import obstruction_rows
     from lungaccess.plans.costs import costs_in_words
 
     words = {

@@ -18,7 +18,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.reachability import ReachMap, RegionReach
+    from lungaccess.planning.reachability import ReachMap, RegionReach
 
 
 def reach(
@@ -49,8 +49,8 @@ def reach(
 
     A run that was stopped goes on where it was if it is started again with the same options.
     """
+    from lungaccess.planning.reachability.reach_map import compare_reach
     from lungaccess.problem.system import load_system
-    from lungaccess.reachability.reach_map import compare_reach
     from lungaccess.report import reach_png
 
     names = [system.system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
@@ -102,7 +102,7 @@ def _stems(maps: tuple[ReachMap, ...]) -> list[str]:
 
 def record(reach: ReachMap) -> dict[str, object]:
     """Return the figures of a map as plain values."""
-    from lungaccess.reachability import KINDS, NOT_COUNTED
+    from lungaccess.planning.reachability import KINDS, NOT_COUNTED
 
     system, needle = reach.system, reach.system.needle
     return {
@@ -124,7 +124,7 @@ def record(reach: ReachMap) -> dict[str, object]:
 
 
 def _plain(row: RegionReach) -> dict[str, object]:
-    from lungaccess.reachability import KINDS, STATES
+    from lungaccess.planning.reachability import KINDS, STATES
 
     return {
         "name": row.name,
@@ -137,7 +137,7 @@ def _plain(row: RegionReach) -> dict[str, object]:
 
 
 def _region_table(reach: ReachMap) -> Table:
-    from lungaccess.reachability import STATES
+    from lungaccess.planning.reachability import STATES
 
     rows = [
         (

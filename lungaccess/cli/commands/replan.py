@@ -26,7 +26,7 @@ from stages.needle import DEFAULT, Objective
 
 if TYPE_CHECKING:
     from anatomy.base.typed import Float
-    from lungaccess.one_stage import RestOfPlan
+    from lungaccess.planning.one_stage import RestOfPlan
     from lungaccess.plans.plan import Plan
 
 
@@ -57,7 +57,7 @@ def replan(
 ) -> ExitCode:
     """Plan the rest from a measured pose: tubes and needle from the scope's tip, or the needle alone."""
     from lungaccess.cli.plan_tables import no_plan_record
-    from lungaccess.one_stage import replan_from_scope, replan_from_tube
+    from lungaccess.planning.one_stage import replan_from_scope, replan_from_tube
     from lungaccess.plans.no_plan import NoPlan
 
     Objective.of(objective)

@@ -100,7 +100,7 @@ def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple
 
     Of a patient that breathes they have their windows.
     """
-    from lungaccess.coupled import alternatives as find
+    from lungaccess.planning.coupled import alternatives as find
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import Target
     from lungaccess.uncertainty.breathing.window import with_window

@@ -45,9 +45,9 @@ def risk(
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it."""
     from lungaccess.judging.appraisal import Headline
+    from lungaccess.planning.procedure import Procedure, simulate_procedure
+    from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.plans.plan import Plan
-    from lungaccess.procedure import Procedure, simulate_procedure
-    from lungaccess.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.uncertainty.risk import assess, find_tolerances
     from lungaccess.uncertainty.risk.assessment import DEFAULT_SAMPLES
 

@@ -59,7 +59,7 @@ def route(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it."""
-    from lungaccess.one_stage import open_source, route_record, widest_end
+    from lungaccess.planning.one_stage import open_source, route_record, widest_end
     from lungaccess.report.route import route_png
     from stages.scope.route import RouteLimits, plan_route
 

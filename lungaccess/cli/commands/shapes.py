@@ -32,7 +32,7 @@ def shapes(
 
     Exit code 0 if the device allows any deployment; 1 if it allows none.
     """
-    from lungaccess.one_stage import design_shapes, load_tubes, save_shapes, shapes_record
+    from lungaccess.planning.one_stage import design_shapes, load_tubes, save_shapes, shapes_record
 
     device = load_tubes(system)
     found = design_shapes(device, cache=output.cache)
@@ -48,7 +48,7 @@ def shapes(
 
 
 def _rows(name: str, found: TubeShapes) -> list[terminal.Row]:
-    from lungaccess.one_stage import shapes_record
+    from lungaccess.planning.one_stage import shapes_record
 
     record = shapes_record(name, found)
     turns = record["relative_rotations"]

@@ -42,7 +42,7 @@ def start_region(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Tell from which poses near its start the needle of a stored plan still reaches the target, clear."""
-    from lungaccess.one_stage import safe_scope_region
+    from lungaccess.planning.one_stage import safe_scope_region
     from lungaccess.plans.plan import Plan
     from lungaccess.uncertainty.risk import safe_start_region
 

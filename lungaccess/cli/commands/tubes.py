@@ -16,7 +16,7 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions, require_pictur
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.one_stage import TubeAnswer
+    from lungaccess.planning.one_stage import TubeAnswer
     from stages.tube import DesignProposal, SequenceComparison
 
 
@@ -50,7 +50,7 @@ def tubes(
 
     Exit code 0 if the device allows it; 1 if the tubes would snap or exceed a limit of the system.
     """
-    from lungaccess.one_stage import deploy_tubes, load_tubes
+    from lungaccess.planning.one_stage import deploy_tubes, load_tubes
 
     require_picture(out)
     answer = deploy_tubes(
@@ -87,7 +87,7 @@ def _show_tables(answer: TubeAnswer, propose: bool) -> None:
     terminal.show([terminal.table(f"Tubes of {answer.name}", ("", "", "limit"), _rows(answer))])
     if not propose:
         return
-    from lungaccess.one_stage import compare_sequences, design_choices
+    from lungaccess.planning.one_stage import compare_sequences, design_choices
 
     comparison = compare_sequences(answer)
     terminal.show([_sequence_table(comparison)])
@@ -177,7 +177,7 @@ def _design_table(present: DesignProposal, choices: tuple[DesignProposal, ...]) 
 
 
 def _show_json(answer: TubeAnswer, propose: bool) -> None:
-    from lungaccess.one_stage import compare_sequences, design_choices, tubes_record
+    from lungaccess.planning.one_stage import compare_sequences, design_choices, tubes_record
 
     written = tubes_record(answer)
     if propose:

@@ -10,8 +10,8 @@ from anatomy.base.records import frozen_value
 from lungaccess.judging.appraisal.headline import Headline
 from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 from lungaccess.judging.checking import Checker, CheckReport
-from lungaccess.procedure import Procedure, load_procedure
-from lungaccess.success import Estimate, estimate_success
+from lungaccess.planning.procedure import Procedure, load_procedure
+from lungaccess.planning.success import Estimate, estimate_success
 from lungaccess.uncertainty.risk import ErrorModel, load_errors
 
 if TYPE_CHECKING:

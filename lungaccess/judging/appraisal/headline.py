@@ -10,9 +10,9 @@ from anatomy.base.records import frozen_value
 from anatomy.base.words import plural
 from anatomy.lobes import FISSURES_UNKNOWN
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+from lungaccess.planning.procedure.report import NO_PATH
+from lungaccess.planning.success.estimate import Estimate, chance_of
 from lungaccess.plans.chance import Chance
-from lungaccess.procedure.report import NO_PATH
-from lungaccess.success.estimate import Estimate, chance_of
 from lungaccess.uncertainty.risk.assessment import MISSES
 from lungaccess.uncertainty.risk.statistics import Share
 

@@ -11,8 +11,8 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT
-from lungaccess.coupled import DirectArcs
 from lungaccess.judging.explanation import kernels
+from lungaccess.planning.coupled import DirectArcs
 from lungaccess.plans.evaluator import blocker_name
 from stages.needle import direct_path
 

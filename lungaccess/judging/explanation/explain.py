@@ -9,7 +9,14 @@ from typing import Any, cast
 
 from anatomy.base.kernel_clock import working_cpu_s
 from anatomy.lung import Lung
-from lungaccess.coupled import (
+from lungaccess.judging.appraisal import DRAWS, SEED
+from lungaccess.judging.checking import Checker
+from lungaccess.judging.explanation.blocking import arc_beyond_limits, look_along
+from lungaccess.judging.explanation.explanation import DONE, NOT_TRIED, TIME_IS_UP, Change, Explanation, Part
+from lungaccess.judging.explanation.neighbours import Surroundings
+from lungaccess.judging.explanation.starts import map_starts
+from lungaccess.judging.presets_in_turn import Attempt, first_attempt
+from lungaccess.planning.coupled import (
     Atlas,
     Counterfactual,
     DirectArcs,
@@ -19,20 +26,13 @@ from lungaccess.coupled import (
     plan,
     scope_changes,
 )
-from lungaccess.judging.appraisal import DRAWS, SEED
-from lungaccess.judging.checking import Checker
-from lungaccess.judging.explanation.blocking import arc_beyond_limits, look_along
-from lungaccess.judging.explanation.explanation import DONE, NOT_TRIED, TIME_IS_UP, Change, Explanation, Part
-from lungaccess.judging.explanation.neighbours import Surroundings
-from lungaccess.judging.explanation.starts import map_starts
-from lungaccess.judging.presets_in_turn import Attempt, first_attempt
+from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
-from lungaccess.reachability import ReachVerdict, UnreachableProof
 from lungaccess.uncertainty.risk import Share, assess
 from stages.needle import DEFAULT, Objective, needle_environment
 
@@ -81,14 +81,15 @@ def explain_no_plan(
     atlas : Atlas, optional
         The system's; made here if None.
     objective, seed
-        As for `lungaccess.coupled.planner.plan`.
+        As for `lungaccess.planning.coupled.planner.plan`.
     time_s : float, optional
         No part begins after so many seconds of processor time, and long ones end; None for no limit.  Getting
         kernels does not count, and one preset is tried even if no time is left.
     atlas_of : callable, optional
         Returns the atlas of a system, and tells a function the share of it made; `build_atlas` if None.
     is_kept : callable, optional
-        Tells whether `atlas_of` need not make the atlas of a system, as `lungaccess.coupled.atlas_is_kept`
+        Tells whether `atlas_of` need not make the atlas of a system, as
+        `lungaccess.planning.coupled.atlas_is_kept`
         does: such presets are tried first.  None is taken to be kept if it is not given.
     on_part : callable, optional
         Told the name of each part as it begins.

@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from dataclasses import field
 
 from anatomy.base.records import frozen_record, frozen_value
-from lungaccess.coupled import Counterfactual
 from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking
 from lungaccess.judging.explanation.neighbours import Neighbour, ReachedShare
 from lungaccess.judging.explanation.starts import StartMap
 from lungaccess.judging.presets_in_turn import Attempt
+from lungaccess.planning.coupled import Counterfactual
+from lungaccess.planning.reachability import ReachVerdict
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.preset_order import presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.reachability import ReachVerdict
 from lungaccess.uncertainty.risk import Share
 
 DONE, NOT_TRIED = "done", "not tried"

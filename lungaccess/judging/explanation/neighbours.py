@@ -10,8 +10,8 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.structures import obstacle_bits
-from lungaccess.coupled import DirectCandidates, plan, reach_scan
 from lungaccess.judging.explanation.blocking import region_of
+from lungaccess.planning.coupled import DirectCandidates, plan, reach_scan
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target

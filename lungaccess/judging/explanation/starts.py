@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
-from lungaccess.coupled import DirectArcs
+from lungaccess.planning.coupled import DirectArcs
 from lungaccess.plans.evaluator import blocker_name
 
 CELL_MM = 4.0

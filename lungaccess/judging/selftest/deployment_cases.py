@@ -14,9 +14,6 @@ from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from lungaccess.coupled.cost_to_go import cost_to_go
-from lungaccess.coupled.kernels import box_queue, deployment_box
-from lungaccess.coupled.kernels.cost_bound import BoundEnvironment
 from lungaccess.judging.selftest.scenes import (
     ROUNDING_MM,
     Case,
@@ -29,9 +26,12 @@ from lungaccess.judging.selftest.scenes import (
     true_distances,
     unit,
 )
-from lungaccess.reachability.kernels import deployment_boxes as reach_boxes
-from lungaccess.reachability.kernels import unreachable
-from lungaccess.reachability.kernels.blocked import ProofEnvironment
+from lungaccess.planning.coupled.cost_to_go import cost_to_go
+from lungaccess.planning.coupled.kernels import box_queue, deployment_box
+from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment
+from lungaccess.planning.reachability.kernels import deployment_boxes as reach_boxes
+from lungaccess.planning.reachability.kernels import unreachable
+from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment
 from stages.needle import ArcPath, Needle, NeedleEnvironment, backward_reach, environment_of_labels
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
 from stages.tube import kernels, tube_environment
@@ -63,8 +63,8 @@ class Reaching:
     """A lung, accepted tubes in it, and a clear path of the needle from them to a target.
 
     `values` (8,) are the two parts of the tip's direction, the rotation, both insertions, and the place along
-    FRAME, as in `lungaccess.reachability.kernels.deployment_boxes`; `base` (9,) is point, direction and +x of
-    the scope's tip.
+    FRAME, as in `lungaccess.planning.reachability.kernels.deployment_boxes`; `base` (9,) is point, direction
+    and +x of the scope's tip.
     """
 
     lung: Lung

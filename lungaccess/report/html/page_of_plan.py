@@ -13,10 +13,10 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.words import plural
-from lungaccess.coupled import with_front
 from lungaccess.judging.appraisal import Appraiser
+from lungaccess.planning.coupled import with_front
+from lungaccess.planning.procedure import load_procedure, procedure_names
 from lungaccess.plans.chance import Chance
-from lungaccess.procedure import load_procedure, procedure_names
 from lungaccess.report.html import breathing, phase, tables, words
 from lungaccess.report.html.deployment import device_points, packed_plan
 from lungaccess.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from anatomy.grid import Volume
     from anatomy.lung import Lung
     from lungaccess.judging.appraisal import Appraisal
+    from lungaccess.planning.procedure import Procedure
     from lungaccess.plans.plan import Plan
-    from lungaccess.procedure import Procedure
     from lungaccess.uncertainty.risk import ErrorModel
     from stages.needle import StartRegion
 

@@ -19,7 +19,7 @@ from lungaccess.report.reach import CLEARANCE_MM, COLOURS, fullest_point
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.reachability import ReachMap
+    from lungaccess.planning.reachability import ReachMap
 
 MODULES = ("reach.js",)
 STEPS_PER_MM = 25.0
@@ -73,7 +73,7 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
 
 def packed_map(reach: ReachMap) -> Packed:
     """Return a map for the scripts: its kinds and clearances, and the surfaces of what is reached and not."""
-    from lungaccess.reachability import KINDS
+    from lungaccess.planning.reachability import KINDS
 
     clearance = np.clip(np.rint(reach.clearance_mm.array * STEPS_PER_MM), 0, 255).astype(np.uint8)
     return {
@@ -106,7 +106,7 @@ def _surfaces(reach: ReachMap) -> list[Packed]:
 
 def volumes_section(maps: Sequence[ReachMap]) -> str:
     """Return a table of volumes by side for each system, in mL and as a share."""
-    from lungaccess.reachability import STATES
+    from lungaccess.planning.reachability import STATES
 
     headings = (
         "", "tissue, mL", *(f"{state}, mL (%)" for state in STATES), "reachable by search alone, mL",

@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from lungaccess.planning.procedure import ProcedureReport
 from lungaccess.plans.chance import Chance
-from lungaccess.procedure import ProcedureReport
 from lungaccess.report.html import words
 from lungaccess.uncertainty.risk import Share
 
 if TYPE_CHECKING:
-    from lungaccess.success import Estimate
+    from lungaccess.planning.success import Estimate
     from lungaccess.uncertainty.risk import RiskReport, Sensitivity
 
 FAILS = "Why procedures fail"

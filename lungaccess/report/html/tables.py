@@ -12,10 +12,10 @@ from lungaccess.report.key_numbers import figures_of_plan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.coupled import Alternative
     from lungaccess.judging.appraisal import Appraisal, Limit
     from lungaccess.judging.checking import CheckReport
     from lungaccess.judging.checking.findings import Finding
+    from lungaccess.planning.coupled import Alternative
     from lungaccess.plans.plan import Plan
 
 TIGHT_FROM = 0.9

@@ -28,7 +28,7 @@ from lungaccess.benchmark import (
 from lungaccess.benchmark.published import NO_STARTS, patients_of, why_no_query
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.one_stage import search_path
+from lungaccess.planning.one_stage import search_path
 from stages.needle import ArcPath
 
 RUN = {

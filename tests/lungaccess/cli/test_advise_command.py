@@ -12,7 +12,7 @@ from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.one_stage.scope import advise_scope
+from lungaccess.planning.one_stage.scope import advise_scope
 from lungaccess.problem.system import System, load_system
 from stages.scope.advisor.instructions import instructions_along
 

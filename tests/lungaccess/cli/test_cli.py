@@ -71,8 +71,8 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
             )
 
     load_with(monkeypatch, lambda *_, **__: toy_lung)
-    monkeypatch.setattr("lungaccess.coupled.open_atlas", lambda *_, **__: None)
-    monkeypatch.setattr("lungaccess.coupled.plan", search)
+    monkeypatch.setattr("lungaccess.planning.coupled.open_atlas", lambda *_, **__: None)
+    monkeypatch.setattr("lungaccess.planning.coupled.plan", search)
     monkeypatch.setattr(
         "lungaccess.problem.target.StatedTarget.resolve",
         lambda stated, lung: SimpleNamespace(named=stated.origin, lps_mm=toy_plan.target_lps),
@@ -190,7 +190,7 @@ def test_an_interruption_keeps_the_best_plan(
         yield toy_plan
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lungaccess.coupled.plan", search)
+    monkeypatch.setattr("lungaccess.planning.coupled.plan", search)
     assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == ExitCode.OK
     assert (tmp_path / "plan.json").exists()
 

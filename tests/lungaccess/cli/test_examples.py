@@ -18,8 +18,8 @@ from lungaccess.cli import app as cli
 from lungaccess.cli.commands.template import FILES
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.one_stage import load_tubes, read_lesions
-from lungaccess.procedure import load_procedure
+from lungaccess.planning.one_stage import load_tubes, read_lesions
+from lungaccess.planning.procedure import load_procedure
 from lungaccess.study import read_study
 from lungaccess.uncertainty.risk import load_errors
 from tests.lungaccess.cli.every_command import commands

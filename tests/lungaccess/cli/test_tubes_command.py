@@ -13,7 +13,13 @@ import pytest
 from anatomy.base.errors import SettingsError
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.one_stage.tubes import BareTubes, compare_sequences, deploy_tubes, design_choices, load_tubes
+from lungaccess.planning.one_stage.tubes import (
+    BareTubes,
+    compare_sequences,
+    deploy_tubes,
+    design_choices,
+    load_tubes,
+)
 from lungaccess.problem.system import load_system
 from stages.tube.shape import centreline
 

@@ -9,9 +9,9 @@ import pytest
 
 import lungaccess as la
 from anatomy.phantom import Phantom, write_phantom
-from tests.lungaccess.coupled.planning import TARGET
 from tests.lungaccess.explorer.client import source_of
 from tests.lungaccess.explorer.windows import Page, Served
+from tests.lungaccess.planning.coupled.planning import TARGET
 
 
 @pytest.fixture(scope="session")

@@ -14,13 +14,13 @@ import pytest
 
 import lungaccess as la
 from lungaccess.cli.app import main
-from lungaccess.coupled import DirectArcs
 from lungaccess.explorer import Explorer
+from lungaccess.planning.coupled import DirectArcs
+from lungaccess.planning.reachability import KINDS
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.task import Task
-from lungaccess.reachability import KINDS
-from tests.lungaccess.coupled.planning import TARGET
 from tests.lungaccess.explorer.client import Client, source_of, with_client
+from tests.lungaccess.planning.coupled.planning import TARGET
 
 SYSTEM = {"system": "ultrathin"}
 ITERATIONS = 60

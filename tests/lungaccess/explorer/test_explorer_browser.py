@@ -11,8 +11,8 @@ import pytest
 import lungaccess as la
 from anatomy.phantom import Phantom, write_phantom
 from lungaccess.explorer import PatientSource
-from tests.lungaccess.coupled.planning import TARGET
 from tests.lungaccess.explorer.windows import PLANNED, Page, Served
+from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.report import browser
 
 pytestmark = [

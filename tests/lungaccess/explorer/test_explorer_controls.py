@@ -12,9 +12,9 @@ import pytest
 
 from lungaccess.explorer.ct_slice import ct_slice
 from lungaccess.report.html.volumes import find_ct, read_ct
-from tests.lungaccess.coupled.planning import TARGET
 from tests.lungaccess.explorer.client import source_of
 from tests.lungaccess.explorer.windows import PLANNED, Page, Served
+from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.report import browser
 
 pytestmark = [

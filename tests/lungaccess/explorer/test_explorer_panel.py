@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from tests.lungaccess.coupled.planning import TARGET
 from tests.lungaccess.explorer.windows import PLANNED, Page, Served
+from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.report import browser
 
 pytestmark = [

@@ -11,8 +11,8 @@ import pytest
 
 import lungaccess as la
 from lungaccess.cli.app import main
-from tests.lungaccess.coupled.planning import TARGET
 from tests.lungaccess.explorer.windows import PLANNED, Page, Served
+from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.report import browser
 
 pytestmark = [

@@ -13,9 +13,9 @@ import numpy as np
 import lungaccess as la
 from anatomy.grid import Volume
 from anatomy.lung import Lung
+from lungaccess.planning.reachability.reach_map import ReachMap, map_reach
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingWindow, WindowLimit
-from lungaccess.reachability.reach_map import ReachMap, map_reach
 from lungaccess.report.html import PageOptions, plan_page, reach_page
 
 SYSTEM = la.load_system("ultrathin")

@@ -14,14 +14,14 @@ import pytest
 from anatomy.base.errors import PlanFileError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
-from lungaccess.coupled import Alternative, with_front
 from lungaccess.judging.appraisal import Headline
+from lungaccess.planning.coupled import Alternative, with_front
+from lungaccess.planning.procedure import ProcedureReport, StageReport, load_procedure
+from lungaccess.planning.success import chance_of
 from lungaccess.plans.plan import Plan
-from lungaccess.procedure import ProcedureReport, StageReport, load_procedure
 from lungaccess.report.html import page_of_plan, trade_off_svg
 from lungaccess.report.html.risk import risk_section
 from lungaccess.slicer import export
-from lungaccess.success import chance_of
 from lungaccess.uncertainty.risk import Share, load_errors
 from tests.lungaccess.appraisals import make_check, make_risk
 

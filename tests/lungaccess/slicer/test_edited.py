@@ -129,7 +129,7 @@ def command(
 ) -> Any:
     """Run a command on the small phantom and return exit code and JSON."""
     monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_atlas.lung)
-    monkeypatch.setattr("lungaccess.coupled.open_atlas", lambda *_, **__: small_atlas)
+    monkeypatch.setattr("lungaccess.planning.coupled.open_atlas", lambda *_, **__: small_atlas)
 
     def run(*words: str) -> tuple[int, dict[str, Any]]:
         code = cli.main([*words, "--json"])

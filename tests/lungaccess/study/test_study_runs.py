@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from anatomy.base.errors import FileError, SettingsError, TargetError
+from lungaccess.planning.procedure import load_procedure
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import peripheral
 from lungaccess.problem.system import load_system
-from lungaccess.procedure import load_procedure
 from lungaccess.study import one_run, summarise
 from lungaccess.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
 from lungaccess.study.needle_run import needle_answer
@@ -223,7 +223,7 @@ OMPL_SCRIPT = """
 import json, sys
 from pathlib import Path
 import numpy as np
-from lungaccess.one_stage.needle import plan_needle
+from lungaccess.planning.one_stage.needle import plan_needle
 from lungaccess.study.patients import open_patient
 from lungaccess.study.runs import Run
 from lungaccess.problem.target import point_target

@@ -28,7 +28,7 @@ from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 PLANS_A_SYSTEM = 3
 MUTANTS_OF_A_KIND = 2
 WITHOUT_EXPLANATION = (
-    "lungaccess.coupled.explanation.explain",
+    "lungaccess.planning.coupled.explanation.explain",
     lambda *_, **__: la.NoPlan("No plan", reasons={}),
 )
 """Why there is no plan is of no interest here."""

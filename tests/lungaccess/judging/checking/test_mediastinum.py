@@ -11,8 +11,8 @@ import pytest
 import lungaccess as la
 from anatomy.base.errors import LungaccessError
 from anatomy.lung import Lung
-from lungaccess.coupled import DirectArcs
 from lungaccess.judging.checking import Checker
+from lungaccess.planning.coupled import DirectArcs
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target

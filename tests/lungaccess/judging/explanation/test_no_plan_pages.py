@@ -129,10 +129,10 @@ def test_the_command_leaves_what_it_learned_and_exits_1(
     load_with(monkeypatch, lambda *_, **__: small_lung)
     atlas = la.build_atlas(small_lung, SYSTEM, rotations=4, stop_spacing_mm=10.0, site_spacing_mm=5.0)
     monkeypatch.setattr(
-        "lungaccess.coupled.open_atlas", lambda _lung, system, **_: replace(atlas, system=system)
+        "lungaccess.planning.coupled.open_atlas", lambda _lung, system, **_: replace(atlas, system=system)
     )
     monkeypatch.setattr(
-        "lungaccess.coupled.atlas_is_kept", lambda _lung, system, **_: system.name == "stylet-needle"
+        "lungaccess.planning.coupled.atlas_is_kept", lambda _lung, system, **_: system.name == "stylet-needle"
     )
     (tmp_path / "plan.json").write_text("{}")
     words = [

@@ -31,8 +31,18 @@ WEAKENED = [
     ("start region", "stages/needle/kernels/start_region.py", "+ (chord", "+ 0.5 * (chord"),
     ("no path", f"{INFEASIBLE}/bounds.py", "return change + (depth", "return 0.5 * change + 0.5 * (depth"),
     ("no path", f"{INFEASIBLE}/cubes.py", "if above + half >=", "if above + -half >="),
-    ("cost bound", "lungaccess/coupled/kernels/cost_bound.py", "max(middle + aside,", "max(0.7 * middle,"),
-    ("unreachable", "lungaccess/reachability/kernels/unreachable.py", "depth + moved", "depth - 0.5 * moved"),
+    (
+        "cost bound",
+        "lungaccess/planning/coupled/kernels/cost_bound.py",
+        "max(middle + aside,",
+        "max(0.7 * middle,",
+    ),
+    (
+        "unreachable",
+        "lungaccess/planning/reachability/kernels/unreachable.py",
+        "depth + moved",
+        "depth - 0.5 * moved",
+    ),
     (
         "window",
         "lungaccess/uncertainty/breathing/kernels/rules.py",

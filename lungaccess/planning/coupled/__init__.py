@@ -1,0 +1,52 @@
+"""The coupled planner: it searches for plans of all stages, diverse plan sets, and counterfactuals."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.planning.coupled.atlas import Atlas, atlas_part, build_atlas
+    from lungaccess.planning.coupled.atlas_measures import tip_clearances_mm, tube_stability
+    from lungaccess.planning.coupled.atlas_store import atlas_is_kept, open_atlas
+    from lungaccess.planning.coupled.counterfactuals import (
+        Counterfactual,
+        find_counterfactuals,
+        needle_changes,
+        scope_changes,
+    )
+    from lungaccess.planning.coupled.diverse_plans import (
+        COUNT,
+        SEPARATION_MM,
+        Alternative,
+        alternatives,
+        criteria,
+        separated_plans,
+        with_front,
+    )
+    from lungaccess.planning.coupled.exits import FeasibleExits, feasible_exits
+    from lungaccess.planning.coupled.explanation import explain
+    from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
+    from lungaccess.planning.coupled.planner import METHODS, ProgressEvent, atlas_event, plan
+    from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes
+    from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
+    from lungaccess.planning.coupled.search.base import (
+        Incumbent,
+        ParallelSearch,
+        PlanSearch,
+        Step,
+        evaluated_step,
+    )
+    from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
+    from lungaccess.planning.coupled.search.direct_candidates import (
+        DirectCandidates,
+        Scan,
+        direct_candidates,
+        reach_scan,
+    )
+    from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
+    from lungaccess.planning.coupled.search.settings import SearchSettings
+    from lungaccess.planning.coupled.window_planner import plan_for_window
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,0 +1,147 @@
+"""Deployment atlases on disk: one file per lung, scope, tubes and margins, whatever the needle."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any, get_type_hints
+
+from anatomy.base.settings import to_mapping
+from anatomy.kept_records import kept_record, record_path
+from anatomy.lung import Lung
+from anatomy.machine_code.sources import kernel_digest
+from lungaccess.planning.coupled.atlas import TIP_SPACING_MM, Atlas, build_atlas
+from lungaccess.problem.system import System
+from lungaccess.problem.task import fissures_are_obstacles
+from stages.needle import StartIndex
+from stages.scope import ScopeMotions, prover_of
+from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, shapes_digest
+
+FORMAT = 9
+"""Raise it when the enumeration changes: stored atlases of another format are made anew."""
+
+
+def atlas_format() -> str:
+    """Return what tells atlases of this version and these kernels from all others."""
+    return (
+        f"{FORMAT}-{kernel_digest('anatomy', 'stages.scope', 'stages.tube', 'lungaccess.planning.coupled')}"
+    )
+
+
+def open_atlas(
+    lung: Lung,
+    system: System,
+    *,
+    rotations: int = DEFAULT_ROTATIONS,
+    stop_spacing_mm: float = DEFAULT_STOP_MM,
+    site_spacing_mm: float = TIP_SPACING_MM,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Atlas:
+    """Return the atlas from the cache, or make and keep it.
+
+    A system that differs in its needle alone finds the same file.  Parameters and errors are those of
+    `lungaccess.planning.coupled.atlas.build_atlas` and, for the cache, of `anatomy.kept_records.kept_record`.
+    """
+    prover_of(lung, system.scope)  # Here: the first plan does not wait for it.
+    depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
+
+    def make() -> Atlas:
+        return build_atlas(
+            lung,
+            system,
+            rotations=rotations,
+            stop_spacing_mm=stop_spacing_mm,
+            site_spacing_mm=site_spacing_mm,
+            progress=progress,
+        )
+
+    def rebuilt(values: dict[str, Any]) -> Atlas:
+        deployments = _rebuilt(Deployments, "deployments", values)
+        return Atlas(
+            lung=lung,
+            system=system,
+            with_fissures=values["with_fissures"],
+            motions=_rebuilt(ScopeMotions, "motions", values),
+            deployments=deployments,
+            index=StartIndex(deployments.positions, deployments.tangents),
+            build_s=values["build_s"],
+        )
+
+    in_use = () if lung.folder is None else (lung.folder,)
+    return kept_record(
+        "atlas",
+        atlas_format(),
+        depends_on,
+        make=make,
+        parts=_parts,
+        rebuilt=rebuilt,
+        cache=cache,
+        name=lung.name,
+        in_use=in_use,
+    )
+
+
+def atlas_is_kept(
+    lung: Lung,
+    system: System,
+    *,
+    rotations: int = DEFAULT_ROTATIONS,
+    stop_spacing_mm: float = DEFAULT_STOP_MM,
+    site_spacing_mm: float = TIP_SPACING_MM,
+    cache: str | os.PathLike[str] | None = None,
+) -> bool:
+    """Tell whether `open_atlas` finds an atlas in the cache; the file is not read, so it may be damaged.
+
+    Tubes that are not planar count as not kept: their file is named by shapes that take long to compute.
+    """
+    if not system.tubes.planar:
+        return False
+    depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
+    return record_path("atlas", atlas_format(), depends_on, cache).is_file()
+
+
+def _depends_on(
+    lung: Lung, system: System, rotations: int, stop_spacing_mm: float, site_spacing_mm: float
+) -> dict[str, Any]:
+    return {
+        "lung": lung.key,
+        "scope": to_mapping(system.scope),
+        "tubes": to_mapping(system.tubes),
+        "margins": to_mapping(system.margins),
+        "shapes": shapes_digest(system.tubes),
+        "with_fissures": fissures_are_obstacles(lung, system),
+        "rotations": rotations,
+        "stop_mm": stop_spacing_mm,
+        "site_mm": site_spacing_mm,
+    }
+
+
+def _parts(atlas: Atlas) -> dict[str, Any]:
+    return {
+        "with_fissures": atlas.with_fissures,
+        "build_s": atlas.build_s,
+        **_flat(atlas.motions, "motions"),
+        **_flat(atlas.deployments, "deployments"),
+    }
+
+
+def _flat(record: Any, name: str) -> dict[str, Any]:
+    """Return the fields of a record, and of the records in it, by dotted names."""
+    flat: dict[str, Any] = {}
+    for field in fields(record):
+        value, key = getattr(record, field.name), f"{name}.{field.name}"
+        flat |= _flat(value, key) if is_dataclass(value) else {key: value}
+    return flat
+
+
+def _rebuilt(cls: Any, name: str, values: dict[str, Any]) -> Any:
+    """Return the record that `_flat` took apart."""
+    hints = get_type_hints(cls)
+    parts: dict[str, Any] = {}
+    for field in fields(cls):
+        key = f"{name}.{field.name}"
+        value = _rebuilt(hints[field.name], key, values) if is_dataclass(hints[field.name]) else values[key]
+        parts[field.name] = tuple(value) if isinstance(value, list) else value
+    return cls(**parts)

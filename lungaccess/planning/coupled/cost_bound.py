@@ -1,0 +1,305 @@
+"""A proved lower bound of the cost of every plan to a target; docs/explanation/cost_bound.md derives it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from anatomy.base.errors import SettingsError
+from anatomy.base.typed import Float
+from anatomy.structures import AIRWAY
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.cost_to_go import cost_to_go
+from lungaccess.planning.coupled.kernels.box_queue import ENDED, MOST_BOXES, WAITING, begin_queue, divide
+from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment
+from lungaccess.planning.coupled.kernels.deployment_box import (
+    BOUND,
+    BOX_COLUMNS,
+    INNER,
+    OUTER,
+    ROTATION,
+    TIP,
+    TubeSurroundings,
+)
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
+from lungaccess.planning.coupled.search.base import Step, evaluated_step
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
+from stages.tube import tube_constants, tube_environment
+from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
+
+BOXES_A_STEP = 500
+"""Boxes that are divided beside one step of a search: in two threads they take as long, or twice as long."""
+STEADY_STEPS, MOST_TIMES = 16, 8
+"""After each so many steps without a cheaper plan they are so many more, up to so many times as many."""
+STEPS_TOGETHER = 4
+"""Steps of a search, at most, before both threads are waited for: more boxes take both more equally long."""
+BOXES_A_TIP = 2
+"""A scope tip is begun with instead of dividing so many boxes."""
+TRIED_A_QUEUE = 2
+"""Deployments that are tried in one step, in the middle of the lowest boxes: less than a millisecond."""
+QUEUES = 2
+"""Queues of boxes, each in a thread of its own: of every second scope tip.  More would be other plans."""
+INSERTION_SPACING_MM = 0.01
+"""Spacing of the insertions that are tried for the greatest one."""
+
+
+class CostBound:
+    """Bounds from below what plans to a target cost, better and better.
+
+    The bound holds for every deployment from a scope tip of the atlas, with any rotation and any insertions
+    of the tubes, and for every path of the needle from there to the target.  Of other scope tips, which the
+    planner tries along the motions between those of the atlas, it says nothing.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+    most_boxes : int
+        Boxes that may wait.
+
+    Raises
+    ------
+    SettingsError
+        If the tubes are not planar, there is no needle, or it is longer than half a circle of its greatest
+        curvature.
+    """
+
+    def __init__(self, task: Task, atlas: Atlas, *, most_boxes: int = MOST_BOXES) -> None:
+        system = task.system
+        needle = system.require_needle("A lower bound of the cost")
+        system.tubes.require_planar("A lower bound of the cost")
+        if needle.max_length_mm * needle.max_curvature_per_mm > math.pi:
+            raise SettingsError(
+                f"The needle is {needle.max_length_mm:g} mm long and bends to a radius of "
+                f"{1.0 / needle.max_curvature_per_mm:g} mm",
+                expected="a needle no longer than half a circle, so that its paths lie near a straight line",
+                remedy="Leave out the gap",
+            )
+        self._most_boxes = most_boxes
+        self._task = task
+        self._tubes = tube_constants(system.tubes, system.margins)
+        self._tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
+        self.queues: list[BoxQueue] = []
+        """Once it has begun."""
+        self._workers = ThreadPoolExecutor(QUEUES)
+        self._running: list[Future[None]] = []
+        self._value, self._left_out = 0.0, math.inf
+        self._lowest: list[tuple[int, float, float, float]] = []
+        self.settled = False
+        """Whether it rises no more."""
+
+    @property
+    def value(self) -> float:
+        """The bound: 0 before it has begun."""
+        self.finish()
+        return self._value
+
+    @property
+    def known(self) -> float:
+        """The bound when the boxes were last divided to the end, while others may be divided now."""
+        return self._value
+
+    @property
+    def lowest(self) -> list[tuple[int, float, float, float]]:
+        """Scope tip, rotation (rad) and insertions (mm) in the middle of some of the lowest boxes.
+
+        Those when the boxes were last divided to the end, while others may be divided now.
+        """
+        return self._lowest
+
+    def start(self, cost: float, boxes: int) -> None:
+        """Begin to divide so many boxes in other threads; `finish` waits for them.
+
+        Parameters
+        ----------
+        cost : float
+            That of a plan: deployments that cost as much need not be told apart.  The first calls only begin
+            with the boxes of some scope tips each.
+        """
+        self.finish()
+        if self.settled:
+            return
+        self._left_out = min(self._left_out, cost)
+        if not self.queues:
+            environment = _environment(self._task, self._tips[:, 0], cost)
+            insertions = np.zeros(int(self._tubes[MAX_EXTENSION] / INSERTION_STEP_MM) + 1)
+            greatest_insertions(self._tubes, self._tubes[MAX_EXTENSION], INSERTION_SPACING_MM, insertions)
+            x, y, z = self._task.target.lps_mm.tolist()
+            for n in range(QUEUES):
+                tips = np.ascontiguousarray(self._tips[n::QUEUES])
+                about = (environment, self._tubes, insertions, tips, np.zeros((len(tips), 2)), (x, y, z))
+                self.queues.append(BoxQueue(about, self._most_boxes // QUEUES))
+        self._running = [self._workers.submit(each.go_on, cost, boxes // QUEUES) for each in self.queues]
+
+    def finish(self) -> None:
+        """Wait until the boxes are divided that `start` has begun with."""
+        if not self._running:
+            return
+        for each in self._running:
+            each.result()
+        self._running = []
+        if any(not each.begun for each in self.queues):
+            return
+        least = min(self.queues, key=lambda each: each.value)
+        self._value, self.settled = min(least.value, self._left_out), least.settled
+        self._lowest = [
+            (tip * QUEUES + n, rotation, outer, inner)
+            for n, each in enumerate(self.queues)
+            for tip, rotation, outer, inner in each.lowest(TRIED_A_QUEUE)
+        ]
+
+    def improve(self, cost: float, boxes: int) -> float:
+        """Divide so many boxes as `start` does, and return the bound."""
+        self.start(cost, boxes)
+        return self.value
+
+
+class BoxQueue:
+    """The boxes of some scope tips, the lowest first.
+
+    Parameters
+    ----------
+    about : tuple
+        What `begin_queue` and `divide` take first: environment, tubes, insertions, tips, rates and target.
+    most_boxes : int
+    """
+
+    def __init__(self, about: tuple[Any, ...], most_boxes: int) -> None:
+        self.about = about
+        self._longest, self._tips = float(about[2].max()), len(about[3])
+        places, numbers = np.zeros(most_boxes, dtype=np.int64), np.zeros(2, dtype=np.int64)
+        self._state = (np.zeros((most_boxes, BOX_COLUMNS)), places, np.zeros_like(places), numbers)
+        self._next_tip = 0
+        self._room = True
+        self.settled = False
+        """Whether its bound rises no more."""
+
+    @property
+    def begun(self) -> bool:
+        """Whether boxes of all scope tips wait."""
+        return self.settled or self._next_tip == self._tips
+
+    @property
+    def value(self) -> float:
+        """The least bound of the boxes that wait; inf if none does."""
+        boxes, heap, _unused, numbers = self._state
+        if not self._room:
+            return 0.0
+        return float(boxes[heap[0], BOUND]) if numbers[WAITING] else math.inf
+
+    def go_on(self, cost: float, boxes: int) -> None:
+        """Divide so many boxes, or let those of some scope tips wait."""
+        if self.settled:
+            return
+        if self.begun:
+            outcome, _divided = divide(*self.about, boxes, cost, self._state)
+            self.settled = outcome != ENDED
+            return
+        first = self._next_tip
+        self._next_tip = min(first + max(boxes // BOXES_A_TIP, 1), self._tips)
+        self._room = begin_queue(*self.about, self._longest, cost, first, self._next_tip, self._state)
+        self.settled = not self._room
+
+    def lowest(self, count: int) -> list[tuple[int, float, float, float]]:
+        """Return scope tip, rotation (rad) and insertions (mm) in the middle of some of the lowest boxes."""
+        boxes, heap, _unused, numbers = self._state
+        rows = boxes[heap[: min(count, int(numbers[WAITING]))]]
+        inner = rows[:, INNER]
+        columns = rows[:, TIP], rows[:, ROTATION], np.clip(rows[:, OUTER], 0.0, inner), inner
+        return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
+
+
+def guided(search: AtlasSearch, steps: Iterator[Step], bound: CostBound) -> Iterator[Step]:
+    """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
+
+    Each of those becomes the search's best candidate, which it then improves.  Who takes the steps improves
+    the bound, which may go on while the search takes its next step.
+    """
+    for step in steps:
+        yield step
+        if bound.settled or search.incumbent.step is None:
+            continue
+        for tip, rotation, outer, inner in bound.lowest:
+            candidate = search.evaluator.direct(search.atlas.motions.tip(tip), rotation, outer, inner)
+            found = evaluated_step(search.evaluator, "lower bound", candidate, step.iteration)
+            if found.cost < search.incumbent.cost:
+                yield search.incumbent.improved(found)
+
+
+class GapGoal:
+    """The goal that a plan costs at most so much more than the best possible, proved.
+
+    Parameters
+    ----------
+    bound : CostBound
+    gap : float
+        Share of the best possible cost.
+
+    Raises
+    ------
+    SettingsError
+        If the gap is negative or not finite.
+    """
+
+    def __init__(self, bound: CostBound, gap: float) -> None:
+        if not 0.0 <= gap < math.inf:
+            raise SettingsError(
+                f"The gap is {gap}", expected="a share of 0 or more", remedy="State 0.05 for five per cent"
+            )
+        self.bound, self._gap = bound, gap
+        self._cost, self._steady, self._ahead = math.inf, 0, 0
+
+    def is_met(self, cost: float) -> bool:
+        """Tell whether a plan of this cost is so near to the best possible.
+
+        If it is not, the bound is improved in other threads: the more, the longer the cost has stayed the
+        same.  Then some of the next calls do not wait for them.
+        """
+        self._steady = self._steady + 1 if cost == self._cost else 0
+        self._cost = cost
+        self._ahead -= 1
+        if self._ahead > 0:
+            return cost <= (1.0 + self._gap) * self.bound.known
+        met = cost <= (1.0 + self._gap) * self.bound.value
+        if not met:
+            times = min(1 + self._steady // STEADY_STEPS, MOST_TIMES)
+            self._ahead = min(times, STEPS_TOGETHER)
+            self.bound.start(cost, times * BOXES_A_STEP)
+        return met
+
+
+def _environment(task: Task, tips: Float, limit: float) -> BoundEnvironment:
+    lung = task.lung
+    evaluator = CandidateEvaluator(task)
+    limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
+    tubes = tube_environment(lung, with_fissures=task.with_fissures)
+    weights = objective.inverse_clearance, objective.length
+    x, y, z = task.target.lps_mm.tolist()
+    togo = cost_to_go(tubes.field, tubes.geometry, limits, weights, (x, y, z), tips[:, :3], limit)
+    return BoundEnvironment(
+        obstacles=tubes.field,
+        geometry=tubes.geometry,
+        surroundings=TubeSurroundings(
+            clearance=tubes.field,
+            labels=tubes.labels,
+            geometry=tubes.geometry,
+            depth=tubes.lumen,
+            depth_geometry=tubes.lumen_geometry,
+            bits=tubes.bits,
+            hazard_bits=tubes.bits & ~AIRWAY,
+            mediastinal=tubes.mediastinal,
+        ),
+        kappa=limits.kappa,
+        max_length_mm=limits.max_length_mm,
+        goal_tolerance_mm=limits.goal_tolerance_mm,
+        per_clearance=objective.inverse_clearance,
+        per_mm=objective.length,
+        required_mm=limits.required_mm,
+        exempt_mm=limits.exempt_mm,
+        togo=togo,
+    )

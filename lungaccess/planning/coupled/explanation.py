@@ -1,0 +1,198 @@
+"""Why there is no plan: the reasons counted, and the smallest change of device that would help."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import replace
+
+from lungaccess.planning.coupled.atlas import Atlas, motions_of
+from lungaccess.planning.coupled.counterfactuals import Counterfactual, find_counterfactuals
+from lungaccess.planning.coupled.search.aimed_tubes import NO_SOLUTION, AimedTubes
+from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.problem.task import Task
+from stages.needle import needle_environment
+
+WITH_A_NEEDLE = "A system with a needle goes on from where the tubes end; `--system auto` tries every preset"
+
+
+def explain(
+    task: Task, atlas: Atlas, blocked: Counter[str], iterations: int, *, counterfactuals: bool = True
+) -> NoPlan:
+    """Return the `NoPlan` of a search that ended without a plan.
+
+    Parameters
+    ----------
+    blocked : Counter of str
+        How many direct arcs were stopped in the search, by what stopped them.
+    iterations : int
+        How many the search had.
+    counterfactuals : bool
+        Whether changes of the device are looked for; without them the advice is empty.
+    """
+    if task.system.needle is None:
+        return _explain_tubes(AimedTubes(task, atlas), blocked, iterations, counterfactuals)
+    arcs = DirectArcs(task, atlas)
+    main_reason = _before_the_needle(task, atlas) or _main_reason(arcs, blocked)
+    found = f"No plan to the target after {iterations} iterations: {main_reason}"
+    reasons = _reasons(arcs, blocked)
+    if not counterfactuals:
+        return NoPlan(found, reasons=reasons, main_reason=main_reason)
+    direct = _reached(arcs)
+    changes = find_counterfactuals(task, atlas) if atlas.deployments.count and not direct else ()
+    return NoPlan(
+        found,
+        reasons=reasons,
+        main_reason=main_reason,
+        advice=_advice(arcs, direct, changes),
+        counterfactuals={str(change): change.plan for change in changes},
+    )
+
+
+def _explain_tubes(
+    aimed: AimedTubes, blocked: Counter[str], iterations: int, counterfactuals: bool
+) -> NoPlan:
+    """Return the `NoPlan` of a search without a needle."""
+    atlas, near = aimed.atlas, len(aimed.promising)
+    main_reason = _before_the_needle(aimed.task, atlas)
+    if not main_reason:
+        main_reason = f"the tip of the tubes was found to come within {aimed.nearest_mm:.1f} mm of the target"
+        stopped = {why: n for why, n in blocked.items() if why != NO_SOLUTION}
+        if stopped:
+            main_reason += f"; nearer it is refused, mostly because {max(stopped, key=stopped.__getitem__)}"
+    reasons = {
+        **_scope_reasons(atlas),
+        **{f"tube: {why}": count for why, count in atlas.deployments.refused.items()},
+        "tube: scope tips with a deployment that ends near the target": near,
+        **{f"tube, aimed at the target: {why}": count for why, count in sorted(blocked.items())},
+    }
+    advice = ""
+    if atlas.motions.count == 0:
+        advice = _thinner_scope(aimed.task, atlas.motions.passages.widest_scope_mm)
+    changes = find_counterfactuals(aimed.task, atlas) if counterfactuals and atlas.deployments.count else ()
+    if changes:
+        advice = " or ".join(str(change) for change in changes)
+        advice = f"{advice[0].upper()}{advice[1:]} would reach it"
+    return NoPlan(
+        f"No plan to the target after {iterations} iterations: {main_reason}",
+        reasons=reasons,
+        main_reason=main_reason,
+        advice=advice or WITH_A_NEEDLE,
+        counterfactuals={str(change): change.plan for change in changes},
+    )
+
+
+def _before_the_needle(task: Task, atlas: Atlas) -> str:
+    """Say what keeps scope or tubes from every deployment; nothing if there are some."""
+    if atlas.motions.count == 0:
+        scope = f"the scope ({task.system.scope.outer_diameter_mm:g} mm) fits nowhere"
+        passages = atlas.motions.passages
+        if (passages.passable & passages.exits_ahead).any():
+            return (
+                "no motion brings the scope to a place from which tubes leave the airway: its bending "
+                "section does not pass the forks"
+            )
+        generation, excess = atlas.motions.passages.narrowest
+        if generation < 0:
+            return f"{scope}; no airway lies in lung tissue"
+        narrow = f"too narrow at generation {generation}, typically by {2 * excess:.1f} mm"
+        return f"{scope}; the airway is {narrow}"
+    if atlas.deployments.count == 0:
+        return "the tubes cannot leave the airway safely from any scope tip"
+    return ""
+
+
+def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
+    if not len(arcs.in_workspace):
+        return "the target lies outside the needle's workspace for every deployment"
+    obstacles = blocked.copy()
+    del obstacles["nothing"], obstacles["the needle's limits"]
+    most = f", mostly by {obstacles.most_common(1)[0][0]}" if obstacles else ""
+    return f"every path tried from a deployment that could reach the target is blocked{most}"
+
+
+def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
+    """Count, stage by stage, what was ruled out and why."""
+    atlas = arcs.atlas
+    reasons = _scope_reasons(atlas)
+    reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
+    outside = atlas.deployments.count - len(arcs.in_workspace)
+    reasons["needle: deployments whose workspace does not hold the target"] = outside
+    for name, count in sorted(blocked.items()):
+        if name != "nothing":
+            reasons[f"needle: arcs stopped by {name}"] = count
+    return reasons
+
+
+def _scope_reasons(atlas: Atlas) -> dict[str, int]:
+    """Count scope tips, airways that are too narrow, and the deployments looked at."""
+    reasons = {"scope: tips with a proved motion": atlas.motions.count}
+    generation, excess = atlas.motions.passages.narrowest
+    closed = int((~atlas.motions.passages.passable).sum())
+    if closed:
+        reasons[
+            f"scope: tree points beyond airways too narrow (mostly at generation {generation}, "
+            f"typically by {2 * excess:.1f} mm)"
+        ] = closed
+    return reasons | {"tube: deployments looked at": atlas.deployments.candidates}
+
+
+def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...]) -> str:
+    """Say what would help, the smallest change first.
+
+    Where no scope tip or no deployment is left, say which change brings one back, if that is known.
+    """
+    atlas = arcs.atlas
+    if atlas.motions.count == 0:
+        return _thinner_scope(arcs.task, atlas.motions.passages.widest_scope_mm)
+    if atlas.deployments.count == 0:
+        return ""
+    if direct:
+        return "The search was too short: a single arc from a deployment of the atlas reaches the target"
+    said = []
+    if changes:
+        first, *others = (str(change) for change in changes)
+        also = f"; so would {' or '.join(others)}" if others else ""
+        said.append(f"{first[0].upper()}{first[1:]} would reach it{also}")
+    if atlas.with_fissures and _reached(arcs, with_fissures=False):
+        said.append(
+            "Crossing a fissure would reach it (--allow-fissures), at the price of piercing the pleura twice"
+        )
+    if not said:
+        return "No tighter or thinner needle and no thinner bronchoscope reaches it with a single arc"
+    return ". ".join(said)
+
+
+def _thinner_scope(task: Task, in_the_middle_mm: float) -> str:
+    """Say how thin the scope must be for a motion to an exit, in tenths of a millimetre.
+
+    `in_the_middle_mm` is the largest diameter that fits on the medial axis; beside it there may be more room.
+    """
+    scope = task.system.scope
+    fits, fits_not = math.floor(10.0 * in_the_middle_mm), math.ceil(10.0 * scope.outer_diameter_mm)
+    if fits == 0 or not _moves(task, fits):
+        return ""
+    while fits_not - fits > 1:
+        middle = (fits + fits_not) // 2
+        if _moves(task, middle):
+            fits = middle
+        else:
+            fits_not = middle
+    return f"A bronchoscope of {fits / 10:.1f} mm or less fits somewhere"
+
+
+def _moves(task: Task, tenths: int) -> bool:
+    """Tell whether a scope so thick, in tenths of a millimetre, gets anywhere."""
+    scope = replace(task.system.scope, outer_diameter_mm=tenths / 10.0)
+    return motions_of(task.lung, replace(task.system, scope=scope)).count > 0
+
+
+def _reached(arcs: DirectArcs, *, with_fissures: bool = True) -> bool:
+    """Tell whether a direct arc from the atlas reaches the target, if need be through fissures."""
+    task = arcs.task
+    environment = arcs.evaluator.environment
+    if not with_fissures:
+        needle, margins = task.system.require_needle("A direct arc"), task.system.margins
+        environment = needle_environment(task.lung, needle, margins, with_fissures=False)
+    return bool((arcs.blockers(arcs.in_workspace, environment)[0] == 0).any())

@@ -1,0 +1,188 @@
+"""Deployments of the tubes validated with FCL: they leave the airway once and touch nothing beyond it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from anatomy.base.typed import Bool, Float, Labels
+from anatomy.structures import AIRWAY, LUMEN
+from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import (
+    SAGITTA_MM,
+    Obstacles,
+    branch_of,
+    chord_mm,
+    labels_at,
+)
+from lungaccess.problem.system import System
+from stages.needle import ArcPath, arc_transform
+from stages.tube import REASONS, Deployment, kernels, tube_constants
+
+NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
+"""The meshes of these are one solid, so that the reason does not tell them apart."""
+LABEL_STEP_MM = 0.05
+"""Spacing of the samples whose voxels are looked up, about a tenth of a voxel."""
+SAMPLES_PER_CONTACT = 5
+"""Every so many samples it is asked whether the tube touches the wall from inside."""
+EXIT_SAMPLES = 51
+"""Points between two label samples among which the exit is found, about 0.001 mm from each other."""
+
+
+class TubeValidator:
+    """Validates deployments without sideways sweep, by the rules of `stages.tube` but none of its fields."""
+
+    def __init__(self, system: System, obstacles: Obstacles) -> None:
+        self._system = system
+        self._obstacles = obstacles
+        constants = tube_constants(system.tubes, system.margins)
+        self._curvatures = (
+            float(constants[kernels.OVERLAP_CURVATURE]),
+            float(constants[kernels.INNER_CURVATURE]),
+        )
+        self._mediastinal = obstacles.lung.tree.mediastinal
+
+    def shape(
+        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
+    ) -> ArcPath:
+        """Return the centreline: one arc inside the outer tube, one beyond it, in one plane."""
+        overlap, free = self._curvatures
+        arcs = np.array([[outer_mm, rotation_rad, overlap], [inner_mm - outer_mm, 0.0, free]])
+        return ArcPath(lps_from_start=lps_from_scope_tip, arcs=arcs)
+
+    def validate(self, shape: ArcPath) -> Deployment | str:
+        """Return the deployment of a centreline, or the reason why it is refused."""
+        (outer_mm, rotation, _), (protrusion, _, _) = shape.arcs
+        if protrusion > self._system.tubes.max_inner_protrusion_mm:
+            return REASONS[kernels.PROTRUDES]
+        points, at_mm = shape.sample(LABEL_STEP_MM)
+        labels = labels_at(self._obstacles.lung, points)
+        first = self._first_outside(points, at_mm, (labels & LUMEN) != 0)
+        if first == 0:
+            return REASONS[kernels.NO_EXIT]
+        branch = int(branch_of(labels[first - 1 : first])[0])
+        if self._mediastinal[branch]:
+            return REASONS[kernels.LEAVES_MEDIASTINAL]
+        exit_mm = self._border_mm(points, at_mm, first)
+        refused = self._contained(labels[first:], at_mm[first:] - exit_mm, branch)
+        if refused:
+            return refused
+        angle = self._wall_angle_rad(shape, exit_mm)
+        if angle < math.radians(self._system.tubes.min_wall_angle_deg):
+            return REASONS[kernels.FLAT_EXIT]
+        contact_mm = self._contact_mm(points[:first], at_mm[:first], float(outer_mm))
+        refused = self._clear(shape, contact_mm, exit_mm, branch)
+        if refused:
+            return refused
+        wall_run_mm = self._wall_run_mm(shape, exit_mm)
+        if wall_run_mm > self._system.tubes.max_wall_run_mm:
+            return REASONS[kernels.LONG_WALL_RUN]
+        return Deployment(
+            rotation_rad=float(rotation),
+            outer_mm=float(outer_mm),
+            inner_mm=float(outer_mm + protrusion),
+            lps_from_tip=shape.frames()[-1],
+            branch=branch,
+            exit_mm=exit_mm,
+            wall_angle_rad=angle,
+            wall_run_mm=wall_run_mm,
+            lateral_sweep_mm=0.0,
+        )
+
+    def _first_outside(self, points: Float, at_mm: Float, inside: Bool) -> int:
+        """Return the first sample beyond the lumen, behind corners of voxels; 0 if there is none."""
+        crossings = np.flatnonzero(inside[1:] != inside[:-1]) + 1
+        if not inside[0] or not len(crossings):
+            return 0
+        for left, back in itertools.zip_longest(crossings[::2], crossings[1::2]):
+            if back is None:
+                return int(left)
+            out_mm = self._border_mm(points, at_mm, back) - self._border_mm(points, at_mm, left)
+            if out_mm > kernels.CORNER_MM:
+                return int(left)
+        return 0
+
+    def _border_mm(self, points: Float, at_mm: Float, sample: int) -> float:
+        """Return the arc length at which the axis crosses the border of the lumen before a sample."""
+        share = np.linspace(0.0, 1.0, EXIT_SAMPLES)
+        begin, end = points[sample - 1 : sample + 1]
+        inside = (labels_at(self._obstacles.lung, begin + share[:, None] * (end - begin)) & LUMEN) != 0
+        last = int(np.argmax(inside != inside[0])) - 1
+        return float(at_mm[sample - 1] + share[last] * (at_mm[sample] - at_mm[sample - 1]))
+
+    def _wall_angle_rad(self, shape: ArcPath, exit_mm: float) -> float:
+        lung, frame = self._obstacles.lung, frame_at(shape, exit_mm)
+        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+        return float(kernels.wall_angle(lung.labels, lung.geometry, pose))
+
+    def _contained(self, labels: Labels, beyond_mm: Float, branch: int) -> str:
+        """Return why the axis beyond the exit lies in something, or an empty text."""
+        own = branch_of(labels) == branch
+        if beyond_mm[-1] < kernels.WALL_ZONE_MM:
+            return REASONS[kernels.NO_EXIT]
+        if (labels & LUMEN).any():
+            return REASONS[kernels.REENTERS_LUMEN]
+        if (labels & self._obstacles.forbidden).any():
+            return NEAR_TISSUE
+        if (((labels & AIRWAY) != 0) & ~own).any():
+            return REASONS[kernels.NEAR_OTHER_BRANCH]
+        return ""
+
+    def _wall_run_mm(self, shape: ArcPath, exit_mm: float) -> float:
+        """Return how much of the tube beyond the exit is nearer to an airway than its radius, if not less."""
+        tubes, outer_mm = self._system.tubes, float(shape.arcs[0, 0])
+        run, at = 0.0, exit_mm
+        while at < shape.length_mm:
+            in_outer = at < outer_mm
+            radius = tubes.outermost.radius_mm if in_outer else tubes.inner.radius_mm
+            end = outer_mm if in_outer else shape.length_mm
+            beyond = self._obstacles.airways.distance_mm(frame_at(shape, at)[:3, 3]) - radius
+            step = min(max(abs(beyond), kernels.RUN_STEP_MM), end - at)
+            run += step if beyond < kernels.RUN_STEP_MM else 0.0
+            at += step
+        return run
+
+    def _contact_mm(self, points: Float, at_mm: Float, outer_mm: float) -> float:
+        """Return the arc length from which on the tube is never clear of the wall, up to its exit."""
+        tubes = self._system.tubes
+        for n in range(len(points) - 1, 0, -SAMPLES_PER_CONTACT):
+            radius = tubes.outermost.radius_mm if at_mm[n] <= outer_mm else tubes.inner.radius_mm
+            if self._obstacles.lumen.depth_mm(points[n]) >= radius:
+                return float(at_mm[n])
+        return 0.0
+
+    def _clear(self, shape: ArcPath, contact_mm: float, exit_mm: float, branch: int) -> str:
+        """Return what the tubes touch from their contact with the wall on, or an empty text."""
+        tubes, margin = self._system.tubes, self._system.margins.total_mm
+        outer_mm, end_mm = float(shape.arcs[0, 0]), shape.length_mm
+        pieces = ((0.0, outer_mm, tubes.outermost.radius_mm), (outer_mm, end_mm, tubes.inner.radius_mm))
+        for begin, end, radius in pieces:
+            distance = radius + margin + SAGITTA_MM
+            if max(begin, contact_mm) < end:
+                line = line_between(shape, max(begin, contact_mm), end)
+                if self._obstacles.tissue.is_near(line, distance):
+                    return NEAR_TISSUE
+            if max(begin, exit_mm) < end:
+                line = line_between(shape, max(begin, exit_mm), end)
+                if self._obstacles.other_airways(branch).is_near(line, distance):
+                    return REASONS[kernels.NEAR_OTHER_BRANCH]
+        return ""
+
+
+def frame_at(path: ArcPath, at_mm: float) -> Float:
+    """Return the frame `(4, 4)` of a path at an arc length."""
+    frame = np.asarray(path.lps_from_start)
+    for length, roll, curvature in path.arcs:
+        here = min(float(length), at_mm)
+        frame = frame @ arc_transform(here, roll, curvature)
+        at_mm -= here
+    return frame
+
+
+def line_between(path: ArcPath, begin_mm: float, end_mm: float) -> Float:
+    """Return points `(N, 3)` of a path between two arc lengths, within SAGITTA_MM of it."""
+    points, at_mm = path.sample(chord_mm(float(path.arcs[:, 2].max())))
+    between = points[(at_mm > begin_mm) & (at_mm < end_mm)]
+    ends = [frame_at(path, at)[None, :3, 3] for at in (begin_mm, end_mm)]
+    return np.concatenate([ends[0], between, ends[1]])

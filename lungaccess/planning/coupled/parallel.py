@@ -1,0 +1,104 @@
+"""Continue a search in several processes, repeatable from the seed."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count
+from multiprocessing.connection import Connection
+
+from anatomy.base.child_process import end_with_parent
+from anatomy.base.errors import AnatomyError, SettingsError
+from lungaccess.planning.coupled.search.base import ParallelSearch, Step
+
+ROUND_ITERATIONS = 100
+"""Iterations of one process before the best of all is shared."""
+
+
+def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
+    """Search in several processes until the caller stops, or until nothing can be found.
+
+    Direct arcs come first.  Then rounds: each process continues a search of its own, which begins from every
+    so many of the direct arcs and has random numbers that depend on the seed and its number, and the best of
+    all goes into the next round.  So the same seed, number of processes and iterations give the same plans,
+    whatever the machine's load.
+
+    Raises
+    ------
+    SettingsError
+        If there are fewer than two processes, or this system cannot fork.
+    """
+    if processes < 2 or "fork" not in multiprocessing.get_all_start_methods():
+        raise SettingsError(
+            f"{processes} processes are asked for",
+            expected="at least 2, on a system that can fork processes: not Windows",
+            remedy="Leave out --processes; studies use several processes on every system",
+        )
+    yield from search.direct_steps()
+    context = multiprocessing.get_context("fork")
+    ends, workers = [], []
+    try:
+        for number in range(processes):
+            here, there = context.Pipe()
+            worker = context.Process(target=_work, args=(search, number, processes, there), daemon=True)
+            worker.start()
+            there.close()
+            ends.append(here)
+            workers.append(worker)
+        for turn in count(1):
+            for end in ends:
+                end.send(search.incumbent.step)
+            found = [_received(end) for end in ends]
+            iteration = turn * processes * ROUND_ITERATIONS
+            yield _best_of(search, found, iteration)
+            if search.is_futile(iteration):
+                return
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.join()
+
+
+def _best_of(search: ParallelSearch, found: list[Step | None], iteration: int) -> Step:
+    """Return the best of a round, if it is better than all before, and keep it."""
+    better = min((step for step in found if step is not None), key=lambda step: step.cost, default=None)
+    if better is None:
+        return Step(iteration=iteration, phase="local search")
+    return search.incumbent.improved(replace(better, iteration=iteration))
+
+
+def _received(end: Connection) -> Step | None:
+    """Return what a process has found in its round."""
+    try:
+        step: Step | None = end.recv()
+    except EOFError as reason:
+        raise AnatomyError(
+            "A process of the search has ended before its time",
+            expected="processes that run until the search ends",
+            remedy="Give it more memory, or fewer processes with --processes",
+        ) from reason
+    return step
+
+
+def _work(search: ParallelSearch, number: int, processes: int, end: Connection) -> None:
+    """Continue the search in this process: a round for each message, which is the best of all.
+
+    An interruption from the keyboard reaches every process; only the one that holds the best heeds it.
+    """
+    end_with_parent()
+    search.take_part(number, processes)
+    steps = search.further_steps()
+    while True:
+        try:
+            best: Step | None = end.recv()
+        except EOFError:
+            return
+        if best is not None:
+            search.incumbent.adopt(best)
+        found = None
+        for _ in range(ROUND_ITERATIONS):
+            step = next(steps, None)
+            if step is not None and step.candidate is not None:
+                found = step
+        end.send(found)

@@ -1,0 +1,338 @@
+"""Tubes aimed at a target from the scope tips of an atlas: what a system without a needle can do."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from anatomy.base.typed import Bool, Float, Int
+from anatomy.lung import Lung
+from anatomy.poses import poses_on_pieces
+from anatomy.structures import obstacle_bits
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.kernels.aimed_tubes import (
+    COST,
+    INNER,
+    JOINTS,
+    MISSES,
+    OUTER,
+    ROTATION,
+    SPOILT_WAY,
+    aim_tubes,
+)
+from lungaccess.plans.candidate import Candidate, tubes_in_tissue
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.system import System
+from lungaccess.problem.task import Task
+from stages.needle import ArcPath, Objective, Obstacles
+from stages.scope import ScopeTip
+from stages.tube import (
+    NO_SHAPES,
+    REASONS,
+    ConcentricTubes,
+    Deployment,
+    ManyShapes,
+    TubeShape,
+    copies,
+    deployed,
+    design_arrays,
+    insertion_stops,
+    many_shapes,
+    shape_arrays,
+    shape_of_arrays,
+    shapes_of,
+    tube_constants,
+    tube_environment,
+)
+
+STOPS_MM = 3.0
+TURN_RAD = math.pi / 12.0
+"""The tubes are aimed from deployments that end near the target: as near as one of the same scope tip ends to
+every point that the tubes can come to.  Stops of turned tips are 4 mm apart, 2.8 mm in both insertions from
+the middle between them, and their rotations 30 degrees apart."""
+STARTS_MM = 8.0
+"""Spacing of the insertions from which the tubes are aimed from one pose: Newton's method goes as far."""
+SHAPES_TRIED = 60
+"""Shapes of tubes that are not planar from which they are aimed from one pose, half a millisecond each."""
+NO_WAY = "on their way to the target the tubes would snap, sweep tissue or be strained too much"
+NO_SOLUTION = "no insertions bring the tip of the tubes to the target"
+
+
+class AimStarts(NamedTuple):
+    """Deployments from which the tubes are aimed, N of them.
+
+    Parameters
+    ----------
+    outer_mm, inner_mm : (N,) float64
+        Insertions of planar tubes.
+    shapes : ManyShapes
+        Those of tubes that are not planar.
+    """
+
+    outer_mm: Float
+    inner_mm: Float
+    shapes: ManyShapes
+
+    @classmethod
+    def of(cls, atlas: Atlas, entries: Int) -> AimStarts:
+        """Return entries (N,) of an atlas."""
+        made, tubes = atlas.deployments, atlas.system.tubes
+        shapes = NO_SHAPES if tubes.planar else many_shapes(shapes_of(tubes), made.shape[entries])
+        return cls(made.outer_mm[entries], made.inner_mm[entries], shapes)
+
+    @classmethod
+    def around(cls, tubes: ConcentricTubes, found: Float, count: int) -> AimStarts | None:
+        """Return `count` times what was found before; None if tubes that are not planar refuse it."""
+        shapes, ones, design = NO_SHAPES, np.ones(count), design_arrays(tubes)
+        if design is not None:
+            n = len(tubes.nested)
+            made = deployed(design, found[JOINTS : JOINTS + n], found[JOINTS + n :])
+            if made is None:
+                return None
+            shapes = copies(made, count)
+        return cls(found[OUTER] * ones, found[INNER] * ones, shapes)
+
+
+class TubeAiming:
+    """Aims the tubes of a system at points in a lung.
+
+    Parameters
+    ----------
+    objective : Objective
+        By which deployments are cheap.
+    """
+
+    def __init__(self, lung: Lung, system: System, objective: Objective, *, with_fissures: bool) -> None:
+        self._environment = tube_environment(lung, with_fissures=with_fissures)
+        self._constants = tube_constants(system.tubes, system.margins)
+        self._design = design_arrays(system.tubes)
+        field, bits = lung.obstacle_field(with_fissures=with_fissures), obstacle_bits(with_fissures)
+        self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
+        weighed = objective.without_map if lung.cost is None else objective
+        arrays = weighed.arrays(None if lung.cost is None else lung.cost.array)
+        of_map = arrays._replace(inverse_clearance=0.0, length=0.0)
+        self._weights = arrays._replace(map_integral=0.0, voxel_sum=0.0), of_map
+
+    def aim(
+        self, target: Float, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts, enough: int = 0
+    ) -> tuple[Float, Int]:
+        """Aim the tubes at a point from scope tips.
+
+        Parameters
+        ----------
+        target : (3,) float64, LPS mm
+        tips : (K, 9) float64
+        allowed : (K,) bool
+            Which of them the scope can take.
+        row_of : (N,) int64
+            The tip of each attempt.
+        starts : AimStarts
+            From which each begins.
+        enough : int
+            So many deployments end the attempts; 0 to make all of them.
+
+        Returns
+        -------
+        found : (N, JOINTS + 2 n) float64
+            Rotation in rad, insertions in mm and estimated cost, which is infinite where there is nothing; of
+            tubes that are not planar all joints, too.
+        why : (N,) int64
+            0 for a deployment that ends at the point, MISSES, SPOILT_WAY, NOT_TRIED, or why tubes refuse it.
+        """
+        scratch = shape_arrays(self._design), shape_arrays(self._design)
+        found = np.zeros((len(row_of), JOINTS + len(scratch[0].joints)))
+        why = np.zeros(len(row_of), dtype=np.int64)
+        tube = (self._environment, self._constants, self._design, *scratch)
+        x, y, z = target.tolist()
+        aim_tubes(
+            tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), *starts,
+            (x, y, z), enough or len(row_of), found, why,
+        )  # fmt: skip
+        return found, why
+
+
+def near_mm(atlas: Atlas, point: Float) -> Float:
+    """Return how near to a point (3,) deployments have to end to be aimed at it, by their scope tips (S,)."""
+    tips = atlas.motions.tips
+    aside = np.linalg.norm(np.cross(point - tips[:, :3], tips[:, 3:6]), axis=1)
+    return np.asarray(STOPS_MM + TURN_RAD * aside)
+
+
+def nearest_of_each_tip(atlas: Atlas, entries: Int, away_mm: Float) -> Int:
+    """Return of entries (N,) of an atlas the nearest of each scope tip, the nearest first.
+
+    Where tubes are turned one against the other, it is the nearest of each tip and relative rotation.
+    """
+    ordered = entries[np.argsort(away_mm, kind="stable")]
+    kinds, tubes = atlas.deployments.site[ordered], atlas.system.tubes
+    if not tubes.planar:
+        shapes = shapes_of(tubes)
+        turns = np.unique(shapes.rotations_rad, axis=0, return_inverse=True)[1].ravel()
+        kinds = kinds * (turns.max() + 1) + turns[atlas.deployments.shape[ordered]]
+    _kinds, first = np.unique(kinds, return_index=True)
+    return ordered[np.sort(first)]
+
+
+def tips_of(atlas: Atlas, entries: Int) -> tuple[Float, Int]:
+    """Return the scope tips (K, 9) of entries (N,) of an atlas, and which of them each entry has."""
+    sites, row_of = np.unique(atlas.deployments.site[entries], return_inverse=True)
+    return np.ascontiguousarray(atlas.motions.tips[sites]), row_of.ravel()
+
+
+class AimedFromPose:
+    """The tubes aimed at the target of a task from one pose of the scope.
+
+    Attributes
+    ----------
+    reasons : dict of str to int
+        How many attempts each reason refused.
+    why : str
+        What prevents a plan, in words.
+    """
+
+    def __init__(self, evaluator: CandidateEvaluator, lps_from_scope_tip: Float) -> None:
+        self._evaluator, self._frame = evaluator, lps_from_scope_tip
+        self.reasons: dict[str, int] = {}
+        self.why = NO_SOLUTION
+
+    def best(self) -> tuple[Deployment, ArcPath] | None:
+        """Return the cheapest proved deployment to the target, and its tubes in tissue."""
+        task, frame = self._evaluator.task, self._frame
+        aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
+        starts = self._starts()
+        count = len(starts.outer_mm)
+        row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
+        found, why = aiming.aim(
+            task.target.lps_mm, row, np.ones(1, dtype=np.bool_), np.zeros(count, dtype=np.int64), starts
+        )
+        self.reasons = {f"tube, aimed at the target: {name}": n for name, n in reasons_of(why).items()}
+        for n in np.argsort(found[:, COST], kind="stable").tolist():
+            if not np.isfinite(found[n, COST]):
+                break
+            made = self._evaluator.tubes.choose(frame, *chosen_of(task.system.tubes, found[n]))
+            if isinstance(made, str):
+                continue
+            path = tubes_in_tissue(task.system, frame, made)
+            if self._evaluator.proves(made, path):
+                return made, path
+        stopped = {name: n for name, n in reasons_of(why).items() if name != NO_SOLUTION}
+        if stopped:
+            self.why = max(stopped, key=stopped.__getitem__)
+        return None
+
+    def _starts(self) -> AimStarts:
+        """Return insertions all over the reach, or the shapes that, turned, end nearest to the target."""
+        tubes, target = self._evaluator.task.system.tubes, self._evaluator.task.target.lps_mm
+        if tubes.planar:
+            stops = insertion_stops(tubes, STARTS_MM)
+            outer, inner = (each.ravel() for each in np.meshgrid(stops, stops))
+            return AimStarts(outer[outer <= inner].copy(), inner[outer <= inner].copy(), NO_SHAPES)
+        shapes, seen = shapes_of(tubes), (target - self._frame[:3, 3]) @ self._frame[:3, :3]
+        tips = shapes.scope_from_tip[:, :3, 3]
+        aside = np.hypot(tips[:, 0], tips[:, 1]) - np.hypot(seen[0], seen[1])
+        near = np.argsort(np.hypot(aside, tips[:, 2] - seen[2]), kind="stable")[:SHAPES_TRIED]
+        inserted = shapes.insertions_mm[near]
+        return AimStarts(inserted[:, -1].copy(), inserted[:, 0].copy(), many_shapes(shapes, near))
+
+
+def chosen_of(tubes: ConcentricTubes, found: Float) -> tuple[float, float, float, int | TubeShape]:
+    """Return a row of what was found as `DeploymentValidator.choose` takes it."""
+    rotation, outer, inner = (float(found[column]) for column in (ROTATION, OUTER, INNER))
+    design, n = design_arrays(tubes), len(tubes.nested)
+    if design is None:
+        return rotation, outer, inner, -1
+    made = deployed(design, found[JOINTS : JOINTS + n], found[JOINTS + n :])
+    return rotation, outer, inner, -1 if made is None else shape_of_arrays(made)
+
+
+def reasons_of(why: Int) -> dict[str, int]:
+    """Return how many attempts (N,) each reason refused, in words."""
+    codes, counts = np.unique(why, return_counts=True)
+    names = {MISSES: NO_SOLUTION, SPOILT_WAY: NO_WAY, **REASONS}
+    return {names[c]: n for c, n in zip(codes.tolist(), counts.tolist(), strict=True) if c in names}
+
+
+class AimedTubes:
+    """The deployments, from the scope tips of an atlas, that end at the target of a task.
+
+    Attributes
+    ----------
+    evaluator : CandidateEvaluator
+    promising : (N,) int64
+        Entries of the atlas from which the tubes are aimed, one for each scope tip, the nearest first.
+    nearest_mm : float
+        Distance of the target from the nearest tip of the tubes in the atlas; infinite if there is none.
+    """
+
+    def __init__(self, task: Task, atlas: Atlas) -> None:
+        self.task, self.atlas = task, atlas
+        self.evaluator = CandidateEvaluator(task)
+        entries = atlas.deployments
+        away = np.linalg.norm(entries.positions - task.target.lps_mm, axis=1)
+        self.nearest_mm = float(away.min(initial=math.inf))
+        near = np.flatnonzero(away <= near_mm(atlas, task.target.lps_mm)[entries.site])
+        self.promising: Int = nearest_of_each_tip(atlas, near, away[near])
+        self._aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
+
+    def aim(self, entries: Int) -> tuple[Float, Int]:
+        """Aim from entries of the atlas; see `aim_from`."""
+        tips, row_of = tips_of(self.atlas, entries)
+        allowed = np.ones(len(tips), dtype=np.bool_)
+        return self.aim_from(tips, allowed, row_of, AimStarts.of(self.atlas, entries))
+
+    def aim_from(self, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts) -> tuple[Float, Int]:
+        """Aim the tubes from scope tips, and count why they are refused; see `TubeAiming.aim`.
+
+        Returns
+        -------
+        found : (N, JOINTS + 2 n) float64
+        clear : (C,) int64
+            The attempts with a deployment, the cheapest first.
+        """
+        target = self.task.target.lps_mm
+        found, why = self._aiming.aim(target, tips, allowed, row_of, starts)
+        self.evaluator.blocked.update(reasons_of(why))
+        clear = np.flatnonzero(np.isfinite(found[:, COST]))
+        return found, clear[np.argsort(found[clear, COST], kind="stable")]
+
+    def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
+        """Return for entries (E,) whether they are refused, 1 if so, their estimated costs, and the least."""
+        found, clear = self.aim(chosen)
+        refused = np.ones(len(chosen), dtype=np.int64)
+        refused[clear] = 0
+        return refused, found[:, COST], float(found[:, COST].min(initial=math.inf))
+
+    def clear(self) -> Int:
+        """Return the entries (C,) with a deployment to the target, the cheapest first."""
+        return self.promising[self.aim(self.promising)[1]]
+
+    def proved(self, entry: int) -> Candidate | None:
+        """Return the deployment from the scope tip of an entry, None if its proof fails."""
+        found, clear = self.aim(np.array([entry]))
+        if not len(clear):
+            return None
+        candidate = self.candidate(self.tip(entry), found[0])
+        proved = candidate is not None and self.evaluator.proves(candidate.deployment, candidate.path)
+        return candidate if proved else None
+
+    def lines(self, chosen: Int, samples: int) -> Float:
+        """Return points (E, samples, 3) of the tubes in tissue from the scope tips of entries."""
+        rows, _clear = self.aim(chosen)
+        lines = np.zeros((len(chosen), samples, 3))
+        for line, entry, row in zip(lines, chosen.tolist(), rows, strict=True):
+            candidate = self.candidate(self.tip(entry), row)
+            if candidate is not None:
+                path = candidate.path
+                poses, _mm = poses_on_pieces(path.lps_from_start, path.arcs, path.length_mm / samples)
+                line[:] = poses[np.linspace(0, len(poses) - 1, samples).round().astype(int), :3, 3]
+        return lines
+
+    def tip(self, entry: int) -> ScopeTip:
+        """Return the scope tip of an entry."""
+        return self.atlas.motions.tip(int(self.atlas.deployments.site[entry]))
+
+    def candidate(self, tip: ScopeTip, found: Float) -> Candidate | None:
+        """Return a row of what was found as a candidate, None if the tubes are refused."""
+        return self.evaluator.aimed(tip, *chosen_of(self.task.system.tubes, found))

@@ -1,0 +1,146 @@
+"""The search over the deployment atlas: direct arcs first, then rounds of all ways to improve on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count, islice
+
+import numpy as np
+
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
+from lungaccess.planning.coupled.search.entries import different
+from lungaccess.planning.coupled.search.local_sampling import sampling_near_target
+from lungaccess.planning.coupled.search.local_search import LocalSearch, LocalSearchRun
+from lungaccess.planning.coupled.search.needle_planner import NamedNeedlePlanner
+from lungaccess.planning.coupled.search.needle_search import PLANNER, needle_searches
+from lungaccess.planning.coupled.search.rounds import LocalSearchRounds
+from lungaccess.planning.coupled.search.settings import SearchSettings
+from lungaccess.plans.candidate import Candidate
+from lungaccess.problem.task import Task
+
+FUTILE_ITERATIONS = 1000
+"""So many iterations without a deployment that has the target in its needle's workspace end the search."""
+WORTH_REFINING = 0.99
+"""The best candidate is refined again once it is cheaper by this factor, as a refinement takes long."""
+
+
+class AtlasSearch:
+    """Direct arcs from the whole atlas, then rounds of local search, sampling, needle search and refinement.
+
+    Attributes
+    ----------
+    arcs : DirectArcs
+        The direct arcs from the atlas, with the evaluator of candidates.
+    incumbent : Incumbent
+        The best candidate so far.
+    """
+
+    def __init__(
+        self, task: Task, atlas: Atlas, settings: SearchSettings | None = None, arcs: DirectArcs | None = None
+    ) -> None:
+        self.task = task
+        self.atlas = atlas
+        self.settings = settings or SearchSettings()
+        self.arcs = arcs or DirectArcs(task, atlas)
+        self.evaluator = self.arcs.evaluator
+        self.blocked = self.evaluator.blocked
+        self.incumbent = Incumbent()
+        self._needle_planner = NamedNeedlePlanner(self.evaluator, PLANNER)
+        self.direct = DirectArcSearch(self.arcs, self.incumbent, self.settings)
+        self._rng = np.random.Generator(np.random.PCG64(task.seed))
+        self._share = (0, 1)
+        self._refined_cost = math.inf
+
+    def steps(self) -> Iterator[Step]:
+        """Search until the caller stops, or the target has come into no needle's workspace."""
+        yield from self.direct_steps()
+        for step in self.further_steps():
+            yield step
+            if self.is_futile(step.iteration):
+                return
+
+    def is_futile(self, iteration: int) -> bool:
+        """Tell whether there is no candidate, and the target has come into no needle's workspace."""
+        if self.incumbent.step is not None or len(self.arcs.in_workspace):
+            return False
+        return iteration >= FUTILE_ITERATIONS or not self.atlas.deployments.count
+
+    def take_part(self, number: int, parts: int) -> None:
+        """Do one part of the work of several processes, with random numbers of its own."""
+        self._share = (number, parts)
+        self._rng = np.random.Generator(np.random.PCG64([self.task.seed, number]))
+
+    def direct_steps(self) -> Iterator[Step]:
+        """Evaluate the direct arcs, nearest first."""
+        return self.direct.steps()
+
+    def further_steps(self) -> Iterator[Step]:
+        """Continue from the direct arcs without end; each step is an iteration."""
+        for number, step in enumerate(self._rounds(), start=1):
+            yield self.incumbent.improved(replace(step, iteration=number))
+
+    def _rounds(self) -> Iterator[Step]:
+        """Start from the best direct arcs, then intensify the best candidate and try new starts, in turns."""
+        if not self.atlas.deployments.count:
+            return
+        settings, number = self.settings, self._share[0]
+        local_search = LocalSearch(self.evaluator, self._rng)
+        rounds = LocalSearchRounds(local_search, self.evaluator, self.incumbent, settings)
+        starts = self._starts(local_search)
+        sampled = self._sampled(local_search)
+        searched = needle_searches(
+            self.arcs, self._needle_planner, self.incumbent, settings, self._rng, self._share
+        )
+        yield from rounds.halve(list(islice(starts, settings.starts)))
+        for turn in count(1):
+            yield from rounds.intensify()
+            if turn % settings.refine_every == 0 and number == 0:
+                yield from self._refined()
+            newcomers = [*islice(starts, 1), *rounds.perturbed()]
+            for phase, iterations in ((sampled, settings.samplings), (searched, settings.needle_searches)):
+                for step, candidate in islice(phase, iterations):
+                    run = local_search.begin(candidate)
+                    newcomers += [] if run is None else [run]
+                    yield step
+            yield from rounds.halve(newcomers)
+
+    def _starts(self, local_search: LocalSearch) -> Iterator[LocalSearchRun]:
+        """Yield local searches from clear direct arcs, different ones by their cost, then any of them."""
+        number, parts = self._share
+        clear = self.direct.clear
+        for entry in different(self.atlas.deployments, clear)[number::parts].tolist():
+            run = local_search.begin(self.arcs.candidate(entry))
+            if run is not None:
+                yield run
+        while len(clear):
+            run = local_search.begin(self.arcs.candidate(int(self._rng.choice(clear))))
+            if run is not None:
+                yield run
+
+    def _sampled(self, local_search: LocalSearch) -> Iterator[tuple[Step, Candidate | None]]:
+        """Sample deployments near those of the atlas whose needle reaches the target, or nearly does."""
+        sampling = sampling_near_target(local_search, self.arcs, self._rng)
+        nothing = Step(iteration=0, phase="local sampling")
+        while True:
+            found = sampling.sample(self.settings.kept_slack * self.incumbent.cost)
+            first = self.incumbent.step is None
+            yield evaluated_step(self.evaluator, nothing.phase, found) if first else nothing, found
+
+    def _refined(self) -> Iterator[Step]:
+        """Improve scope pose, tubes and needle of the best candidate together, by a nonlinear program."""
+        from lungaccess.planning.refinement import refine
+
+        best = self.incumbent.candidate
+        if best is None or self.incumbent.cost >= WORTH_REFINING * self._refined_cost:
+            return
+        before = self.incumbent.cost
+        end = replace(self.task.target, lps_mm=self.evaluator.end_of(best.path))
+        step = evaluated_step(
+            self.evaluator, "joint refinement", refine(replace(self.task, target=end), best)
+        )
+        self._refined_cost = min(before, step.cost)
+        yield step

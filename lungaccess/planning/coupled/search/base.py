@@ -1,0 +1,127 @@
+"""What the planner needs of a search for whole plans, and what it gets from it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Protocol, runtime_checkable
+
+from anatomy.base.records import frozen_value
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
+
+
+@frozen_value
+class Step:
+    """One step of a search.
+
+    Parameters
+    ----------
+    iteration : int
+        0 for what comes before the iterations, then counted from 1.
+    phase : str
+        What the search did, in words for the user.
+    candidate : Candidate or None
+        A proved candidate, if the step found one.
+    cost : float
+        Its cost under the task's objective; infinite without a candidate.
+    """
+
+    iteration: int
+    phase: str
+    candidate: Candidate | None = None
+    cost: float = math.inf
+
+
+class PlanSearch(Protocol):
+    """A search for whole plans: the planner drives it and makes plans of its candidates.
+
+    A search is made from a `Task` and an `Atlas`.  Its name in
+    `lungaccess.planning.coupled.planner.METHODS` is the `method` of the planner and of the command line.
+
+    Attributes
+    ----------
+    blocked : Counter of str
+        How many direct arcs were stopped, by what stopped them, for the reasons of a `NoPlan`.  It may stay
+        empty.
+    """
+
+    blocked: Counter[str]
+
+    def steps(self) -> Iterator[Step]:
+        """Search until the caller stops, or until it is certain that nothing will be found.
+
+        A step has a candidate only if that is proved and cheaper than all before.  The same task and the
+        same number of steps have to give the same candidates.
+        """
+
+
+@runtime_checkable
+class ParallelSearch(PlanSearch, Protocol):
+    """A search that can be continued in several processes; see `lungaccess.planning.coupled.parallel`.
+
+    Attributes
+    ----------
+    incumbent : Incumbent
+        The best candidate so far, shared between rounds.
+    """
+
+    incumbent: Incumbent
+
+    def direct_steps(self) -> Iterator[Step]:
+        """Do what one process does alone, before the others begin."""
+
+    def further_steps(self) -> Iterator[Step]:
+        """Continue from there without end; each step is an iteration."""
+
+    def take_part(self, number: int, parts: int) -> None:
+        """Do part `number` of `parts` of the work from here on, with random numbers of its own."""
+
+    def is_futile(self, iteration: int) -> bool:
+        """Tell whether nothing will be found after so many iterations without a candidate."""
+
+
+SearchFactory = Callable[[Task, Atlas], PlanSearch]
+"""What makes a search, for instance its class."""
+
+
+class Incumbent:
+    """The best step so far of a search, shared by its phases."""
+
+    def __init__(self) -> None:
+        self.step: Step | None = None
+
+    @property
+    def cost(self) -> float:
+        """Cost of the best candidate, infinite without one."""
+        return math.inf if self.step is None else self.step.cost
+
+    @property
+    def candidate(self) -> Candidate | None:
+        """The best candidate."""
+        return None if self.step is None else self.step.candidate
+
+    def adopt(self, step: Step) -> None:
+        """Take over a step if it is better."""
+        if step.cost < self.cost:
+            self.step = step
+
+    def improved(self, step: Step) -> Step:
+        """Take over a step if it is better, else return it without its candidate."""
+        if step.candidate is not None and step.cost < self.cost:
+            self.step = step
+            return step
+        return Step(iteration=step.iteration, phase=step.phase)
+
+
+def evaluated_step(
+    evaluator: CandidateEvaluator, phase: str, candidate: Candidate | None, iteration: int = 0
+) -> Step:
+    """Return a step with a candidate and its cost, without one if there is none or its proof fails."""
+    cost = math.inf if candidate is None else evaluator.evaluate(candidate)
+    if not math.isfinite(cost):
+        return Step(iteration=iteration, phase=phase)
+    return Step(iteration=iteration, phase=phase, candidate=candidate, cost=cost)

@@ -1,0 +1,60 @@
+"""Algorithm 1 of [Kuntz2015] on clearance fields, for comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled.search.needle_planner import NamedNeedlePlanner
+from lungaccess.planning.coupled.search.random_placement import Placement, random_placements
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
+
+RRT_ITERATIONS = 300
+"""Iterations of each RRT; the paper gives it 0.05 s, but a run by time cannot be repeated exactly."""
+PLANNER = "rrt"
+"""The planner of line 9 where none is named: the paper's."""
+
+
+class KuntzSearch:
+    """Algorithm 1 of [Kuntz2015]: random placement, workspace rejection, RRT, keep the best.
+
+    Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not hold
+    the target; line 9 runs the RRT, here for a fixed number of iterations so that runs repeat.
+
+    Parameters
+    ----------
+    atlas : Atlas
+        Only its motions of the scope are used.
+    rejects : bool
+        Whether line 8 is carried out; the paper compares with a run without it.
+    """
+
+    phase = "Algorithm 1"
+
+    def __init__(self, task: Task, atlas: Atlas, *, rejects: bool = True) -> None:
+        task.system.tubes.require_planar("Algorithm 1 of [Kuntz2015]")
+        self._task, self._atlas, self._rejects = task, atlas, rejects
+        self._evaluator = CandidateEvaluator(task)
+        self._needle_planner = NamedNeedlePlanner(self._evaluator, PLANNER)
+        self.blocked = self._evaluator.blocked
+
+    def steps(self) -> Iterator[Step]:
+        """Search until the caller stops, or not at all if the scope fits nowhere."""
+        incumbent = Incumbent()
+        for iteration, placement in enumerate(random_placements(self._task, self._atlas), start=1):
+            candidate = self._attempt(placement)
+            yield incumbent.improved(evaluated_step(self._evaluator, self.phase, candidate, iteration))
+
+    def _attempt(self, placement: Placement) -> Candidate | None:
+        """Carry out lines 8 and 9 for a placement."""
+        evaluator, tip = self._evaluator, placement.tip
+        deployment = evaluator.tubes.validate(
+            tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
+        )
+        if isinstance(deployment, str) or (self._rejects and not evaluator.reaches(deployment.lps_from_tip)):
+            return None
+        path = self._needle_planner.path(deployment, seed=placement.needle_seed, iterations=RRT_ITERATIONS)
+        return None if path is None else Candidate(tip=tip, deployment=deployment, path=path)

@@ -1,0 +1,92 @@
+"""Why there is no plan for a window of the breath: which phase and structure stop how many deployments."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from anatomy.base.words import plural
+from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
+from lungaccess.planning.coupled.search.window_search import WindowSearch
+from lungaccess.plans.evaluator import blocker_name
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.window import WindowLimit
+from lungaccess.uncertainty.breathing.window import require_motion
+
+MOST_WINDOWS = 150
+"""Deployments whose windows are computed for the advice: of many, those that may have the widest."""
+WORTH_SAYING = 0.01
+"""Phases of which a plan is not worth a sentence are fewer than this share of the breath."""
+
+
+def explain_window(search: WindowSearch, iterations: int) -> NoPlan | None:
+    """Return the `NoPlan` of a search for a window; None if the breath is not what stops every deployment.
+
+    Every deployment whose needle reaches its aim is counted once: it misses the target, is stopped in the
+    masks' phase, or is refused at a phase of the breath.
+    """
+    evaluator, task = search.window_evaluator, search.task
+    reaching = DirectArcs(task, search.atlas, evaluator, search.aims).in_workspace
+    misses = search.misses_mm[search.atlas.deployments.site[reaching]]
+    missing = misses[misses > 0.0]
+    refused = search.direct.refused
+    if not len(missing) and not refused:
+        return None
+    counts: dict[str, int] = {}
+    if len(missing):
+        begin, end = (100.0 * phase for phase in evaluator.phases or (0.0, 1.0))
+        where = f"between {begin:g} % and {end:g} % of the breath by {missing.min():.2f} mm at least"
+        counts[f"miss the moving target {where}, wherever they aim"] = len(missing)
+    for label, number in zip(*np.unique(search.direct.blockers, return_counts=True), strict=True):
+        if label:
+            counts[f"are stopped by {blocker_name(int(label))} in the masks' phase"] = int(number)
+    counts |= dict(_by_structure(refused.values()))
+    left = len(reaching) - sum(counts.values())
+    if left:
+        counts["are refused by the whole proof in the masks' phase"] = left
+    wanted = "a window" if evaluator.phases is None else "the phases {:g} to {:g}".format(*evaluator.phases)
+    said = ", ".join(f"{number} {what}" for what, number in sorted(counts.items(), key=lambda each: -each[1]))
+    reason = f"of {plural(len(reaching), 'deployment')} whose needle reaches its aim {said}"
+    return NoPlan(
+        f"No plan for {wanted} of the breath after {iterations} iterations: {reason}",
+        reasons={f"breathing: deployments that {what}": number for what, number in counts.items()},
+        main_reason=reason,
+        advice=_advice(search),
+    )
+
+
+def _by_structure(limits: Iterable[WindowLimit]) -> Iterator[tuple[str, int]]:
+    """Yield what the breath brings too near, with the phase at which it first does, and how often."""
+    phases: dict[str, list[float]] = defaultdict(list)
+    for limit in limits:
+        phases[limit.what].append(limit.phase)
+    for what, found in phases.items():
+        where = f"at {100.0 * min(found):.0f} %"
+        if max(found) - min(found) > WORTH_SAYING:
+            where = f"between {100.0 * min(found):.0f} % and {100.0 * max(found):.0f} %"
+        yield f"are refused {where} of the breath because {what}", len(found)
+
+
+def _advice(search: WindowSearch) -> str:
+    """Say which of the phases that were asked for a plan was found for, the most that there are."""
+    asked = search.window_evaluator.phases
+    if asked is None:
+        return "No phase of the breath has a plan by a single arc; plan without --objective window"
+    motion = require_motion(search.task.lung)
+    middle = min(max(motion.masks_phase, asked[0]), asked[1])
+    widest = WindowSearch(search.task, search.atlas, None, widest=True, middle=middle)
+    best = (0.0, 0.0)
+    for number, step in enumerate(widest.direct.steps()):
+        window = widest.window_evaluator.window
+        for begin, end in () if step.candidate is None or window is None else window.phases.tolist():
+            held = max(begin, asked[0]), min(end, asked[1])
+            best = max(best, held, key=lambda each: each[1] - each[0])
+        if number > MOST_WINDOWS:
+            break
+    first, last = math.ceil(100.0 * best[0]) / 100.0, math.floor(100.0 * best[1]) / 100.0
+    if last - first < WORTH_SAYING:
+        return "No part of these phases was found that has a plan by a single arc"
+    return f"The phases {first:g} to {last:g} have a plan (--phases {first:g}:{last:g})"

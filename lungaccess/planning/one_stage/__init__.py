@@ -1,0 +1,68 @@
+"""Each stage alone, from a patient to an answer: needle, scope, tubes, route and tour."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.planning.one_stage.from_scope import ScopeReplanner
+    from lungaccess.planning.one_stage.near_place import (
+        TIP_WITHIN_MM,
+        plan_near_exit,
+        plan_near_scope_tip,
+        tips_near,
+    )
+    from lungaccess.planning.one_stage.needle import (
+        NeedleAnswer,
+        NeedleQuestion,
+        begins_at_wall,
+        needle_question,
+        pierced_branches,
+        plan_needle,
+    )
+    from lungaccess.planning.one_stage.needle_search import PathSearch, search_path
+    from lungaccess.planning.one_stage.obstruction import (
+        obstruction_record,
+        obstruction_rows,
+        point_in_words,
+        reason_in_words,
+    )
+    from lungaccess.planning.one_stage.replan import measured_pose, replan_from_scope, replan_from_tube
+    from lungaccess.planning.one_stage.rest import RestOfPlan
+    from lungaccess.planning.one_stage.route import (
+        RouteSource,
+        open_source,
+        read_drawing,
+        route_record,
+        widest_end,
+    )
+    from lungaccess.planning.one_stage.scope import (
+        ADVICE_FILE,
+        CAMERA_FILE,
+        ScopeAdvice,
+        advise_scope,
+        save_advice,
+    )
+    from lungaccess.planning.one_stage.scope_region import ScopeRegion, safe_scope_region
+    from lungaccess.planning.one_stage.shapes import design_shapes, save_shapes, shapes_record
+    from lungaccess.planning.one_stage.tour import (
+        TourAnswer,
+        coupled_plan_test,
+        lesions_of,
+        plan_tour,
+        read_lesions,
+        tour_record,
+    )
+    from lungaccess.planning.one_stage.tubes import (
+        BareTubes,
+        TubeAnswer,
+        compare_sequences,
+        deploy_tubes,
+        design_choices,
+        load_tubes,
+        tubes_record,
+    )
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

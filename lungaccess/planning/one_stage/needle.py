@@ -1,0 +1,262 @@
+"""The needle stage alone: from a given pose to a target, with any of its planners."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from anatomy.base.errors import SettingsError, TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
+from anatomy.kernels.field import exact_distance
+from anatomy.liver import with_entry
+from anatomy.lung import Lung
+from anatomy.morphology import voxels_in
+from anatomy.organ import Organ
+from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
+from lungaccess.planning.one_stage.needle_search import PathSearch, search_path
+from lungaccess.planning.one_stage.obstruction import obstruction_record
+from lungaccess.plans.costs import known_costs
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target
+from stages.needle import (
+    OMPL_PLANNERS,
+    NeedleEnvironment,
+    Objective,
+    Query,
+    begun_at_wall,
+    needle_environment,
+    path_costs,
+    require_planner,
+)
+
+WALL_MM = 3.0
+"""A start so near to an airway is taken to have pierced its wall."""
+
+
+@frozen_record
+class NeedleAnswer(PathSearch):
+    """What a planner found, and what it was asked.
+
+    Parameters
+    ----------
+    branches : tuple of int
+        Branches of the airway tree whose wall the start is taken to have pierced, the nearest first; none if
+        no airway is near.
+    at_wall : bool
+        Whether the needle begins so near to the lumen that it pierces the wall itself.
+    lobe : str
+        Where what stands in the way lies; "" if the lobes are not known.
+    environment : NeedleEnvironment
+        What the planner looked at.
+    query : Query
+        What it was asked.
+    objective : Objective
+        What it was asked to make small; planners of OMPL look at none.
+    """
+
+    branches: tuple[int, ...]
+    at_wall: bool
+    lobe: str
+    environment: NeedleEnvironment
+    query: Query
+    objective: Objective
+
+    @property
+    def branch(self) -> int:
+        """The branch that is exempt at the exit; -1 for none."""
+        return self.branches[0] if self.branches else -1
+
+    @property
+    def costs(self) -> dict[str, float]:
+        """Every cost of the path by its key, and that under the objective by its text; empty without a path.
+
+        Exact, and evaluated at every call.
+        """
+        if self.path is None:
+            return {}
+        return self.objective.stated(
+            path_costs(self.environment.obstacles, self.environment.cost_map, self.path)
+        )
+
+    @property
+    def known_costs(self) -> dict[str, float | None]:
+        """The same, None for costs of the map where there is none."""
+        return known_costs(self.costs, has_map=self.environment.cost_map is not None)
+
+    def record(self) -> dict[str, Any]:
+        """Return plain JSON values; poses in LPS mm, angles in rad."""
+        path = self.path
+        record: dict[str, Any] = {
+            "outcome": self.outcome,
+            "no_path_is_proved": self.proved,
+            "pierced_branches": list(self.branches),
+            "begins_at_the_wall": self.at_wall,
+            "blocked": None
+            if self.obstruction is None
+            else obstruction_record(self.obstruction, self.proved, self.lobe),
+            "open_passage": None if self.open_passage is None else asdict(self.open_passage),
+            "path": None,
+        }
+        if path is None:
+            return record
+        record["path"] = {
+            "first_path_s": self.first_path_s,
+            "length_mm": path.length_mm,
+            "max_angle_from_start_rad": path.max_angle_from_start_rad(),
+            "accumulated_turn_rad": path.accumulated_turn_rad,
+            "costs": self.known_costs,
+            "lps_from_start": path.lps_from_start.tolist(),
+            "arcs": path.arc_records(),
+        }
+        return record
+
+
+def plan_needle(
+    lung: Organ,
+    system: System,
+    lps_from_start: Float,
+    target: Target,
+    *,
+    planner: str = "decide",
+    objective: str | Objective = "length",
+    seed: int = 0,
+    iterations: int | None = None,
+    time_s: float | None = None,
+) -> NeedleAnswer:
+    """Plan the needle of a system, with its margins, from a pose to a target.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+        +z is the direction of insertion.
+    planner : str
+        One of `stages.needle.NEEDLE_PLANNERS`.  Those of OMPL look at no objective, end by time alone, and
+        can be seeded once in a process, so each call needs a process of its own.
+    objective : str or Objective
+        What is made small; see `stages.needle.objective.Objective.of`.
+    iterations, time_s : optional
+        The search ends by whichever comes first, or by itself.  At least one is needed.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such planner or objective, no limit, or a cost map is missing; if OMPL has been used
+        in this process.
+    TargetError
+        If the start lies outside the images.
+    """
+    weighed = Objective.of(objective)
+    require_planner(planner)
+    if time_s is None and (iterations is None or planner in OMPL_PLANNERS):
+        raise SettingsError(
+            f"The needle search {planner} has no limit",
+            expected="a time in seconds" if planner in OMPL_PLANNERS else "iterations or a time in seconds",
+        )
+    if not lung.grid.contains(lps_from_start[:3, 3]).all():
+        raise TargetError(
+            f"The start lies outside the images, at LPS {lps_from_start[:3, 3].round(1).tolist()}",
+            expected="a pose inside the lung",
+            remedy="Check the frame of its numbers: RAS or LPS",
+        )
+    asked = needle_question(lung, system, lps_from_start, target.lps_mm)
+    found = search_path(
+        asked.environment,
+        asked.query,
+        planner,
+        objective=weighed,
+        seed=seed,
+        iterations=iterations,
+        time_s=time_s,
+    )
+    blocked = found.obstruction
+    return NeedleAnswer(
+        **vars(found),
+        **vars(asked),
+        lobe=lung.lobe_at(blocked.point_lps) if blocked and isinstance(lung, Lung) else "",
+        objective=weighed,
+    )
+
+
+@frozen_record
+class NeedleQuestion:
+    """A start and a target in a lung as the needle stage takes them; see `NeedleAnswer`."""
+
+    environment: NeedleEnvironment
+    query: Query
+    branches: tuple[int, ...]
+    at_wall: bool
+
+
+def needle_question(lung: Organ, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
+    """Ask for a path of a system's needle, with its margins, and the exemption that its start has.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+    target_lps : (3,) float64, LPS mm
+    """
+    if not isinstance(lung, Lung):
+        lung = _opened(lung, system, lps_from_start[:3, 3])
+    needle = system.require_needle("A path of the needle")
+    environment = needle_environment(lung, needle, system.margins, with_fissures=not system.fissures_allowed)
+    point = lps_from_start[:3, 3]
+    branches = pierced_branches(lung, point, environment.required_clearance_mm)
+    at_wall = begins_at_wall(lung, point, needle.radius_mm)
+    if at_wall:
+        environment = begun_at_wall(environment, point, branches)
+    query = Query(lps_from_start=lps_from_start, target=target_lps, branch=[*branches, -1][0])
+    return NeedleQuestion(environment=environment, query=query, branches=branches, at_wall=at_wall)
+
+
+def _opened(organ: Organ, system: System, point: Float) -> Organ:
+    """Return an organ whose surface is pierced at a start, if it lies within `WALL_MM` of it."""
+    if organ.exact_clearance_mm(point, OUTSIDE, cap_mm=WALL_MM)[0] >= WALL_MM:
+        return organ
+    needle = system.require_needle("A path of the needle")
+    reach_mm = needle.exit_exemption_mm + needle.radius_mm + system.margins.total_mm
+    return with_entry(organ, point, reach_mm)
+
+
+def pierced_branches(lung: Organ, point: Float, near_mm: float) -> tuple[int, ...]:
+    """Return the airway branches that a needle at a point `(3,)` LPS mm has pierced, the nearest first.
+
+    The nearest lies within `WALL_MM`.  Near a junction the tree draws the line between branches, not the
+    anatomy: those that meet the nearest one and come within `near_mm` of the point are pierced with it.
+    """
+    x, y, z = (float(c) for c in point)
+    _distance, label = exact_distance(lung.labels, lung.geometry, x, y, z, AIRWAY, -1, WALL_MM)
+    branch = (int(label) >> BRANCH_SHIFT) - 1
+    if branch < 0:
+        return ()
+    around = lung.labels[lung.grid.window(point, near_mm)]
+    others = np.setdiff1d((around[(around & AIRWAY) != 0] >> BRANCH_SHIFT).astype(int) - 1, [-1, branch])
+    meeting = {int(b) for b in others} & _meeting(lung, branch) if isinstance(lung, Lung) else set()
+    near = [b for b in sorted(meeting) if _distance_to_branch(lung, point, b, near_mm) < near_mm]
+    return (branch, *near)
+
+
+def _meeting(lung: Lung, branch: int) -> set[int]:
+    """Return the parent, the children, and the other children of the parent of a branch."""
+    tree = lung.tree
+    parent = int(tree.branch_parent[branch])
+    joined = {int(b) for b in tree.children(branch)}
+    if parent >= 0:
+        joined |= {parent, *(int(b) for b in tree.children(parent))}
+    return joined - {branch}
+
+
+def _distance_to_branch(lung: Organ, point: Float, branch: int, cap_mm: float) -> float:
+    """Return the distance in mm from a point to the airway voxels of a branch as boxes, at most `cap_mm`."""
+    part = lung.grid.window(point, cap_mm)
+    labels = lung.labels[part]
+    of_branch = ((labels & AIRWAY) != 0) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == branch)
+    found = voxels_in(part, of_branch)
+    return float(lung.grid.box_distance_mm(found, point).min(initial=cap_mm))
+
+
+def begins_at_wall(lung: Organ, point: Float, radius_mm: float) -> bool:
+    """Tell whether a needle of this radius at a point `(3,)` LPS mm touches the lumen of an airway."""
+    return bool(lung.exact_clearance_mm(point, LUMEN, cap_mm=radius_mm)[0] < radius_mm)

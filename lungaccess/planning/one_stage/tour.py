@@ -1,0 +1,324 @@
+"""Plan a tour of the airway to several lesions of one patient."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anatomy.base.errors import FileError, TargetError
+from anatomy.base.files import read_text
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
+from anatomy.io.frames import parse_point
+from anatomy.lung import Lung
+from lungaccess.plans.no_plan import NoPlan
+from stages.scope.tour import (
+    MOST_COMBINATIONS,
+    MOST_LESIONS,
+    Circuits,
+    Exit,
+    ExitRule,
+    ExitTest,
+    Itinerary,
+    Reading,
+    Resistances,
+    Subtree,
+    circuits,
+    combinations,
+    exits_of,
+    one_by_one_mm,
+    plan_itinerary,
+    shortest_tour,
+    subtree_to,
+)
+
+if TYPE_CHECKING:
+    from lungaccess.planning.coupled.atlas import Atlas
+    from lungaccess.problem.target import Target
+
+FARTHEST_MM = 200.0
+"""No exit farther from a lesion is of use: a lung is not wider."""
+PROOFS_PER_SITE = 3
+"""How many deployments of a site are tried in full before the site counts as refused."""
+ITERATIONS = 100
+"""Of the coupled planner for a lesion that no direct arc reaches: some seconds."""
+
+
+@frozen_record
+class TourAnswer:
+    """Tours to M lesions.
+
+    Parameters
+    ----------
+    lesions_lps : (M, 3) float64, LPS mm
+    numbers : tuple of int
+        Their numbers, from 1, in the order in which the user gave them.
+    left_out : mapping of int to str
+        Numbers of lesions without an exit, and why.
+    shortest : Itinerary
+        The shortest tour over all choices of exits.
+    least_resistance : Itinerary or None
+        The shortest tour over the exits of the circuit with the least resistance [Pan2025]; None if there
+        are too many combinations.
+    one_by_one_mm : float
+        Length of a tour in which the scope returns to the root between any two lesions, over the exits of
+        `shortest`.
+    plan_required : bool
+        Whether an exit counted only if a coupled plan from there exists.
+    """
+
+    lesions_lps: Float
+    numbers: tuple[int, ...]
+    left_out: Mapping[int, str]
+    subtree: Subtree
+    shortest: Itinerary
+    least_resistance: Itinerary | None
+    circuits: Circuits | None
+    one_by_one_mm: float
+    plan_required: bool
+
+    @property
+    def title(self) -> str:
+        """How many of the lesions the tours visit."""
+        visited = len(self.lesions_lps)
+        if not self.left_out:
+            return f"tour to {visited} lesions"
+        return f"tour to {visited} of {visited + len(self.left_out)} lesions"
+
+
+def read_lesions(path: str | Path) -> Float:
+    """Read lesions from a text file, one `ras:x,y,z` or `lps:x,y,z` a line; return `(M, 3)` LPS mm.
+
+    Empty lines, and what follows a `#`, are passed over.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or names no lesion, or more than 62.
+    FrameError
+        If a line states no frame.
+    """
+    lines = [line.split("#")[0].strip() for line in read_text(path).splitlines()]
+    points = [parse_point(line) for line in lines if line]
+    if not 1 <= len(points) <= MOST_LESIONS:
+        raise FileError(
+            f"{path} names {len(points)} lesions",
+            expected=f"1 to {MOST_LESIONS}, one a line",
+            remedy="Write lines such as lps:-57,131,-520",
+        )
+    return np.array(points)
+
+
+def lesions_of(lung: Lung) -> Float:
+    """Return the targets that came with a patient, `(M, 3)` LPS mm.
+
+    Raises
+    ------
+    TargetError
+        If none came with it, or more than 62.
+    """
+    count = len(lung.targets_lps)
+    if not 1 <= count <= MOST_LESIONS:
+        raise TargetError(
+            f"Patient {lung.name} came with {count} targets",
+            expected=f"1 to {MOST_LESIONS} lesions",
+            remedy="Name them in a file for --targets; `lungaccess template lesions` prints an example",
+        )
+    return np.array(lung.targets_lps, dtype=np.float64)
+
+
+def plan_tour(
+    lung: Lung,
+    lesions_lps: Float,
+    *,
+    rule: ExitRule | None = None,
+    weights: Resistances | None = None,
+    reading: Reading = "printed",
+    closed: bool = False,
+    tissue_weight: float = 0.0,
+    atlas: Atlas | None = None,
+    iterations: int = ITERATIONS,
+) -> TourAnswer:
+    """Plan the shortest tour to all lesions, and the one by least resistance beside it.
+
+    Parameters
+    ----------
+    lesions_lps : (M, 3) float64, LPS mm
+    rule : ExitRule, optional
+        By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
+    reading : str
+        How resistances are merged: "printed" or "reduced", see `stages.scope.tour.circuit`.
+    closed : bool
+        Whether the tour returns to the root.
+    tissue_weight : float
+        How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the shortest tour.
+    atlas : Atlas, optional
+        If given, an exit counts only if a coupled plan from there was found: scope, tubes and needle, all
+        proved; see `coupled_plan_test`.
+    iterations : int
+        Of the coupled planner for a lesion that no direct arc reaches; 0 for direct arcs alone.
+
+    A lesion without an exit is left out of the tour, and named in the answer.  That no plan was found does
+    not prove that there is none.
+
+    Raises
+    ------
+    TargetError
+        If a lesion lies outside the image, or none has an exit.
+    """
+    lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
+    for number, inside in enumerate(lung.grid.contains(lesions).tolist(), 1):
+        if not inside:
+            raise TargetError(
+                f"Lesion {number} lies outside the image of {lung.name}",
+                expected="a point in the lungs, in LPS mm",
+                remedy="Check the frame of the coordinates",
+            )
+    chosen = rule or _rule_of(atlas)
+    exits: list[tuple[Exit, ...]] = []
+    numbers: list[int] = []
+    left_out: dict[int, str] = {}
+    for number, lesion in enumerate(lesions, 1):
+        try:
+            accepts = None if atlas is None else coupled_plan_test(atlas, lesion, iterations)
+            exits.append(exits_of(lung.tree, len(exits), lesion, chosen, accepts))
+            numbers.append(number)
+        except TargetError as error:
+            left_out[number] = error.found
+        except NoPlan as error:
+            left_out[number] = f"no plan was found in {iterations} iterations: {error.main_reason}"
+    if not exits:
+        raise TargetError(
+            "No lesion has an exit: " + "; ".join(f"{n}: {why}" for n, why in left_out.items()),
+            remedy="Name other lesions, or plan a tour of the scope alone with --no-require-plan",
+            expected="at least one lesion with an exit",
+        )
+    cost = [[tissue_weight * each.distance_mm for each in of_one] for of_one in exits]
+    subtree = subtree_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)
+    best = shortest_tour(subtree, closed=closed)
+    found = circuits(subtree) if combinations(subtree) <= MOST_COMBINATIONS else None
+    return TourAnswer(
+        lesions_lps=lesions[np.array(numbers) - 1],
+        numbers=tuple(numbers),
+        left_out=left_out,
+        subtree=subtree,
+        shortest=best,
+        least_resistance=None
+        if found is None
+        else plan_itinerary(subtree, found.choice(reading), closed=closed),
+        circuits=found,
+        one_by_one_mm=one_by_one_mm(subtree, best.chosen, closed=closed),
+        plan_required=atlas is not None,
+    )
+
+
+def _rule_of(atlas: Atlas | None) -> ExitRule:
+    if atlas is None:
+        return ExitRule()
+    system, needle = atlas.system, atlas.system.needle
+    reach = system.tubes.max_extension_mm + (0.0 if needle is None else needle.max_length_mm)
+    return ExitRule(reach_mm=min(reach, FARTHEST_MM))
+
+
+def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATIONS) -> ExitTest:
+    """Return the test whether a coupled plan leads from a tree point to a lesion, `(3,)` LPS mm.
+
+    All deployments of the atlas whose workspace holds the lesion are tried with the direct arc, or without a
+    needle those that end nearby, aimed at it; a site counts if one of its best deployments is proved in full.
+    Where none is, the coupled planner searches, and the sites of its plans count.  So a refused exit may
+    still be possible.
+
+    Raises
+    ------
+    NoPlan
+        If no plan was found at all.
+    TargetError
+        If the lesion lies outside the lung or inside an obstacle.
+    """
+    from lungaccess.problem.target import point_target
+
+    target = point_target(atlas.lung, lesion_lps)
+    good = _points_of_arcs(atlas, target) or _points_of_plans(atlas, target, iterations)
+    return lambda _lesion, point: point in good
+
+
+def _points_of_arcs(atlas: Atlas, target: Target) -> frozenset[int]:
+    """Return the tree points from where a direct arc, or without a needle the tubes, reach a target."""
+    from lungaccess.planning.coupled import direct_candidates
+    from lungaccess.problem.task import Task
+    from stages.needle import SHORTEST
+
+    task = Task(lung=atlas.lung, system=atlas.system, target=target, objective=SHORTEST)
+    direct = direct_candidates(task, atlas)
+    clear = direct.clear()
+    points = atlas.motions.tree_point[atlas.deployments.site[clear]]
+    good: set[int] = set()
+    tried: dict[int, int] = {}
+    for entry, point in zip(clear.tolist(), points.tolist(), strict=True):
+        if point in good or tried.get(point, 0) >= PROOFS_PER_SITE:
+            continue
+        tried[point] = tried.get(point, 0) + 1
+        if direct.proved(entry) is not None:
+            good.add(int(point))
+    return frozenset(good)
+
+
+def _points_of_plans(atlas: Atlas, target: Target, iterations: int) -> frozenset[int]:
+    """Return the tree points nearest to the scope tips of the plans that a search finds."""
+    from lungaccess.planning.coupled import plan
+
+    plans = plan(atlas.lung, atlas.system, target, atlas=atlas, iterations=iterations, counterfactuals=False)
+    tips = np.stack([found.scope.lps_from_scope_tip[:3, 3] for found in plans])
+    away = np.linalg.norm(atlas.lung.tree.points_lps[:, None] - tips, axis=2)
+    return frozenset(away.argmin(axis=0).tolist())
+
+
+def tour_record(answer: TourAnswer) -> dict[str, Any]:
+    """Return a tour as plain JSON types: points in LPS mm, lengths in mm, lesions counted from 1."""
+    least = answer.least_resistance
+    return {
+        "lesions": [
+            {"number": number, "lps_mm": place}
+            for number, place in zip(answer.numbers, answer.lesions_lps.tolist(), strict=True)
+        ],
+        "left_out": {str(number): why for number, why in answer.left_out.items()},
+        "exits_require_coupled_plans": answer.plan_required,
+        "shortest": _itinerary_record(answer.shortest, answer.numbers),
+        "least_resistance": None if least is None else _itinerary_record(least, answer.numbers),
+        "circuits": None if answer.circuits is None else answer.circuits.count,
+        "one_by_one_mm": answer.one_by_one_mm,
+    }
+
+
+def _itinerary_record(tour: Itinerary, numbers: Sequence[int]) -> dict[str, Any]:
+    subtree = tour.subtree
+    used = [v for v in range(1, subtree.n_vertices) if tour.passes[v] > 0]
+    return {
+        "closed": tour.closed,
+        "length_mm": tour.length_mm,
+        "order": [numbers[lesion] for lesion in tour.order],
+        "visits": [
+            {
+                "lesion": numbers[visit.lesion],
+                "tree_point": visit.tree_point,
+                "roles": list(visit.roles),
+                "distance_mm": visit.distance_mm,
+                "angle_rad": visit.angle_rad,
+            }
+            for visit in tour.visits
+        ],
+        "tree_points_in_order": [int(subtree.tree_point[v]) for v in tour.vertices()],
+        "stretches": [
+            {
+                "from_tree_point": int(subtree.tree_point[subtree.parent[v]]),
+                "to_tree_point": int(subtree.tree_point[v]),
+                "length_mm": float(subtree.length_mm[v]),
+                "passes": int(tour.passes[v]),
+                "loops": int(tour.loops[v]),
+            }
+            for v in used
+        ],
+    }

@@ -1,0 +1,27 @@
+"""What a procedure measures and corrects on its way, and how often it then succeeds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.planning.procedure.insertion import (
+        Errors,
+        InsertionStudy,
+        SimulatedTracker,
+        TrackerModel,
+        insert_plan,
+    )
+    from lungaccess.planning.procedure.report import ProcedureReport, StageReport
+    from lungaccess.planning.procedure.settings import (
+        DEFAULT_PROCEDURE,
+        Procedure,
+        load_procedure,
+        procedure_names,
+    )
+    from lungaccess.planning.procedure.simulation import Simulator, simulate_procedure
+    from lungaccess.planning.procedure.tracker import Measured, Tracker
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

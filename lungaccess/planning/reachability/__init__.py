@@ -1,0 +1,27 @@
+"""What of a lung a system reaches, and proofs that it cannot reach a target."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.planning.reachability.open_places import OpenPlace
+    from lungaccess.planning.reachability.reach_map import (
+        DEFAULT_SPACING_MM,
+        KINDS,
+        NOT_COUNTED,
+        STATES,
+        ReachMap,
+        RegionReach,
+        compare_reach,
+        map_reach,
+        reach_grid,
+    )
+    from lungaccess.planning.reachability.reach_stream import STREAM_SPACING_MM, ReachPart, ReachStream
+    from lungaccess.planning.reachability.regions import Regions, lung_regions
+    from lungaccess.planning.reachability.unreachable import MOST_BOXES, ReachVerdict, UnreachableProof
+    from lungaccess.planning.reachability.voxel_plan import plan_to_voxel
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,0 +1,162 @@
+"""The work behind a reachability map: its points layer by layer, kept on disk as they are finished."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from anatomy.base.checksums import array_checksum, values_checksum, warn_of_damage
+from anatomy.base.files import DAMAGE, atomic_write, require_writable_folder
+from anatomy.base.typed import Float, Float32, Int, Int32, Mask, UInt64
+from anatomy.grid import Grid
+from anatomy.lung import Lung
+from anatomy.structures import obstacle_bits
+from lungaccess.planning.coupled import Scan
+from stages.needle import BLOCK_MM, Reached
+
+SLAB_MM = BLOCK_MM
+"""Thickness of the slabs of layers that are tried, and kept on disk, at a time."""
+THREADS = 2
+"""The kernels hold no lock, and two cores are the least that a machine of today has."""
+
+
+def counted_voxels(lung: Lung, grid: Grid, with_fissures: bool) -> Mask:
+    """Tell which voxels of a map have their centre in lung tissue that is no obstacle."""
+    bits = obstacle_bits(with_fissures)
+    counted = np.zeros(grid.shape, dtype=bool, order="F")
+    for k in range(grid.shape[2]):
+        ijk = np.floor(lung.grid.ijk(_layer_points(grid, k)) + 0.5).astype(np.int64)
+        inside = ((ijk >= 0) & (ijk < lung.grid.shape)).all(axis=-1)
+        layer = np.zeros(inside.shape, dtype=bool)
+        layer[inside] = (lung.labels[tuple(ijk[inside].T)] & bits) == 0
+        counted[:, :, k] = layer
+    return counted
+
+
+def _layer_points(grid: Grid, k: int) -> Float:
+    """Return the centres `(ni, nj, 3)` of a layer of voxels, LPS mm."""
+    ni, nj, _nk = grid.shape
+    i, j = np.meshgrid(np.arange(ni), np.arange(nj), indexing="ij")
+    return grid.lps(np.stack([i, j, np.full_like(i, k)], axis=-1))
+
+
+def scan_layers(
+    scan: Scan, grid: Grid, counted: Mask, store: LayerStore | None, progress: Callable[[float], None] | None
+) -> tuple[Float32, Int32, int]:
+    """Try the points of all layers, slab by slab.
+
+    Parameters
+    ----------
+    counted : (ni, nj, nk) bool
+        Voxels whose centres are tried.
+    store : LayerStore or None
+        Where finished slabs are kept; emptied at the end.
+    progress : callable or None
+        Told the share of the layers done.
+
+    Returns
+    -------
+    found : (4, ni, nj, nk) float32
+        Kind, cost, clearance and share of the breath, see `stages.needle.reach.Reached`.
+    entries : (ni, nj, nk) int32
+        Start pose of what is reached, else -1.
+    resumed : int
+        Layers taken from the store.
+    """
+    found = np.zeros((4, *grid.shape), dtype=np.float32)
+    entries = np.full(grid.shape, -1, dtype=np.int32)
+    done, resumed = 0, 0
+    thickness = max(int(SLAB_MM / grid.spacing_mm[2] + 1e-9), 1)
+
+    def one_slab(first: int) -> None:
+        nonlocal done, resumed
+        slab = counted[:, :, first : first + thickness]
+        places = np.argwhere(slab)
+        kept = None if store is None else store.load(first, len(places))
+        ijk = places + np.array([0, 0, first], dtype=np.int64)
+        if kept is None and len(places):
+            kept = _as_rows(scan.reach(grid.lps(ijk), voxel_seeds(grid, ijk), _earlier_neighbours(slab)))
+            if store is not None:
+                store.save(first, kept)
+        elif kept is not None:
+            resumed += slab.shape[2]
+        if kept is not None:
+            found[:, *ijk.T], entries[*ijk.T] = kept
+        done += slab.shape[2]
+        if progress:
+            progress(done / grid.shape[2])
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(one_slab, range(0, grid.shape[2], thickness)))
+    if store is not None:
+        store.clear()
+    return found, entries, resumed
+
+
+def voxel_seeds(grid: Grid, ijk: Int) -> UInt64:
+    """Return the seed of the search to each of voxels (N, 3): its number in the grid."""
+    return np.asarray(np.ravel_multi_index(tuple(ijk.T), grid.shape), dtype=np.uint64)
+
+
+def _earlier_neighbours(counted: Mask) -> Int:
+    """Return the indices `(N, 3)` of the neighbours before each True place along each axis, -1 for none."""
+    index = np.full(tuple(n + 1 for n in counted.shape), -1, dtype=np.int64)
+    index[1:, 1:, 1:][counted] = np.arange(np.count_nonzero(counted))
+    i, j, k = np.nonzero(counted)
+    return np.stack([index[i, j + 1, k + 1], index[i + 1, j, k + 1], index[i + 1, j + 1, k]], axis=1)
+
+
+Rows = tuple[Float32, Int32]
+"""What was found of N voxels: `(4, N)` and `(N,)`, see `scan_layers`."""
+
+
+def _as_rows(reached: Reached) -> Rows:
+    share = np.zeros_like(reached.cost) if reached.window_share is None else reached.window_share
+    rows = np.stack([reached.kinds, reached.cost, reached.clearance_mm, share]).astype(np.float32)
+    return rows, reached.entries.astype(np.int32)
+
+
+class LayerStore:
+    """Finished slabs of layers on disk, in a folder named after what they depend on."""
+
+    def __init__(self, work: Path, key: str) -> None:
+        self._folder = require_writable_folder(work / f".reach-{key}")
+
+    def _path(self, layer: int) -> Path:
+        return self._folder / f"layer-{layer:04d}.npz"
+
+    def load(self, layer: int, count: int) -> Rows | None:
+        """Return the rows of the slab that begins with a layer, None if it is not there or not whole."""
+        try:
+            with self._path(layer).open("rb") as stream, np.load(stream) as stored:
+                rows, entries = np.asarray(stored["rows"]), np.asarray(stored["entries"])
+                checksum = str(stored["checksum"])
+        except FileNotFoundError:
+            return None
+        except DAMAGE:
+            checksum = ""
+        whole = checksum and rows.shape == (4, count) and entries.shape == (count,)
+        if whole and checksum == self._checksum(layer, (rows, entries)):
+            return rows.astype(np.float32, copy=False), entries.astype(np.int32, copy=False)
+        warn_of_damage(self._path(layer))
+        return None
+
+    def save(self, layer: int, found: Rows) -> None:
+        """Write a slab, whole or not at all."""
+        rows, entries = found
+        with atomic_write(self._path(layer)) as temporary:
+            checksum = np.array(self._checksum(layer, found))
+            np.savez_compressed(temporary, rows=rows, entries=entries, checksum=checksum)
+
+    def _checksum(self, layer: int, found: Rows) -> str:
+        """Return what binds the rows of a slab to the run and to its place."""
+        rows, entries = (array_checksum(each) for each in found)
+        return values_checksum({"of": [self._folder.name, layer], "rows": rows, "entries": entries})
+
+    def clear(self) -> None:
+        """Remove all slabs."""
+        shutil.rmtree(self._folder, ignore_errors=True)

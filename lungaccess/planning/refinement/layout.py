@@ -1,0 +1,199 @@
+"""The layout of the refinement's program: the place of each variable, parameter and constraint."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
+
+AXIS_DEGREE = 5
+"""The airway's axis near the site is a polynomial of this degree in the arc length along it."""
+AXIS_SCALE_MM = 2.5
+"""The scope moves at most so far either way; the polynomial's variable is the arc length in this unit."""
+ZONE_POINTS = 8
+NEEDLE_POINTS = 60
+TUBE_POINTS = 24
+WALL_POINTS = 8
+"""Samples of the exempt length, the needle, the tubes behind the exit and before it, about one a mm.  Slack
+in the constraints covers what lies between."""
+WALL_CONTACT_MM = 6.0
+"""Length of the tubes before the exit where they may touch the wall."""
+SLOPE_MM = 0.5
+"""Step over which the share of lumen is compared at the exit."""
+CURVE_DEGREE = 12
+"""Of the polynomial of a shape that is not planar: it is then right to a hundredth of a millimetre, though
+curvature jumps where a tube ends."""
+N_FEATURES = 3 * (CURVE_DEGREE + 1) + 10
+"""Of such a shape: coefficients of its curve, the tip's point, direction and +x, and the space beside it."""
+
+
+@frozen_value
+class Layout:
+    """The shape of a program.
+
+    Parameters
+    ----------
+    arcs : int
+        Arcs of the needle.
+    with_map : bool
+        Whether the objective looks at a cost map.
+    tubes, turned : int
+        Of tubes that are not planar how many there are, and how many of them are turned against the others.
+    zone_points, tube_points, wall_points : int
+        Samples of the needle's exempt length, and of the tubes behind and before the exit.
+    """
+
+    arcs: int
+    with_map: bool
+    tubes: int = 0
+    turned: int = 0
+    zone_points: int = ZONE_POINTS
+    tube_points: int = TUBE_POINTS
+    wall_points: int = WALL_POINTS
+
+    @cached_property
+    def variables(self) -> dict[str, Any]:
+        """Places of the variables: mm, rad, curvatures as shares of the greatest."""
+        a = self.arcs
+        return {
+            "site": 0,
+            "rotation": 1,
+            "outer": 2,
+            "inner": 3,
+            "exit": 4,
+            "lengths": slice(5, 5 + a),
+            "bend_x": slice(5 + a, 5 + 2 * a),
+            "bend_y": slice(5 + 2 * a, 5 + 3 * a),
+            "middle": slice(5 + 3 * a, 5 + 3 * a + self.middle),
+            "turned": slice(5 + 3 * a + self.middle, self.n_variables),
+        }
+
+    @property
+    def joints(self) -> list[int]:
+        """Places of the joints of tubes that are not planar; see `ShapeModel`."""
+        at = self.variables
+        inserted = [at["outer"], *range(at["middle"].start, at["middle"].stop), at["inner"]]
+        return [*inserted[-self.tubes :], *range(at["turned"].start, at["turned"].stop)]
+
+    @property
+    def middle(self) -> int:
+        """Number of middle tubes."""
+        return max(self.tubes - 2, 0)
+
+    @property
+    def model_terms(self) -> int:
+        """Number of terms of the polynomials of tubes that are not planar."""
+        m = self.tubes + self.turned
+        return (m + 1) * (m + 2) // 2
+
+    @property
+    def n_variables(self) -> int:
+        """Number of variables."""
+        return 5 + 3 * self.arcs + self.middle + self.turned
+
+    @property
+    def arc_points(self) -> int:
+        """Number of samples of each arc: fewer of shorter arcs."""
+        return max(NEEDLE_POINTS // self.arcs, 1)
+
+    @cached_property
+    def parameters(self) -> dict[str, slice]:
+        """Places of the parameters, without the values of the fields."""
+        sizes = {
+            "axis_points": 3 * (AXIS_DEGREE + 1),
+            "axis_tangents": 3 * (AXIS_DEGREE + 1),
+            "sideways": 3,
+            "target": 3,
+            "max_curvature_per_mm": 1,
+            "shared_curvature_per_mm": 1,
+            "inner_curvature_per_mm": 1,
+            "curved_length_mm": 1,
+            "straight_out": 1,
+            "outer_radius_step_mm": 1,
+            "exempt_mm": 1,
+            "weigh_clear": 1,
+            "weigh_length": 1,
+            "weigh_map": 1,
+        }
+        if self.tubes:
+            sizes |= {
+                "middle_radius_step_mm": 1,
+                "model_centre": self.tubes + self.turned,
+                "model": N_FEATURES * self.model_terms,
+            }
+        for n in range(self.boxes):
+            sizes[f"affine{n}"] = 12
+            sizes[f"shape{n}"] = 3
+        return _in_a_row(sizes)
+
+    @property
+    def boxes(self) -> int:
+        """Number of fields, see `lungaccess.planning.refinement.boxes`."""
+        return 5 if self.with_map else 4
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of parameters."""
+        return _end(self.parameters)
+
+    @cached_property
+    def constraints(self) -> dict[str, slice]:
+        """Places of the constraints."""
+        sizes = {
+            "end": 3,
+            "curvature": self.arcs,
+            "length": 1,
+            "turn": 1,
+            "cosine": 2 * self.arcs,
+            "order": 1,
+            "overlap": 1,
+            "in_tissue": 1,
+            "exit": 1,
+            "slope": 1,
+            "zone": self.zone_points,
+            "needle": self.arcs * self.arc_points,
+            "tube": self.tube_points + 1,
+            "wall": self.wall_points,
+        }
+        if self.tubes:
+            sizes |= {"beside": 1, "middle": 2 * self.middle}
+        return _in_a_row(sizes)
+
+    @property
+    def n_constraints(self) -> int:
+        """Number of constraints."""
+        return _end(self.constraints)
+
+
+def _in_a_row(sizes: dict[str, int]) -> dict[str, slice]:
+    places, begin = {}, 0
+    for name, size in sizes.items():
+        places[name] = slice(begin, begin + size)
+        begin += size
+    return places
+
+
+def _end(places: dict[str, slice]) -> int:
+    return int(max(place.stop for place in places.values()))
+
+
+@frozen_record
+class Numbers:
+    """The numbers of one call of a program.
+
+    Parameters
+    ----------
+    parameters : (P,) float64
+    lower, upper : (n,) float64
+        Bounds of the variables.
+    least, most : (m,) float64
+        Bounds of the constraints.
+    """
+
+    parameters: Float
+    lower: Float
+    upper: Float
+    least: Float
+    most: Float

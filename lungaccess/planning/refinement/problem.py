@@ -1,0 +1,300 @@
+"""The numbers of the refinement's program for one candidate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy import ndimage
+
+from anatomy.base.typed import Float
+from anatomy.structures import obstacle_bits
+from lungaccess.planning.refinement import boxes as fields
+from lungaccess.planning.refinement.axis import LocalAxis, one_tip
+from lungaccess.planning.refinement.curve import rows_of, split
+from lungaccess.planning.refinement.layout import SLOPE_MM, WALL_CONTACT_MM, Layout, Numbers
+from lungaccess.planning.refinement.shape_model import ShapeModel
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.task import Task
+from stages.scope import ScopeTip
+from stages.tube import TubeShape, design_arrays, tracking_length_mm, tube_constants
+from stages.tube import kernels as index
+
+ARC_COUNTS = (3, 5, 8)
+"""A program is built for each; shorter paths are split."""
+NEEDLE_MARGIN_MM = 10.0
+TUBE_MARGIN_MM = 8.0
+"""The boxes of field values reach so far beyond needle and tubes of the candidate: so far these may move."""
+MAX_TURN_RAD = 1.2
+"""The tubes turn by no more than this, so that they stay within the boxes."""
+SHORTEST_ARC_MM = 1.0
+"""Shorter arcs are not made: the direction of their curvature would hardly matter."""
+NEEDLE_SLACK_MM = 0.02
+TUBE_SLACK_MM = 0.1
+"""The program demands so much more clearance, for what lies between samples and between lattice points."""
+SWEEP_SLACK_MM = 0.02
+"""The program keeps so far from the limit of the sweep, which its model knows to a few hundredths."""
+CURVATURE_SLACK = 1e-3
+ANGLE_SLACK_RAD = math.radians(2.0)
+"""The program keeps so far from the limits of curvature and wall angle, for the same reason."""
+EASED = ("zone", "needle", "tube", "wall", "slope")
+"""Constraints on field values, which the candidate may break in the program though it is proved."""
+EASE = 1e-4
+"""The candidate lies so far inside the eased constraints, so that it is a strictly feasible start."""
+
+
+def program_weights(task: Task) -> tuple[float, float, float] | None:
+    """Return the weights of 1 / clearance, length and cost map in the program of a task.
+
+    The program has no sum over voxels.  Where nothing else is weighed, the map's line integral stands for
+    it.  Where it is one cost of several, the program cannot express the objective; where only a map is
+    weighed and there is none, there is nothing to improve: then None is returned.
+    """
+    weighed = task.objective
+    if weighed.voxel_sum > 0.0:
+        if len(weighed.weighed) > 1:
+            return None
+        weights = (0.0, 0.0, weighed.voxel_sum)
+    else:
+        weights = (weighed.inverse_clearance, weighed.length, weighed.cost_map)
+    if task.lung.cost is None:
+        weights = (*weights[:2], 0.0)
+    return weights if any(weights) else None
+
+
+class Problem:
+    """The program's numbers for one candidate.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        With at most as many arcs as the last of ARC_COUNTS.
+    weights : tuple of 3 float
+        See `program_weights`.
+
+    Attributes
+    ----------
+    layout : Layout
+    start : (n,) float64
+        The candidate as variables.
+    numbers : Numbers
+    boxes : tuple of FieldBox
+    axis : LocalAxis
+    """
+
+    def __init__(
+        self, evaluator: CandidateEvaluator, candidate: Candidate, weights: tuple[float, float, float]
+    ) -> None:
+        self.task = evaluator.task
+        self._candidate, self._weights = candidate, weights
+        self._needle = needle = self.task.system.require_needle("The joint refinement")
+        deployment = candidate.deployment
+        rows = rows_of(candidate.path)
+        arcs = next(count for count in ARC_COUNTS if count >= len(rows))
+        self._exempt_mm = min(needle.exit_exemption_mm, 0.8 * candidate.path.length_mm)
+        rows = split(rows, arcs, self._exempt_mm)
+        self.design = design = design_arrays(self.task.system.tubes)
+        self.model = self._model(deployment.shape)
+        self.layout = Layout(
+            arcs=arcs,
+            with_map=weights[2] > 0.0,
+            tubes=0 if design is None else len(design.lengths),
+            turned=0 if design is None else int(design.turned.sum()),
+        )
+        self.axis = LocalAxis(evaluator.tip_rows, candidate.tip)
+        tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
+        bends = rows[:, 1:].T / needle.max_curvature_per_mm
+        further = np.zeros(self.layout.n_variables - 5 - 3 * arcs)
+        self.start = np.concatenate([[0.0], tubes, rows[:, 0], *bends, further])
+        if self.model is not None:
+            self.start[self.layout.joints] = self.model.centre
+        self.boxes = self._cut_boxes()
+        lower, upper = self._variable_bounds()
+        least, most = self._constraint_bounds()
+        self.numbers = Numbers(
+            parameters=self._parameters(self.axis.points, self.axis.tangents, self.model),
+            lower=lower,
+            upper=upper,
+            least=least,
+            most=most,
+        )
+
+    def eased(self, values: Float) -> Numbers:
+        """Return the numbers with the clearances of the start, `values` (m,), allowed where they are less.
+
+        So the program starts from where it may be, though its fields are not exact.
+        """
+        least = self.numbers.least.copy()
+        for name in EASED:
+            place = self.layout.constraints[name]
+            least[place] = np.minimum(least[place], values[place] - EASE)
+        return replace(self.numbers, least=least)
+
+    def for_needle(self, x: Float, tip: ScopeTip, shape: TubeShape | None) -> Numbers:
+        """Return the numbers for the needle alone, from the tubes of `x` and a tip that stay as they are.
+
+        Parameters
+        ----------
+        shape : TubeShape or None
+            That of tubes which are not planar.
+        """
+        rows, numbers = self.layout.constraints, self.numbers
+        lower, upper = numbers.lower.copy(), numbers.upper.copy()
+        least, most = numbers.least.copy(), numbers.most.copy()
+        tubes = np.r_[: self.layout.variables["lengths"].start, self.layout.joints]
+        lower[tubes] = upper[tubes] = x[tubes]
+        for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall", "beside", "middle"):
+            if name in rows:
+                least[rows[name]], most[rows[name]] = -np.inf, np.inf
+        parameters = self._parameters(*one_tip(tip), self._model(shape, constant=True))
+        return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
+
+    def _model(self, shape: TubeShape | None, *, constant: bool = False) -> ShapeModel | None:
+        """Return the model of tubes around a shape; None for planar tubes, which have a closed form."""
+        if shape is None or self.design is None:
+            return None
+        return ShapeModel(self.design, shape, constant=constant)
+
+    @property
+    def sideways(self) -> Float:
+        """The +x of the candidate's tip, from which rotations count."""
+        return np.asarray(self._candidate.tip.lps_from_scope_tip[:3, 0])
+
+    @property
+    def _straight_out(self) -> bool:
+        """Whether the straight part of the inner tube reaches out of the scope."""
+        return 0.0 < self.task.system.tubes.inner.curved_length_mm < self._candidate.deployment.inner_mm
+
+    @property
+    def longest_mm(self) -> float:
+        """The greatest insertion: where the tubes follow their own track, or that of the candidate."""
+        return max(tracking_length_mm(self.task.system.tubes), self._candidate.deployment.inner_mm)
+
+    def _cut_boxes(self) -> tuple[fields.FieldBox, ...]:
+        lung, fissures = self.task.lung, self.task.with_fissures
+        deployment, margin = self._candidate.deployment, self.task.system.margins.total_mm
+        bits = obstacle_bits(fissures)
+        leaves = deployment.exit_mm
+        outside = self._tube_points(np.linspace(leaves, deployment.inner_mm, 12))
+        inside = self._tube_points(np.linspace(max(leaves - WALL_CONTACT_MM, 0.0), leaves, 6))
+        needle, lengths = self._candidate.path.sample(1.0)
+        near = np.concatenate([outside, needle[lengths <= self._exempt_mm]])
+        boxes = [
+            fields.clearance_box(lung, needle, NEEDLE_MARGIN_MM, with_fissures=fissures),
+            fields.spared_box(lung, near, TUBE_MARGIN_MM, bits=bits, branch=deployment.branch),
+            fields.wall_box(lung, inside, TUBE_MARGIN_MM, with_fissures=fissures, kept_mm=margin),
+            fields.lumen_box(lung, inside[-1:], TUBE_MARGIN_MM),
+        ]
+        if self.layout.with_map and lung.cost is not None:
+            boxes.append(fields.map_box(lung.cost, needle, NEEDLE_MARGIN_MM))
+        return tuple(boxes)
+
+    def _tube_points(self, arc_lengths: Float) -> Float:
+        scope, tubes = self._candidate.tip.lps_from_scope_tip, self.task.system.tubes
+        return self._candidate.deployment.points(tubes, scope, arc_lengths)
+
+    def _lumen_at_exit(self) -> tuple[float, float]:
+        """Return the share of lumen at the exit, and its greatest slope there, per mm."""
+        box = self.boxes[fields.LUMEN_SHARE]
+        exit_point = self._tube_points(np.array([self._candidate.deployment.exit_mm]))
+        places = exit_point + SLOPE_MM * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+        lattice = places @ box.lattice_from_lps[:, :3].T + box.lattice_from_lps[:, 3]
+        values = box.values.reshape(box.shape, order="F")
+        share = ndimage.map_coordinates(values, lattice.T, order=3, prefilter=False, mode="nearest")
+        return float(share[0]), float(np.linalg.norm(share[1:4] - share[4:]) / (2.0 * SLOPE_MM))
+
+    def _parameters(self, points: Float, tangents: Float, model: ShapeModel | None) -> Float:
+        """Return the parameters for an axis of the scope's tip given by coefficients and a model."""
+        tubes = self.task.system.tubes
+        constants = tube_constants(tubes, self.task.system.margins)
+        clear, length, mapped = self._weights
+        values: dict[str, object] = {
+            "axis_points": points,
+            "axis_tangents": tangents,
+            "sideways": self.sideways,
+            "target": self.task.target.lps_mm,
+            "max_curvature_per_mm": self._needle.max_curvature_per_mm,
+            "shared_curvature_per_mm": constants[index.OVERLAP_CURVATURE],
+            "inner_curvature_per_mm": constants[index.INNER_CURVATURE],
+            "curved_length_mm": constants[index.CURVED_LENGTH],
+            "straight_out": float(self._straight_out),
+            "outer_radius_step_mm": tubes.outermost.radius_mm - tubes.inner.radius_mm,
+            "exempt_mm": self._exempt_mm,
+            "weigh_clear": clear,
+            "weigh_length": length,
+            "weigh_map": mapped,
+        }
+        if model is not None:
+            radii = [
+                tubes.outermost.radius_mm,
+                (tubes.middle or tubes.inner).radius_mm,
+                tubes.inner.radius_mm,
+            ]
+            values["outer_radius_step_mm"], values["middle_radius_step_mm"] = -np.diff(radii)
+            values |= {"model_centre": model.centre, "model": model.matrix}
+        for n, box in enumerate(self.boxes):
+            values[f"affine{n}"] = box.lattice_from_lps.T
+            values[f"shape{n}"] = box.shape
+        out = np.zeros(self.layout.n_parameters)
+        for name, place in self.layout.parameters.items():
+            out[place] = np.asarray(values[name], dtype=np.float64).ravel()
+        return out
+
+    def _variable_bounds(self) -> tuple[Float, Float]:
+        at, system = self.layout.variables, self.task.system
+        lower, upper = np.full(self.layout.n_variables, -1.0), np.full(self.layout.n_variables, 1.0)
+        rotation = self._candidate.deployment.rotation_rad
+        bounds = {
+            "site": (self.axis.low_mm, self.axis.high_mm),
+            "rotation": (rotation - MAX_TURN_RAD, rotation + MAX_TURN_RAD),
+            "outer": (0.0, self.longest_mm),
+            "inner": (system.tubes.inner.curved_length_mm if self._straight_out else 0.0, self.longest_mm),
+            "exit": (0.0, self.longest_mm),
+            "lengths": (SHORTEST_ARC_MM, self._needle.max_length_mm),
+        }
+        for name, (low, high) in bounds.items():
+            lower[at[name]], upper[at[name]] = low, high
+        lower[at["lengths"].start] += self._exempt_mm
+        if self.model is not None:
+            joints = self.layout.joints
+            lower[joints], upper[joints] = self.model.lower, self.model.upper
+            inserted = joints[: self.layout.tubes]
+            lower[inserted] = np.maximum(lower[inserted], 0.0)
+            upper[inserted] = np.minimum(upper[inserted], self.longest_mm)
+        return lower, upper
+
+    def _constraint_bounds(self) -> tuple[Float, Float]:
+        system, deployment = self.task.system, self._candidate.deployment
+        needle, tubes, margin = self._needle, system.tubes, system.margins.total_mm
+        level, slope = self._lumen_at_exit()
+        swept, allowed = deployment.lateral_sweep_mm, tubes.max_lateral_sweep_mm - SWEEP_SLACK_MM
+        if deployment.shape is not None:
+            # The sweep is a feature of the model instead, and the arcs' error with it.
+            allowed, swept = max(allowed, swept) + deployment.shape.arc_error_mm, 0.0
+        thick = tubes.inner.radius_mm + swept + TUBE_SLACK_MM
+        clear = needle.radius_mm + margin + NEEDLE_SLACK_MM
+        steep = math.sin(math.radians(tubes.min_wall_angle_deg) + ANGLE_SLACK_RAD)
+        bounds = {
+            "end": (0.0, 0.0),
+            "curvature": (-np.inf, (1.0 - CURVATURE_SLACK) ** 2),
+            "length": (-np.inf, needle.max_length_mm),
+            "turn": (-np.inf, math.radians(needle.max_accumulated_turn_deg)),
+            "cosine": (math.cos(math.radians(needle.max_angle_from_start_deg)), np.inf),
+            "order": (0.0, tubes.max_inner_protrusion_mm),
+            "overlap": (0.0, np.inf),
+            "in_tissue": (index.WALL_ZONE_MM + NEEDLE_SLACK_MM, np.inf),
+            "exit": (level, level),
+            "slope": (slope * steep, np.inf),
+            "zone": (clear, np.inf),
+            "needle": (clear, np.inf),
+            "tube": (thick + margin, np.inf),
+            "wall": (thick, np.inf),
+            "beside": (-np.inf, allowed),
+            "middle": (0.0, np.inf),
+        }
+        least, most = np.zeros(self.layout.n_constraints), np.zeros(self.layout.n_constraints)
+        for name, place in self.layout.constraints.items():
+            least[place], most[place] = bounds[name]
+        return least, most

@@ -1,0 +1,147 @@
+"""What a policy decides by: measurements weighed by their errors, foreseen chances, prepared replanning."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import lungaccess as la
+from anatomy import poses
+from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from lungaccess.planning.one_stage import ScopeReplanner
+from lungaccess.planning.procedure import Procedure, Simulator, load_procedure
+from lungaccess.planning.procedure.fusion import fused, fused_share, scope_moves, tip_moves
+from lungaccess.planning.procedure.residuals import Residuals, fused_size
+from lungaccess.planning.procedure.settings import ScopePlacing
+from lungaccess.planning.procedure.truth import as_measured
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
+from lungaccess.uncertainty.risk import load_errors
+from stages.needle import Objective
+from stages.tube import enumerate_deployments, one_site_enumerator
+
+SYSTEM = la.load_system("ultrathin")
+ERRORS = load_errors("gated-ct")
+
+
+def tip_row(plan: Plan) -> Float:
+    frame = np.asarray(plan.scope.lps_from_scope_tip)
+    return np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
+
+
+# Measurements ------------------------------------------------------------------------------------
+
+
+def a_pose(seed: int = 0) -> Float:
+    turn = Rotation.random(random_state=seed).as_matrix()
+    return poses.pose(np.array([1.0, -2.0, 3.0]), turn[:, 2], turn[:, 0])
+
+
+def test_a_measurement_is_weighed_by_its_errors() -> None:
+    """Of 600 true poses and measurements, what is left of the errors is what theory says, not more."""
+    expected, rng = a_pose(), np.random.default_rng(0)
+    sizes, seen = (1.3, math.radians(2.0)), (0.7, 1.0)
+    left = []
+    for _ in range(600):
+        a, b = sizes[1] * rng.standard_normal(2)
+        true = expected @ poses.pose(np.zeros(3), np.array([a, b, 1.0]) / math.hypot(a, b, 1.0), np.eye(3)[0])
+        true[:3, 3] += sizes[0] * rng.standard_normal(3)
+        measured = as_measured(true, *seen, rng.standard_normal(5))
+        likely = fused(expected, scope_moves(expected, *sizes), measured, seen[0], math.radians(seen[1]))
+        across = expected[:3, :2].T @ (likely[:3, 2] - true[:3, 2])
+        left.append([*(likely[:3, 3] - true[:3, 3]), *across])
+    spread = np.std(left, axis=0)
+    assert spread[:3] == pytest.approx(fused_size(1.3, 0.7), rel=0.12)
+    assert spread[3:] == pytest.approx(fused_size(sizes[1], math.radians(1.0)), rel=0.12)
+
+
+def test_an_exact_measurement_is_believed_and_a_needless_one_is_not() -> None:
+    expected, measured = a_pose(), as_measured(a_pose(), 1.0, 3.0, np.array([1.0, -1.0, 0.5, 1.0, -2.0]))
+    moves = scope_moves(expected, 1.3, 0.02)
+    assert np.array_equal(fused(expected, moves, measured, 0.0, 0.0), measured)
+    nearly = fused(expected, moves, measured, 1e-6, 1e-8)
+    assert np.allclose(nearly, measured, atol=1e-6)
+    sure = fused(expected, np.zeros_like(moves), measured, 0.7, 0.01)
+    assert np.allclose(sure[:3, 3], expected[:3, 3]) and np.allclose(sure[:3, 2], expected[:3, 2])
+    assert (fused_share(0.0, 1.0), fused_share(1.0, 0.0)) == (0.0, 1.0)
+    assert (fused_size(0.0, 1.0), fused_size(3.0, 4.0)) == (0.0, pytest.approx(2.4))
+
+
+def test_a_wrong_rotation_is_told_from_where_the_tip_is() -> None:
+    """A tip that a turn of the tubes has moved is found along that turn, more exactly than it is measured."""
+    scope, tip = np.eye(4), poses.pose(np.array([10.0, 0.0, 30.0]), [0.6, 0.0, 0.8], [0.8, 0.0, -0.6])
+    left = Residuals.of(load_errors("gated-ct"), load_procedure("measured-tip"), 0.0)
+    only = dict.fromkeys(("scope_mm", "scope_rad", "insertion_mm"), 0.0)
+    turned = Residuals(**(vars(left) | only))
+    moves = tip_moves(scope, tip, turned, 0.0)
+    assert np.linalg.matrix_rank(moves) == 1
+    true = poses.pose(np.zeros(3), [0.0, 0.0, 1.0], [math.cos(0.05), math.sin(0.05), 0.0]) @ tip
+    measured = as_measured(true, 0.7, 1.0, np.array([1.0, 1.0, 1.0, 0.0, 1.0]))
+    likely = fused(tip, moves, measured, 0.7, math.radians(1.0))
+    assert abs(likely[2, 3] - 30.0) < 1e-9
+    assert np.linalg.norm(likely[:3, 3] - true[:3, 3]) < 0.5 * np.linalg.norm(measured[:3, 3] - true[:3, 3])
+
+
+# Replanning from many poses ----------------------------------------------------------------------
+
+
+def test_a_prepared_replan_is_that_of_the_public_function(plan: Plan, small_lung: Lung) -> None:
+    target = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
+    objective = Objective.of("inverse_clearance")
+    task = Task(lung=small_lung, system=SYSTEM, target=target, objective=objective, method="replan", seed=0)
+    prepared, found = ScopeReplanner(task, tries=50, searches=2), 0
+    for seed in range(4):
+        noise = np.random.default_rng(seed).standard_normal(5)
+        pose = as_measured(np.asarray(plan.scope.lps_from_scope_tip), 0.3, 1.0, noise)
+        try:
+            alone = la.replan_from_scope(small_lung, SYSTEM, pose, target, tries=50, searches=2)
+        except NoPlan as failure:
+            with pytest.raises(NoPlan) as again:
+                prepared.replan(pose)
+            assert again.value.reasons == failure.reasons
+            continue
+        rest, found = prepared.replan(alone.lps_from_measured), found + 1
+        assert rest.record() == alone.record()
+    assert found > 0
+
+
+def test_fewer_rotations_are_some_of_all(plan: Plan, small_lung: Lung) -> None:
+    row, target = tip_row(plan), np.asarray(plan.target_lps)
+
+    def towards(positions: Float, _tangents: Float) -> np.ndarray:
+        return np.linalg.norm(positions - target, axis=1) < 60.0
+
+    options = {"with_fissures": True}
+    every = enumerate_deployments(
+        small_lung, SYSTEM.tubes, SYSTEM.margins, row[None], worthwhile=towards, **options
+    )
+    some = one_site_enumerator(
+        small_lung, SYSTEM.tubes, SYSTEM.margins, enough=every.candidates // 3, **options
+    )(row, towards)
+    assert 0 < some.candidates <= every.candidates // 3 and 0 < some.count < every.count
+    whole = {every.choice(n) for n in range(every.count)}
+    assert {some.choice(n) for n in range(some.count)} <= whole
+
+
+# Chances -----------------------------------------------------------------------------------------
+
+
+def test_foreseen_chances_are_those_of_procedures(plan: Plan, small_lung: Lung) -> None:
+    """The mean chance over placements is near the share of procedures that succeed with one placement."""
+    procedure = Procedure(scope=ScopePlacing(measured=True, position_mm=0.7, direction_deg=1.0, placements=2))
+    simulator = Simulator(plan, small_lung, ERRORS, procedure, radius_mm=5.0)
+    worth = simulator._policy.worth
+    assert worth[0] == 0.0 < worth[1] < 1.0
+    once = Procedure(scope=ScopePlacing(measured=True, position_mm=0.7, direction_deg=1.0))
+    counted = la.simulate_procedure(
+        plan, small_lung, errors=ERRORS, procedure=once, samples=60, radius_mm=5.0
+    )
+    assert abs(worth[1] - counted.succeeds.value) < 0.25
+    twice = simulator.report(60, 0)
+    assert twice.placements > 1.0 and twice.succeeds.count >= counted.succeeds.count

@@ -15,8 +15,8 @@ from PIL import Image
 
 from anatomy.io import read_volume
 from docs.make_first_steps import BOX, GREATEST_HU, IMAGES, LEAST_HU, LET_GO, output_of
-from lungaccess.report.html.volumes import find_ct, resampled
-from tests.lungaccess.report.browser import Browser
+from lungaccess.showing.report.html.volumes import find_ct, resampled
+from tests.lungaccess.showing.report.browser import Browser
 
 COMMANDS = (
     "lungaccess phantom --out BREATHING --breathing",

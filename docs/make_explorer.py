@@ -11,8 +11,8 @@ from pathlib import Path
 from PIL import Image
 
 from docs.make_first_steps import IMAGES, output_of
-from lungaccess.explorer import PatientSource
-from tests.lungaccess.explorer.windows import PLANNED, Page, Served
+from lungaccess.showing.explorer import PatientSource
+from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served
 
 COMMAND = "lungaccess phantom --out phantom"
 SIZE = 1440, 1000

@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from anatomy.io import read_volume
-from tests.lungaccess.report.browser import Browser
+from tests.lungaccess.showing.report.browser import Browser
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "tutorials" / "first_steps.md"

@@ -5,7 +5,7 @@ same plans. The independent check judges the last plan before it is stored.
 """
 
 import lungaccess as la
-from lungaccess.report import overview_png
+from lungaccess.showing.report import overview_png
 
 lung = la.load_patient("phantom-3")
 system = la.load_system("ultrathin")

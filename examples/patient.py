@@ -7,7 +7,7 @@ lumen.
 
 import lungaccess as la
 from anatomy.phantom import make_phantom, write_phantom
-from lungaccess.report import tree_png
+from lungaccess.showing.report import tree_png
 
 write_phantom(make_phantom(seed=3, size="small"), "phantom-3")
 lung = la.load_patient("phantom-3")

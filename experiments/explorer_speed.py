@@ -19,8 +19,8 @@ import numpy as np
 
 from anatomy.structures import obstacle_bits
 from lungaccess import load_patient
-from lungaccess.explorer import Address, Explorer, PatientSource
-from lungaccess.explorer.messages import read_frame
+from lungaccess.showing.explorer import Address, Explorer, PatientSource
+from lungaccess.showing.explorer.messages import read_frame
 
 LAST = ("end", "error", "superseded")
 RADII_MM = (121.0, 90.0, 60.0, 150.0)

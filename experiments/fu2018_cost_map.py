@@ -36,7 +36,7 @@ from experiments.support.anatomies import PHANTOM, default_anatomies, require_da
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.segmentation import scores
 from experiments.support.segmentation.synthetic_ct import CtLook, SyntheticCt, render_ct
-from lungaccess.report import style
+from lungaccess.showing.report import style
 
 PAPER_F1 = 0.9709
 DRAWS = 20

@@ -30,7 +30,7 @@ from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
-from lungaccess.report import style
+from lungaccess.showing.report import style
 
 NOT_REPRODUCED = [
     "The goals and the costs of fig. 9: the paper prints no numbers for them, and its lung cannot be had."

@@ -26,7 +26,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.report import style
+from lungaccess.showing.report import style
 from lungaccess.study.driver import run_study
 from lungaccess.study.results import ResultsFile
 from lungaccess.study.runs import runs_of

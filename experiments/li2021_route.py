@@ -24,7 +24,7 @@ from experiments.support.results import Result, setting_of, study_parser, write_
 from experiments.support.route.baselines import sampled_route
 from experiments.support.route.groups import LIMITS_PER_MM, NOISE_MM, TRIALS, Trial, load_group, trials
 from experiments.support.route.speed import replanning, side_by_side
-from lungaccess.report import style
+from lungaccess.showing.report import style
 from stages.scope.route.curve import Curve
 from stages.scope.route.metrics import measure
 from stages.scope.route.planner import Repair, plan_route

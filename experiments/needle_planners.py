@@ -43,7 +43,7 @@ from experiments.support.needle.runs import (
 )
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.benchmark import UncObstacles, unc_obstacles
-from lungaccess.report import style
+from lungaccess.showing.report import style
 from stages.needle.search.planners import PLANNERS
 
 NAMES = ("rrt", "optimal", "resolution", "decide")

@@ -21,7 +21,7 @@ from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.tour_models import random_airway, random_lesions
-from lungaccess.report import style
+from lungaccess.showing.report import style
 from stages.scope.tour.circuit import SAME_RESISTANCE, circuits
 from stages.scope.tour.exits import Exit, find_exits
 from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary

@@ -23,7 +23,7 @@ from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.planning.reachability import map_reach
 from lungaccess.problem.system import System
-from lungaccess.report import style
+from lungaccess.showing.report import style
 
 
 @frozen_value

@@ -20,7 +20,7 @@ from experiments.support.results import Result, setting_of, study_parser, write_
 from experiments.support.scope.ends import NEAR_MM, success, touching
 from experiments.support.scope.goals import PAPER_SPACING_MM, ends, goal_with_clearance
 from experiments.support.scope.speed import ARRIVED_MM, SPARE_VOXELS, measure_speed
-from lungaccess.report import style
+from lungaccess.showing.report import style
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import Weights
 from stages.scope.advisor.environment import ScopeEnvironment

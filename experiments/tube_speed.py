@@ -21,7 +21,7 @@ from benchmarks.scenes import configurations, mechanics, random_mechanics
 from experiments.support.anatomies import data_folder, require_data
 from experiments.support.machine import median_cpu_s
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.report import style
+from lungaccess.showing.report import style
 from stages.tube.casadi_model import CasadiTubes
 from stages.tube.device import Tube
 from stages.tube.mechanics import TubeMechanics

@@ -68,8 +68,8 @@ if TYPE_CHECKING:
         presets_by_invasiveness,
         resolve_target,
     )
-    from lungaccess.report.html import plan_page
-    from lungaccess.slicer import export_slicer
+    from lungaccess.showing.report.html import plan_page
+    from lungaccess.showing.slicer import export_slicer
     from lungaccess.study import read_study, run_study
     from lungaccess.uncertainty.breathing.window import breathing_window
     from lungaccess.uncertainty.risk import (

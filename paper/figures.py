@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from anatomy.base.files import atomic_write
 from experiments.support.results import small_png
 from experiments.write_results import read_all
-from lungaccess.report import style
+from lungaccess.showing.report import style
 
 HERE = Path(__file__).resolve().parent
 PATIENT = "Patient1"

@@ -84,8 +84,8 @@ def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float 
 
 
 def _drawn(lung: Lung, request: PlanRequest, explanation: Explanation) -> tuple[str, ...]:
-    from lungaccess.report import no_plan_png
-    from lungaccess.report.html import no_plan_page
+    from lungaccess.showing.report import no_plan_png
+    from lungaccess.showing.report.html import no_plan_page
 
     with progress("drawing why there is no plan"):
         no_plan_png(explanation, lung, request.out / PICTURE)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
-    from lungaccess.report import CostPoint
+    from lungaccess.showing.report import CostPoint
     from lungaccess.uncertainty.risk import ErrorModel
 
 PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
@@ -64,7 +64,7 @@ class CostHistory:
     """Collects how the best cost falls while a search runs; its clock is that of the planner."""
 
     def __init__(self, display: Display) -> None:
-        from lungaccess.report import CostPoint
+        from lungaccess.showing.report import CostPoint
 
         self._point = CostPoint
         self._display = display
@@ -277,7 +277,7 @@ def write_history(
     found: Found, history: list[CostPoint], lung: Lung, appraisal: Appraisal, request: PlanRequest
 ) -> None:
     """Write how the cost fell, and the pictures if they are wanted."""
-    from lungaccess.report import cost_over_time_csv
+    from lungaccess.showing.report import cost_over_time_csv
 
     cost_over_time_csv(history, request.out / HISTORY_FILE)
     if request.pictures:
@@ -289,7 +289,7 @@ def draw_plan(
     plan: Plan, history: list[CostPoint], lung: Lung, appraisal: Appraisal, request: PlanRequest
 ) -> None:
     """Write the pictures of a plan and of its search into the request's folder."""
-    from lungaccess.report import cost_over_time_png, overview_png, tree_png
+    from lungaccess.showing.report import cost_over_time_png, overview_png, tree_png
 
     words, out = request.made_small or Objective.of(plan.objective).words, request.out
     overview_png(plan, lung, out / "overview.png", appraisal)

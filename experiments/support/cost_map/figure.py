@@ -13,7 +13,7 @@ from anatomy.base.typed import Float
 from experiments.support.cost_map.case import Case
 from experiments.support.cost_map.problems import Scenario, unit
 from experiments.support.cost_map.runs import COST_MAP, INTENSITY, SHORTEST_PATH, Run, success_and_means
-from lungaccess.report import style
+from lungaccess.showing.report import style
 from stages.needle.path import ArcPath
 
 VARIANTS: dict[str, dict[str, Any]] = {

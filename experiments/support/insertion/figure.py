@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 from anatomy.lung import Lung
 from lungaccess.planning.procedure.insertion import TOLERANCE_MM, Study
-from lungaccess.report import style
-from lungaccess.report.insertion import draw_paths
+from lungaccess.showing.report import style
+from lungaccess.showing.report.insertion import draw_paths
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
 

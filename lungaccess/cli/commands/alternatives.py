@@ -85,7 +85,7 @@ def alternatives(
     from lungaccess.planning.coupled import alternatives as find_alternatives
     from lungaccess.planning.coupled import with_front
     from lungaccess.planning.success import alternatives_for_success
-    from lungaccess.report.html import trade_off_svg
+    from lungaccess.showing.report.html import trade_off_svg
 
     for_success, widest, asked = objective == SUCCESS, objective == WINDOW, stated_phases(phases)
     if for_success and asked is not None:

@@ -69,7 +69,7 @@ def certify(
             progress=lambda share: shown.step("proving", share),
         )
     if out is not None:
-        from lungaccess.report.open_places import open_places_png
+        from lungaccess.showing.report.open_places import open_places_png
 
         open_places_png(lung, proof, verdict, point, out)
     if output.json:

@@ -80,7 +80,7 @@ def _check_curve(
     from lungaccess.cli.plan_tables import check_tables, show_headline
     from lungaccess.judging.appraisal import Headline
     from lungaccess.plans.plan import Plan
-    from lungaccess.slicer import check_curve
+    from lungaccess.showing.slicer import check_curve
 
     saved = parse_reference(text)
     if saved is None:

@@ -76,7 +76,7 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
 def _write_page(lung: Lung, out: Path) -> None:
     """Write report.html about the plan in `out`."""
     from lungaccess.plans.plan import Plan
-    from lungaccess.report.html import PageOptions, plan_page
+    from lungaccess.showing.report.html import PageOptions, plan_page
 
     options = PageOptions(cost_over_time=out / HISTORY_FILE)
     plan_page(Plan.load(out / PLAN_FILE), lung, out / "report.html", options)

@@ -43,9 +43,9 @@ def export(
     from lungaccess.cli.plan_tables import show_headline
     from lungaccess.judging.appraisal import DRAWS, SEED, Headline
     from lungaccess.judging.checking import check
-    from lungaccess.live import plan_trajectory, write_trajectory
     from lungaccess.plans.plan import Plan
-    from lungaccess.slicer import export_slicer
+    from lungaccess.showing.live import plan_trajectory, write_trajectory
+    from lungaccess.showing.slicer import export_slicer
     from lungaccess.uncertainty.risk import assess
 
     stored = Plan.load(plan)

@@ -40,7 +40,7 @@ def info(
         terminal.show_warnings(lung.warnings)
     if out is not None:
         from anatomy.lung import Lung
-        from lungaccess.report import motion_png, organ_png, tree_png
+        from lungaccess.showing.report import motion_png, organ_png, tree_png
 
         if isinstance(lung, Lung):
             what, picture = "tree", tree_png(lung, out / "tree.png")

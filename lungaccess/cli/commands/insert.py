@@ -54,7 +54,7 @@ def insert(
     from lungaccess.judging.checking import check
     from lungaccess.planning.procedure.insertion import TrackerModel, insert_plan
     from lungaccess.plans.plan import Plan
-    from lungaccess.report.insertion import insertion_webp, insertions_png
+    from lungaccess.showing.report.insertion import insertion_webp, insertions_png
 
     stored = Plan.load(plan)
     tracker = TrackerModel(

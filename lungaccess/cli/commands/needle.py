@@ -107,7 +107,7 @@ def needle(
         elif answer.path is not None:
             terminal.say("The independent check reads lungs alone: this path was not checked.")
     if out is not None:
-        from lungaccess.report import needle_png
+        from lungaccess.showing.report import needle_png
 
         needle_png(answer, lung, out)
         if not output.json:

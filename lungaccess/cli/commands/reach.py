@@ -51,7 +51,7 @@ def reach(
     """
     from lungaccess.planning.reachability.reach_map import compare_reach
     from lungaccess.problem.system import load_system
-    from lungaccess.report import reach_png
+    from lungaccess.showing.report import reach_png
 
     names = [system.system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
     systems = [load_system(name, fissures_allowed=system.allow_fissures) for name in dict.fromkeys(names)]
@@ -75,7 +75,7 @@ def reach(
     written = [record(each) for each in maps]
     write_json(folder / "reach.json", written)
     if page is not None:
-        from lungaccess.report.html import reach_page
+        from lungaccess.showing.report.html import reach_page
 
         reach_page(maps, lung, page)
     if output.json:

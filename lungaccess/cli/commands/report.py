@@ -60,8 +60,8 @@ def report(
     A plan that states its chance of success shows that, unless errors, procedure, samples or seed are given.
     """
     from lungaccess.plans.plan import Plan
-    from lungaccess.report.html import PageOptions, bronchoscopy_webp, plan_page
-    from lungaccess.report.html.volumes import find_ct, read_ct
+    from lungaccess.showing.report.html import PageOptions, bronchoscopy_webp, plan_page
+    from lungaccess.showing.report.html.volumes import find_ct, read_ct
 
     page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):

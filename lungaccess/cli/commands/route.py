@@ -60,7 +60,7 @@ def route(
 ) -> ExitCode:
     """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it."""
     from lungaccess.planning.one_stage import open_source, route_record, widest_end
-    from lungaccess.report.route import route_png
+    from lungaccess.showing.report.route import route_png
     from stages.scope.route import RouteLimits, plan_route
 
     limits = RouteLimits(

@@ -172,7 +172,7 @@ def segment(
         (out / "refused.png").unlink(missing_ok=True)
         quality = quality_of(result.parts)
         if pictures:
-            from lungaccess.report.segmentation import segmentation_png
+            from lungaccess.showing.report.segmentation import segmentation_png
 
             shown.step("pictures", STEP_SHARES["pictures"])
             segmentation_png(volume, result.parts, out / "segmentation.png")
@@ -191,7 +191,7 @@ def segment(
 def _show_refused(ct: Volume, error: AnatomyError, path: Path) -> None:
     """Draw the CT with what was found in it until it was refused."""
     from anatomy.segmentation.parts import RefusedError
-    from lungaccess.report.segmentation import segmentation_png
+    from lungaccess.showing.report.segmentation import segmentation_png
 
     segmentation_png(ct, error.parts if isinstance(error, RefusedError) else None, path)
     terminal.progress_console.print(f"{path} shows what was found", highlight=False)

@@ -15,7 +15,7 @@ from lungaccess.cli.numbers import Hertz, Port, Seconds
 from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
 
 if TYPE_CHECKING:
-    from lungaccess.live import Answer, LiveCounts
+    from lungaccess.showing.live import Answer, LiveCounts
 
 
 def stream(
@@ -47,8 +47,8 @@ def stream(
     from lungaccess.cli.plan_tables import show_headline
     from lungaccess.judging.appraisal import Headline
     from lungaccess.judging.checking import check
-    from lungaccess.live import Link, LiveSession
     from lungaccess.plans.plan import Plan
+    from lungaccess.showing.live import Link, LiveSession
 
     stored = Plan.load(plan)
     with Link(host, port, connects=connect) as link:

@@ -70,7 +70,7 @@ def tour(
     """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out."""
     from lungaccess.planning.one_stage import lesions_of, plan_tour, read_lesions, tour_record
     from lungaccess.problem.system import load_system
-    from lungaccess.report.tour import tour_png
+    from lungaccess.showing.report.tour import tour_png
     from stages.scope.tour import Resistances
 
     stated = None if targets is None else read_lesions(targets)

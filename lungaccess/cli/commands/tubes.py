@@ -210,7 +210,7 @@ def _proposal(proposal: DesignProposal) -> dict[str, object]:
 
 
 def _draw(answer: TubeAnswer, out: Path) -> None:
-    from lungaccess.report import tubes_png
+    from lungaccess.showing.report import tubes_png
 
     deployed = answer.deployed
     notes = [

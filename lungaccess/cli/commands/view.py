@@ -43,10 +43,10 @@ def view(
     import webbrowser
 
     from lungaccess.problem import load_system, shipped_names
-    from lungaccess.report.html.volumes import find_ct, read_ct
+    from lungaccess.showing.report.html.volumes import find_ct, read_ct
 
     try:
-        from lungaccess.explorer import Address, Explorer, PatientSource
+        from lungaccess.showing.explorer import Address, Explorer, PatientSource
     except ModuleNotFoundError as error:
         raise SettingsError(
             f"The explorer needs {error.name}, which is not installed",

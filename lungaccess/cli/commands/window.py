@@ -54,7 +54,7 @@ def window(
     if out is not None:
         replace(stored, window=found).save(out)
     if picture is not None:
-        from lungaccess.report import window_png
+        from lungaccess.showing.report import window_png
 
         window_png(found, picture)
     if output.json:

@@ -30,7 +30,7 @@ class Measured:
 class Tracker(Protocol):
     """Tells where the tip of a needle is.
 
-    `lungaccess.live.LinkTracker` reads a real one by OpenIGTLink;
+    `lungaccess.showing.live.LinkTracker` reads a real one by OpenIGTLink;
     `lungaccess.planning.procedure.SimulatedTracker` stands for one in simulations.
     """
 

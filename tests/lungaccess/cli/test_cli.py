@@ -85,7 +85,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the two slow pictures out where a test does not look at them."""
     for name in ("overview_png", "tree_png"):
-        monkeypatch.setattr(f"lungaccess.report.{name}", lambda *_: None)
+        monkeypatch.setattr(f"lungaccess.showing.report.{name}", lambda *_: None)
 
 
 # Help and speed ----------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def test_all_examples_work_in_their_order(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LUNGACCESS_CACHE", str(tmp_path / "cache"))
     for name in EXAMPLES:
-        if name != "view":  # It serves until it is ended; its tests are in tests/lungaccess/explorer.
+        if name != "view":  # It serves until it is ended; its tests are in tests/lungaccess/showing/explorer.
             run(name)
 
 

@@ -97,7 +97,7 @@ def test_a_plan_as_json_says_what_the_check_says(
     load_with(monkeypatch, lambda *_, **__: toy_lung)
     monkeypatch.setattr("lungaccess.problem.target.StatedTarget.resolve", lambda *_: target)
     for name in ("overview_png", "tree_png", "cost_over_time_png"):
-        monkeypatch.setattr(f"lungaccess.report.{name}", lambda *_: None)
+        monkeypatch.setattr(f"lungaccess.showing.report.{name}", lambda *_: None)
     appraise_as_told(monkeypatch, {"accepted": True, "risk": make_risk(1900)})
     found = plan_search.Found(plan=toy_plan, cost=toy_plan.cost)
     monkeypatch.setattr(plan_search, "run_search", lambda *_: (found, []))
@@ -111,7 +111,7 @@ def test_a_plan_as_json_says_what_the_check_says(
     assert json.loads((tmp_path / "summary.json").read_text()) == said
     assert "overview.png" in said["files"]
     for name in ("overview_png", "tree_png", "cost_over_time_png"):
-        monkeypatch.setattr(f"lungaccess.report.{name}", lambda *_: pytest.fail("it draws"))
+        monkeypatch.setattr(f"lungaccess.showing.report.{name}", lambda *_: pytest.fail("it draws"))
     assert cli.main([*words, "--no-pictures"]) == ExitCode.OK
     assert not [file for file in json.loads(capsys.readouterr().out)["files"] if file.endswith(".png")]
 

@@ -18,7 +18,7 @@ from anatomy.lung import Lung
 from lungaccess.judging import presets_in_turn as presets
 from lungaccess.judging.checking import Checker
 from lungaccess.problem.system import System
-from lungaccess.report.html.tables import provenance_section
+from lungaccess.showing.report.html.tables import provenance_section
 
 SYSTEM = replace(la.load_system("ultrathin"), name="does")
 SHORT = replace(SYSTEM, name="too short", needle=replace(SYSTEM.needle, max_length_mm=5.0, diameter_mm=0.7))

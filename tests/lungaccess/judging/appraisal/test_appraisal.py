@@ -22,7 +22,7 @@ from lungaccess.judging.appraisal.grade import FAIR_FROM, GOOD_FROM, grade_of_ch
 from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.judging.checking import Finding
 from lungaccess.plans.plan import Plan
-from lungaccess.report.html import words
+from lungaccess.showing.report.html import words
 from lungaccess.uncertainty.risk import ErrorModel, Share, load_errors
 from tests.lungaccess.appraisals import make_check, make_risk
 

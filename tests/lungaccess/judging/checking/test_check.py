@@ -18,8 +18,8 @@ from lungaccess.cli.plan_tables import check_tables
 from lungaccess.judging.checking import Finding, check
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.plans.plan import Plan
-from lungaccess.report.html import tables
-from lungaccess.slicer.readme import readme
+from lungaccess.showing.report.html import tables
+from lungaccess.showing.slicer.readme import readme
 
 LIMITS = {
     "tube.sweep.limit": "at most",

@@ -15,11 +15,11 @@ from anatomy.lung import Lung
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.judging.explanation import FAILS, Explanation, explain_no_plan
-from lungaccess.report import no_plan_png
-from lungaccess.report.html import no_plan_page
+from lungaccess.showing.report import no_plan_png
+from lungaccess.showing.report.html import no_plan_page
 from tests.lungaccess.loading import load_with
 from tests.lungaccess.points import FAR_TARGET
-from tests.lungaccess.report import browser
+from tests.lungaccess.showing.report import browser
 
 SYSTEM = la.load_system("ultrathin")
 NO_TIME_S = 1e-9
@@ -51,7 +51,7 @@ def test_the_picture_is_drawn_in_colours_of_the_reasons(
 ) -> None:
     from PIL import Image
 
-    from lungaccess.report.colours import START_COLOURS
+    from lungaccess.showing.report.colours import START_COLOURS
 
     pixels = np.asarray(Image.open(no_plan_png(explanation, small_lung, tmp_path / "a.png")).convert("RGB"))
     grey = tuple(int(START_COLOURS["out of reach"][n : n + 2], 16) for n in (1, 3, 5))

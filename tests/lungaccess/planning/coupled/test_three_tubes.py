@@ -16,10 +16,10 @@ from lungaccess.plans.assemble import assemble
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
-from lungaccess.report.html import PageOptions, plan_page
-from lungaccess.report.html.deployment import packed_plan
-from lungaccess.report.pack import unpack
-from lungaccess.slicer import export_slicer
+from lungaccess.showing.report.html import PageOptions, plan_page
+from lungaccess.showing.report.html.deployment import packed_plan
+from lungaccess.showing.report.pack import unpack
+from lungaccess.showing.slicer import export_slicer
 from lungaccess.uncertainty.risk import assess
 from stages.tube import ConcentricTubes, Tube
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes

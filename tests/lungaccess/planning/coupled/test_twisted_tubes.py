@@ -23,8 +23,8 @@ from lungaccess.plans.assemble import assemble
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
-from lungaccess.report.html.deployment import packed_plan
-from lungaccess.report.pack import unpack
+from lungaccess.showing.report.html.deployment import packed_plan
+from lungaccess.showing.report.pack import unpack
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.deviations import Deviations
 from stages.tube import DeploymentValidator, design_arrays, points_on_arcs, shapes_of

@@ -92,7 +92,7 @@ def test_the_command_writes_a_film_and_a_picture(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: breathing_lung)
-    monkeypatch.setattr("lungaccess.report.insertion.FRAMES", 4)
+    monkeypatch.setattr("lungaccess.showing.report.insertion.FRAMES", 4)
     small_plan.save(tmp_path / "plan.json")
     film, picture = tmp_path / "a.webp", tmp_path / "a.png"
     words: list[Any] = ["insert", tmp_path / "plan.json", "toy", "--samples", 2, "--rate", 1]

@@ -1,0 +1,1 @@
+"""What a person sees of a plan: pages, pictures, scenes, and what a tracker is told."""

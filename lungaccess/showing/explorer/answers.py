@@ -1,0 +1,341 @@
+"""The answers to the questions of the page, each a generator of parts; one instance serves a process."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.settings_file import settings_toml
+from anatomy.base.typed import Float, Int
+from anatomy.lung import Lung
+from lungaccess.planning.coupled import Atlas, ProgressEvent, atlas_is_kept, feasible_exits, open_atlas, plan
+from lungaccess.planning.one_stage import tips_near
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
+from lungaccess.showing.explorer import questions as ask
+from lungaccess.showing.explorer.changed_system import plan_command, system_of
+from lungaccess.showing.explorer.chosen_place import ChosenPlace
+from lungaccess.showing.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
+from lungaccess.showing.explorer.questions import WhatIf
+from lungaccess.showing.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
+from lungaccess.showing.report.html.deployment import packed_plan
+from lungaccess.uncertainty.breathing.window import with_window
+from stages.tube import exit_points, shapes_digest
+
+KEPT_ATLASES = 3
+"""In memory; others come from the cache within a second."""
+TELL_EVERY_S = 0.25
+"""Exits and plans that become better are sent so often: more often, nobody sees the difference."""
+
+
+class Answers:
+    """Holds the patient and the latest atlases, and answers questions.
+
+    Parameters
+    ----------
+    folder : path
+        Where files that the page may fetch are written.
+    """
+
+    def __init__(self, source: PatientSource, folder: Path) -> None:
+        self._source, self._folder = source, folder
+        self._own = {system.name: system for _path, system in source.own}
+        self._lung: Lung | None = None
+        self._atlases: OrderedDict[tuple[Any, ...], Atlas] = OrderedDict()
+        self._appraiser: Any = None
+        self._reached: dict[tuple[Any, ...], Int] = {}
+
+    def parts(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
+        """Answer a question; see `lungaccess.showing.explorer.worker.Answering`."""
+        answer = getattr(self, f"_{asked.name}")
+        yield from answer(asked, turn)
+
+    @property
+    def lung(self) -> Lung:
+        """The patient, read when it is first needed."""
+        if self._lung is None:
+            self._lung = load_patient(self._source.folder, cache=self._source.cache)
+        return self._lung
+
+    def _system(self, what_if: WhatIf) -> System:
+        return system_of(what_if, self._own)
+
+    def _atlas(self, system: System, turn: Turn) -> Atlas:
+        """Return the atlas of a system, from memory, from the cache, or made while its progress is sent."""
+        key = (
+            system.scope, system.tubes, system.margins, fissures_are_obstacles(self.lung, system),
+            shapes_digest(system.tubes),
+        )  # fmt: skip
+        told = time.monotonic()
+
+        def progress(share: float) -> None:
+            nonlocal told
+            turn.check()
+            if time.monotonic() - told >= TELL_EVERY_S:
+                told = time.monotonic()
+                turn.send(Part({"answer": "progress", "what": "deployment atlas", "share": round(share, 4)}))
+
+        if key not in self._atlases:
+            self._atlases[key] = open_atlas(self.lung, system, cache=self._source.cache, progress=progress)
+        self._atlases.move_to_end(key)
+        while len(self._atlases) > KEPT_ATLASES:
+            self._atlases.popitem(last=False)
+        return replace(self._atlases[key], system=system)
+
+    def _patient(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        yield Part({"answer": "patient", **patient_facts(self.lung, self._source)})
+
+    def _scene(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        for message in scene_parts(self.lung, self._source):
+            yield Part({"answer": "scene", **message})
+
+    def _image(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        yield Part({"answer": "image", **image_parts(self.lung, self._source, asked.question.around)})
+
+    def _slice(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        from lungaccess.showing.explorer.ct_slice import ct_slice
+
+        question, ct = asked.question, patient_ct(self._source.ct)
+        if ct is None:
+            raise SettingsError("The patient came without a CT", remedy="Start the explorer with --ct")
+        plane = question.origin, question.across, question.down
+        yield Part({"answer": "slice"}, {"hu": ct_slice(ct, *plane, question.columns, question.rows)})
+
+    def _place(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        place = describe_place(self.lung, asked.question.point)
+        yield Part(
+            {
+                "answer": "place", "lps_mm": place.lps_mm.tolist(), "tissue": place.tissue,
+                "lobe": place.lobe, "distance_mm": dict(place.distance_mm),
+                "generation": place.generation, "may_be_target": place.may_be_target,
+            }
+        )  # fmt: skip
+
+    def _prepare(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        system = self._system(asked.question.what_if)
+        atlas = self._atlas(system, turn)
+        motions, tree = atlas.motions, self.lung.tree
+        yield Part(
+            {
+                "answer": "prepared", "system": system.name, "system_toml": settings_toml(system),
+                "deployments": atlas.deployments.count, "scope_radius_mm": system.scope.radius_mm,
+            },
+            {
+                "tips": motions.tips[:, :6].astype(np.float32),
+                "turned": motions.turned.astype(np.uint8),
+                "depth_mm": tree.distance_from_root_mm[motions.tree_point].astype(np.float32),
+                "deployments": np.bincount(atlas.deployments.site, minlength=motions.count).astype(np.int32),
+            },
+        )  # fmt: skip
+
+    def _ready(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        self._atlas(self._system(asked.question.what_if), turn)
+        yield from ()
+
+    def _exits(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
+        question = asked.question
+        system = self._system(question.what_if)
+        target = target_of(self.lung, question.target)
+        system.require_needle("The list of feasible exits")
+        atlas = self._atlas(system, turn)
+        tips = None if question.scope_tip is None else tips_near(atlas, _tip(atlas, question.scope_tip))
+        began = told = time.monotonic()
+        for found in feasible_exits(self.lung, system, target, atlas=atlas, scope_tips=tips):
+            now = time.monotonic()
+            if not (found.is_complete or now - told >= TELL_EVERY_S or told == began):
+                yield None
+                continue
+            told = now
+            best = found.best
+            entries = found.entries[best]
+            yield Part(
+                {
+                    "answer": "exits", "complete": found.is_complete, "deployments": len(found.entries),
+                    "in_workspace": found.in_workspace, "tried": found.tried, "blocked": dict(found.blocked),
+                    "target_lps": target.lps_mm.tolist(), "elapsed_s": now - began,
+                },
+                {
+                    "points": found.exit_lps.astype(np.float32),
+                    "cost": found.cost[best].astype(np.float32),
+                    "clearance_mm": found.clearance_mm.astype(np.float32),
+                    "length_mm": found.length_mm[best].astype(np.float32),
+                    "count": found.sizes.astype(np.int32),
+                    "entry": entries.astype(np.int32),
+                    "tip": atlas.deployments.site[entries].astype(np.int32),
+                },
+            )  # fmt: skip
+
+    def _plan(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
+        question: ask.PlanQuestion = asked.question
+        system = self._system(question.what_if)
+        target = target_of(self.lung, question.target)
+        atlas = self._atlas(system, turn)
+        place = _place_of(atlas, question)
+        search = plan if place is None else place.search
+        began = time.monotonic()
+        curve: list[tuple[float, float, float]] = []
+        told, last, shown = -np.inf, None, None
+
+        def on_progress(_event: ProgressEvent) -> None:
+            turn.give_way()
+
+        try:
+            for found in search(
+                self.lung, system, target, objective=question.objective, seed=question.seed,
+                iterations=question.iterations, atlas=atlas, counterfactuals=False, on_progress=on_progress,
+            ):  # fmt: skip
+                last = found
+                curve.append((time.monotonic() - began, float(found.iterations), float(found.cost)))
+                if time.monotonic() - told >= TELL_EVERY_S:
+                    told, shown = time.monotonic(), found
+                    yield self._plan_part(asked, found, curve, system, place, final=False)
+                else:
+                    yield None
+        except NoPlan as failure:
+            elapsed_s, point = time.monotonic() - began, target.lps_mm.tolist()
+            yield Part({"answer": "no_plan", "elapsed_s": elapsed_s, "target_lps": point, **_why(failure)})
+            return
+        if last is None:
+            return
+        final = last if last.window is not None else with_window(last, self.lung)
+        yield self._plan_part(asked, final, curve, system, place, final=True, known=shown is final)
+
+    def _plan_part(
+        self,
+        asked: Asked,
+        found: Plan,
+        curve: list[tuple[float, float, float]],
+        system: System,
+        place: ChosenPlace | None,
+        *,
+        final: bool,
+        known: bool = False,
+    ) -> Part:
+        """Return a plan for the page; one that it knows already without its curves."""
+        question = asked.question
+        own = {each.name: path for path, each in self._source.own}
+        message = {
+            "answer": "plan", "final": final, "digest": found.digest, "curve": curve,
+            "cost": float(found.cost), "iterations": found.iterations, "system": system.name,
+            "objective": found.objective, "generation": found.scope.generation,
+            "needle_mm": None if found.needle is None else found.needle.length_mm,
+            "arcs": 0 if found.needle is None else len(found.needle.arcs), "insertions": found.insertions,
+            "window": None if found.window is None else found.window.words,
+            "scope_tip_lps": np.asarray(found.scope.lps_from_scope_tip)[:3, 3].tolist(),
+            "exit_lps": np.asarray(found.tube.exit.point_lps).tolist(),
+            "clearance_mm": {
+                device: {name: float(mm) for name, mm in each.items()}
+                for device, each in found.clearance_mm.items()
+            },
+            "required_mm": {name: float(mm) for name, mm in found.required_clearance_mm.items()},
+            "command": plan_command(
+                self._source.folder, question, system, own, self._source.cache, place
+            ),
+        }  # fmt: skip
+        if not known:
+            message["packed"] = packed_plan(found, self.lung, "", cross_sections=False)
+        kept = KeptPlan(digest=found.digest, text=found.to_json(), curve=tuple(curve))
+        return Part(message, plan=kept)
+
+    def _reach(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
+        from lungaccess.showing.explorer.reach import reach_parts
+
+        system = self._system(asked.question.what_if)
+        atlas = self._atlas(system, turn)
+        yield from reach_parts(self.lung, system, atlas, asked.question.around, self._reached, turn)
+
+    def _appraise(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        from lungaccess.judging.appraisal import Appraiser
+
+        found = self._plan_asked(asked)
+        if self._appraiser is None:
+            self._appraiser = Appraiser(self.lung)
+        appraisal = self._appraiser.appraise(found)
+        window = None if found.window is None else found.window.words
+        motion = "The patient came without a motion: nothing is known of its breathing"
+        yield Part(
+            {
+                "answer": "appraisal", "digest": found.digest, **appraisal.to_mapping(),
+                "window": window or motion, "breathing_known": window is not None,
+                "findings": len(appraisal.check.findings), "refusals": len(appraisal.check.refusals),
+            }
+        )  # fmt: skip
+
+    def _explain(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        from lungaccess.showing.explorer.explaining import explanation_part
+
+        system = self._system(asked.question.what_if)
+        target: Target = target_of(self.lung, asked.question.target)
+        own = self._atlas(system, turn)
+
+        def atlas_of(other: System, progress: Callable[[float], None]) -> Atlas:
+            return open_atlas(self.lung, other, cache=self._source.cache, progress=progress)
+
+        def is_kept(other: System) -> bool:
+            return atlas_is_kept(self.lung, other, cache=self._source.cache)
+
+        yield explanation_part(self.lung, system, target, asked.question, own, atlas_of, is_kept, turn)
+
+    def _export(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        from lungaccess.showing.explorer.exports import export_file
+
+        turn.send(Part({"answer": "progress", "what": f"making {asked.question.what}", "share": None}))
+        found = self._plan_asked(asked)
+        curve = () if asked.plan is None else asked.plan.curve
+        file = export_file(found, self.lung, asked.question.what, self._folder, curve, self._source.ct)
+        yield Part({"answer": "file", "name": asked.question.what, "bytes": file.stat().st_size}, file=file)
+
+    def _plan_asked(self, asked: Asked) -> Plan:
+        """Return the plan that a question is about."""
+        if asked.plan is None:
+            raise SettingsError(
+                "The plan is not known", expected="the digest of a plan of this page", remedy="Plan again"
+            )
+        return Plan.from_json(asked.plan.text)
+
+
+def _place_of(atlas: Atlas, question: ask.PlanQuestion) -> ChosenPlace | None:
+    """Return the place that a plan is asked to go through: the exit of a deployment, or a tip of the scope.
+
+    Raises
+    ------
+    SettingsError
+        If the atlas has no such deployment or tip.
+    """
+    if question.entry is not None:
+        _require_below(question.entry, atlas.deployments.count, "deployment")
+        chosen = np.array([question.entry])
+        points = exit_points(atlas.system.tubes, atlas.motions.tips, atlas.deployments, chosen)
+        return ChosenPlace.of("exit", points[0])
+    if question.scope_tip is not None:
+        return ChosenPlace.of("scope tip", _tip(atlas, question.scope_tip))
+    return None
+
+
+def _tip(atlas: Atlas, tip: int) -> Float:
+    """Return the place `(3,)` of a tip of the scope."""
+    _require_below(tip, atlas.motions.count, "tip of the scope")
+    return atlas.motions.tips[tip, :3]
+
+
+def _require_below(number: int, count: int, what: str) -> None:
+    if number >= count:
+        raise SettingsError(f"There is no {what} {number}", expected=f"a number below {count}")
+
+
+def _why(failure: LungaccessError) -> dict[str, Any]:
+    """Return why there is no plan, as `NoPlan` says it."""
+    reasons = getattr(failure, "reasons", {})
+    return {
+        "found": failure.found,
+        "remedy": failure.remedy,
+        "reasons": {name: int(count) for name, count in reasons.items() if count},
+    }

@@ -1,0 +1,138 @@
+"""What the page needs of the patient: its facts, surfaces, voxels, and the target that a text names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.base.errors import LungaccessError
+from anatomy.base.typed import Float
+from anatomy.grid import Volume
+from anatomy.lung import Lung
+from lungaccess.problem import System, Target, load_system, nodule_target, preset_names, resolve_target
+from lungaccess.showing.explorer.worker import PatientSource
+from lungaccess.showing.report.html.meshes import structure_meshes
+from lungaccess.showing.report.html.volumes import CODES, page_image, read_ct
+from lungaccess.showing.report.reach import COLOURS
+
+MOST_NODULES = 50
+NODULE = "nodule"
+"""The target `nodule 2` is the second largest nodule."""
+
+
+def target_of(lung: Lung, text: str) -> Target:
+    """Return the target that a text names: `nodule N`, a point with its frame, or a published name.
+
+    Raises
+    ------
+    LungaccessError
+        As `lungaccess.problem.resolve_target`.
+    """
+    kind, _, number = text.partition(" ")
+    if kind == NODULE and number.isdecimal():
+        return resolve_target(lung, nodule=int(number))
+    return resolve_target(lung, text=text)
+
+
+def patient_facts(lung: Lung, source: PatientSource) -> dict[str, Any]:
+    """Return name, warnings, targets and systems of a patient as plain values."""
+    own = {system.name: system for _path, system in source.own}
+    systems = own | {name: load_system(name) for name in preset_names()}
+    low, high = _box(lung)
+    return {
+        "patient": lung.name,
+        "folder": str(source.folder),
+        "warnings": list(lung.warnings),
+        "breath_hold": lung.breath_hold,
+        "breathing_known": lung.motion is not None,
+        "has_fissures": lung.has_fissures,
+        "has_ct": source.ct is not None,
+        "low_lps": low.tolist(),
+        "high_lps": high.tolist(),
+        "carina_lps": np.asarray(lung.tree.carina_lps).tolist(),
+        "targets": _targets(lung),
+        "reach_colours": COLOURS,
+        "first_system": source.system,
+        "systems": [_system(system) for system in systems.values()],
+    }
+
+
+def _box(lung: Lung) -> tuple[Float, Float]:
+    """Return the corners of the grid, LPS mm."""
+    corners = lung.grid.corners_lps
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def _targets(lung: Lung) -> list[dict[str, Any]]:
+    """Return nodules, the largest first, then the targets that came with the patient."""
+    found = []
+    for number in range(1, MOST_NODULES + 1):
+        try:
+            target = nodule_target(lung, number)
+        except LungaccessError:
+            break
+        found.append(
+            {
+                "text": f"{NODULE} {number}",
+                "lps_mm": target.lps_mm.tolist(),
+                "lobe": lung.lobe_at(target.lps_mm),
+            }
+        )
+    for name in lung.target_names:
+        try:
+            target = resolve_target(lung, text=name)
+        except LungaccessError:
+            continue
+        found.append({"text": name, "lps_mm": target.lps_mm.tolist(), "lobe": lung.lobe_at(target.lps_mm)})
+    return found
+
+
+def _system(system: System) -> dict[str, Any]:
+    """Return what the page shows and changes of a system."""
+    needle = system.needle
+    return {
+        "name": system.name,
+        "description": system.description,
+        "scope_diameter_mm": system.scope.outer_diameter_mm,
+        "channel_diameter_mm": system.scope.channel_diameter_mm,
+        "needle_radius_mm": None if needle is None else needle.min_radius_of_curvature_mm,
+        "needle_length_mm": None if needle is None else needle.max_length_mm,
+        "margin_mm": system.margins.segmentation_margin_mm,
+        "fissures_allowed": system.fissures_allowed,
+    }
+
+
+def scene_parts(lung: Lung, source: PatientSource) -> Iterator[dict[str, Any]]:
+    """Yield the voxels of the whole lung, then its surfaces."""
+    around = np.asarray(lung.tree.carina_lps)
+    image = page_image(lung, around[None], patient_ct(source.ct))
+    yield {"image": _some(image, slice(0, 1))}
+    yield {"structures": structure_meshes(lung)}
+
+
+def image_parts(lung: Lung, source: PatientSource, around_lps: ArrayLike) -> dict[str, Any]:
+    """Return the fine voxels around a point; within the images, where the point lies beyond them."""
+    low, high = _box(lung)
+    around = np.clip(np.asarray(around_lps, dtype=np.float64), low, high)
+    return {"image": _some(page_image(lung, around[None], patient_ct(source.ct)), slice(1, 2))}
+
+
+def _some(image: dict[str, Any], which: slice) -> dict[str, Any]:
+    ct = image["ct"]
+    return {
+        **image,
+        "labels": image["labels"][which],
+        "ct": None if ct is None else ct[which],
+        "codes": CODES,
+    }
+
+
+@lru_cache(maxsize=1)
+def patient_ct(path: Path | None) -> Volume | None:
+    """Return the CT that the explorer was started with, read once; None without one."""
+    return None if path is None else read_ct(path)

@@ -1,0 +1,167 @@
+"""A plan in the breath, for its page: the displacement of the lung, and clearances at phases."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from anatomy.base.typed import Bool, Float
+from anatomy.meshes import point_distances_mm
+from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.checking.space import airway_except, has, labels_at
+from lungaccess.showing.report.html.deployment import CAP_MM, NOT_MEASURED, profile_points, required_mm
+from lungaccess.showing.report.pack import Packed, pack
+from lungaccess.uncertainty.breathing.moving import Moving
+from lungaccess.uncertainty.breathing.window import TOLERANCE_MM, miss_allowed
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.judging.checking.space import Select
+    from lungaccess.plans.plan import Plan
+    from lungaccess.plans.window import BreathingWindow
+
+FIELD_STEP_MM = 0.02
+"""Displacements are stored in such steps: finer than anything that is seen or measured."""
+SAMPLES = 21
+"""Phases at which clearances are computed: every 5 % of the breath, as often as the check looks."""
+VALUE_STEP_MM = 0.01
+"""Distances at phases are stored in such steps."""
+REACH_MM = 1.4 * CAP_MM
+"""So near to the devices tissue of the masks is looked at: enough for `CAP_MM` where it shrinks by 0.7."""
+
+
+def shown_window(plan: Plan, lung: Lung) -> BreathingWindow | None:
+    """Return the window that the page shows in motion; None where plan or patient have none."""
+    return None if lung.motion is None else plan.window
+
+
+def field_data(plan: Plan, lung: Lung) -> Packed:
+    """Return the displacement that moves the anatomy of the page, as differences along its last axis.
+
+    Each component `[i, j, k]` counts `FIELD_STEP_MM`.
+    """
+    moving = Moving.of(plan, lung)
+    motion = moving.tissue
+    counts = np.rint(np.moveaxis(moving.field, -1, 0) / FIELD_STEP_MM).astype(np.int32)
+    return {
+        "first_lps": motion.frame[:3].tolist(),
+        "spacing_mm": float(motion.frame[3]),
+        "step_mm": FIELD_STEP_MM,
+        "differences": pack(np.diff(counts, axis=-1, prepend=0), "i4"),
+        "amplitude": motion.amplitude,
+        "masks_phase": motion.masks_phase,
+    }
+
+
+def breath_data(plan: Plan, lung: Lung) -> Packed:
+    """Return what carries tubes and needle of a plan, its window, and its clearances at phases."""
+    moving, window = Moving.of(plan, lung), plan.window
+    return {
+        "centre_lps": moving.rigid.centre.tolist(),
+        "displacement_mm": moving.rigid.displacement.tolist(),
+        "gradient": moving.rigid.gradient.tolist(),
+        "window": None if window is None else window.phases.tolist(),
+        "warning_only": window is not None and window.warning_only,
+        "samples": _samples(plan, lung, moving),
+    }
+
+
+def _samples(plan: Plan, lung: Lung, moving: Moving) -> Packed:
+    """Return distances at `SAMPLES` phases: of the axes to each structure, and of their end to the target.
+
+    The exact surfaces of the voxels are deformed, and distances measured to them.  "margin_mm" is as in
+    `deployment.profile`; "spare_mm" the least beyond what is required, on tubes beyond their exit and needle,
+    wherever tissue strays by the window's hysteresis; "allowed_mm" is how far from the target they may end.
+    """
+    phases = np.linspace(0.0, 1.0, SAMPLES)
+    points, along, start = profile_points(plan)
+    share = 0.0 if plan.window is None else plan.window.hysteresis
+    lever = np.linalg.norm(points - plan.scope.lps_from_scope_tip[:3, 3], axis=1)
+    required = required_mm(plan, along, start)
+    kept = (required + share * lever) / (1.0 - share)
+    clearance = clearances_at(plan, lung, moving, phases)
+    clearance["airway"][:, along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
+    limited = {k: v for k, v in clearance.items() if k != "fissure" or plan.fissures_are_obstacles}
+    margin = np.min(list(limited.values()), axis=0) - required
+    free = along >= plan.tube.exit.arc_length_mm
+    of_needle = len(plan.curves().needle.arc_length_mm)
+    target = np.asarray(plan.target_lps)[None]
+    ends = [moving.carried(points[-1:], phase) - moving.moved(target, phase) for phase in phases]
+    return {
+        "phases": phases.tolist(),
+        "clearance_mm": {name: _whole(values) for name, values in clearance.items()},
+        "margin_mm": _whole(margin[:, -of_needle:]),
+        "spare_mm": {
+            name: np.round((v - kept)[:, free].min(axis=1), 3).tolist() for name, v in limited.items()
+        },
+        "target_mm": np.round(np.linalg.norm(np.concatenate(ends), axis=1), 3).tolist(),
+        "allowed_mm": miss_allowed(
+            moving.tissue, TOLERANCE_MM if plan.window is None else plan.window.tolerance_mm, float(lever[-1])
+        ),
+    }
+
+
+def _whole(values: Float) -> Packed:
+    """Return distances `(K, N)` as whole numbers of `VALUE_STEP_MM`, rounded down."""
+    return {"step_mm": VALUE_STEP_MM, "values": pack(np.floor(values / VALUE_STEP_MM).astype(np.int32), "i4")}
+
+
+def clearances_at(plan: Plan, lung: Lung, moving: Moving, phases: Float) -> dict[str, Float]:
+    """Return exact distances `(K, N)` of tubes and needle to each structure, deformed, at phases `(K,)`.
+
+    The rules are those of `deployment.profile`: up to `CAP_MM`, or less where tissue shrinks by more than
+    `REACH_MM` allows for, and the pierced branch is passed over as long as it is exempt.
+    """
+    points, along, start = profile_points(plan)
+    exempt = along <= start + plan.exemption.needle_length_mm
+    structures = {"airway": has(AIRWAY), "vessel": has(VESSEL), "pleura": has(OUTSIDE)}
+    if lung.has_fissures:
+        structures["fissure"] = has(FISSURE)
+    environment = Environment(lung)
+    found = {
+        name: _distances(points, select, lung, environment, moving, phases)
+        for name, select in structures.items()
+    }
+    others = airway_except(plan.exemption.branch)
+    found["airway"][:, exempt] = _distances(points[exempt], others, lung, environment, moving, phases)
+    return found
+
+
+def _distances(
+    points: Float, select: Select, lung: Lung, environment: Environment, moving: Moving, phases: Float
+) -> Float:
+    """Return the distances `(K, N)` of carried points from a structure, 0 inside, at most `CAP_MM`."""
+    carried = [moving.carried(points, phase) for phase in phases]
+    places = [moving.pulled_back(each, phase) for each, phase in zip(carried, phases, strict=True)]
+    mesh = environment.boxes(select, REACH_MM).surface_near(np.concatenate(places[::5]), REACH_MM)
+    cap_mm = min(CAP_MM, REACH_MM * _least_stretch(moving, np.concatenate(places)))
+    rows = []
+    for at, place, phase in zip(carried, places, phases, strict=True):
+        deformed = replace(mesh, vertices_lps=moving.moved(mesh.vertices_lps, phase))
+        away = point_distances_mm(deformed, at, cap_mm)
+        inside: Bool = select(labels_at(lung, place))
+        rows.append(np.where(inside, 0.0, away))
+    return np.array(rows)
+
+
+def _least_stretch(moving: Moving, places: Float) -> float:
+    """Return by what factor tissue within `REACH_MM` of places of the masks shortens lengths at most."""
+    bounds, frame = moving.tissue.least_stretch(0), moving.tissue.frame
+    low, high = places.min(axis=0) - REACH_MM, places.max(axis=0) + REACH_MM
+    most = np.array(bounds.shape) - 1
+    first, last = (
+        np.clip(np.floor((end - frame[:3]) / frame[3]).astype(int), 0, most) for end in (low, high)
+    )
+    near = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
+    return float(np.clip(bounds[near].min(), 0.0, 1.0))
+
+
+def packed_breath(plans: Sequence[Plan], lung: Lung) -> dict[str, Any]:
+    """Return the data of the page for all plans; empty where the first has no window to show."""
+    if shown_window(plans[0], lung) is None:
+        return {}
+    return {"breath": {**field_data(plans[0], lung), "plans": [breath_data(each, lung) for each in plans]}}

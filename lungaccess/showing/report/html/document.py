@@ -1,0 +1,99 @@
+"""One HTML file of templates, style sheet, scripts and data: complete in itself, nothing is fetched."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from anatomy.base.files import write_text
+from lungaccess.showing.report.pack import script_text
+
+SHARED_MODULES = (
+    "decode.js", "vectors.js", "colours.js", "surfaces.js", "shaders.js", "layers.js", "picking.js",
+    "solids.js", "scene.js", "orbit.js", "voxels.js", "voxel_image.js", "slices.js", "slice_views.js",
+    "slice_panel.js", "structures.js", "view_tools.js", "anatomy_page.js",
+)  # fmt: skip
+TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
+"""Looks at the target; for `scene_figure`."""
+_IMPORT = re.compile(r"^import .*;\n", re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(async )?(function|class|const|let) )", re.MULTILINE)
+_HOLE = re.compile(r"\{\{(\w+)\}\}")
+
+
+def asset(name: str) -> str:
+    """Return the text of a file of the page."""
+    return (resources.files("lungaccess.showing.report") / "page" / name).read_text(encoding="utf-8")
+
+
+def bundle(names: Sequence[str]) -> str:
+    """Return modules joined to one script, each after those that it imports.
+
+    The modules import only each other and their names are all different, so that the lines of import and
+    the words of export can be dropped.
+    """
+    return "\n".join(_EXPORT.sub("", _IMPORT.sub("", asset(name))) for name in names)
+
+
+def filled(template: str, parts: Mapping[str, str]) -> str:
+    """Return a template with each `{{name}}` replaced by the part of that name, in one pass.
+
+    Raises
+    ------
+    KeyError
+        If a part is missing.
+    """
+    return _HOLE.sub(lambda hole: parts[hole.group(1)], template)
+
+
+def scene_figure(*, more_views: str = "", more_notes: str = "") -> str:
+    """Return the figure of the 3-D view, with further buttons and words as HTML."""
+    return filled(asset("scene.html"), {"more_views": more_views, "more_notes": more_notes})
+
+
+def slice_controls(*, more: str = "") -> str:
+    """Return the controls of the slices, with further ones as HTML."""
+    return filled(asset("slices.html"), {"more": more})
+
+
+def write_page(
+    path: str | os.PathLike[str],
+    template: str,
+    modules: Sequence[str],
+    data: Mapping[str, Any],
+    parts: Mapping[str, str],
+) -> Path:
+    """Write a page, all or nothing.
+
+    Parameters
+    ----------
+    path : path of the HTML file
+    template : str
+        Name of the page's own HTML, which goes into the body.
+    modules : sequence of str
+        Scripts of this page, after `SHARED_MODULES`.
+    data : mapping
+        Plain JSON values; the scripts find them in the element "report-data".
+    parts : mapping of str to str
+        HTML for the holes of the template; "title" is plain text, escaped already.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    whole = filled(
+        asset("frame.html"),
+        {
+            "title": parts["title"],
+            "style": asset("style.css"),
+            "body": filled(asset(template), parts),
+            "data": script_text(data),
+            "script": bundle([*SHARED_MODULES, *modules]),
+        },
+    )
+    write_text(os.fspath(path), whole)
+    return Path(path)

@@ -1,0 +1,204 @@
+"""What is known about a plan, as tables of the page: limits, instructions, risk, provenance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from anatomy.base.words import plural
+from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
+from lungaccess.showing.report.html import words
+from lungaccess.showing.report.key_numbers import figures_of_plan
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.judging.appraisal import Appraisal, Limit
+    from lungaccess.judging.checking import CheckReport
+    from lungaccess.judging.checking.findings import Finding
+    from lungaccess.planning.coupled import Alternative
+    from lungaccess.plans.plan import Plan
+
+TIGHT_FROM = 0.9
+"""From so much of a limit on its bar is coloured."""
+AXES_AGREE = "largest angle between the axes"
+STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
+
+
+def limits_section(appraisal: Appraisal) -> str:
+    """Return the limits that the plan comes nearest to, broken ones first."""
+    rows = [
+        (words.text(each.what), each.found_words, each.bound_words, _bar(each))
+        for each in appraisal.limits[:SHOWN_LIMITS]
+    ]
+    return words.table(LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows, "nearest")
+
+
+def _bar(limit: Limit) -> str:
+    """Return how much of a limit is used, as a bar and in words."""
+    width = 100.0 * min(limit.used, 1.0)
+    kind = "bar" if limit.used < TIGHT_FROM else "bar tight"
+    said = limit.used_words if limit.ok else "BROKEN"
+    return (
+        f'<span class="{kind}" aria-hidden="true"><span style="width:{width:.0f}%"></span></span> '
+        f"{words.text(said) if limit.ok else words.verdict(False, no=said)}"
+    )
+
+
+def check_section(report: CheckReport) -> str:
+    """Return all findings of the check, folded: limits, comparisons of statements, and what has no limit."""
+    limits = [f for f in report.findings if f.margin is not None and not _compares_record(f)]
+    record = [f for f in report.findings if f.margin is not None and _compares_record(f)]
+    others = [f for f in report.findings if f.margin is None]
+    stages = [name for name in STAGE_NAMES if any(f.stage == name for f in limits)]
+    stages += sorted({f.stage for f in limits} - set(stages))
+    shown = [_limits(STAGE_NAMES.get(name, name), [f for f in limits if f.stage == name]) for name in stages]
+    rows = [(words.text(f.name), words.verdict(f.ok), _value(f), words.text(f.detail)) for f in others]
+    unlimited = words.table("Without a limit", ("what", "verdict", "found", "detail"), rows)
+    return "".join(
+        [
+            _refusals(report),
+            _folded(f"{len(limits)} limits of devices and tolerances", "".join(shown)),
+            _folded(f"{len(record)} comparisons of what the plan states with what the check recomputed",
+                    _limits("Stated and recomputed", record)),
+            _folded(f"{len(others)} findings without a limit", unlimited),
+        ]
+    )  # fmt: skip
+
+
+def _compares_record(finding: Finding) -> bool:
+    """Tell whether a finding is about the plan's own statements, not about a limit of a device."""
+    return ".stated" in finding.name or "stated" in finding.detail or finding.detail == AXES_AGREE
+
+
+def _folded(summary: str, content: str) -> str:
+    return f"<details><summary>{words.text(summary)}</summary>{content}</details>"
+
+
+def _refusals(report: CheckReport) -> str:
+    """Return the verdict, what is refused, and what could not be checked."""
+    missing = words.bullets(report.unchecked)
+    missing = (
+        f"<p>{plural(len(report.unchecked), 'thing')} could not be checked:</p>{missing}" if missing else ""
+    )
+    if report.accepted:
+        number = len(report.findings) - len(report.unchecked)
+        return f"<p>The independent check accepts the geometry: {number} findings are ok.</p>{missing}"
+    refused = words.bullets(report.refusals)
+    return f"<p>{words.verdict(False)}: do not use this plan.</p>{refused}{missing}"
+
+
+def _limits(title: str, findings: Sequence[Finding]) -> str:
+    ordered = sorted(findings, key=lambda f: (f.ok, _headroom(f)))
+    rows = [
+        (
+            words.text(f.name),
+            _value(f),
+            _limit(f),
+            f"{words.number(f.margin)} {words.text(f.unit)}",
+            words.verdict(f.ok),
+            words.text(f.detail),
+        )
+        for f in ordered
+    ]
+    return words.table(title, ("what", "found", "limit", "margin", "verdict", "detail"), rows, "limits")
+
+
+def _limit(finding: Finding) -> str:
+    spare = f" (tolerance {words.number(finding.tolerance, 2)})" if finding.tolerance else ""
+    return words.text(f"{finding.side or ''} {words.number(finding.limit)} {finding.unit}{spare}")
+
+
+def _headroom(finding: Finding) -> float:
+    """Return the margin as a share of the limit, which compares findings of different units."""
+    return (finding.margin or 0.0) / max(abs(finding.limit or 0.0), 1e-9)
+
+
+def _value(finding: Finding) -> str:
+    return f"{words.number(finding.value)} {words.text(finding.unit)}" if finding.value is not None else "–"
+
+
+def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal]) -> str:
+    """Return a table that compares plans, each with its chance of success; those on the front are marked."""
+    rows, breathe = [], any(each.plan.window is not None for each in found)
+    for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True)):
+        headline, tightest, plan = appraisal.headline, appraisal.limits[:1], each.plan
+        rows.append(
+            (
+                words.text(plan_name(number)),
+                words.grade(headline.grade, headline.chance_words),
+                words.text(headline.failures[0][0] if headline.failures else "–"),
+                words.number(each.criteria["length_in_tissue_mm"]),
+                words.number(each.criteria["clearance_mm"]),
+                "yes" if each.on_front and len(found) > 1 else "",
+                words.text(headline.geometry_words),
+                words.text(tightest[0].words if tightest else "–"),
+                words.text(plan.tube.exit.branch),
+                words.text(plan.scope.generation),
+                words.number(plan.costs["inverse_clearance"], 4),
+                *([] if not breathe else [_window(plan)]),
+            )
+        )
+    headings = (
+        "plan", "succeeds", "fails most often because it", "tissue, mm", "clearance, mm", "on the front",
+        "check", "nearest limit", "branch pierced", "generation of the scope's tip",
+        "integral of 1/clearance",
+    )  # fmt: skip
+    more = ("share of the breath in the window",) if breathe else ()
+    return words.table("Plans to this target", (*headings, *more), rows)
+
+
+def _window(plan: Plan) -> str:
+    return "not computed" if plan.window is None else f"{100.0 * plan.window.share:.0f} %"
+
+
+def plan_name(number: int) -> str:
+    """Return the name of a plan by its place on the page; the first is the one that was given."""
+    return "The plan" if number == 0 else f"Alternative {number}"
+
+
+def key_section(plan: Plan, lung: Lung) -> str:
+    """Return the key numbers of a plan but for its limits, which stand at the top of the page."""
+    return "".join(words.pairs(heading, rows) for heading, rows in figures_of_plan(plan, lung))
+
+
+def instructions_section(plan: Plan, lung: Lung) -> str:
+    """Return step by step how hands bring the scope to where the plan has its tip."""
+    from lungaccess.plans.bifurcations import route_bifurcations
+    from lungaccess.plans.insertion import scope_motion, shown_motion
+    from lungaccess.plans.scope_steps import handle_words, scope_steps
+
+    steps = scope_steps(scope_motion(plan), lung.tree)
+    note = (
+        f"These steps merge the {plural(len(plan.scope.states), 'state')} of the plan, which are proved; "
+        "within a step all changes evenly. Up, down and o'clock are those of the scope's picture; twist 0 "
+        "is as the scope enters the trachea, and inserted lengths count from there."
+    )
+    texts = [*(one.text for one in steps), handle_words(plan)]
+    ways = [one.text for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)]
+    return (
+        f"<h3>Which way at each bifurcation</h3>{words.steps(ways)}"
+        f"<h3>With the hands</h3>{words.steps(texts)}<p class='note'>{words.text(note)}</p>"
+    )
+
+
+def provenance_section(plan: Plan, lung: Lung) -> str:
+    """Return where a plan came from."""
+    rows: list[tuple[str, object]] = [
+        ("plan made with lungaccess", plan.software_version),
+        ("kernels", plan.kernels or "not stated"),
+        ("digest of the plan", plan.digest),
+        ("patient", plan.patient_name),
+        ("lung", plan.lung_key),
+        ("breath hold", plan.breath_hold or "not stated"),
+        ("target from", plan.target_origin),
+        ("system", plan.system.name),
+        *(("choice of the system", sentence) for sentence in plan.system_choice),
+        ("fingerprint of the system", plan.system_fingerprint),
+        ("method, seed, iterations", f"{plan.method}, {plan.seed}, {plan.iterations}"),
+        ("objective", plan.objective),
+        *((f"seconds: {name}", f"{seconds:.2f}") for name, seconds in plan.timing.items()),
+    ]
+    warnings = words.bullets(lung.warnings)
+    files = words.pairs("SHA-256 of the image files", sorted(plan.sources.items()))
+    noted = f"<p>Warnings of the anatomy:</p>{warnings}" if warnings else ""
+    return words.pairs("Plan", rows) + noted + f"<details><summary>Image files</summary>{files}</details>"

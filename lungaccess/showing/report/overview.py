@@ -1,0 +1,136 @@
+"""The one picture of a plan: three projections, two cuts, the clearances and the key numbers."""
+
+from __future__ import annotations
+
+import os
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from anatomy.base.typed import Float
+from lungaccess.judging.appraisal.headline import Headline
+from lungaccess.showing.report import drawing, panels, style, zoom
+from lungaccess.showing.report.layers import Layers
+from lungaccess.showing.report.views import STANDARD, View
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from anatomy.lung import Lung
+    from lungaccess.judging.appraisal import Appraisal
+    from lungaccess.plans.plan import Plan
+
+
+WIDTH_IN, HEIGHT_IN = 18.0, 11.9
+HEADLINE_TOP_IN = 0.47
+HEADLINE_CHARACTERS = 240
+"""So many letters of the headline's size fill the width of the picture."""
+# left, bottom, width, height of each panel, inches
+PROJECTIONS_IN = ((0.55, 6.0, 4.75, 4.7), (5.85, 6.0, 4.75, 4.7), (11.15, 6.0, 3.35, 4.7))
+EXIT_IN, NEEDLE_IN = (0.3, 0.75, 4.3, 4.3), (4.8, 0.75, 4.3, 4.3)
+CLEARANCE_IN, TEXT_IN = (9.75, 0.95, 4.75, 4.05), (14.85, 0.5, 2.95, 10.4)
+
+
+def overview_png(
+    plan: Plan, lung: Lung, path: str | os.PathLike[str], appraisal: Appraisal | None = None
+) -> Path:
+    """Draw a plan in its anatomy and write the picture to `path`.
+
+    Below the title stands the headline of the appraisal; without one it says that nothing was checked.
+
+    The axial projection is seen from the feet and the coronal one from the front, as radiologists
+    do: the patient's left is on the right of the picture.  Ticks are LPS mm.  The two cuts below show
+    scope, tubes and needle true to their width; vessels up to 2 mm beside the cut show faintly.
+    Fissures, nodules and cost may be missing.
+
+    FileError is raised if the file cannot be written, as when the folder is missing.  Returns its path.
+    """
+    figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
+    layers = Layers(lung)
+    for box, view in zip(PROJECTIONS_IN, STANDARD, strict=True):
+        projection(style.panel(figure, box), plan, layers, view)
+    zoom.exit_zoom(style.panel(figure, EXIT_IN), plan, layers)
+    zoom.needle_zoom(style.panel(figure, NEEDLE_IN), plan, layers)
+    panels.clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
+    panels.text_panel(style.panel(figure, TEXT_IN), plan, lung, appraisal)
+    _heading(figure, plan, appraisal)
+    _legend(figure, layers, plan)
+    return style.save_png(figure, path)
+
+
+def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
+    """Draw anatomy and all three stages as seen along a view."""
+    frame = layers.footprint("lung", view) or layers.footprint("airway", view)
+    scope = view.project(plan.curves().scope.points_lps)
+    drawing.anatomy_seen_through(axes, layers, view)
+    drawing.fit_around(axes, frame, scope)
+    _nodule(axes, layers, view)
+    _stages(axes, plan, view, scope)
+    zoom.goal_marks(axes, plan, view)
+    drawing.dress(axes, view, ticks=True)
+    drawing.title(axes, view.name)
+
+
+def _stages(axes: Axes, plan: Plan, view: View, scope: Float) -> None:
+    _scope, *others = plan.curves().present
+    drawing.curve(axes, scope, style.SCOPE, 3.4, 6)
+    looks = ((style.TUBE, 3.0), (style.NEEDLE, 2.2))
+    for order, (curve, (colour, width)) in enumerate(zip(others, looks, strict=False), start=7):
+        drawing.curve(axes, view.project(curve.points_lps), colour, width, order)
+
+
+def _nodule(axes: Axes, layers: Layers, view: View) -> None:
+    footprint = layers.footprint("nodule", view)
+    drawing.see_through(axes, footprint, style.NODULE, 2.0, 0.8)
+    drawing.outline(axes, footprint, style.NODULE, 1.0)
+
+
+def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
+    """Write the title, and the headline below it in the colour of its grade."""
+    stages = "Three-stage plan" if plan.needle is not None else "Plan of scope and tubes"
+    style.heading(figure, f"{stages} for {plan.patient_name}", size=15)
+    headline = Headline.of(None, None) if appraisal is None else appraisal.headline
+    words = f"{headline.grade.mark} {headline.verdict}: {headline.text}"
+    figure.text(
+        0.3 / WIDTH_IN,
+        1 - HEADLINE_TOP_IN / HEIGHT_IN,
+        textwrap.fill(words, HEADLINE_CHARACTERS),
+        va="top",
+        fontsize=10,
+        color=headline.grade.colour,
+    )
+
+
+def _legend(figure: Figure, layers: Layers, plan: Plan) -> None:
+    entries = _legend_entries(layers, plan)
+    figure.legend(
+        handles=entries, loc="lower left",
+        bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN), ncols=len(entries), fontsize=9, frameon=False,
+        handlelength=1.8, columnspacing=1.3,
+    )  # fmt: skip
+
+
+def _legend_entries(layers: Layers, plan: Plan) -> list[Line2D | Patch]:
+    entries: list[Line2D | Patch] = [
+        Line2D([], [], color=style.SCOPE, lw=4, label="bronchoscope"),
+        Line2D([], [], color=style.TUBE, lw=4, label="tubes"),
+        *([Line2D([], [], color=style.NEEDLE, lw=3, label="needle")] if plan.needle is not None else []),
+        Line2D([], [], color=style.INK, lw=0.9, ls=(0, (3, 2)), label="required clearance"),
+        Line2D([], [], ls="none", marker="D", mfc="white", mec=style.INK, label="exit"),
+        Line2D([], [], ls="none", marker="o", ms=9, mfc="none", mec=style.TARGET, mew=2, label="target"),
+    ]
+    if plan.aim is not None:
+        entries.append(Line2D([], [], ls="none", marker="x", ms=7, mec=style.AIM, mew=2, label="aim"))
+    if layers.has("nodule"):
+        entries.append(Patch(color=style.NODULE, alpha=0.6, label="nodule"))
+    entries.append(Patch(facecolor=style.LUMEN, edgecolor=style.AIRWAY, label="airway lumen"))
+    if layers.count("airway") > layers.count("lumen"):
+        entries.append(Patch(color=style.AIRWAY, label="airway wall"))
+    entries += [Patch(color=style.VESSEL, label="vessel"), Patch(color="#C9C9C9", label="outside the lung")]
+    if layers.has("fissure"):
+        entries.append(Patch(color=style.FISSURE, alpha=0.6, label="fissure"))
+    return entries

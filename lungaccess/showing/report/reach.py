@@ -1,0 +1,193 @@
+"""The picture of a reachability map: three planes of what is reached and how clear, with the shares."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
+from matplotlib.patches import Patch
+
+from anatomy.base.typed import Float
+from lungaccess.showing.report import drawing, style
+from lungaccess.showing.report.layers import Layers
+from lungaccess.showing.report.views import STANDARD, View
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from anatomy.grid import Volume
+    from anatomy.lung import Lung
+    from lungaccess.planning.reachability import ReachMap
+
+
+WIDTH_IN, HEIGHT_IN = 18.0, 11.0
+LEFTS_IN, WIDTHS_IN = (0.55, 5.55, 10.55), (4.5, 4.5, 3.4)
+BOTTOMS_IN, PANEL_IN = (5.75, 0.8), 4.3
+BAR_IN = (14.1, 1.0, 0.15, 3.8)
+TEXT_IN = (14.2, 10.0)
+PIXEL_MM = 0.75
+CLEARANCE_MM = (0.0, 8.0)
+
+COLOURS: dict[str, str] = {
+    "direct arc": "#009E73",
+    "search": "#8FD3B6",
+    "undecided": "#C4C4C4",
+    "unreachable": "#D55E00",
+}
+
+
+def reach_png(reach: ReachMap, lung: Lung, path: str | os.PathLike[str]) -> Path:
+    """Draw a reachability map in three planes and write the picture to `path`.
+
+    Each plane is the one with the most lung tissue.  Airways and vessels that it cuts are drawn over the
+    map.  The upper row shows what is reached, the lower one the clearance of the best path found.
+
+    FileError is raised if the file cannot be written, as when the folder is missing.  Returns its path.
+    """
+    figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
+    layers = Layers(lung)
+    centre = fullest_point(reach.kinds)
+    points = reach.kinds.grid.lps(np.argwhere(reach.kinds.array > 0))
+    if not len(points):
+        points = reach.kinds.grid.lps(np.array([[0, 0, 0], reach.kinds.grid.shape]))
+    for left, width, view in zip(LEFTS_IN, WIDTHS_IN, STANDARD, strict=True):
+        for bottom, paint in zip(BOTTOMS_IN, (_kind_colours, _clearance_colours), strict=True):
+            axes = style.panel(figure, (left, bottom, width, PANEL_IN))
+            uv = view.project(points)
+            drawing.fit(axes, uv.min(axis=0) - 6.0, uv.max(axis=0) + 6.0)
+            lps, extent = _plane(axes, view, centre)
+            _paint(axes, paint(reach, lps), extent)
+            _anatomy(axes, layers, lps, extent)
+            drawing.dress(axes, view, ticks=True)
+            depth = float(centre @ view.towards_viewer)
+            axis = "xyz"[int(np.argmax(np.abs(view.towards_viewer)))]
+            sign = float(np.sign(view.towards_viewer.sum()))
+            drawing.title(axes, f"{view.name}, {axis} = {sign * depth:.0f}")
+    _bar(figure)
+    _text(figure, reach)
+    return style.save_png(figure, path)
+
+
+def fullest_point(kinds: Volume) -> Float:
+    """Return a point `(3,)` LPS mm through whose three LPS planes the most counted voxels pass."""
+    points = kinds.grid.lps(np.argwhere(kinds.array > 0))
+    if not len(points):
+        return kinds.grid.lps(np.array(kinds.grid.shape) / 2.0)
+    width = float(kinds.grid.spacing_mm.max())
+    centre = np.zeros(3)
+    for axis in range(3):
+        slots = np.floor(points[:, axis] / width).astype(np.int64)
+        counts = np.bincount(slots - slots.min())
+        centre[axis] = (slots.min() + int(np.argmax(counts)) + 0.5) * width
+    return centre
+
+
+def _plane(axes: Axes, view: View, centre: Float) -> tuple[Float, tuple[float, float, float, float]]:
+    """Return the points `(rows, columns, 3)` of a picture plane through `centre`, and its extent."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    u = np.arange(left + 0.5 * PIXEL_MM, right, PIXEL_MM)
+    v = np.arange(bottom + 0.5 * PIXEL_MM, top, PIXEL_MM)
+    depth = float(centre @ view.towards_viewer)
+    lps = (
+        u[None, :, None] * view.right
+        + v[:, None, None] * view.up
+        + depth * view.towards_viewer[None, None, :]
+    )
+    return lps, (left, left + len(u) * PIXEL_MM, bottom, bottom + len(v) * PIXEL_MM)
+
+
+def _values(volume: Volume, lps: Float) -> Float:
+    """Return the values of the voxels that hold points, 0 beyond the grid."""
+    inside = volume.grid.contains(lps)
+    values = np.zeros(lps.shape[:-1])
+    ijk = np.floor(volume.grid.ijk(lps[inside]) + 0.5).astype(np.int64)
+    values[inside] = volume.array[tuple(ijk.T)]
+    return values
+
+
+def _kind_colours(reach: ReachMap, lps: Float) -> Float:
+    from lungaccess.planning.reachability import KINDS
+
+    kinds = _values(reach.kinds, lps)
+    image = np.zeros((*kinds.shape, 4))
+    for name, code in KINDS.items():
+        image[kinds == code] = (*to_rgb(COLOURS[name]), 0.85)
+    return image
+
+
+def _clearance_colours(reach: ReachMap, lps: Float) -> Float:
+    from lungaccess.planning.reachability import KINDS
+
+    kinds = _values(reach.kinds, lps)
+    reached = (kinds == KINDS["direct arc"]) | (kinds == KINDS["search"])
+    image = np.zeros((*kinds.shape, 4))
+    image[(kinds > 0) & ~reached] = (*to_rgb("#E6E6E6"), 1.0)
+    shades = matplotlib.colormaps["viridis"](Normalize(*CLEARANCE_MM)(_values(reach.clearance_mm, lps)))
+    image[reached] = shades[reached]
+    return image
+
+
+def _paint(axes: Axes, image: Float, extent: tuple[float, float, float, float]) -> None:
+    axes.imshow(image, extent=extent, origin="lower", aspect="auto", interpolation="nearest", zorder=1)
+
+
+def _anatomy(axes: Axes, layers: Layers, lps: Float, extent: tuple[float, float, float, float]) -> None:
+    """Draw what the plane cuts of airways, vessels and fissures."""
+    for name, colour in (("vessel", style.VESSEL), ("fissure", style.FISSURE), ("airway", style.SCOPE)):
+        image = np.zeros((*lps.shape[:-1], 4))
+        image[layers.cut(name, lps)] = (*to_rgb(colour), 0.9)
+        axes.imshow(image, extent=extent, origin="lower", aspect="auto", interpolation="nearest", zorder=2)
+
+
+def _bar(figure: Figure) -> None:
+    axes = style.panel(figure, BAR_IN)
+    bar = figure.colorbar(
+        ScalarMappable(norm=Normalize(*CLEARANCE_MM), cmap="viridis"), cax=axes, extend="max"
+    )
+    bar.set_label("clearance of the best path found, mm; grey: none", fontsize=9)
+    bar.ax.tick_params(labelsize=8)
+
+
+def _text(figure: Figure, reach: ReachMap) -> None:
+    from lungaccess.planning.reachability import KINDS, STATES
+
+    system = reach.system
+    style.heading(figure, reach.words, size=15)
+    total = reach.total
+    figure.legend(
+        handles=[
+            Patch(color=COLOURS[name], label=f"{name}: {100.0 * share:.1f} %")
+            for name, share in zip(KINDS, total.shares, strict=True)
+        ]
+        + [
+            Patch(color=style.SCOPE, label="airway"),
+            Patch(color=style.VESSEL, label="vessel"),
+            Patch(color=style.FISSURE, label="fissure"),
+        ],
+        loc="upper left", bbox_to_anchor=(TEXT_IN[0] / WIDTH_IN, TEXT_IN[1] / HEIGHT_IN), fontsize=10,
+        frameon=False, title="share of the counted lung tissue", alignment="left",
+    )  # fmt: skip
+    lines = ["region: mL reachable / unreachable / undecided"]
+    lines += [
+        f"{row.name}: " + " / ".join(f"{row.state_ml(state):.0f}" for state in STATES)
+        for row in reach.by_region()
+    ]
+    diameter, radius = system.needle_sizes
+    of_needle = f"needle {diameter} mm,\nradius of curvature {radius} mm" if system.needle else "no needle"
+    lines += [
+        "",
+        f"scope {system.scope.outer_diameter_mm:g} mm, " + of_needle,
+        f"fissures {'are obstacles' if reach.with_fissures else 'may be crossed or have no mask'}",
+        f"{reach.entries} deployments, voxels of {reach.kinds.grid.spacing_mm[0]:g} mm",
+        "not counted: outside the lung, in an obstacle",
+    ]
+    figure.text(
+        TEXT_IN[0] / WIDTH_IN, (TEXT_IN[1] - 2.6) / HEIGHT_IN, "\n".join(lines), va="top", fontsize=10,
+        color=style.INK, linespacing=1.5,
+    )  # fmt: skip

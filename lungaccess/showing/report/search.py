@@ -1,0 +1,55 @@
+"""Best cost over time of a search, as a picture."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+
+from lungaccess.showing.report import drawing, style
+from lungaccess.showing.report.cost_points import CostPoint
+
+
+def cost_over_time_png(
+    history: Sequence[CostPoint], path: str | os.PathLike[str], objective: str = "cost"
+) -> Path:
+    """Draw the best cost against planning time; a search without a plan says so.
+
+    Raises
+    ------
+    anatomy.base.errors.FileError
+        If the file cannot be written.
+    """
+    figure = style.new_figure(8.0, 4.5)
+    axes = figure.add_axes((0.105, 0.135, 0.86, 0.77))
+    found = [point for point in history if point.best_cost is not None]
+    if found:
+        _steps(axes, found, history[-1].elapsed_s, objective)
+    else:
+        axes.text(0.5, 0.5, "no plan was found", ha="center", va="center", transform=axes.transAxes)
+    drawing.graph(axes, "planning time (s)", objective)
+    drawing.title(axes, "Best cost over planning time")
+    return style.save_png(figure, path)
+
+
+def _steps(axes: Axes, found: Sequence[CostPoint], end_s: float, objective: str) -> None:
+    times = [point.elapsed_s for point in found] + [max(end_s, found[-1].elapsed_s)]
+    costs = [float(point.best_cost or 0.0) for point in found]
+    axes.step(times, [*costs, costs[-1]], where="post", color=style.SCOPE, lw=2)
+    better = [n for n in range(len(costs)) if n == 0 or costs[n] < costs[n - 1]]
+    axes.plot([times[n] for n in better], [costs[n] for n in better], "o", color=style.SCOPE, ms=5)
+    _note(axes, times[0], costs[0], f"first plan {times[0]:.2f} s, {costs[0]:.4g}", (12, 2), "left")
+    if costs[-1] < costs[0]:
+        _note(axes, times[-1], costs[-1], f"best {costs[-1]:.4g}", (-4, 8), "right")
+        axes.set_ylim(costs[-1] - 0.08 * (costs[0] - costs[-1]), costs[0] + 0.12 * (costs[0] - costs[-1]))
+    if len(better) > 2 and times[-1] > 50 * max(times[0], 1e-3):
+        axes.set_xscale("log")
+
+
+def _note(axes: Axes, x: float, y: float, text: str, shift: tuple[float, float], side: str) -> None:
+    axes.annotate(
+        text, (x, y), xytext=shift, textcoords="offset points", ha=side, va="bottom",
+        fontsize=9, color=style.INK, path_effects=drawing.halo(3),
+    )  # fmt: skip

@@ -1,0 +1,91 @@
+"""The airway tree over its mask, coloured by generation."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
+
+from anatomy.base.typed import Float
+from lungaccess.showing.report import drawing, style
+from lungaccess.showing.report.layers import Layers
+from lungaccess.showing.report.views import STANDARD, View
+
+if TYPE_CHECKING:
+    from anatomy.airway_tree import AirwayTree
+    from anatomy.lung import Lung
+
+
+WIDTH_IN, HEIGHT_IN = 17.0, 6.6
+PANELS_IN = ((0.55, 0.6, 5.4, 5.3), (6.5, 0.6, 5.4, 5.3), (12.4, 0.6, 3.6, 5.3))
+BAR_IN = (16.2, 0.8, 0.16, 4.9)
+"""Left, bottom, width and height of panels and colour bar."""
+
+
+def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
+    """Draw the airway tree of a patient over the airway mask, from three sides.
+
+    Every branch has the colour of its generation (trachea 0) and a width that follows its radius;
+    the carina and every gap that was bridged are marked.
+
+    FileError is raised if the file cannot be written.
+    """
+    figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
+    layers = Layers(lung)
+    colours, norm = _generation_colours(int(np.max(lung.tree.generation)))
+    for box, view in zip(PANELS_IN, STANDARD, strict=True):
+        axes = style.panel(figure, box)
+        _tree_panel(axes, lung.tree, layers, view, colours, norm)
+    bar_axes = style.panel(figure, BAR_IN)
+    bar = figure.colorbar(ScalarMappable(norm=norm, cmap=colours), cax=bar_axes)
+    generations = np.arange(int(np.max(lung.tree.generation)) + 1)
+    bar.set_ticks(generations.tolist(), labels=[str(g) for g in generations], fontsize=8)
+    bar.set_label("generation (trachea 0)", fontsize=9)
+    style.heading(
+        figure,
+        f"Airway tree of {lung.name}: {lung.tree.n_branches} branches, up to generation {generations[-1]}",
+    )
+    return style.save_png(figure, path)
+
+
+def _generation_colours(deepest: int) -> tuple[Colormap, BoundaryNorm]:
+    """Return one colour a generation, distinct in lightness too."""
+    shades = matplotlib.colormaps["plasma"](np.linspace(0.0, 0.88, deepest + 1))
+    return ListedColormap(shades), BoundaryNorm(np.arange(deepest + 2) - 0.5, deepest + 1)
+
+
+def _tree_panel(
+    axes: Axes, tree: AirwayTree, layers: Layers, view: View, colours: Colormap, norm: BoundaryNorm
+) -> None:
+    points = view.project(tree.points_lps)
+    lung = layers.footprint("lung", view)
+    drawing.see_through(axes, layers.footprint("airway", view), "#555555", 5.0, 0.45)
+    drawing.outline(axes, lung, "#B9AEA2", 0.8)
+    axes.add_collection(_branches(tree, points, colours, norm))
+    carina = view.project(np.asarray(tree.carina_lps))
+    axes.plot(*carina, marker="*", ms=13, mfc="white", mec=style.INK, mew=1.0, ls="none", zorder=9)
+    for gap in tree.report.gaps_bridged:
+        u, v = view.project(np.asarray(gap.position_lps))
+        axes.plot(u, v, marker="x", ms=7, color="#00A0A0", mew=1.8, ls="none", zorder=9)
+    drawing.fit_around(axes, lung, points)
+    drawing.dress(axes, view, ticks=True)
+    drawing.title(axes, view.name)
+
+
+def _branches(tree: AirwayTree, points: Float, colours: Colormap, norm: BoundaryNorm) -> LineCollection:
+    """Join each point to its parent; deep branches lie on top."""
+    child = np.flatnonzero(np.asarray(tree.parent_point) >= 0)
+    generation = np.asarray(tree.generation)[tree.branch_of_point[child]]
+    child = child[np.argsort(generation, kind="stable")]
+    segments = np.stack([points[tree.parent_point[child]], points[child]], axis=1)
+    lines = LineCollection(list(segments), cmap=colours, norm=norm, zorder=5, capstyle="round")
+    lines.set_array(np.asarray(tree.generation)[tree.branch_of_point[child]])
+    lines.set_linewidth(np.clip(0.35 * np.asarray(tree.radius_mm)[child], 0.9, 3.2).tolist())
+    return lines

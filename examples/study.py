@@ -9,7 +9,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-from lungaccess.study import run_study, study_of, summarise
+from lungaccess.running.study import run_study, study_of, summarise
 
 if __name__ == "__main__":  # the worker processes import this file
     study = study_of(

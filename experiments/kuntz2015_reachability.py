@@ -26,11 +26,11 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result
+from lungaccess.running.study.driver import run_study
+from lungaccess.running.study.results import ResultsFile
+from lungaccess.running.study.runs import runs_of
+from lungaccess.running.study.settings import study_of
 from lungaccess.showing.report import style
-from lungaccess.study.driver import run_study
-from lungaccess.study.results import ResultsFile
-from lungaccess.study.runs import runs_of
-from lungaccess.study.settings import study_of
 
 PAPER_SHARES = {1.0: 36.0, 60.0: 70.0, 3600.0: 75.0}
 TIMES_S = {0.1: None, 1.0: 1.0, 5.0: None, 20.0: 60.0}

@@ -13,8 +13,8 @@ import tempfile
 from pathlib import Path
 
 from anatomy.base.files import write_text
-from lungaccess.benchmark.synthetic.manifest import Entry, manifest_text, measured_entry
-from lungaccess.benchmark.synthetic.phantoms import benchmark_phantoms
+from lungaccess.running.benchmark.synthetic.manifest import Entry, manifest_text, measured_entry
+from lungaccess.running.benchmark.synthetic.phantoms import benchmark_phantoms
 
 
 def main() -> None:

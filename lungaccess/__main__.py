@@ -1,10 +1,5 @@
 """The command line as `python -m lungaccess`, where the command itself is not on the path."""
 
-from __future__ import annotations
+from runpy import run_module
 
-import sys
-
-from lungaccess.cli.app import main
-
-if __name__ == "__main__":
-    sys.exit(main())
+run_module("lungaccess.cli", run_name="__main__")

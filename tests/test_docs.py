@@ -21,7 +21,7 @@ from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.usage import with_nodule_number
 from lungaccess.planning.one_stage import load_tubes
 from lungaccess.problem.system import load_system
-from lungaccess.study import read_study
+from lungaccess.running.study import read_study
 from lungaccess.uncertainty.risk import load_errors
 from tests.pages import PAGES, ROOT, RUN, SHOWN, blocks, name_of
 

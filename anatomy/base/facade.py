@@ -1,8 +1,8 @@
 """Package facades: a package names its public API once, and imports a name when it is first used.
 
 The `__init__` of a package imports its public names for type checkers alone, under `if TYPE_CHECKING:`, each
-as itself.  `lazy_exports` reads that block when a name is first asked for.  Importing the package therefore
-loads none of its modules, and the names stand in one place.
+as itself, or a stub `__init__.pyi` beside it does.  `lazy_exports` reads that when a name is first asked for.
+Importing the package therefore loads none of its modules, and the names stand in one place.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ def public_names(file: str) -> dict[str, str]:
     import ast  # Not before a name is asked for, so that importing a package stays fast.
     from pathlib import Path
 
-    for node in ast.parse(Path(file).read_text(encoding="utf-8")).body:
+    stub = Path(file).with_suffix(".pyi")
+    body = ast.parse((stub if stub.exists() else Path(file)).read_text(encoding="utf-8")).body
+    for node in body:
         if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-            imports = [each for each in node.body if isinstance(each, ast.ImportFrom) and each.module]
-            return {alias.name: str(each.module) for each in imports for alias in each.names}
-    return {}
+            body = node.body
+    imports = [each for each in body if isinstance(each, ast.ImportFrom) and each.module]
+    return {alias.name: str(each.module) for each in imports for alias in each.names}
 
 
 def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -139,7 +139,7 @@ def _text_targets() -> dict[str, Target]:
     from lungaccess.planning.procedure.settings import load_procedure
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
-    from lungaccess.study.settings import read_study
+    from lungaccess.running.study.settings import read_study
     from lungaccess.uncertainty.risk.error_files import load_errors
     from tests.lungaccess.conftest import make_plan
 
@@ -188,11 +188,11 @@ def _text_targets() -> dict[str, Target]:
 
 def _results(folder: Path) -> None:
     from lungaccess.problem.system import load_system
-    from lungaccess.study.patients import Patient
-    from lungaccess.study.results import ResultsFile
-    from lungaccess.study.runs import Problem, Run
-    from lungaccess.study.settings import PlannerChoice
-    from tests.lungaccess.study.toys import toy_answer
+    from lungaccess.running.study.patients import Patient
+    from lungaccess.running.study.results import ResultsFile
+    from lungaccess.running.study.runs import Problem, Run
+    from lungaccess.running.study.settings import PlannerChoice
+    from tests.lungaccess.running.study.toys import toy_answer
 
     patient = Patient(anatomy="phantom", seed=1, size="small", spacing_mm=None, sources=(("a", "0" * 64),))
     problem = Problem(
@@ -208,10 +208,10 @@ def _results(folder: Path) -> None:
 
 
 def _read_results(folder: Path) -> None:
-    from lungaccess.study.compare import differences
-    from lungaccess.study.results import ResultsFile
-    from lungaccess.study.summary import summarise
-    from lungaccess.study.tables import QUERIES, table
+    from lungaccess.running.study.compare import differences
+    from lungaccess.running.study.results import ResultsFile
+    from lungaccess.running.study.summary import summarise
+    from lungaccess.running.study.tables import QUERIES, table
 
     for left in folder.glob("results.db-*"):
         left.unlink()
@@ -252,7 +252,7 @@ def _peer(folder: Path) -> None:
 
 
 def _read_peer(folder: Path) -> None:
-    from lungaccess.benchmark.peer import read_peer
+    from lungaccess.running.benchmark.peer import read_peer
 
     read_peer(folder / "peer.json")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from experiments.support.needle.queries import Validator, environment_of, hard_queries, load_obstacles
-from lungaccess.benchmark import UncObstacles
+from lungaccess.running.benchmark import UncObstacles
 from stages.needle import query as needle_query
 from stages.needle.search.planners import PLANNERS
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES

@@ -1,6 +1,6 @@
 """Recorded needle queries on Med-RAD patients: their obstacles, poses, and the results of another planner.
 
-Their rules are those of `lungaccess.benchmark.unc_rules`.
+Their rules are those of `lungaccess.running.benchmark.unc_rules`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from anatomy.base.typed import Float
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.io.med_rad import load_med_rad
 from anatomy.structures import OBSTACLES
-from lungaccess.benchmark import UNC_GOAL_TOLERANCE_MM, UncObstacles, unc_needle, unc_obstacles
+from lungaccess.running.benchmark import UNC_GOAL_TOLERANCE_MM, UncObstacles, unc_needle, unc_obstacles
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.path import ArcPath

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from anatomy.liver import LiverImages
     from anatomy.organ import Organ
     from anatomy.patient import PatientImages
-    from lungaccess.benchmark import BenchmarkRow
-    from lungaccess.benchmark.posing import Pose
     from lungaccess.problem.system import System
+    from lungaccess.running.benchmark import BenchmarkRow
+    from lungaccess.running.benchmark.posing import Pose
 
 Rules = Literal["ours", "unc"]
 UNC_RADII_MM = "50,100,121"
@@ -76,8 +76,8 @@ def med_rad(
     out : Path
         File for all runs: .csv, or .json, which holds the arcs of the paths, too.
     """
-    from lungaccess.benchmark import read_peer, summary_rows, write_rows
-    from lungaccess.benchmark.export import require_table_file
+    from lungaccess.running.benchmark import read_peer, summary_rows, write_rows
+    from lungaccess.running.benchmark.export import require_table_file
 
     names = _planners(planners)
     device = system.load()
@@ -122,8 +122,8 @@ def _rows(
     output: PatientOptions,
 ) -> Iterator[BenchmarkRow]:
     """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
-    from lungaccess.benchmark import BenchmarkRow, patients_of, published_queries, run_query
-    from lungaccess.benchmark.published import why_no_query
+    from lungaccess.running.benchmark import BenchmarkRow, patients_of, published_queries, run_query
+    from lungaccess.running.benchmark.published import why_no_query
 
     paths = list(patients_of(folder))
     for path in paths:
@@ -147,7 +147,7 @@ def _posing(
     path: Path, rules: Rules, device: System, output: PatientOptions
 ) -> tuple[Pose, Organ | PatientImages | LiverImages]:
     """Return what makes environments of a patient by the rules, and the patient."""
-    from lungaccess.benchmark import posed_by_unc, posed_in_lung
+    from lungaccess.running.benchmark import posed_by_unc, posed_in_lung
 
     if rules == "ours":
         lung = output.load_organ(path)

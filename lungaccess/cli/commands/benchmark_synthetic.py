@@ -17,7 +17,7 @@ from lungaccess.cli.options import OutputOptions, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from lungaccess.benchmark.synthetic.scoring import Score
+    from lungaccess.running.benchmark.synthetic.scoring import Score
 
 NAME = "synthetic-v1"
 synthetic = App(
@@ -71,7 +71,7 @@ def make(
     tips : bool
         Also the scope tips, from which a planner without a bronchoscope of its own can start.
     """
-    from lungaccess.benchmark.synthetic.cases import write_benchmark
+    from lungaccess.running.benchmark.synthetic.cases import write_benchmark
 
     with progress("making synthetic patients") as shown:
         made = write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
@@ -130,8 +130,8 @@ def run(
     workers : int
         How many processes on this machine.
     """
-    from lungaccess.benchmark.synthetic.reference import benchmark_study
-    from lungaccess.study.driver import run_study
+    from lungaccess.running.benchmark.synthetic.reference import benchmark_study
+    from lungaccess.running.study.driver import run_study
 
     if workers is not None and scheduler is not None:
         raise SettingsError(
@@ -163,8 +163,8 @@ def run(
 
 def _write_answers(results: Path, folder: Path) -> list[Path]:
     from anatomy.base.files import require_writable_folder
-    from lungaccess.benchmark.synthetic.reference import submissions_of
-    from lungaccess.benchmark.synthetic.submission import write_submission
+    from lungaccess.running.benchmark.synthetic.reference import submissions_of
+    from lungaccess.running.benchmark.synthetic.submission import write_submission
 
     require_writable_folder(folder)
     written = []
@@ -203,10 +203,10 @@ def score(
     out : Path
         File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
     """
-    from lungaccess.benchmark.export import require_table_file
-    from lungaccess.benchmark.synthetic.scoring import REFUSED, score_submission
-    from lungaccess.benchmark.synthetic.sheet import write_scores
-    from lungaccess.benchmark.synthetic.submission import read_submission
+    from lungaccess.running.benchmark.export import require_table_file
+    from lungaccess.running.benchmark.synthetic.scoring import REFUSED, score_submission
+    from lungaccess.running.benchmark.synthetic.sheet import write_scores
+    from lungaccess.running.benchmark.synthetic.submission import read_submission
 
     if out is not None:
         require_table_file(out)
@@ -248,7 +248,7 @@ def sheet(
     brief : bool
         One line a planner, without families and devices.
     """
-    from lungaccess.benchmark.synthetic.sheet import read_scores, score_sheet, write_sheet
+    from lungaccess.running.benchmark.synthetic.sheet import read_scores, score_sheet, write_sheet
 
     if not scores:
         raise SettingsError("No scores were given", expected="one or more files", remedy="Name scores.json")
@@ -262,15 +262,15 @@ def sheet(
 @synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} schema"))
 def schema() -> ExitCode:
     """Print the JSON Schema of a submission."""
-    from lungaccess.benchmark.synthetic.submission import submission_schema
+    from lungaccess.running.benchmark.synthetic.submission import submission_schema
 
     terminal.show_json(submission_schema())
     return ExitCode.OK
 
 
 def _show_sheet(scores: list[Score], output: OutputOptions, *, by_family: bool = True) -> None:
-    from lungaccess.benchmark.synthetic.manifest import manifest_sha256
-    from lungaccess.benchmark.synthetic.sheet import HEADINGS, score_sheet
+    from lungaccess.running.benchmark.synthetic.manifest import manifest_sha256
+    from lungaccess.running.benchmark.synthetic.sheet import HEADINGS, score_sheet
 
     lines = score_sheet(scores, by_family=by_family)
     if output.json:

@@ -19,7 +19,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.study.summary import Group
+    from lungaccess.running.study.summary import Group
 
 
 study = App(
@@ -54,9 +54,9 @@ def run(
         How many processes on this machine; as many as it has cores if not given.
     """
     from lungaccess.plans.version import software_kernels
-    from lungaccess.study.driver import run_study
-    from lungaccess.study.settings import read_study
-    from lungaccess.study.summary import summarise
+    from lungaccess.running.study.driver import run_study
+    from lungaccess.running.study.settings import read_study
+    from lungaccess.running.study.summary import summarise
 
     if workers is not None and scheduler is not None:
         raise SettingsError(
@@ -99,7 +99,7 @@ def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     results : Path
         Results file.
     """
-    from lungaccess.study.summary import summarise
+    from lungaccess.running.study.summary import summarise
 
     groups = summarise(results)
     if output.json:
@@ -128,7 +128,7 @@ def export(
     parquet : Path
         Folder for the same as Parquet.
     """
-    from lungaccess.study.export import export_csv, export_parquet
+    from lungaccess.running.study.export import export_csv, export_parquet
 
     if csv is None and parquet is None:
         raise SettingsError(
@@ -155,7 +155,7 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
     first, second : Path
         Results files.
     """
-    from lungaccess.study.compare import differences
+    from lungaccess.running.study.compare import differences
 
     found = differences(first, second)
     if output.json:

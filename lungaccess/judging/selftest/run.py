@@ -26,7 +26,7 @@ from lungaccess.judging.selftest.kinds import KINDS
 TOLERANCE = 1e-9
 """Relative, or in mm and rad.  Arithmetic is done in the same order, but `hypot` and others may differ in
 their last digit, and a proof goes on from what it has computed."""
-PACKAGES = Path(__file__).resolve().parents[2]
+PACKAGES = Path(__file__).resolve().parents[3]
 
 
 @frozen_value

@@ -20,7 +20,7 @@ from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning.one_stage import load_tubes, read_lesions
 from lungaccess.planning.procedure import load_procedure
-from lungaccess.study import read_study
+from lungaccess.running.study import read_study
 from lungaccess.uncertainty.risk import load_errors
 from tests.lungaccess.cli.every_command import commands
 

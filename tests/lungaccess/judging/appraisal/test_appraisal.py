@@ -247,7 +247,7 @@ def test_a_notebook_shows_headline_and_limits(appraisal: Appraisal) -> None:
 
 
 def test_every_key_of_the_summary_is_documented(appraisal: Appraisal) -> None:
-    page = (Path(__file__).parents[3] / "docs/reference/command_line.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[4] / "docs/reference/command_line.md").read_text(encoding="utf-8")
     mapping: dict[str, Any] = appraisal.to_mapping()
     for key in mapping["headline"]:
         assert f"`headline.{key}`" in page

@@ -19,7 +19,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.judging.selftest import KINDS, self_test
 from lungaccess.judging.selftest.run import TOLERANCE, _difference
 
-CHECKOUT = Path(__file__).resolve().parents[3]
+CHECKOUT = Path(__file__).resolve().parents[4]
 FIELD, BOUND = "anatomy/kernels/field.py", "math.sqrt(max(total - spread, 0.0))"
 INFEASIBLE = "stages/needle/infeasibility/kernels"
 WEAKENED = [

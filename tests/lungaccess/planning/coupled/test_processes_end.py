@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[4]
 SEARCH = """
 import itertools, signal, sys, time
 from lungaccess.planning.coupled.parallel import parallel_steps

@@ -30,7 +30,7 @@ from lungaccess.uncertainty.risk.draws import Draws
 from lungaccess.uncertainty.risk.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
 from lungaccess.uncertainty.risk.errors import BREATHING
 
-PAGE = Path(__file__).parents[3] / "docs/reference/errors.md"
+PAGE = Path(__file__).parents[4] / "docs/reference/errors.md"
 MODELS = st.sampled_from([load_errors(name) for name in error_preset_names()])
 COUNT = 4000
 

@@ -1,0 +1,169 @@
+"""Runs of needle planners on published queries, and what each came to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from anatomy.base.kernel_clock import working_cpu_s
+from anatomy.base.records import frozen_value
+from lungaccess.planning.one_stage import PathSearch, reason_in_words, search_path
+from lungaccess.running.benchmark.published import PublishedQuery
+from stages.needle import OMPL_PLANNERS, ArcPath, NeedleEnvironment, Query, obstacle_clearance_mm
+
+SLICE = 200
+"""Iterations between two looks at the clock: a fraction of a millisecond."""
+SAMPLE_MM = 0.05
+"""Clearance is measured at points so far apart: a tenth of a voxel."""
+THERE_IS_ONE = "nothing found in the time given, though another planner found a path"
+BEFORE_PLANNING = ""
+"""The planner of rows that hold for all planners: what is ruled out before any of them begins."""
+
+
+@frozen_value
+class BenchmarkRow:
+    """One run of one planner on one query, or what keeps all of them from running.
+
+    Parameters
+    ----------
+    start, target : int or None
+        Numbers of the published start and target, from 1; None for a patient without queries.
+    radius_mm : float or None
+        Least radius of curvature of the needle.
+    planner : str
+        "" if the query is ruled out, by proof, before any planner begins.
+    first_cpu_ms : float or None
+        Processor time to the first path, without compilation.
+    first_length_mm, length_mm : float or None
+        Of the first and the last path, with the distance left to the target.
+    clearance_mm, needed_clearance_mm : float or None
+        Least distance from the path's axis to obstacles, where the exit is not exempt, and what it must be.
+    proved : bool
+        Whether it is proved that no path exists.
+    reason : str
+        Why there is no path; "" if there is one.
+    arcs : tuple of mapping
+        The last path from the published start: "length_mm", "roll_rad" and "curvature_per_mm" of each arc, as
+        `stages.needle.ArcPath` has them; no arcs if there is none.
+    """
+
+    patient: str
+    start: int | None = None
+    target: int | None = None
+    radius_mm: float | None = None
+    planner: str = BEFORE_PLANNING
+    seed: int | None = None
+    solved: bool = False
+    first_cpu_ms: float | None = None
+    first_length_mm: float | None = None
+    length_mm: float | None = None
+    clearance_mm: float | None = None
+    needed_clearance_mm: float | None = None
+    proved: bool = False
+    reason: str = ""
+    arcs: tuple[Mapping[str, float], ...] = ()
+
+
+def run_query(
+    environment: NeedleEnvironment,
+    query: Query,
+    published: PublishedQuery,
+    radius_mm: float,
+    planners: Iterable[str],
+    seeds: Iterable[int],
+    time_s: float,
+) -> Iterator[BenchmarkRow]:
+    """Run all planners on one query; a query ruled out by proof beforehand is answered once.
+
+    `environment` and `query` are the published query with a radius, by the rules in force.
+
+    Parameters
+    ----------
+    seeds : iterable of int
+        One run each; the resolution search draws nothing at random, so it runs once.
+    time_s : float
+        Processor time of a run.
+    """
+    rows = list(_runs(environment, query, published, radius_mm, tuple(planners), tuple(seeds), time_s))
+    known = any(row.solved for row in rows)
+    for row in rows:
+        yield replace(row, reason=THERE_IS_ONE) if known and not row.solved else row
+
+
+def _runs(
+    environment: NeedleEnvironment,
+    query: Query,
+    published: PublishedQuery,
+    radius_mm: float,
+    planners: tuple[str, ...],
+    seeds: tuple[int, ...],
+    time_s: float,
+) -> Iterator[BenchmarkRow]:
+    for planner in planners:
+        for seed in seeds[:1] if planner == "resolution" else seeds:
+            found = search_path(
+                environment,
+                query,
+                planner,
+                seed=None if planner in OMPL_PLANNERS else seed,
+                time_s=time_s,
+                clock=working_cpu_s,
+                portion=SLICE,
+            )
+            ruled_out = found.obstruction is not None and found.obstruction.proved
+            yield _row(environment, query, published, radius_mm, "" if ruled_out else planner, seed, found)
+            if ruled_out:
+                return
+
+
+def _row(
+    environment: NeedleEnvironment,
+    query: Query,
+    published: PublishedQuery,
+    radius_mm: float,
+    planner: str,
+    seed: int,
+    found: PathSearch,
+) -> BenchmarkRow:
+    named = BenchmarkRow(
+        patient=published.patient,
+        start=published.start,
+        target=published.target,
+        radius_mm=radius_mm,
+        planner=planner,
+        seed=seed if planner and planner not in OMPL_PLANNERS else None,
+        needed_clearance_mm=environment.required_clearance_mm,
+        proved=found.proved,
+    )
+    if found.path is None:
+        return replace(named, reason=_reason(found))
+    first = found.first_path or found.path
+    return replace(
+        named,
+        solved=True,
+        first_cpu_ms=None if found.first_path_s is None else 1e3 * found.first_path_s,
+        first_length_mm=_length(first, query),
+        length_mm=_length(found.path, query),
+        clearance_mm=_clearance(environment, query, found.path),
+        arcs=tuple(found.path.arc_records()),
+    )
+
+
+def _reason(found: PathSearch) -> str:
+    if found.obstruction is None:
+        return f"{found.outcome} in the time given (not proved)"
+    return f"{reason_in_words(found.obstruction)} ({'proved' if found.proved else 'not proved'})"
+
+
+def _length(path: ArcPath, query: Query) -> float:
+    """Return the length of a path with the distance that it leaves to the target."""
+    return path.length_mm + float(np.linalg.norm(path.frames()[-1][:3, 3] - query.target))
+
+
+def _clearance(environment: NeedleEnvironment, query: Query, path: ArcPath) -> float | None:
+    points, lengths = path.sample(SAMPLE_MM)
+    exempt_mm = environment.limits.exempt_mm if query.branch >= 0 else 0.0
+    beyond = points[lengths >= exempt_mm]
+    return float(obstacle_clearance_mm(environment.obstacles, beyond).min()) if len(beyond) else None

@@ -1,0 +1,275 @@
+"""Scores of a submission: every answer is checked anew, by the independent check and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from anatomy.base.errors import AnatomyError, PlanFileError
+from anatomy.base.records import frozen_value
+from anatomy.lung import Lung
+from lungaccess.judging.checking import Checker
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.patients import load_patient
+from lungaccess.problem.system import load_system
+from lungaccess.running.benchmark.synthetic.answers import motions_of_answer
+from lungaccess.running.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
+from lungaccess.running.benchmark.synthetic.manifest import entries
+from lungaccess.running.benchmark.synthetic.phantoms import BenchmarkPhantom, phantom_named
+from lungaccess.running.benchmark.synthetic.submission import Submission, SubmittedAnswer, require_queries
+from lungaccess.running.benchmark.synthetic.tips import PublishedTips
+from lungaccess.uncertainty.breathing.window import with_window
+
+if TYPE_CHECKING:
+    from lungaccess.planning.reachability import UnreachableProof
+
+SOLVED, REFUSED, NONE, CLAIMED, CERTIFIED, MISSING = (
+    "solved", "refused", "no plan", "claimed unreachable", "proved unreachable", "no answer",
+)  # fmt: skip
+"""What an answer comes to.  Only `SOLVED` and `CERTIFIED` are proved; a mere claim is not."""
+SAMPLES = 1000
+"""Deviated plans for the chance of success, which is then known to 1.6 % or better."""
+SUCCESS_SEED = 281
+REASONS = 3
+"""Findings that a refusal names."""
+Progress = Callable[[str, float], None]
+
+
+@frozen_value
+class Score:
+    """What one answer comes to.
+
+    Parameters
+    ----------
+    query, phantom, family, system : str
+    target : int
+    planner : str
+    status : str
+        "solved", "refused", "no plan", "claimed unreachable", "proved unreachable" or "no answer".
+    reason : str
+        Why it is refused: what the check found.
+    cost : float or None
+        Integral of 1 / clearance over the needle; this and all below only where it is solved.
+    needle_mm : float or None
+        Length of the needle.
+    success : float or None
+        Estimated chance of success under the errors `breath-hold` without correction; None if not asked for.
+    breath_share : float or None
+        Share of the breath in which the plan is proved clear and on target, of phantoms that breathe.
+    not_checked : str
+        What the check could not look at; "" for nothing.
+    first_cpu_s, cpu_s : float or None
+        Processor time, as the submission states it.
+    """
+
+    query: str
+    phantom: str
+    family: str
+    system: str
+    target: int
+    planner: str
+    status: str
+    reason: str = ""
+    cost: float | None = None
+    needle_mm: float | None = None
+    success: float | None = None
+    breath_share: float | None = None
+    not_checked: str = ""
+    first_cpu_s: float | None = None
+    cpu_s: float | None = None
+
+
+def score_submission(
+    submission: Submission,
+    folder: Path,
+    *,
+    cache: Path | None = None,
+    samples: int = SAMPLES,
+    certify_boxes: int = 0,
+    only_answered: bool = False,
+    progress: Progress | None = None,
+) -> Iterator[Score]:
+    """Yield the score of every query of the phantoms in a folder, phantom by phantom.
+
+    Parameters
+    ----------
+    folder : Path
+        The cases, as `write_benchmark` makes them.
+    cache : Path, optional
+        Folder of prepared anatomies; the usual one if None.
+    samples : int
+        Deviated plans for the chance of success; 0 for no estimate.
+    certify_boxes : int
+        Budget of a proof that a target claimed unreachable is so; 0 for no proof.
+    only_answered : bool
+        Whether queries without an answer are left out.
+
+    Raises
+    ------
+    FileError
+        If the folder is not one of this benchmark, or lacks a phantom that an answer is about.
+    AnatomyError
+        If the masks of a phantom in the folder are not those of the manifest.
+    SettingsError
+        If an answer names a tip that was not published.
+    """
+    phantoms = require_cases(folder)
+    require_queries(submission.answers, (each.name for each in phantoms), folder)
+    answers = {each.query: each for each in submission.answers}
+    held = {each.name for each in phantoms}
+    asked = [
+        query for query in all_queries().values()
+        if query.phantom in held and (query.name in answers or not only_answered)
+    ]  # fmt: skip
+    tips = PublishedTips(folder)
+    done = 0
+    for name, of_phantom in groupby(asked, key=lambda query: query.phantom):
+        queries = list(of_phantom)
+        judge: _Scorer | None = None
+        for query in queries:
+            (progress or (lambda _words, _share: None))(query.name, done / len(asked))
+            done += 1
+            answer = answers.get(query.name)
+            if answer is not None and (answer.planned or (answer.unreachable and certify_boxes)):
+                judge = judge or _Scorer(phantom_named(name), folder, cache, tips, samples, certify_boxes)
+                yield judge.score(query, answer, submission.planner)
+            else:
+                yield _unplanned(query, answer, submission.planner)
+
+
+def _unplanned(query: BenchmarkQuery, answer: SubmittedAnswer | None, planner: str) -> Score:
+    status = MISSING if answer is None else CLAIMED if answer.unreachable else NONE
+    cpu_s = None if answer is None else answer.cpu_s
+    return _named(query, planner, status, cpu_s=cpu_s)
+
+
+def _named(
+    query: BenchmarkQuery,
+    planner: str,
+    status: str,
+    *,
+    reason: str = "",
+    first_cpu_s: float | None = None,
+    cpu_s: float | None = None,
+) -> Score:
+    return Score(
+        query=query.name,
+        phantom=query.phantom,
+        family=phantom_named(query.phantom).family,
+        system=query.system,
+        target=query.target,
+        planner=planner,
+        status=status,
+        reason=reason,
+        first_cpu_s=first_cpu_s,
+        cpu_s=cpu_s,
+    )
+
+
+class _Scorer:
+    """Scores the answers about one phantom."""
+
+    def __init__(
+        self,
+        case: BenchmarkPhantom,
+        folder: Path,
+        cache: Path | None,
+        tips: PublishedTips,
+        samples: int,
+        certify_boxes: int,
+    ) -> None:
+        self._lung = _own_masks(case, folder / case.name, cache)
+        self._checker = Checker(self._lung)
+        self._tips, self._samples, self._certify_boxes = tips, samples, certify_boxes
+        self._proofs: dict[str, UnreachableProof] = {}
+
+    def score(self, query: BenchmarkQuery, answer: SubmittedAnswer, planner: str) -> Score:
+        """Return what an answer comes to."""
+        if not answer.planned:
+            proved = self._is_proved(query)
+            return _named(query, planner, CERTIFIED if proved else CLAIMED, cpu_s=answer.cpu_s)
+        system = load_system(query.system)
+        target = np.array(query.target_lps)
+        motions = motions_of_answer(query, answer, self._tips)
+        try:
+            plan = self._checker.completed(motions, system, target, method=planner)
+            report = self._checker.check(plan, system, target_lps=target)
+        except (PlanFileError, FloatingPointError, np.linalg.LinAlgError) as error:
+            return _named(query, planner, REFUSED, reason=f"{error}", cpu_s=answer.cpu_s)
+        if report.accepted and self._lung.motion is not None:
+            plan = with_window(plan, self._lung)
+            report = self._checker.check(plan, system, target_lps=target)
+        if not report.accepted:
+            refusals = [str(each) for each in report.refusals]
+            more = f"; and {len(refusals) - REASONS} more" if len(refusals) > REASONS else ""
+            reason = "; ".join(refusals[:REASONS]) + more
+            return _named(query, planner, REFUSED, reason=reason, cpu_s=answer.cpu_s)
+        return self._solved(query, answer, planner, plan, ", ".join(each.name for each in report.unchecked))
+
+    def _solved(
+        self, query: BenchmarkQuery, answer: SubmittedAnswer, planner: str, plan: Plan, not_checked: str
+    ) -> Score:
+        named = _named(query, planner, SOLVED, first_cpu_s=answer.first_cpu_s, cpu_s=answer.cpu_s)
+        return replace(
+            named,
+            cost=plan.costs["inverse_clearance"],
+            needle_mm=plan.costs["length_mm"],
+            success=self._success(plan),
+            breath_share=None if plan.window is None else plan.window.share,
+            not_checked=not_checked,
+        )
+
+    def _success(self, plan: Plan) -> float | None:
+        """Return the estimated chance of success; every plan has the same luck."""
+        from lungaccess.uncertainty.risk import assess
+
+        if not self._samples:
+            return None
+        report = assess(plan, self._lung, samples=self._samples, seed=SUCCESS_SEED, each_kind=False)
+        return report.succeeds.value
+
+    def _is_proved(self, query: BenchmarkQuery) -> bool:
+        from lungaccess.planning.reachability import UnreachableProof
+
+        if query.system not in self._proofs:
+            system = load_system(query.system)
+            self._proofs[query.system] = UnreachableProof(
+                self._lung, system, with_fissures=not system.fissures_allowed
+            )
+        target = np.array(query.target_lps)
+        return self._proofs[query.system].prove(target, most_boxes=self._certify_boxes).proved
+
+
+def _own_masks(case: BenchmarkPhantom, folder: Path, cache: Path | None) -> Lung:
+    """Return the lung of a case, whose masks are those of the manifest.
+
+    Raises
+    ------
+    AnatomyError
+        If they are not: answers about other masks count for nothing.
+    """
+    from anatomy.io.patients import load_patient as read_images
+    from lungaccess.running.benchmark.synthetic.manifest import masks_sha256
+
+    wanted, found = entries()[case.name].masks_sha256, masks_sha256(read_images(folder))
+    if found != wanted:
+        raise AnatomyError(
+            f"The masks in {folder} have the hash {found[:16]}",
+            expected=f"{wanted[:16]}, as the manifest says",
+            remedy="Delete the folder of this phantom and make it again",
+        )
+    return load_patient(folder, cache=cache)
+
+
+def refuted(scores: Iterable[Score]) -> dict[str, str]:
+    """Return the queries claimed unreachable that somebody solved, with the latter's name."""
+    scores = list(scores)
+    solved = {each.query: each.planner for each in scores if each.status == SOLVED}
+    return {
+        each.query: solved[each.query] for each in scores if each.status == CLAIMED and each.query in solved
+    }

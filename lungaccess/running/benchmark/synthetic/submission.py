@@ -1,0 +1,214 @@
+"""What a planner hands in: poses and arcs of every query that it solved, as JSON.
+
+`docs/reference/submission.md` describes the file with an example; `submission_schema` is its JSON Schema.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter
+
+from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.files import read_json, write_text
+from anatomy.base.settings import impossible, parse, quantity, settings, switch, text, to_mapping
+from lungaccess.running.benchmark.synthetic.cases import all_queries
+from lungaccess.running.benchmark.synthetic.phantoms import VERSION
+
+SCHEMA = "lungaccess-submission/1"
+MOST_STATES, MOST_ARCS = 10_000, 1000
+REMEDY = "docs/reference/submission.md shows a whole file; `... synthetic-v1 schema` prints its schema"
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Row = tuple[Number, Number, Number, Number]
+Pose = Annotated[tuple[Row, Row, Row, Row], Field(description="4x4 rigid pose, LPS mm, +z forward")]
+State = tuple[Number, Number, Number]
+
+
+@settings
+class ScopeAnswer:
+    """How the bronchoscope gets to where it stands: by a published tip, or by a motion of the planner's own.
+
+    Parameters
+    ----------
+    tip : int or None
+        Number of a tip in `tips-DEVICE.json` of the phantom, from 0.
+    lps_from_entry : 4x4 or None
+        Base of the bending section at the beginning, in the trachea.
+    states : list of [mm, rad, rad] or None
+        Advance, twist and bend; the scope never draws back, and turns only where it does not advance.
+    lps_from_tip : 4x4 or None
+        Pose of the working channel's end; needed without `tip`, and compared if stated with it.
+    """
+
+    tip: Annotated[int | None, Field(strict=True, ge=0, description="published tip")] = None
+    lps_from_entry: Pose | None = None
+    states: Annotated[tuple[State, ...] | None, Field(min_length=1, max_length=MOST_STATES)] = None
+    lps_from_tip: Pose | None = None
+
+    def __post_init__(self) -> None:
+        own = [self.lps_from_entry, self.states, self.lps_from_tip]
+        if self.tip is None and any(each is None for each in own):
+            raise impossible(
+                "tip", self.tip, "a number, or lps_from_entry, states and lps_from_tip instead of it"
+            )
+        if self.tip is not None and (self.states is not None or self.lps_from_entry is not None):
+            raise impossible("tip", self.tip, "left out where lps_from_entry and states are stated")
+
+
+@settings
+class TubesAnswer:
+    """How the tubes are turned and inserted, and the pose of their tip, from which the needle starts."""
+
+    rotation_rad: Number
+    outer_insertion_mm: Annotated[float, quantity("outer tube beyond the scope tip", at_least=0.0)]
+    inner_insertion_mm: Annotated[float, quantity("inner tube beyond the scope tip", at_least=0.0)]
+    lps_from_tip: Pose
+
+
+@settings
+class ArcAnswer:
+    """One arc of the needle: turn by `roll_rad` about the axis, insert `length_mm`, bending to local +x."""
+
+    length_mm: Annotated[float, quantity("length", above=0.0)]
+    roll_rad: Number
+    curvature_per_mm: Annotated[float, quantity("curvature", at_least=0.0)]
+
+
+@settings
+class NeedleAnswer:
+    """The arcs of the needle, from the tip of the tubes to the target."""
+
+    arcs: Annotated[tuple[ArcAnswer, ...], Field(min_length=1, max_length=MOST_ARCS)]
+
+
+@settings
+class SubmittedAnswer:
+    """The answer to one query.
+
+    Parameters
+    ----------
+    query : str
+        Name of the query, "PHANTOM/DEVICE/NN".
+    scope, tubes, needle
+        All three, or none where no plan was found.
+    unreachable : bool
+        Whether the planner claims that there is none; only without a plan.
+    first_cpu_s, cpu_s : float or None
+        Processor time of the first plan, and of the whole query.
+    """
+
+    query: Annotated[str, text("name of the query")]
+    scope: ScopeAnswer | None = None
+    tubes: TubesAnswer | None = None
+    needle: NeedleAnswer | None = None
+    unreachable: Annotated[bool, switch("whether there is no plan at all")] = False
+    first_cpu_s: Annotated[float | None, quantity("processor time of the first plan", at_least=0.0)] = None
+    cpu_s: Annotated[float | None, quantity("processor time of the query", at_least=0.0)] = None
+
+    def __post_init__(self) -> None:
+        parts = [self.scope, self.tubes, self.needle]
+        if any(each is None for each in parts) and any(each is not None for each in parts):
+            raise impossible("scope, tubes, needle", "some of them", "all three, or none of them")
+        if self.planned and self.unreachable:
+            raise impossible("unreachable", True, "false where there is a plan")
+
+    @property
+    def planned(self) -> bool:
+        """Whether the answer is a plan."""
+        return self.needle is not None
+
+
+@settings
+class Submission:
+    """The answers of one planner; a query without an answer counts as not solved."""
+
+    schema: Annotated[str, text("format of the file")] = SCHEMA
+    benchmark: Annotated[str, text("name of the benchmark")] = VERSION
+    planner: Annotated[str, text("name of the planner in tables")]
+    machine: Annotated[str, text("processor that the times are of", may_be_empty=True)] = ""
+    answers: tuple[SubmittedAnswer, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.schema != SCHEMA:
+            raise impossible("schema", self.schema, SCHEMA)
+        if self.benchmark != VERSION:
+            raise impossible("benchmark", self.benchmark, VERSION)
+
+
+def read_submission(path: Path) -> Submission:
+    """Read a submission; every answer is looked at before any is scored.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read or is not JSON.
+    SettingsError
+        If something in it is missing, unknown, of the wrong type or not finite, or a query is unknown or
+        answered twice; the message names the answer.
+    """
+    content = read_json(path, expected="a submission in JSON", remedy=REMEDY)
+    return submission_of(content, path.name)
+
+
+def submission_of(content: object, where: str = "submission") -> Submission:
+    """Return the submission that plain values describe; errors as of `read_submission`."""
+    if not isinstance(content, Mapping) or not isinstance(content.get("answers"), list):
+        raise SettingsError(f"{where} is no submission", expected='{"answers": [...], ...}', remedy=REMEDY)
+    answers = tuple(
+        parse(SubmittedAnswer, _mapping(each, f"{where}, answer {n}"), f"{where}, answer {n}", REMEDY)
+        for n, each in enumerate(content["answers"], start=1)
+    )
+    known, seen = all_queries(), set[str]()
+    for n, each in enumerate(answers, start=1):
+        if each.query not in known:
+            raise SettingsError(
+                f"{where}, answer {n}: there is no query {each.query!r}",
+                expected="PHANTOM/DEVICE/NN, such as adult-01/lung-default/01",
+                remedy="The names are in the files case.json",
+            )
+        if each.query in seen:
+            raise SettingsError(
+                f"{where}, answer {n}: {each.query} is answered twice", expected="one answer", remedy=REMEDY
+            )
+        seen.add(each.query)
+    head = {key: value for key, value in content.items() if key != "answers"}
+    return parse(Submission, {**head, "answers": [to_mapping(each) for each in answers]}, where, REMEDY)
+
+
+def _mapping(value: object, where: str) -> Mapping[str, object]:
+    if not isinstance(value, Mapping):
+        raise SettingsError(f"{where} is {value!r:.60}", expected="a JSON object", remedy=REMEDY)
+    return value
+
+
+def submission_schema() -> dict[str, Any]:
+    """Return the JSON Schema of a submission."""
+    return TypeAdapter(Submission).json_schema()
+
+
+def write_submission(submission: Submission, path: Path) -> None:
+    """Write a submission, all or nothing.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    write_text(path, json.dumps(to_mapping(submission), allow_nan=False) + "\n")
+
+
+def require_queries(answers: Iterable[SubmittedAnswer], phantoms: Iterable[str], folder: Path) -> None:
+    """Raise FileError unless a folder holds the phantoms of all answers."""
+    held = set(phantoms)
+    for answer in answers:
+        phantom = answer.query.split("/")[0]
+        if phantom not in held:
+            raise FileError(
+                f"{folder} does not hold {phantom}, which {answer.query} is about",
+                expected="the phantoms of all answers",
+                remedy=f"lungaccess benchmark {VERSION} make --out {folder} --phantoms {phantom}",
+            )

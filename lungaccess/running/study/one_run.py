@@ -1,0 +1,256 @@
+"""Make one run: in this process, or in one of its own with `python -m lungaccess.running.study.one_run`.
+
+That command reads a run as JSON on standard input and writes its answer as JSON on standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import psutil
+
+from anatomy.base.child_process import end_with_parent
+from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
+from anatomy.lung import Lung
+from lungaccess.judging.checking import Checker
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.atlas_store import open_atlas
+from lungaccess.planning.coupled.planner import plan
+from lungaccess.planning.success import plan_for_success
+from lungaccess.planning.success.estimate import FRESH_SEED, MEASURED, OPEN_LOOP, chance_of, estimate_success
+from lungaccess.plans.chance import Chance
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target, point_target
+from lungaccess.running.study.answers import (
+    EXACT,
+    INVALID_GOAL,
+    NO_PLAN,
+    PLAN,
+    TIMEOUT,
+    UNKNOWN,
+    Answer,
+    Improvement,
+)
+from lungaccess.running.study.needle_run import needle_answer
+from lungaccess.running.study.patients import Patient, open_patient
+from lungaccess.running.study.runs import Problem, Run
+from lungaccess.running.study.settings import SUCCESS, StudyError
+
+KEPT_PATIENTS = 2
+"""Runs come case by case, so that a worker needs the last patient and sometimes the next."""
+MIB = 2.0**20
+FIRST_CPU, SEARCH_CPU = "first_plan_cpu_s", "search_cpu_s"
+"""What a stored plan says in its `timing`: processor time to the first plan, and of the whole search."""
+ANSWERS = (AnatomyError, PlanFileError, SettingsError, TargetError)
+"""Errors that the run would end with on any machine, at any time."""
+
+_one_at_a_time = threading.Lock()
+
+
+class Opened(NamedTuple):
+    """A patient and the check that belongs to it."""
+
+    lung: Lung
+    checker: Checker
+
+
+def answer(run: Run, cache: Path | None = None) -> Answer:
+    """Make a run and return what it ended with.
+
+    Parameters
+    ----------
+    cache : Path, optional
+        Folder of prepared anatomies and atlases; `anatomy.base.cache.default_cache()` if None.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read or written here; whatever else is not the run's own answer is raised, too.
+    """
+    if run.planner.own_process or run.planner.is_of_ompl:
+        return _in_own_process(run, cache)
+    return _here(run, cache)
+
+
+def prepare(problem: Problem, cache: Path | None = None) -> None:
+    """Make sure that the cache has the patient and the atlas of a problem.
+
+    Raises
+    ------
+    LungaccessError
+        If the patient cannot be read or the cache cannot be written.
+    """
+    with _one_at_a_time:
+        numba.set_num_threads(1)
+        _atlas_of(problem, cache)
+
+
+def _here(run: Run, cache: Path | None) -> Answer:
+    with _one_at_a_time:
+        numba.set_num_threads(1)
+        return _measured(run, cache)
+
+
+def _measured(run: Run, cache: Path | None) -> Answer:
+    opened = _opened(run.problem.patient, cache)
+    atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
+    began, cpu_began = time.perf_counter(), time.process_time()
+    try:
+        made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
+    except NoPlan as failure:
+        made = _no_plan(run, failure)
+    except ANSWERS as error:
+        status = INVALID_GOAL if isinstance(error, TargetError) else UNKNOWN
+        made = Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
+    return replace(
+        made,
+        time_s=time.perf_counter() - began,
+        cpu_s=time.process_time() - cpu_began,
+        memory_mb=psutil.Process().memory_info().rss / MIB,
+    )
+
+
+def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
+    """Search for plans and let the best be checked."""
+    problem, best = run.problem, None
+    improvements = []
+    target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
+    began, first_s = time.process_time(), 0.0
+    for best, cost in _plans(run, opened.lung, target, atlas):
+        improvements.append(
+            Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=cost)
+        )
+        first_s = first_s or time.process_time() - began
+        if problem.first_plan:
+            break
+    if best is None:
+        raise NoPlan("The search ended without a plan", reasons={})
+    spent = {FIRST_CPU: first_s, SEARCH_CPU: time.process_time() - began}
+    best = replace(best, chance=_chance(run, best, opened.lung), timing={**best.timing, **spent})
+    report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
+    return Answer(
+        key=run.key,
+        outcome=PLAN,
+        status=EXACT,
+        iterations=best.iterations,
+        accepted=report.accepted,
+        costs=dict(best.costs),
+        improvements=tuple(improvements),
+        findings=tuple(each.to_mapping() for each in report.findings),
+        plan=best.to_json(),
+        digest=best.digest,
+    )
+
+
+def _plans(run: Run, lung: Lung, target: Target, atlas: Atlas) -> Iterator[tuple[Plan, float]]:
+    """Yield better and better plans, each with what is made small: its cost, or its chance of failure."""
+    problem = run.problem
+    limits: dict[str, Any] = {
+        "seed": run.seed,
+        "iterations": run.iterations,
+        "time_s": problem.time_s,
+        "atlas": atlas,
+    }
+    if run.planner.method == SUCCESS:
+        for each in plan_for_success(
+            lung, problem.system, target, errors=problem.errors, procedure=problem.procedure, **limits
+        ):
+            yield each.plan, 1.0 - each.succeeds.value
+        return
+    for found in plan(
+        lung, problem.system, target, objective=problem.objective, method=run.planner.method,
+        needle_planner=run.planner.needle_planner,
+        counterfactuals=not run.planner.without_counterfactuals, **limits,
+    ):  # fmt: skip
+        yield found, found.cost
+
+
+def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:
+    """Return the chance of success of a plan on draws that no search saw, the same for all planners."""
+    errors, procedure = run.problem.errors, run.problem.procedure
+    if errors is None:
+        return None
+    samples = (OPEN_LOOP if procedure.is_open_loop else MEASURED).fresh
+    if found.chance is not None and found.chance.samples == samples:
+        return found.chance
+    seed = run.seed + FRESH_SEED
+    return chance_of(
+        estimate_success(found, lung, errors=errors, procedure=procedure, samples=samples, seed=seed)
+    )
+
+
+def _no_plan(run: Run, failure: NoPlan) -> Answer:
+    return Answer(
+        key=run.key,
+        outcome=NO_PLAN,
+        status=TIMEOUT,
+        message=failure.found,
+        advice=failure.advice,
+        rejections=dict(failure.reasons),
+    )
+
+
+@lru_cache(maxsize=KEPT_PATIENTS)
+def _opened(patient: Patient, cache: Path | None) -> Opened:
+    lung = open_patient(patient, cache)
+    return Opened(lung, Checker(lung))
+
+
+def _atlas_of(problem: Problem, cache: Path | None) -> Atlas:
+    spacing = (problem.rotations, problem.stop_spacing_mm, problem.site_spacing_mm)
+    return _atlas(problem.patient, problem.system, spacing, cache)
+
+
+@lru_cache(maxsize=KEPT_PATIENTS)
+def _atlas(patient: Patient, system: System, spacing: tuple[int, float, float], cache: Path | None) -> Atlas:
+    rotations, stop_mm, site_mm = spacing
+    return open_atlas(
+        _opened(patient, cache).lung,
+        system,
+        rotations=rotations,
+        stop_spacing_mm=stop_mm,
+        site_spacing_mm=site_mm,
+        cache=cache,
+    )
+
+
+def _in_own_process(run: Run, cache: Path | None) -> Answer:
+    """Make a run in a fresh process, as a library with one seed a process needs."""
+    words = [sys.executable, "-m", "lungaccess.running.study.one_run", *([str(cache)] if cache else [])]
+    done = subprocess.run(words, input=run.to_json(), capture_output=True, encoding="utf-8", errors="replace")
+    if done.returncode != 0:
+        raise StudyError(
+            f"The process of a run ended with code {done.returncode}: {done.stderr.strip()[-500:]}",
+            expected="a process that ends with 0",
+            remedy="Start the study again; it goes on from what is stored",
+        )
+    return Answer.from_mapping(json.loads(done.stdout))
+
+
+def main(words: list[str]) -> int:
+    """Make the run on standard input; an error goes to standard error."""
+    end_with_parent()
+    try:
+        made = _here(Run.from_json(sys.stdin.read()), Path(words[0]) if words else None)
+    except LungaccessError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    sys.stdout.write(json.dumps(asdict(made)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,201 @@
+"""The results file of a study: SQLite, one transaction a run, each run at most once."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from anatomy.base.errors import FileError
+from anatomy.base.settings import to_mapping
+from lungaccess.running.study.answers import Answer
+from lungaccess.running.study.file_errors import BUSY_S, damaged, file_errors
+from lungaccess.running.study.rows import add_rest, experiment_row, problem_row, run_row
+from lungaccess.running.study.runs import Problem, Run
+from lungaccess.running.study.schema import APPLICATION_ID, FORMAT, KERNELS_TABLE, statements
+
+BATCH = 1000
+"""Rows that are read at once: a few of them take no time, and all of them would fill the memory."""
+
+
+class ResultsFile:
+    """A results file, open for reading and adding; for a `with` statement.
+
+    Several processes may have the same file open.
+
+    Parameters
+    ----------
+    create : bool
+        Whether a file that is not there is made.
+
+    Raises
+    ------
+    FileError
+        If the file is not there, cannot be written, is damaged, or is not a results file of this format.
+    """
+
+    def __init__(self, path: Path, *, create: bool = False) -> None:
+        self.path = Path(path)
+        if not create and not (self.path.is_file() and self.path.stat().st_size):
+            raise FileError(
+                f"There is no file {path}, or it is empty",
+                expected="a results file of `lungaccess study run`",
+                remedy="Check the name, or run the study: lungaccess study run study.toml --out results.db",
+            )
+        with file_errors(self.path):
+            self._connection = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
+            try:
+                self._begin()
+            except BaseException:
+                self._connection.close()
+                raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._connection.close()
+
+    def _begin(self) -> None:
+        """Make a new file's tables, or make sure that an old one is sound."""
+        if self._is_new():
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._make()
+        identity = (self._number("application_id"), self._number("user_version"))
+        if identity != (APPLICATION_ID, FORMAT):
+            raise FileError(
+                f"{self.path} is a database of another kind or format ({identity[0]}, {identity[1]})",
+                expected=f"results of lungaccess, format {FORMAT}",
+                remedy="Choose another file with --out",
+            )
+        self._connection.execute("PRAGMA foreign_keys = ON")
+        verdict = self._connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
+        if verdict != "ok":
+            raise damaged(self.path, verdict)
+
+    def _is_new(self) -> bool:
+        """Tell whether there is nothing in the file, which another process may be about to change."""
+        return (
+            self._number("application_id") == 0
+            and not self._connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchall()
+        )
+
+    def _make(self) -> None:
+        try:
+            self._connection.executescript(statements())
+        except sqlite3.OperationalError:
+            # Another process may have made the tables in between.
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+            if self._is_new():
+                raise
+
+    def _number(self, pragma: str) -> int:
+        return int(self._connection.execute(f"PRAGMA {pragma}").fetchone()[0])
+
+    def rows(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of a query.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read.
+        """
+        with file_errors(self.path):
+            cursor = self._connection.execute(query, values)
+        while True:
+            with file_errors(self.path):
+                batch = cursor.fetchmany(BATCH)
+            if not batch:
+                return
+            yield from batch
+
+    def columns(self, query: str) -> tuple[str, ...]:
+        """Return the names of the columns of a query.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read.
+        """
+        with file_errors(self.path):
+            found = self._connection.execute(f"SELECT * FROM ({query}) LIMIT 0").description
+        return tuple(each[0] for each in found)
+
+    def finished_keys(self) -> set[str]:
+        """Return the keys of the runs that need not be made again: all but those that failed."""
+        query = "SELECT key FROM runs JOIN outcomes ON runid = id WHERE NOT failed"
+        return {key for (key,) in self.rows(query)}
+
+    def made_with_other_kernels(self, keys: set[str], kernels: str) -> int:
+        """Return how many of the runs with these keys other kernels made, or none that are stated."""
+        stated = "SELECT key FROM runs JOIN made_with ON runid = id WHERE kernels = ?"
+        known = self._connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'made_with'").fetchone()
+        return len(keys - {key for (key,) in self.rows(stated, (kernels,))} if known else keys)
+
+    def add(self, run: Run, answer: Answer) -> bool:
+        """Store what a run ended with, all of it or nothing; return whether it was new.
+
+        A run that is there already stays as it is, unless it failed.
+
+        Raises
+        ------
+        FileError
+            If the disk is full, another program holds the file for too long, or it is damaged.
+        """
+        with file_errors(self.path), self._transaction() as connection:
+            connection.execute(
+                "DELETE FROM runs WHERE key = ? AND id IN (SELECT runid FROM outcomes WHERE failed)",
+                (run.key,),
+            )
+            experiment, planner = self._experiment(run.problem), self._planner(run)
+            made = connection.execute(*run_row(run, answer, experiment, planner))
+            if made.rowcount == 0:
+                return False
+            connection.execute(KERNELS_TABLE)
+            add_rest(connection, int(made.lastrowid or 0), answer)
+            connection.execute(
+                "UPDATE experiments SET totaltime = totaltime + ?, runcount = (SELECT max(n) FROM "
+                "(SELECT count(*) AS n FROM runs WHERE experimentid = ? GROUP BY plannerid)) WHERE id = ?",
+                (answer.time_s, experiment, experiment),
+            )
+        return True
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        self._connection.execute("BEGIN IMMEDIATE")
+        try:
+            yield self._connection
+            self._connection.execute("COMMIT")
+        except BaseException:
+            # A full disk ends the transaction by itself.
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+            raise
+
+    def _experiment(self, problem: Problem) -> int:
+        """Return the number of the problem, which is stored if it is new."""
+        known = self._connection.execute(
+            "SELECT experimentid FROM problems WHERE key = ?", (problem.key,)
+        ).fetchone()
+        if known:
+            return int(known[0])
+        made = self._connection.execute(*experiment_row(problem))
+        number = int(made.lastrowid or 0)
+        self._connection.execute(*problem_row(problem, number))
+        return number
+
+    def _planner(self, run: Run) -> int:
+        settings = to_mapping(run.planner)
+        row = (settings.pop("name"), json.dumps(settings, sort_keys=True))
+        self._connection.execute("INSERT OR IGNORE INTO plannerConfigs (name, settings) VALUES (?, ?)", row)
+        found = self._connection.execute(
+            "SELECT id FROM plannerConfigs WHERE name = ? AND settings = ?", row
+        ).fetchone()
+        return int(found[0])

@@ -1,0 +1,252 @@
+"""The runs of a study: every case, target and start with every planner and seed, each with its key."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from anatomy.base.errors import LungaccessError
+from anatomy.base.records import frozen_value
+from anatomy.base.settings import to_mapping
+from anatomy.io.frames import parse_point
+from anatomy.lung import Lung
+from lungaccess.planning.procedure import Procedure, load_procedure
+from lungaccess.plans.version import software_version
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.system import System, load_system, system_fingerprint
+from lungaccess.problem.target import nodule_target
+from lungaccess.problem.task import objective_of
+from lungaccess.running.study.patients import Patient, open_patient, patient_of
+from lungaccess.running.study.settings import Case, PlannerChoice, Study
+from lungaccess.uncertainty.risk import ErrorModel, load_errors
+
+OF_THEIR_OWN_CLASS = ("patient", "system", "errors", "procedure")
+"""The fields of a problem that are not plain values."""
+RUN_FORMAT = 1
+"""Raise it when what a run does changes: stored runs of another format are run anew."""
+
+
+@frozen_value
+class Problem:
+    """What is asked of the planners: everything but planner and seed.
+
+    Parameters
+    ----------
+    target : int
+        Number of the target in its case, from 1.
+    target_lps : tuple of 3 float
+        LPS mm.
+    origin : str
+        Where the target came from.
+    start : int
+        Number of the needle's start pose, 0 for none.
+    stop_spacing_mm, site_spacing_mm : float
+        Of the deployment atlas.
+    time_s : float or None
+        The budget.
+    first_plan : bool
+        Whether a run ends with its first plan.
+    errors : ErrorModel or None
+        Under which the chance of success of a plan is counted; None for not at all.
+    procedure : Procedure
+        By which it is counted.
+    """
+
+    case: str
+    patient: Patient
+    system: System
+    objective: str
+    target: int
+    target_lps: tuple[float, float, float]
+    origin: str
+    start: int
+    rotations: int
+    stop_spacing_mm: float
+    site_spacing_mm: float
+    iterations: int | None
+    time_s: float | None
+    first_plan: bool = False
+    errors: ErrorModel | None = None
+    procedure: Procedure = Procedure()
+
+    @property
+    def patient_name(self) -> str:
+        """What tables call the patient."""
+        return Path(self.patient.anatomy).name
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what the answers depend on, as plain JSON types; where the patient lies does not."""
+        return {
+            **self.plain(),
+            "target_lps": list(self.target_lps),
+            "lung": self.patient.key,
+            "system": system_fingerprint(self.system),
+            "version": software_version(),
+            "format": RUN_FORMAT,
+            **self.counted(),
+        }
+
+    def counted(self) -> dict[str, Any]:
+        """Return errors and procedure as plain JSON types; nothing where no chance is counted."""
+        if self.errors is None:
+            return {}
+        return {"errors": to_mapping(self.errors), "procedure": to_mapping(self.procedure)}
+
+    def plain(self) -> dict[str, Any]:
+        """Return the fields that are plain values."""
+        names = (item.name for item in fields(self) if item.name not in OF_THEIR_OWN_CLASS)
+        return {name: getattr(self, name) for name in names}
+
+    @cached_property
+    def key(self) -> str:
+        """Hash (hex) of all that the answers depend on besides planner and seed."""
+        return _hash(self.to_mapping())
+
+
+@frozen_value
+class Run:
+    """One run: a problem, a planner and a seed."""
+
+    problem: Problem
+    planner: PlannerChoice
+    seed: int
+
+    @property
+    def iterations(self) -> int | None:
+        """Iterations of the run: the planner's own, or those of the budget."""
+        own = self.planner.iterations
+        return self.problem.iterations if own is None else own
+
+    @cached_property
+    def key(self) -> str:
+        """Hash (hex) of all that the answer depends on."""
+        planner = to_mapping(self.planner)
+        return _hash({"problem": self.problem.key, "planner": planner, "seed": self.seed})
+
+    def to_json(self) -> str:
+        """Return the run as JSON, for another process."""
+        values = self.problem.plain() | {
+            "patient": asdict(self.problem.patient),
+            "system": to_mapping(self.problem.system),
+            **self.problem.counted(),
+        }
+        return json.dumps({"problem": values, "planner": to_mapping(self.planner), "seed": self.seed})
+
+    @staticmethod
+    def from_json(text: str) -> Run:
+        """Return the run that `to_json` wrote."""
+        from anatomy.base.settings import parse
+
+        values = json.loads(text)
+        problem = values["problem"]
+        patient = problem["patient"]
+        problem |= {
+            "target_lps": tuple(problem["target_lps"]),
+            "patient": Patient(**patient | {"sources": tuple(map(tuple, patient["sources"]))}),
+            "system": parse(System, problem["system"], "run"),
+        }
+        for name, cls in (("errors", ErrorModel), ("procedure", Procedure)):
+            if name in problem:
+                problem[name] = parse(cls, problem[name], "run")
+        planner = parse(PlannerChoice, values["planner"], "run")
+        return Run(problem=Problem(**problem), planner=planner, seed=values["seed"])
+
+
+def runs_of(
+    study: Study, *, cache: Path | None = None, progress: Callable[[str], None] | None = None
+) -> Iterator[Run]:
+    """Yield the runs of a study, case by case; each patient is opened once to find the targets.
+
+    Raises
+    ------
+    LungaccessError
+        If a patient or a system cannot be read, a target cannot be understood, there is no such nodule, or a
+        planner needs a needle that a system does not have.
+    """
+    for case in study.case:
+        (progress or (lambda _words: None))(f"targets of {case.name}")
+        folder = Path(study.folder)
+        patient = patient_of(case, folder, cache)
+        system = load_system(_beside(case.system, folder), fissures_allowed=case.fissures_allowed)
+        counted: dict[str, Any] = {}
+        if case.errors:
+            counted = {
+                "errors": load_errors(_beside(case.errors, folder)),
+                "procedure": load_procedure(_beside(case.procedure, folder)),
+            }
+        for planner in study.planner:
+            if planner.needs_a_needle:
+                system.require_needle(f"The planner {planner.name!r} of the study")
+        lung = open_patient(patient, cache)
+        objective, targets = str(objective_of(lung, case.objective)), _targets(case, lung)
+        for number, (point, origin) in enumerate(targets, start=1):
+            problem = Problem(
+                case=case.name,
+                patient=patient,
+                system=system,
+                objective=objective,
+                target=number,
+                target_lps=point,
+                origin=origin,
+                start=0,
+                rotations=study.atlas.rotations,
+                stop_spacing_mm=study.atlas.stop_spacing_mm,
+                site_spacing_mm=study.atlas.site_spacing_mm,
+                iterations=study.budget.iterations,
+                time_s=study.budget.time_s,
+                first_plan=study.budget.first_plan,
+                **counted,
+            )
+            yield from _runs_to(study, case, problem)
+
+
+Point = tuple[float, float, float]
+
+
+def _beside(name: str, folder: Path) -> str:
+    """Return the name of a preset as it is, and that of a file as it lies beside the study's."""
+    return str(folder / name) if name.endswith(".toml") else name
+
+
+def _runs_to(study: Study, case: Case, problem: Problem) -> Iterator[Run]:
+    """Yield the runs of a problem with every planner, start and seed."""
+    for planner in study.planner:
+        for start in case.starts if planner.kind == "needle" else (0,):
+            for seed in study.seeds:
+                yield Run(problem=replace(problem, start=start), planner=planner, seed=seed)
+
+
+def _targets(case: Case, lung: Lung) -> list[tuple[Point, str]]:
+    """Return points and where they came from; whether a needle may end there is part of the run."""
+    found = [_stated(lung, words) for words in case.targets]
+    drawn = peripheral_targets(lung, case.peripheral.per_lung, case.peripheral.seed)
+    return found + [(_point(each), f"peripheral {n}") for n, each in enumerate(drawn, start=1)]
+
+
+def _stated(lung: Lung, words: str) -> tuple[Point, str]:
+    first, *rest = words.split()
+    if first != "nodule":
+        return _point(parse_point(words)), f"point {words}"
+    if len(rest) > 1 or not all(each.isdigit() for each in rest):
+        raise LungaccessError(
+            f"{words!r} is not a target",
+            expected="nodule, or nodule N with a whole number",
+            remedy="Correct `targets` in the study's file",
+        )
+    target = nodule_target(lung, int(rest[0]) if rest else 1)
+    return _point(target.lps_mm), target.origin
+
+
+def _point(values: Any) -> Point:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _hash(values: Mapping[str, Any]) -> str:
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,77 @@
+"""The tables of a results file as a user wants them: without the file's own row numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from lungaccess.running.study.results import ResultsFile
+
+TIMES = frozenset({"time", "cpu_time", "first_solution_time", "memory"})
+"""Columns that two equal runs may differ in."""
+
+_RUNS = """
+SELECT r.key, p.case_name AS "case", p.patient, p.lung, p.system, p.fissures_allowed, p.objective, p.target,
+       p.origin, p.x_lps_mm, p.y_lps_mm, p.z_lps_mm, p.start, p.iterations AS iterations_allowed,
+       p.time_s AS time_allowed_s, e.version, c.name AS planner, c.settings AS planner_settings, r.seed,
+       o.outcome, o.failed, o.message, o.advice, r.solved, r.correct_solution, r.status, r.iterations,
+       r.solutions, r.cost, r.inverse_clearance, r.cost_map, r.voxel_sum, r.solution_length,
+       json_extract(l.plan, '$.chance.errors') AS errors,
+       json_extract(l.plan, '$.chance.procedure') AS procedure,
+       json_extract(l.plan, '$.chance.samples') AS success_samples,
+       json_extract(l.plan, '$.chance.successes') AS successes,
+       r.time, r.cpu_time, r.first_solution_time, r.memory
+FROM runs r JOIN outcomes o ON o.runid = r.id JOIN plannerConfigs c ON c.id = r.plannerid
+     JOIN experiments e ON e.id = r.experimentid JOIN problems p ON p.experimentid = e.id
+     LEFT JOIN plans l ON l.runid = r.id
+ORDER BY p.case_name, p.target, p.start, c.name, r.seed, r.key"""
+
+QUERIES = {
+    "runs": _RUNS,
+    "progress": """
+SELECT r.key, row_number() OVER (PARTITION BY t.runid ORDER BY t.time) AS number, t.iterations, t.best_cost,
+       t.time FROM progress t JOIN runs r ON r.id = t.runid ORDER BY r.key, t.time""",
+    "findings": """
+SELECT r.key, t.number, t.name, t.ok, t.value, t.bound, t.side, t.tolerance, t.unit, t.detail
+FROM findings t JOIN runs r ON r.id = t.runid ORDER BY r.key, t.number""",
+    "rejections": """
+SELECT r.key, t.reason, t.count FROM rejections t JOIN runs r ON r.id = t.runid ORDER BY r.key, t.reason""",
+    "plans": """
+SELECT r.key, t.digest, t.plan FROM plans t JOIN runs r ON r.id = t.runid ORDER BY r.key""",
+}
+"""What is exported and compared, by the name of the table."""
+
+INTEGERS = frozenset(
+    {
+        "target", "start", "iterations_allowed", "seed", "status", "iterations", "solutions", "number",
+        "count", "success_samples", "successes",
+    }
+)  # fmt: skip
+TRUTHS = frozenset({"fissures_allowed", "failed", "solved", "correct_solution", "ok"})
+TEXTS = frozenset(
+    {
+        "key", "case", "patient", "lung", "system", "objective", "origin", "version", "planner",
+        "planner_settings", "outcome", "message", "advice", "name", "side", "unit", "detail", "reason",
+        "digest", "plan", "errors", "procedure",
+    }
+)  # fmt: skip
+"""Kinds of columns; every other one holds real numbers."""
+
+
+class Table(NamedTuple):
+    """A table's column names, and its rows as they are read."""
+
+    columns: tuple[str, ...]
+    rows: Iterator[tuple[Any, ...]]
+
+
+def table(results: ResultsFile, name: str) -> Table:
+    """Return one of the tables of `QUERIES`.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    """
+    columns = results.columns(QUERIES[name])
+    return Table(columns, results.rows(QUERIES[name]))

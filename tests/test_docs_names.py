@@ -59,7 +59,8 @@ def exists(dotted: str) -> bool:
         if not file.is_file():
             continue
         rest = parts[count:]
-        known = definitions(file)
+        stub = file.with_suffix(".pyi")
+        known = definitions(stub if stub.is_file() else file)
         if len(rest) < 2:
             return not rest or rest[0] in known
         return rest[0] in known and (not known[rest[0]] or rest[1] in known[rest[0]])

@@ -15,7 +15,8 @@ import pytest
 TESTS = Path(__file__).resolve().parent
 ROOMS = {
     folder.name: folder
-    for parent in (TESTS, TESTS / "stages", TESTS / "lungaccess")
+    for parent in (TESTS, TESTS / "stages", TESTS / "lungaccess", *(TESTS / "lungaccess").iterdir())
+    if parent.is_dir()
     for folder in parent.iterdir()
     if folder.is_dir() and not folder.name.startswith("_")
 }
@@ -53,7 +54,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark tests by their rooms; of slower files keep the cases alone, where quick ones are asked for."""
     for item in items:
-        for room in ROOMS.keys() & item.path.parts[len(TESTS.parts) :][:2]:
+        for room in ROOMS.keys() & item.path.parts[len(TESTS.parts) :][:3]:
             item.add_marker(room)
     if config.option.quick:
         left_out = {item for item in items if is_slower(item.path) and item.nodeid not in CASES}

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from anatomy.base.files import atomic_write, require_writable_folder, sha256
     from anatomy.io.dicom import SeriesInfo, list_series, read_dicom
     from anatomy.io.frames import parse_point, read_points, read_pose
     from anatomy.io.images import read_mask, read_volume, write_volume

@@ -5,7 +5,7 @@ import hashlib
 import pytest
 
 from anatomy.base.errors import FileError
-from anatomy.io import atomic_write, require_writable_folder, sha256
+from anatomy.base.files import atomic_write, require_writable_folder, sha256
 
 
 def test_hash_is_of_the_bytes(tmp_path):

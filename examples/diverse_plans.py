@@ -7,7 +7,7 @@ The picture shows tubes and needles of the set from the front, over the airway t
 import matplotlib.pyplot as plt
 
 import lungaccess as la
-from lungaccess.planning.coupled import alternatives
+from lungaccess.planning import alternatives
 
 lung = la.load_patient("phantom-3")
 system = la.load_system("ultrathin")

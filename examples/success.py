@@ -9,7 +9,7 @@ other beats in all three.
 import matplotlib.pyplot as plt
 
 import lungaccess as la
-from lungaccess.planning.coupled import with_front
+from lungaccess.planning import with_front
 from lungaccess.planning.success import chance_of, estimate_success
 
 lung = la.load_patient("phantom-3")

@@ -25,7 +25,7 @@ from experiments.support.kuntz2015.rrt_time import LONG_S, PAPER_S, PAPER_SHARE,
 from experiments.support.kuntz2015.workspace_rejection import PAPER_PATHS
 from experiments.support.kuntz2015.workspace_rejection import PAPER_S as PAPER_PATHS_S
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.planning.coupled import Alternative, alternatives
+from lungaccess.planning import Alternative, alternatives
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from anatomy.lung import Lung
-    from lungaccess.cli.plan_search import PlanRequest
+    from lungaccess.cli.plan_search import PlanJob
     from lungaccess.judging.explanation import Explanation
     from lungaccess.planning.coupled import Atlas
     from lungaccess.plans.no_plan import NoPlan
@@ -28,37 +28,39 @@ STALE = "plan.json in this folder is from another run: it is no answer to this o
 
 
 def explain_and_report(
-    lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float | None
+    lung: Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None
 ) -> dict[str, Any]:
     """Explain a `NoPlan`, write and show what was learned, and return it as plain values.
 
     Parameters
     ----------
+    cost : str
+        By which plans of other systems are searched.
     time_s : float or None
         Processor time for the explanation; the default of `explain_no_plan` if None.
     """
     from lungaccess.judging.explanation import explanation_record, save_explanation
 
-    explanation = _explained(lung, request, failure, time_s)
-    written = save_explanation(explanation, request.out)
-    if not request.output.json:
+    explanation = _explained(lung, job, failure, cost, time_s)
+    written = save_explanation(explanation, job.out)
+    if not job.output.json:
         show_explanation(explanation)
-    if request.pictures:
-        written = (*written, *_drawn(lung, request, explanation))
+    if job.pictures:
+        written = (*written, *_drawn(lung, job, explanation))
     record = explanation_record(explanation)
-    record |= {"folder": str(request.out), "files": list(written)}
-    if not request.output.json:
-        terminal.say(f"Written to {request.out}: {', '.join(written)}")
-        if (request.out / "plan.json").exists():
+    record |= {"folder": str(job.out), "files": list(written)}
+    if not job.output.json:
+        terminal.say(f"Written to {job.out}: {', '.join(written)}")
+        if (job.out / "plan.json").exists():
             terminal.say(STALE)
     return record
 
 
-def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float | None) -> Explanation:
+def _explained(lung: Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None) -> Explanation:
     from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan
     from lungaccess.planning.coupled import atlas_is_kept, open_atlas
 
-    system, cache = request.systems[0], request.output.cache
+    system, cache = job.asked.systems[0], job.output.cache
 
     def atlas_of(other: System, on_share: Callable[[float], None]) -> Atlas:
         def tell(share: float) -> None:
@@ -71,11 +73,11 @@ def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float 
         return explain_no_plan(
             lung,
             system,
-            request.target.resolve(lung),
+            job.target.resolve(lung),
             failure,
             atlas=open_atlas(lung, system, cache=cache, progress=shown.share),
-            objective=request.search.objective,
-            seed=request.search.seed,
+            objective=cost,
+            seed=job.asked.fields["seed"],
             time_s=DEFAULT_TIME_S if time_s is None else time_s,
             atlas_of=atlas_of,
             is_kept=lambda other: atlas_is_kept(lung, other, cache=cache),
@@ -83,14 +85,14 @@ def _explained(lung: Lung, request: PlanRequest, failure: NoPlan, time_s: float 
         )
 
 
-def _drawn(lung: Lung, request: PlanRequest, explanation: Explanation) -> tuple[str, ...]:
+def _drawn(lung: Lung, job: PlanJob, explanation: Explanation) -> tuple[str, ...]:
     from lungaccess.showing.report import no_plan_png
     from lungaccess.showing.report.html import no_plan_page
 
     with progress("drawing why there is no plan"):
-        no_plan_png(explanation, lung, request.out / PICTURE)
+        no_plan_png(explanation, lung, job.out / PICTURE)
     with progress("making the page"):
-        no_plan_page(explanation, lung, request.out / PAGE)
+        no_plan_page(explanation, lung, job.out / PAGE)
     return PICTURE, PAGE
 
 

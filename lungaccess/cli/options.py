@@ -6,7 +6,7 @@ Every class is a group of options that cyclopts flattens into those of a command
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -15,7 +15,9 @@ from anatomy.base.files import require_writable_folder
 from anatomy.base.records import frozen_value
 from lungaccess.cli.numbers import Count, NotNegative, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
-from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS, Objective
+from lungaccess.problem.goals import SUCCESS, WINDOW, goal_of
+from lungaccess.problem.request import ATLAS, AUTO, Request, StatedPlace, require_phases
+from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS
 
 if TYPE_CHECKING:
     from anatomy.base.typed import Float
@@ -24,32 +26,25 @@ if TYPE_CHECKING:
     from lungaccess.planning.coupled.atlas import Atlas
     from lungaccess.planning.procedure import Procedure
     from lungaccess.problem.system import System
-    from lungaccess.problem.target import StatedTarget
+    from lungaccess.problem.target import StatedTarget, Target
     from lungaccess.uncertainty.risk import ErrorModel
 
+    GoalText = str
     ObjectiveText = str
     OurPlannerName = str
     PlannerName = str
 else:
     ObjectiveText = Literal[DEFAULT, *(term.option for term in TERMS)] | str
+    GoalText = Literal[SUCCESS.name, WINDOW.name, DEFAULT, *(term.option for term in TERMS)] | str
     OurPlannerName, PlannerName = Literal[OUR_PLANNERS], Literal[NEEDLE_PLANNERS]
 """The costs by name, for help and completion, or a weighted sum, which `Objective.of` reads; the planners."""
 
-Method = Literal[
-    "atlas", "kuntz2015", "kuntz2015-without-rejection", "reference", "reference-without-rejection"
-]
 PatientFolder = Annotated[
     Path, Parameter(help="Folder of masks: Med-RAD, TotalSegmentator, or own masks with a patient.toml.")
 ]
 PlanFile = Annotated[Path, Parameter(help="The plan.json.")]
 PatientOfPlan = Annotated[Path, Parameter(help="Folder of the patient it was made for.")]
-SUCCESS = "success"
-"""The objective that is no cost: the chance of success."""
-WINDOW = "window"
-"""The objective that is no cost: the share of the breath in which the plan is proved."""
 DEFAULT_SYSTEM = "lung-default"
-AUTO = "auto"
-"""Stands for the least invasive preset that reaches the target."""
 DEFAULT_BUDGET_S = 10.0
 """Long enough that the best cost of most targets has settled, short enough to wait for."""
 
@@ -177,20 +172,11 @@ class PlaceOptions:
                 remedy="Leave one of them out",
             )
         if self.exit is not None:
-            return StatedPlace(option="--exit", lps_mm=_point(self.exit), within_mm=self.exit_within)
+            return StatedPlace(kind="exit", lps_mm=_point(self.exit), within_mm=self.exit_within)
         if self.scope_tip is None:
             return None
         point = _point(self.scope_tip)
-        return StatedPlace(option="--scope-tip", lps_mm=point, within_mm=self.scope_tip_within)
-
-
-@frozen_value
-class StatedPlace:
-    """A point `(3,)` LPS mm that a plan has to go through, how near, and the option that states it."""
-
-    option: Literal["--exit", "--scope-tip"]
-    lps_mm: Float
-    within_mm: float
+        return StatedPlace(kind="scope tip", lps_mm=point, within_mm=self.scope_tip_within)
 
 
 def _point(text: str) -> Float:
@@ -261,7 +247,8 @@ class ErrorOptions:
         str | None,
         Parameter(
             help="What is measured and planned again on the way: a preset (closed-loop, measured-scope, "
-            "measured-tip, open-loop) or a TOML file; open-loop if not given."
+            "measured-tip, open-loop) or a TOML file; if not given, measured-tip for plans that are made for "
+            "success, and open-loop for others."
         ),
     ] = None
 
@@ -306,25 +293,32 @@ class BudgetOptions:
 @Parameter(name="*")
 @frozen_value
 class SearchOptions(BudgetOptions):
-    """How to search for plans, and how long."""
+    """What a plan is to be good at, how to search for it, and how long."""
 
-    objective: Annotated[
-        ObjectiveText,
+    goal: Annotated[
+        GoalText,
         Parameter(
-            help="What to make small: integral of 1/clearance, integral of the patient's cost map, its sum "
-            "over the voxels crossed, or length; or a weighted sum such as length=1,cost-map=0.5; default is "
-            "the first, and the second too where there is a map.  Or success: the chance that the procedure "
-            "succeeds is made large; or window: the share of the breath in which the plan is proved."
+            name=("--goal", "--objective"),
+            help="What to make good. success: the chance that the procedure succeeds; window: the share of "
+            "the breath in which it is proved; or a cost to make small: integral of 1/clearance, of the "
+            "patient's cost map, its sum over the voxels crossed, or length, of the needle alone; a weighted "
+            "sum such as length=1,cost-map=0.5; default is the first, and the second too where there is a "
+            "map; or a goal that a package adds.",
         ),
-    ] = DEFAULT
+    ] = SUCCESS.name
     phases: PhasesText = None
+    least_clearance: Annotated[
+        NotNegative,
+        Parameter(help="Every axis in tissue keeps at least so many mm from every obstacle, if not more."),
+    ] = 0.0
     method: Annotated[
-        Method,
+        str,
         Parameter(
-            help="Search over the deployment atlas; Algorithm 1 of Kuntz et al. 2015; or reference: the same "
-            "as printed, with collisions of surface meshes, slow."
+            help="Search for plans. atlas: over all that scope and tubes can do; kuntz2015: Algorithm 1 of "
+            "Kuntz et al. 2015; reference: the same as printed, with collisions of surface meshes, slow; "
+            "each of the two also -without-rejection; or one that a package adds."
         ),
-    ] = "atlas"
+    ] = ATLAS
     needle_planner: Annotated[
         PlannerName | None,
         Parameter(
@@ -335,6 +329,9 @@ class SearchOptions(BudgetOptions):
     processes: Annotated[
         Processes, Parameter(help="How many processes refine the plan at the same time; not on Windows.")
     ] = 1
+    cpu_budget: Annotated[Seconds | None, Parameter(help="Stop after so many seconds of processor time.")] = (
+        None
+    )
     gap: Annotated[
         NotNegative | None,
         Parameter(
@@ -342,6 +339,54 @@ class SearchOptions(BudgetOptions):
             "of the atlas, such as 0.05; the plan states what is proved."
         ),
     ] = None
+
+    @property
+    def cost(self) -> str:
+        """The cost that is meant where a goal is none: the default one."""
+        return self.goal if goal_of(self.goal).objective is not None else DEFAULT
+
+    def asked(
+        self,
+        systems: tuple[System, ...],
+        errors: ErrorModel | None = None,
+        procedure: Procedure | None = None,
+        place: StatedPlace | None = None,
+    ) -> Asked:
+        """Return all of a request but patient and target, after what can be looked at without them.
+
+        Raises
+        ------
+        SettingsError
+            If there is no such goal or method, or a value is wrong.
+        """
+        from lungaccess.planning.searches import planners, unknown_method
+
+        goal_of(self.goal)
+        if self.method not in planners():
+            raise unknown_method(self.method)
+        return Asked(
+            systems=systems,
+            fields={
+                "goal": self.goal, "phases": stated_phases(self.phases),
+                "least_clearance_mm": self.least_clearance, "method": self.method,
+                "needle_planner": self.needle_planner or "", "processes": self.processes, "gap": self.gap,
+                "seed": self.seed, "iterations": self.iterations, "time_s": self.time_s,
+                "cpu_s": self.cpu_budget, "errors": errors, "procedure": procedure, "place": place,
+            },
+        )  # fmt: skip
+
+
+@frozen_value
+class Asked:
+    """All of a request but patient and target, by the names of `Request.of`."""
+
+    systems: tuple[System, ...]
+    fields: dict[str, Any]
+
+    def request(self, lung: Lung, target: Target) -> Request:
+        """Return the request for a target in a lung; errors as `Request`."""
+        require_map(lung, self.fields["goal"])
+        return Request.of(lung, self.systems, target, **self.fields)
 
 
 def stated_phases(text: str | None) -> tuple[float, float] | None:
@@ -352,8 +397,6 @@ def stated_phases(text: str | None) -> tuple[float, float] | None:
     SettingsError
         If it is not two phases from 0 to 1 in order.
     """
-    from lungaccess.planning.coupled.window_planner import require_phases
-
     if text is None:
         return None
     first, _colon, last = text.partition(":")
@@ -381,7 +424,8 @@ def require_picture(path: Path) -> None:
 
 def require_map(lung: Lung, objective: str) -> None:
     """Raise SettingsError if a stated objective weighs a cost map that the patient does not have."""
-    if objective != DEFAULT and Objective.of(objective).weighs_map and lung.cost is None:
+    weighed = goal_of(objective).objective
+    if objective != DEFAULT and weighed is not None and weighed.weighs_map and lung.cost is None:
         raise SettingsError(
             f"Patient {lung.name} has no cost map",
             expected=f"a cost map among the patient's files for --objective {objective}",

@@ -135,6 +135,7 @@ class SearchDisplay(_Shown):
 
     def __init__(self, time_s: float | None, iterations: int | None, what: str = "cost") -> None:
         self._time_s, self._iterations, self._what = time_s, iterations, what
+        self._found = False
         self._progress = _bar(TextColumn("{task.fields[best]}"))
         total = float(iterations) if iterations is not None else time_s
         self._task = self._progress.add_task("searching", total=total, best="no plan yet")
@@ -142,12 +143,14 @@ class SearchDisplay(_Shown):
     def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
         """Show the state of the search."""
         done = float(iteration) if self._iterations is not None else elapsed_s
-        best = "no plan yet" if best_cost is None else f"best {self._what} {best_cost:.4g}"
-        self._progress.update(self._task, description=description, completed=done, best=best)
+        self._found = self._found or best_cost is not None
+        words = "improving the plan" if self._found else "no plan yet"
+        self._progress.update(self._task, description=description, completed=done, best=words)
 
-    def better(self, elapsed_s: float, cost: float) -> None:
+    def better(self, elapsed_s: float, value: float | None) -> None:
         """Leave a line about a better plan above the bar."""
-        self._progress.console.print(f"  {elapsed_s:8.2f} s   {self._what} {cost:.5g}", highlight=False)
+        said = "a first clear plan" if value is None else f"{self._what} {value:.5g}"
+        self._progress.console.print(f"  {elapsed_s:8.2f} s   {said}", highlight=False)
 
     def interrupted(self) -> None:
         """Leave a line that says that the user ended the search."""

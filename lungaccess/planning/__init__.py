@@ -1,1 +1,24 @@
 """From a request to plans, and from a measurement to the next step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from anatomy.base.facade import lazy_exports
+
+if TYPE_CHECKING:
+    from lungaccess.planning.constraints import TIP_WITHIN_MM, WITHIN_MM, tips_near
+    from lungaccess.planning.diverse_plans import COUNT, SEPARATION_MM, Alternative, alternatives, with_front
+    from lungaccess.planning.driver import ProgressEvent, atlas_event
+    from lungaccess.planning.one_system import run
+    from lungaccess.planning.searches import NEED_A_NEEDLE, planners
+    from lungaccess.planning.tour import (
+        TourAnswer,
+        coupled_plan_test,
+        lesions_of,
+        plan_tour,
+        read_lesions,
+        tour_record,
+    )
+
+__getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -74,7 +74,7 @@ class Plan(Record):
         The planner of the needle that the search was told to use; "" for the method's own.
     system_choice : tuple of str
         Where the system was chosen among several: in sentences, which were tried, why each failed, and why
-        this one was chosen; see `lungaccess.judging.presets_in_turn`.  Empty otherwise.
+        this one was chosen; see `lungaccess.judging.answering`.  Empty otherwise.
     timing : mapping of str to float
         Seconds; the only values that differ between two equal runs.
     chance : Chance or None
@@ -87,6 +87,8 @@ class Plan(Record):
     cost_bound : float
         Proved lower bound of the cost of every plan from a scope tip of the atlas, where the search was told
         to find one; 0 for any other.
+    goals : mapping of str to float
+        Values of functions of the plan that it was made good at; see `lungaccess.problem.goals.Goal`.
     """
 
     schema: str = plan_file.SCHEMA
@@ -119,6 +121,7 @@ class Plan(Record):
     window: BreathingWindow | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     aim: BreathingAim | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     cost_bound: float = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
+    goals: Mapping[str, float] = field(default_factory=dict, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""

@@ -144,6 +144,11 @@ class BreathingWindow(Record):
                 remedy="Run `lungaccess plan` again",
             )
 
+    def holds_all(self, phases: tuple[float, float]) -> bool:
+        """Tell whether one stretch of the window holds all phases from the first to the last."""
+        first, last = phases
+        return bool(((self.phases[:, 0] <= first) & (self.phases[:, 1] >= last)).any())
+
     @property
     def share(self) -> float:
         """The share of the phases that the window holds."""

@@ -215,10 +215,15 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     given = os.fspath(name_or_path)
     loaded = parse(System, _FILES.read(name_or_path), given, remedy=_FILES.remedy)
     require_own_name(loaded, given)
-    if fissures_allowed is None or fissures_allowed == loaded.fissures_allowed:
-        return loaded
-    name = loaded.name + FISSURE_RULES[fissures_allowed]
-    return replace(loaded, name=name, fissures_allowed=fissures_allowed)
+    return with_fissure_rule(loaded, fissures_allowed)
+
+
+def with_fissure_rule(system: System, fissures_allowed: bool | None) -> System:
+    """Return a system that may cross fissures or not, with a name that says so; itself for None."""
+    if fissures_allowed is None or fissures_allowed == system.fissures_allowed:
+        return system
+    name = system.name + FISSURE_RULES[fissures_allowed]
+    return replace(system, name=name, fissures_allowed=fissures_allowed)
 
 
 def preset_named(name: str) -> System | None:

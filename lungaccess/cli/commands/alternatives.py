@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative
 from lungaccess.cli.options import (
-    SUCCESS,
-    WINDOW,
     ErrorOptions,
-    ObjectiveText,
     PatientFolder,
     PatientOptions,
-    PhasesText,
+    SearchOptions,
     SystemOptions,
     TargetOptions,
-    require_map,
-    stated_phases,
 )
 from lungaccess.cli.plan_search import system_of
 from lungaccess.cli.progress import progress
-from stages.needle import DEFAULT, Objective
+from lungaccess.problem.goals import SUCCESS
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.judging.appraisal import Appraisal
-    from lungaccess.planning.coupled import Alternative
+    from lungaccess.planning import Alternative
+    from lungaccess.planning.coupled import Atlas
     from lungaccess.problem.system import System
 
 PICTURE = "trade_off.svg"
@@ -62,14 +55,7 @@ def alternatives(
         NotNegative,
         Parameter(help="The needles of every two plans lie somewhere at least so many mm from each other."),
     ] = 5.0,
-    objective: Annotated[
-        ObjectiveText,
-        Parameter(
-            help="By what the best come first, as for `plan`; success: the likeliest to succeed; window: as "
-            "default, with aims for the widest window."
-        ),
-    ] = DEFAULT,
-    phases: PhasesText = None,
+    search: SearchOptions = SearchOptions(),
     errors: ErrorOptions = ErrorOptions(),
     out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on, and trade_off.svg.")] = Path(
         "lungaccess-alternatives"
@@ -81,51 +67,31 @@ def alternatives(
     Those that no other beats in success, length and clearance together are marked: the Pareto front.
     """
     from anatomy.base.files import write_text
+    from lungaccess.judging import answer_with_several
     from lungaccess.judging.appraisal import Appraiser
-    from lungaccess.planning.coupled import alternatives as find_alternatives
-    from lungaccess.planning.coupled import with_front
-    from lungaccess.planning.success import alternatives_for_success
+    from lungaccess.planning import with_front
+    from lungaccess.planning.coupled import open_atlas
     from lungaccess.showing.report.html import trade_off_svg
 
-    for_success, widest, asked = objective == SUCCESS, objective == WINDOW, stated_phases(phases)
-    if for_success and asked is not None:
-        raise SettingsError(
-            "--phases is asked for with --objective success", expected="one of them", remedy="Leave one out"
-        )
-    objective = DEFAULT if for_success or widest else objective
-    Objective.of(objective)
-    stated = target.stated()
-    model, procedure = errors.load(), errors.given_procedure()
+    stated, systems = target.stated(), system.candidates()
+    asked = search.asked(systems, errors.given(), errors.given_procedure())
     require_writable_folder(out)
-    systems = system.candidates()
     lung = output.load(patient)
-    require_map(lung, objective)
-    aim = stated.resolve(lung)
+    request = asked.request(lung, stated.resolve(lung))
+    with progress("searching") as shown:
 
-    def search(device: System) -> tuple[Alternative, ...]:
-        shared: dict[str, Any] = {
-            "atlas": output.open_atlas(lung, device),
-            "count": count,
-            "separation_mm": separation,
-            "counterfactuals": len(systems) == 1,
-        }
-        with progress("searching") as shown:
-            if for_success:
-                return alternatives_for_success(
-                    lung, device, aim, errors=model, procedure=procedure, progress=shown.share, **shared
-                )
-            return find_alternatives(
-                lung, device, aim, objective=objective, phases=asked, widest=widest, **shared
-            )
+        def atlas_of(device: System) -> Atlas:
+            return open_atlas(lung, device, cache=output.cache, progress=shown.share)
 
-    found = search(systems[0]) if len(systems) == 1 else _of_the_least_invasive(lung, systems, search)
-    chosen = system_of(found[0].plan, systems)
-    appraiser = Appraiser(lung) if for_success else Appraiser(lung, model, procedure=procedure)
+        found = answer_with_several(request, count=count, separation_mm=separation, atlas_of=atlas_of)
+    chosen, by_success = system_of(found[0].plan, systems), request.goal is SUCCESS
+    given = (None, None) if by_success else (request.errors, request.procedure)
+    appraiser = Appraiser(lung, given[0], procedure=given[1])
     appraisals = []
     with progress("checking") as shown:
         for number, each in enumerate(found, start=1):
             each.plan.save(out / f"plan-{number:02d}.json")
-            appraisals.append(appraiser.appraise(each.plan, chosen, target_lps=aim.lps_mm))
+            appraisals.append(appraiser.appraise(each.plan, chosen, target_lps=request.target.lps_mm))
             shown.share(number / len(found))
     found = with_front([each.plan for each in found], [each.headline.chance for each in appraisals])
     if drawing := trade_off_svg(found):
@@ -139,32 +105,6 @@ def alternatives(
         terminal.say(" ".join(found[0].plan.system_choice))
     terminal.say(f"Written to {out}; the check refuses {refused} of {len(found)}")
     return ExitCode.of(not refused)
-
-
-def _of_the_least_invasive(
-    lung: Lung, systems: Sequence[System], search: Callable[[System], tuple[Alternative, ...]]
-) -> tuple[Alternative, ...]:
-    """Return the plans of the first system whose cheapest plan the check accepts, with the reasons."""
-    from lungaccess.judging import Attempt, choice_in_words, none_reaches
-    from lungaccess.judging.checking import Checker
-    from lungaccess.plans.no_plan import NoPlan
-
-    checker = Checker(lung)
-    failed: list[Attempt] = []
-    for system in systems:
-        try:
-            found = search(system)
-        except NoPlan as failure:
-            failed.append(Attempt(system=system, failure=failure))
-            continue
-        first = found[0].plan
-        attempt = Attempt(system=system, plan=first, report=checker.check(first, system))
-        if not attempt.succeeded:
-            failed.append(attempt)
-            continue
-        choice = choice_in_words(failed, system, systems)
-        return tuple(replace(each, plan=replace(each.plan, system_choice=choice)) for each in found)
-    raise none_reaches(failed)
 
 
 def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal]) -> None:

@@ -15,8 +15,8 @@ from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Seconds, Seed
-from lungaccess.cli.options import ErrorOptions, PatientOptions, SearchOptions, SystemOptions
-from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, PlanRequest, plan_and_report
+from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions
+from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, PlanJob, plan_and_report
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -48,10 +48,8 @@ def demo(
     with progress("making a synthetic patient") as shown:
         lung = demo_lung(seed, output.cache, shown.step)
     target, systems = stated_target(None, 1), SystemOptions().candidates()
-    request = PlanRequest(
-        systems=systems, target=target, search=search, errors=ErrorOptions().load(), out=out, output=output
-    )
-    code = _first_reachable_nodule(lung, request)
+    job = PlanJob(asked=search.asked(systems), target=target, out=out, output=output)
+    code = _first_reachable_nodule(lung, job)
     if code == ExitCode.OK:
         with progress("making the page"):
             _write_page(lung, out)
@@ -82,7 +80,7 @@ def _write_page(lung: Lung, out: Path) -> None:
     plan_page(Plan.load(out / PLAN_FILE), lung, out / "report.html", options)
 
 
-def _first_reachable_nodule(lung: Lung, request: PlanRequest) -> ExitCode:
+def _first_reachable_nodule(lung: Lung, job: PlanJob) -> ExitCode:
     """Plan to the nodules in their order until one can be reached."""
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import stated_target
@@ -90,7 +88,7 @@ def _first_reachable_nodule(lung: Lung, request: PlanRequest) -> ExitCode:
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
-            return plan_and_report(lung, replace(request, target=stated_target(None, number)))
+            return plan_and_report(lung, replace(job, target=stated_target(None, number)))
         except NoPlan as error:
             terminal.progress_console.print(f"Nodule {number} cannot be reached; trying the next one.")
             failure = error

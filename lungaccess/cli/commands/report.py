@@ -100,7 +100,7 @@ def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple
 
     Of a patient that breathes they have their windows.
     """
-    from lungaccess.planning.coupled import alternatives as find
+    from lungaccess.judging import alternatives
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import Target
     from lungaccess.uncertainty.breathing.window import with_window
@@ -108,7 +108,7 @@ def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple
     target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
     atlas = output.open_atlas(lung, plan.system)
     try:
-        found = find(lung, plan.system, target, objective=plan.objective, count=count, atlas=atlas)
+        found = alternatives(lung, plan.system, target, goal=plan.objective, count=count, atlas=atlas)
     except NoPlan:
         return ()
     return tuple(with_window(each.plan, lung) for each in found)

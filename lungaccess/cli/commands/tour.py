@@ -15,7 +15,7 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from lungaccess.planning.one_stage import TourAnswer
+    from lungaccess.planning import TourAnswer
     from stages.scope.tour import Itinerary
 
 
@@ -68,7 +68,7 @@ def tour(
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out."""
-    from lungaccess.planning.one_stage import lesions_of, plan_tour, read_lesions, tour_record
+    from lungaccess.planning import lesions_of, plan_tour, read_lesions, tour_record
     from lungaccess.problem.system import load_system
     from lungaccess.showing.report.tour import tour_png
     from stages.scope.tour import Resistances

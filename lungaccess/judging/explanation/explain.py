@@ -9,13 +9,13 @@ from typing import Any, cast
 
 from anatomy.base.kernel_clock import working_cpu_s
 from anatomy.lung import Lung
+from lungaccess.judging.answering import Attempt, first_attempt
 from lungaccess.judging.appraisal import DRAWS, SEED
 from lungaccess.judging.checking import Checker
 from lungaccess.judging.explanation.blocking import arc_beyond_limits, look_along
 from lungaccess.judging.explanation.explanation import DONE, NOT_TRIED, TIME_IS_UP, Change, Explanation, Part
 from lungaccess.judging.explanation.neighbours import Surroundings
 from lungaccess.judging.explanation.starts import map_starts
-from lungaccess.judging.presets_in_turn import Attempt, first_attempt
 from lungaccess.planning.coupled import (
     Atlas,
     Counterfactual,
@@ -23,13 +23,14 @@ from lungaccess.planning.coupled import (
     build_atlas,
     direct_candidates,
     needle_changes,
-    plan,
     scope_changes,
 )
+from lungaccess.planning.one_system import run
 from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
+from lungaccess.problem.request import Limits, Request
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
@@ -81,7 +82,7 @@ def explain_no_plan(
     atlas : Atlas, optional
         The system's; made here if None.
     objective, seed
-        As for `lungaccess.planning.coupled.planner.plan`.
+        As for `lungaccess.planning.one_system.run`.
     time_s : float, optional
         No part begins after so many seconds of processor time, and long ones end; None for no limit.  Getting
         kernels does not count, and one preset is tried even if no time is left.
@@ -260,10 +261,8 @@ class Explainer:
             atlas = replace(self._atlas, system=system)
         else:
             atlas = self._atlas_of(system, self._alive_share)
-        plans = plan(
-            task.lung, system, task.target, objective=task.objective, seed=task.seed, iterations=ITERATIONS,
-            atlas=atlas, counterfactuals=False,
-        )  # fmt: skip
+        asked = Request.by_cost(replace(task, system=system), limits=Limits(iterations=ITERATIONS))
+        plans = run(asked, atlas=atlas, counterfactuals=False)
         tried.append(first_attempt(plans, system, self._checker))
 
     def _needle_changes(self) -> None:

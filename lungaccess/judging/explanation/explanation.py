@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import field
 
 from anatomy.base.records import frozen_record, frozen_value
+from lungaccess.judging.answering import Attempt
 from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking
 from lungaccess.judging.explanation.neighbours import Neighbour, ReachedShare
 from lungaccess.judging.explanation.starts import StartMap
-from lungaccess.judging.presets_in_turn import Attempt
 from lungaccess.planning.coupled import Counterfactual
 from lungaccess.planning.reachability import ReachVerdict
 from lungaccess.plans.no_plan import NoPlan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,9 +12,11 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.structures import obstacle_bits
 from lungaccess.judging.explanation.blocking import region_of
-from lungaccess.planning.coupled import DirectCandidates, plan, reach_scan
+from lungaccess.planning.coupled import DirectCandidates, reach_scan
+from lungaccess.planning.one_system import run
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.request import Limits, Request
 from lungaccess.problem.target import Target
 from lungaccess.uncertainty.risk import Share
 from stages.needle import DIRECT
@@ -117,11 +120,12 @@ class Surroundings:
         target = Target(lps_mm=point, origin=f"neighbour of {task.target.origin}")
         try:
             return next(
-                plan(
-                    task.lung, task.system, target, objective=task.objective, seed=task.seed, iterations=0,
-                    atlas=self._atlas, counterfactuals=False,
+                run(
+                    Request.by_cost(replace(task, target=target), limits=Limits(iterations=0)),
+                    atlas=self._atlas,
+                    counterfactuals=False,
                 )
-            )  # fmt: skip
+            )
         except NoPlan:
             return None
 

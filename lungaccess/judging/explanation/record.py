@@ -9,10 +9,10 @@ from typing import Any
 from anatomy.base.files import write_json
 from anatomy.base.typed import Float
 from anatomy.io.frames import LPS_FROM_RAS
+from lungaccess.judging.answering import Attempt
 from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, Structure
 from lungaccess.judging.explanation.explanation import Change, Explanation
 from lungaccess.judging.explanation.neighbours import ReachedShare
-from lungaccess.judging.presets_in_turn import Attempt
 from lungaccess.plans.version import made_by
 from lungaccess.uncertainty.risk import Share
 

@@ -16,19 +16,9 @@ if TYPE_CHECKING:
         needle_changes,
         scope_changes,
     )
-    from lungaccess.planning.coupled.diverse_plans import (
-        COUNT,
-        SEPARATION_MM,
-        Alternative,
-        alternatives,
-        criteria,
-        separated_plans,
-        with_front,
-    )
     from lungaccess.planning.coupled.exits import FeasibleExits, feasible_exits
     from lungaccess.planning.coupled.explanation import explain
     from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
-    from lungaccess.planning.coupled.planner import METHODS, ProgressEvent, atlas_event, plan
     from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes
     from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
     from lungaccess.planning.coupled.search.base import (
@@ -47,6 +37,5 @@ if TYPE_CHECKING:
     )
     from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
     from lungaccess.planning.coupled.search.settings import SearchSettings
-    from lungaccess.planning.coupled.window_planner import plan_for_window
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

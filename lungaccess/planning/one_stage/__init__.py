@@ -8,12 +8,6 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.planning.one_stage.from_scope import ScopeReplanner
-    from lungaccess.planning.one_stage.near_place import (
-        TIP_WITHIN_MM,
-        plan_near_exit,
-        plan_near_scope_tip,
-        tips_near,
-    )
     from lungaccess.planning.one_stage.needle import (
         NeedleAnswer,
         NeedleQuestion,
@@ -47,14 +41,6 @@ if TYPE_CHECKING:
     )
     from lungaccess.planning.one_stage.scope_region import ScopeRegion, safe_scope_region
     from lungaccess.planning.one_stage.shapes import design_shapes, save_shapes, shapes_record
-    from lungaccess.planning.one_stage.tour import (
-        TourAnswer,
-        coupled_plan_test,
-        lesions_of,
-        plan_tour,
-        read_lesions,
-        tour_record,
-    )
     from lungaccess.planning.one_stage.tubes import (
         BareTubes,
         TubeAnswer,

@@ -20,9 +20,9 @@ from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
 from lungaccess.planning.coupled import reach_scan
 from lungaccess.planning.coupled.atlas import Atlas, build_atlas
-from lungaccess.planning.coupled.window_planner import require_phases
 from lungaccess.planning.reachability.layers import LayerStore, counted_voxels, scan_layers
 from lungaccess.planning.reachability.regions import Regions, lung_regions
+from lungaccess.problem.request import require_phases
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.uncertainty.breathing.window import require_motion
 from stages.needle import DEFAULT_ARCS, DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED

@@ -10,11 +10,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -26,12 +25,13 @@ from anatomy.lung import Lung
 from lungaccess.judging.checking import Checker
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.atlas_store import open_atlas
-from lungaccess.planning.coupled.planner import plan
-from lungaccess.planning.success import plan_for_success
-from lungaccess.planning.success.estimate import FRESH_SEED, MEASURED, OPEN_LOOP, chance_of, estimate_success
+from lungaccess.planning.one_system import run as plan
+from lungaccess.planning.success.estimate import FRESH_SEED, chance_of, estimate_success
+from lungaccess.planning.success.judges import MEASURED, OPEN_LOOP
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.request import Request
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, point_target
 from lungaccess.running.study.answers import (
@@ -47,7 +47,7 @@ from lungaccess.running.study.answers import (
 from lungaccess.running.study.needle_run import needle_answer
 from lungaccess.running.study.patients import Patient, open_patient
 from lungaccess.running.study.runs import Problem, Run
-from lungaccess.running.study.settings import SUCCESS, StudyError
+from lungaccess.running.study.settings import StudyError
 
 KEPT_PATIENTS = 2
 """Runs come case by case, so that a worker needs the last patient and sometimes the next."""
@@ -129,10 +129,14 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     improvements = []
     target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
     began, first_s = time.process_time(), 0.0
-    for best, cost in _plans(run, opened.lung, target, atlas):
-        improvements.append(
-            Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=cost)
-        )
+    request = _request(run, opened.lung, target)
+    plans = plan(request, atlas=atlas, counterfactuals=not run.planner.without_counterfactuals)
+    for best in plans:
+        loss = request.goal.loss(best)
+        if np.isfinite(loss):
+            improvements.append(
+                Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
+            )
         first_s = first_s or time.process_time() - began
         if problem.first_plan:
             break
@@ -155,27 +159,14 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     )
 
 
-def _plans(run: Run, lung: Lung, target: Target, atlas: Atlas) -> Iterator[tuple[Plan, float]]:
-    """Yield better and better plans, each with what is made small: its cost, or its chance of failure."""
-    problem = run.problem
-    limits: dict[str, Any] = {
-        "seed": run.seed,
-        "iterations": run.iterations,
-        "time_s": problem.time_s,
-        "atlas": atlas,
-    }
-    if run.planner.method == SUCCESS:
-        for each in plan_for_success(
-            lung, problem.system, target, errors=problem.errors, procedure=problem.procedure, **limits
-        ):
-            yield each.plan, 1.0 - each.succeeds.value
-        return
-    for found in plan(
-        lung, problem.system, target, objective=problem.objective, method=run.planner.method,
-        needle_planner=run.planner.needle_planner,
-        counterfactuals=not run.planner.without_counterfactuals, **limits,
-    ):  # fmt: skip
-        yield found, found.cost
+def _request(run: Run, lung: Lung, target: Target) -> Request:
+    """Return what a run asks of the planner."""
+    problem, planner = run.problem, run.planner
+    return Request.of(
+        lung, problem.system, target, goal=planner.goal or problem.objective, errors=problem.errors,
+        procedure=problem.procedure, method=planner.method, needle_planner=planner.needle_planner,
+        seed=run.seed, iterations=run.iterations, time_s=problem.time_s,
+    )  # fmt: skip
 
 
 def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:

@@ -17,10 +17,10 @@ from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
 from lungaccess.planning.procedure import Procedure, load_procedure
 from lungaccess.plans.version import software_version
+from lungaccess.problem.goals import goal_of
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
-from lungaccess.problem.task import objective_of
 from lungaccess.running.study.patients import Patient, open_patient, patient_of
 from lungaccess.running.study.settings import Case, PlannerChoice, Study
 from lungaccess.uncertainty.risk import ErrorModel, load_errors
@@ -183,7 +183,7 @@ def runs_of(
             if planner.needs_a_needle:
                 system.require_needle(f"The planner {planner.name!r} of the study")
         lung = open_patient(patient, cache)
-        objective, targets = str(objective_of(lung, case.objective)), _targets(case, lung)
+        objective, targets = goal_of(case.objective, lung).name, _targets(case, lung)
         for number, (point, origin) in enumerate(targets, start=1):
             problem = Problem(
                 case=case.name,

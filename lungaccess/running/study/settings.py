@@ -14,13 +14,12 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.files import read_toml
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, parse, quantity, settings, switch, text
-from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS, Objective
+from lungaccess.problem.goals import SUCCESS, goal_of
+from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
 PHANTOM = "phantom"
-SUCCESS = "success"
-"""The method that makes the chance of success large."""
 _REMEDY = "`lungaccess template study` prints a complete file to start from"
 Seed = Annotated[int, Field(strict=True, ge=0)]
 Iterations = Annotated[int, Field(strict=True, ge=0, description="iterations beyond the direct arcs")]
@@ -62,7 +61,7 @@ class Case:
     fissures_allowed : bool or None
         Whether fissures may be crossed; None for what the system says.
     objective : str
-        What is minimised; see `stages.needle.objective.Objective.of`.
+        What plans are made good at, unless a planner states a goal; see `lungaccess.problem.goals.goal_of`.
     errors, procedure : str
         Error model and procedure under which the chance of success of each plan is counted: presets, or TOML
         files relative to the study's file.  Without errors no chance is counted.
@@ -90,7 +89,7 @@ class Case:
         if not self.targets and not self.peripheral.per_lung:
             raise impossible("targets", self.targets, "at least one target, or [case.peripheral]")
         try:
-            Objective.of(self.objective)
+            goal_of(self.objective)
         except SettingsError as error:
             raise impossible("objective", self.objective, error.expected) from None
 
@@ -104,9 +103,10 @@ class PlannerChoice:
     kind : str
         "plan" for all three stages, "needle" for the needle alone from the case's start poses.
     method : str
-        One of `lungaccess.planning.coupled.planner.METHODS`, or "success", see
-        `lungaccess.planning.success.plan_for_success`; for the needle, one of
+        One of `lungaccess.planning.searches.planners`; for the needle, one of
         `stages.needle.NEEDLE_PLANNERS`.
+    goal : str
+        For "plan", what plans are made good at instead of the case's objective, such as "success".
     needle_planner : str
         For "plan", one of the latter instead of the method's own.
     iterations : int or None
@@ -120,6 +120,9 @@ class PlannerChoice:
     name: Annotated[str, text("name of the planner in tables")]
     kind: Annotated[Literal["plan", "needle"], Field(description="plan or needle")] = "plan"
     method: Annotated[str, text("a method of plan, or a planner of the needle")] = "atlas"
+    goal: Annotated[str, text("what plans are made good at", may_be_empty=True)] = field(
+        default="", metadata={LEFT_OUT_IF_EMPTY: True}
+    )
     needle_planner: Annotated[str, text("a planner of the needle", may_be_empty=True)] = ""
     iterations: Iterations | None = None
     own_process: Annotated[bool, switch("whether each run has a fresh process")] = False
@@ -131,8 +134,10 @@ class PlannerChoice:
         known = methods(self.kind)
         if self.method not in known:
             raise impossible("method", self.method, f"one of {', '.join(known)}")
-        if self.needle_planner and self.method == SUCCESS:
-            raise impossible("needle_planner", self.needle_planner, "none, for the method success")
+        if self.goal and self.kind == "needle":
+            raise impossible("goal", self.goal, "none, for a planner of the needle alone")
+        if self.goal:
+            goal_of(self.goal)
         if self.needle_planner and (self.kind == "needle" or self.needle_planner not in NEEDLE_PLANNERS):
             expected = f"one of {', '.join(NEEDLE_PLANNERS)}, for a planner of the kind plan"
             raise impossible("needle_planner", self.needle_planner, expected)
@@ -150,10 +155,9 @@ class PlannerChoice:
     @property
     def needs_a_needle(self) -> bool:
         """Whether it plans for no system that has none."""
-        from lungaccess.planning.coupled.planner import NEED_A_NEEDLE
+        from lungaccess.planning import NEED_A_NEEDLE
 
-        need = (*NEED_A_NEEDLE, SUCCESS)
-        return self.kind == "needle" or bool(self.needle_planner) or self.method in need
+        return self.kind == "needle" or bool(self.needle_planner) or self.method in NEED_A_NEEDLE
 
 
 @settings
@@ -212,10 +216,9 @@ class Study:
         of_ompl = [each for each in self.planner if each.kind == "needle" and each.is_of_ompl]
         if self.budget.time_s is None and of_ompl:
             raise impossible("budget", "no time_s", "time_s, which planners of OMPL end by")
-        if any(each.method == SUCCESS for each in self.planner) and not all(c.errors for c in self.case):
-            raise impossible(
-                "case", 'errors = ""', "errors in every case, for planners of the method success"
-            )
+        by_success = {each.goal for each in self.planner} | {each.objective for each in self.case}
+        if SUCCESS.name in by_success and not all(case.errors for case in self.case):
+            raise impossible("case", 'errors = ""', "errors in every case, for the goal success")
         if any(each.kind == "needle" for each in self.planner) and not all(c.starts for c in self.case):
             raise impossible("case", "starts = []", "start poses in every case, for planners of the needle")
 
@@ -224,9 +227,9 @@ def methods(kind: str) -> tuple[str, ...]:
     """Return the names of the planners of a kind, "plan" or "needle"."""
     if kind == "needle":
         return NEEDLE_PLANNERS
-    from lungaccess.planning.coupled.planner import METHODS
+    from lungaccess.planning import planners
 
-    return (*METHODS, SUCCESS)
+    return tuple(planners())
 
 
 def read_study(path: str | os.PathLike[str]) -> Study:

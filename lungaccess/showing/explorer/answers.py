@@ -15,11 +15,12 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.settings_file import settings_toml
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from lungaccess.planning.coupled import Atlas, ProgressEvent, atlas_is_kept, feasible_exits, open_atlas, plan
-from lungaccess.planning.one_stage import tips_near
+from lungaccess.planning import ProgressEvent, run, tips_near
+from lungaccess.planning.coupled import Atlas, atlas_is_kept, feasible_exits, open_atlas
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
+from lungaccess.problem.request import Request
 from lungaccess.showing.explorer import questions as ask
 from lungaccess.showing.explorer.changed_system import plan_command, system_of
 from lungaccess.showing.explorer.chosen_place import ChosenPlace
@@ -179,7 +180,10 @@ class Answers:
         target = target_of(self.lung, question.target)
         atlas = self._atlas(system, turn)
         place = _place_of(atlas, question)
-        search = plan if place is None else place.search
+        request = Request.of(
+            self.lung, system, target, goal=question.objective, seed=question.seed,
+            iterations=question.iterations, place=None if place is None else place.stated,
+        )  # fmt: skip
         began = time.monotonic()
         curve: list[tuple[float, float, float]] = []
         told, last, shown = -np.inf, None, None
@@ -188,12 +192,10 @@ class Answers:
             turn.give_way()
 
         try:
-            for found in search(
-                self.lung, system, target, objective=question.objective, seed=question.seed,
-                iterations=question.iterations, atlas=atlas, counterfactuals=False, on_progress=on_progress,
-            ):  # fmt: skip
-                last = found
-                curve.append((time.monotonic() - began, float(found.iterations), float(found.cost)))
+            for found in run(request, atlas=atlas, counterfactuals=False, on_progress=on_progress):
+                last, loss = found, request.goal.loss(found)
+                if np.isfinite(loss):
+                    curve.append((time.monotonic() - began, float(found.iterations), loss))
                 if time.monotonic() - told >= TELL_EVERY_S:
                     told, shown = time.monotonic(), found
                     yield self._plan_part(asked, found, curve, system, place, final=False)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.records import frozen_value
-from anatomy.lung import Lung
+from lungaccess.planning import TIP_WITHIN_MM
 from lungaccess.planning.coupled.exits import PLACE_MM
-from lungaccess.planning.one_stage import TIP_WITHIN_MM, plan_near_exit, plan_near_scope_tip
-from lungaccess.plans.plan import Plan
-from lungaccess.problem import System, Target
+from lungaccess.problem.request import StatedPlace
 
 DIGITS = 3
 """Of the point in mm, as the command states it; the search takes the same number."""
@@ -21,7 +18,7 @@ DIGITS = 3
 
 @frozen_value
 class ChosenPlace:
-    """A place, LPS mm, with the search for plans through it and the words of the command for it.
+    """A place, LPS mm, with the words of the command for it.
 
     Parameters
     ----------
@@ -44,10 +41,10 @@ class ChosenPlace:
         """How far from the place a plan may be."""
         return PLACE_MM if self.kind == "exit" else TIP_WITHIN_MM
 
-    def search(self, lung: Lung, system: System, target: Target, **options: Any) -> Iterator[Plan]:
-        """Search as `lungaccess.plan` does; errors as `lungaccess.planning.one_stage.plan_near_exit`."""
-        near = plan_near_exit if self.kind == "exit" else plan_near_scope_tip
-        return near(lung, system, target, self.lps_mm, within_mm=self.within_mm, **options)
+    @property
+    def stated(self) -> StatedPlace:
+        """The place as a request states it."""
+        return StatedPlace(kind=self.kind, lps_mm=np.array(self.lps_mm), within_mm=self.within_mm)
 
     @property
     def words(self) -> list[str]:

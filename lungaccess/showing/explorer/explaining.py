@@ -7,9 +7,11 @@ from collections.abc import Callable
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan, sections
-from lungaccess.planning.coupled import Atlas, plan
+from lungaccess.planning import run
+from lungaccess.planning.coupled import Atlas
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem import System, Target
+from lungaccess.problem.request import Request
 from lungaccess.showing.explorer.questions import ExplainQuestion
 from lungaccess.showing.explorer.worker import Part, Turn
 
@@ -40,11 +42,15 @@ def explanation_part(
 
     try:
         next(
-            plan(
-                lung, system, target, objective=question.objective, seed=question.seed, iterations=ITERATIONS,
-                atlas=atlas, counterfactuals=False, on_progress=lambda _event: turn.check(),
+            run(
+                Request.of(
+                    lung, system, target, goal=question.objective, seed=question.seed, iterations=ITERATIONS
+                ),
+                atlas=atlas,
+                counterfactuals=False,
+                on_progress=lambda _event: turn.check(),
             )
-        )  # fmt: skip
+        )
     except NoPlan as failure:
         made = explain_no_plan(
             lung, system, target, failure, atlas=atlas, objective=question.objective, seed=question.seed,

@@ -17,7 +17,7 @@ from lungaccess.showing.report.views import CORONAL, SAGITTAL, View
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
     from anatomy.lung import Lung
-    from lungaccess.planning.one_stage import TourAnswer
+    from lungaccess.planning import TourAnswer
     from stages.scope.tour import Itinerary
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import lungaccess as la
 from lungaccess.cli.commands.alternatives import _of_the_least_invasive
-from lungaccess.planning.coupled import Alternative
+from lungaccess.planning import Alternative
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 

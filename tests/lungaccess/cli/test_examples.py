@@ -18,7 +18,8 @@ from lungaccess.cli import app as cli
 from lungaccess.cli.commands.template import FILES
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.planning.one_stage import load_tubes, read_lesions
+from lungaccess.planning import read_lesions
+from lungaccess.planning.one_stage import load_tubes
 from lungaccess.planning.procedure import load_procedure
 from lungaccess.running.study import read_study
 from lungaccess.uncertainty.risk import load_errors

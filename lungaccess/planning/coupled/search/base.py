@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from anatomy.base.records import frozen_value
 from lungaccess.planning.coupled.atlas import Atlas
@@ -57,6 +57,18 @@ class PlanSearch(Protocol):
         A step has a candidate only if that is proved and cheaper than all before.  The same task and the
         same number of steps have to give the same candidates.
         """
+
+
+@runtime_checkable
+class AtlasBound(PlanSearch, Protocol):
+    """A search that begins with the simplest ways from all entries of an atlas.
+
+    Attributes
+    ----------
+    arcs : lungaccess.planning.coupled.search.direct_candidates.DirectCandidates
+    """
+
+    arcs: Any
 
 
 @runtime_checkable

@@ -40,7 +40,7 @@ class TubeSearch:
     """
 
     def __init__(self, task: Task, atlas: Atlas) -> None:
-        self._aimed = AimedTubes(task, atlas)
+        self._aimed = self.arcs = AimedTubes(task, atlas)
         self._atlas, self._evaluator = atlas, self._aimed.evaluator
         self.blocked = self._evaluator.blocked
         self._incumbent = Incumbent()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from lungaccess.judging.appraisal import Appraisal, Limit
     from lungaccess.judging.checking import CheckReport
     from lungaccess.judging.checking.findings import Finding
-    from lungaccess.planning.coupled import Alternative
+    from lungaccess.planning import Alternative
     from lungaccess.plans.plan import Plan
 
 TIGHT_FROM = 0.9

@@ -9,7 +9,7 @@ from lungaccess.showing.report.html import words
 from lungaccess.uncertainty.risk import Share
 
 if TYPE_CHECKING:
-    from lungaccess.planning.coupled import Alternative
+    from lungaccess.planning import Alternative
 
 WIDTH, HEIGHT = 560.0, 366.0
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 26.0, 14.0, 72.0

@@ -20,7 +20,7 @@ from lungaccess.judging.explanation import FAILS, explain, explain_no_plan, expl
 from lungaccess.judging.explanation.blocking import MOST_ARCS
 from lungaccess.judging.explanation.explanation import Explanation
 from lungaccess.judging.explanation.kernels import STEP_MM
-from lungaccess.judging.presets_in_turn import Attempt
+from lungaccess.judging.answering import Attempt
 from lungaccess.planning.coupled import DirectArcs
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target

@@ -14,7 +14,7 @@ import lungaccess as la
 from anatomy.base import kernel_clock
 from anatomy.lung import Lung
 from lungaccess.judging.explanation import Explanation, explain, explain_no_plan, explanation_record, sections
-from lungaccess.judging.presets_in_turn import Attempt
+from lungaccess.judging.answering import Attempt
 from lungaccess.problem.preset_order import presets_by_invasiveness
 from lungaccess.problem.system import System
 from tests.lungaccess.points import FAR_TARGET

@@ -16,9 +16,9 @@ from anatomy.lung import Lung
 from anatomy.phantom import Phantom, write_phantom
 from experiments.support.tour_models import random_airway
 from lungaccess.cli.app import main
-from lungaccess.planning.one_stage import tour as tour_module
+from lungaccess.planning import tour as tour_module
 from lungaccess.planning.one_stage.route import open_source, read_drawing, widest_end
-from lungaccess.planning.one_stage.tour import coupled_plan_test, plan_tour, read_lesions, tour_record
+from lungaccess.planning.tour import coupled_plan_test, plan_tour, read_lesions, tour_record
 
 
 @pytest.fixture(scope="module")

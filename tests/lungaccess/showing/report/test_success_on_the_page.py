@@ -15,7 +15,7 @@ from anatomy.base.errors import PlanFileError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import Headline
-from lungaccess.planning.coupled import Alternative, with_front
+from lungaccess.planning import Alternative, with_front
 from lungaccess.planning.procedure import ProcedureReport, StageReport, load_procedure
 from lungaccess.planning.success import chance_of
 from lungaccess.plans.plan import Plan

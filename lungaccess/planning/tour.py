@@ -14,7 +14,10 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
+from lungaccess.planning.one_system import run
 from lungaccess.plans.no_plan import NoPlan
+from lungaccess.problem.request import Request
+from stages.needle import DEFAULT
 from stages.scope.tour import (
     MOST_COMBINATIONS,
     MOST_LESIONS,
@@ -268,9 +271,8 @@ def _points_of_arcs(atlas: Atlas, target: Target) -> frozenset[int]:
 
 def _points_of_plans(atlas: Atlas, target: Target, iterations: int) -> frozenset[int]:
     """Return the tree points nearest to the scope tips of the plans that a search finds."""
-    from lungaccess.planning.coupled import plan
-
-    plans = plan(atlas.lung, atlas.system, target, atlas=atlas, iterations=iterations, counterfactuals=False)
+    asked = Request.of(atlas.lung, atlas.system, target, goal=DEFAULT, iterations=iterations)
+    plans = run(asked, atlas=atlas, counterfactuals=False)
     tips = np.stack([found.scope.lps_from_scope_tip[:3, 3] for found in plans])
     away = np.linalg.norm(atlas.lung.tree.points_lps[:, None] - tips, axis=2)
     return frozenset(away.argmin(axis=0).tolist())

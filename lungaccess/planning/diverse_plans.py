@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.lung import Lung
+from anatomy.base.typed import Float, Int
+from lungaccess.planning.constraints import holds, place_part
 from lungaccess.planning.coupled.atlas import Atlas, build_atlas, require_same
-from lungaccess.planning.coupled.explanation import explain
-from lungaccess.planning.coupled.planner import plan as find_plans
-from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
+from lungaccess.planning.coupled.search.base import AtlasBound
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.planning.coupled.search.separated_arcs import separated_candidates
-from lungaccess.planning.coupled.search.window_search import WindowSearch
-from lungaccess.planning.coupled.window_planner import plan_for_window, require_phases, with_aim
-from lungaccess.plans.assemble import assemble
+from lungaccess.planning.driver import ProgressEvent
+from lungaccess.planning.one_system import run
+from lungaccess.planning.searches import plan_of, search_of
+from lungaccess.planning.success.judges import Judge, judge_of
 from lungaccess.plans.chance import Chance
-from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.system import System, require_own_name
-from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task, objective_of
+from lungaccess.problem.goals import SUCCESS
+from lungaccess.problem.request import Limits, Request
 from lungaccess.uncertainty.breathing.window import with_window
-from stages.needle import DEFAULT, Objective
 
 COUNT = 15
 SEPARATION_MM = 5.0
@@ -33,7 +33,9 @@ SEPARATION_MM = 5.0
 
 WINDOW = "window_share"
 ITERATIONS = 100
-"""Of the planner where no direct arc reaches the target: some seconds."""
+"""Iterations of the search for the best plan: some seconds."""
+METHOD = "alternatives"
+"""What the method of the other plans is called."""
 
 SMALL_IS_GOOD = ("inverse_clearance", "cost_map", "length_in_tissue_mm")
 LARGE_IS_GOOD = ("success", "clearance_mm", "pleura_mm", WINDOW)
@@ -69,96 +71,41 @@ class Alternative:
 
 
 def alternatives(
-    lung: Lung,
-    system: System,
-    target: Target,
+    request: Request,
     *,
-    objective: str | Objective = DEFAULT,
     count: int = COUNT,
     separation_mm: float = SEPARATION_MM,
     atlas: Atlas | None = None,
     counterfactuals: bool = True,
-    phases: tuple[float, float] | None = None,
-    widest: bool = False,
+    on_progress: Callable[[ProgressEvent], None] | None = None,
 ) -> tuple[Alternative, ...]:
     """Return a diverse plan set: the needles of every two of its plans are separated by `separation_mm`.
 
     Two needles are separated if some point of either is at least so far from all points of the other.  The
-    plans are direct arcs from the atlas.  Without a needle they are tubes aimed at the target, whose parts
-    beyond the lumen are separated.  Where there is none, the one plan is the best that `lungaccess.plan`
-    finds in ITERATIONS.  The cheapest through each airway branch comes first, then the others by their cost.
-    Each plan is proved and complete as any other.
+    first plan is the best that the request's search finds within its limits, in ITERATIONS if it states
+    none.  The others are direct ways from the atlas, those without a needle tubes aimed at the target, whose
+    parts beyond the lumen are separated: the best through each airway branch comes first, then the others.
+    Each plan is proved and complete as any other, and states what the goal is of it.
 
     Parameters
     ----------
-    lung, system, target, atlas, counterfactuals
-        See `lungaccess.planning.coupled.planner.plan`.
-    objective : str or Objective
-        What "cheap" means; see there, too.
+    request : Request
+        For one system.
     count : int
         The most plans that are returned.
     separation_mm : float
         The least separation of the needles of two plans.
-    phases, widest
-        Plans for a window of the breath, as of `lungaccess.plan_for_window`.  Without them every plan of a
-        patient with motion has a window all the same.
+    atlas, counterfactuals, on_progress
+        See `lungaccess.planning.driver.run`.
 
     Raises
     ------
     NoPlan
-        If no plan was found, either.
+        If no plan was found.
     SettingsError
-        If a number is not above 0, the objective is unknown, or the atlas belongs to another lung or system.
+        If a number is not above 0, or as `run`.
     TargetError
         If the target lies outside the lung or inside an obstacle.
-    """
-    weighed = objective_of(lung, objective)
-    require_own_name(system)
-    task = Task(lung=lung, system=system, target=target, objective=weighed, method="alternatives")
-    if atlas is not None:
-        require_same(atlas, lung, system)
-    atlas = atlas or build_atlas(lung, system)
-    if phases is None and not widest:
-        direct = direct_candidates(task, atlas)
-        return with_front(separated_plans(direct, count, separation_mm, counterfactuals=counterfactuals))
-    system.require_needle("Planning for a window of the breath")
-    search = WindowSearch(task, atlas, phases and require_phases(*phases), widest=widest)
-    try:
-        plans = separated_plans(search.arcs, count, separation_mm, counterfactuals=False, iterations=0)
-    except NoPlan:
-        *_, best = plan_for_window(
-            lung,
-            system,
-            target,
-            phases,
-            widest=widest,
-            objective=weighed,
-            iterations=ITERATIONS,
-            atlas=atlas,
-            counterfactuals=counterfactuals,
-        )
-        return with_front([best])
-    return with_front([with_aim(plan, lung, phases) for plan in plans])
-
-
-def separated_plans(
-    direct: DirectCandidates,
-    count: int,
-    separation_mm: float,
-    *,
-    counterfactuals: bool,
-    iterations: int = ITERATIONS,
-) -> list[Plan]:
-    """Return the plans of a diverse plan set, chosen among direct candidates; see `alternatives`.
-
-    Where there are none, the planner searches for so many iterations.
-
-    Raises
-    ------
-    NoPlan
-        If there is none.
-    SettingsError
-        If a number is not above 0.
     """
     if count < 1 or not separation_mm > 0.0:
         raise SettingsError(
@@ -166,25 +113,58 @@ def separated_plans(
             expected="both above 0",
             remedy="State both, such as --count 15 --separation 5",
         )
-    began, task, atlas = time.perf_counter(), direct.task, direct.atlas
-    chosen = list(separated_candidates(direct, count, separation_mm))
-    if not chosen and iterations:
-        *_, best = find_plans(
-            task.lung,
-            task.system,
-            task.target,
-            objective=task.objective,
-            seed=task.seed,
-            iterations=iterations,
-            atlas=atlas,
-            counterfactuals=counterfactuals,
-        )
-        return [with_window(best, task.lung)]
-    if not chosen:
-        raise explain(task, atlas, direct.evaluator.blocked, 0, counterfactuals=counterfactuals)
-    timing = {"planning_s": time.perf_counter() - began, "atlas_s": atlas.build_s}
-    plans = (assemble(task, each, iteration=0, timing=timing) for each in chosen)
-    return [with_window(plan, task.lung) for plan in plans]
+    if atlas is not None:
+        require_same(atlas, request.lung, request.system)
+    atlas = atlas or build_atlas(request.lung, request.system)
+    limited = (
+        request if request.limits != Limits() else replace(request, limits=Limits(iterations=ITERATIONS))
+    )
+    *_, best = run(limited, atlas=atlas, counterfactuals=counterfactuals, on_progress=on_progress)
+    plans = [best]
+    for each in _others(request, place_part(request, atlas), count, separation_mm):
+        if len(plans) < count and are_separated(best, each, separation_mm):
+            plans.append(each)
+    made = [with_window(plan, request.lung) if plan.window is None else plan for plan in plans]
+    return with_front(made, [each.chance for each in made] if request.goal is SUCCESS else None)
+
+
+def _others(request: Request, atlas: Atlas, count: int, separation_mm: float) -> Iterator[Plan]:
+    """Yield direct ways that are separated, with what they state of the goal."""
+    task = replace(request.task, method=METHOD)
+    search, judge = search_of(request, task, atlas), judge_of(request)
+    if not isinstance(search, AtlasBound):
+        return
+    arcs: DirectCandidates = search.arcs
+    if judge is not None:
+        arcs = RankedArcs(arcs, judge)
+    for each in separated_candidates(arcs, count, separation_mm):
+        made = plan_of(request, task, atlas, each, 0, 0.0)
+        if holds(request, made):
+            yield made if judge is None else judge.stated(made)
+
+
+class RankedArcs:
+    """Direct ways whose cost is what a judge expects of them, better first; see `DirectCandidates`."""
+
+    def __init__(self, arcs: DirectCandidates, judge: Judge) -> None:
+        self._arcs, self._judge = arcs, judge
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._arcs, name)
+
+    def evaluate(self, chosen: Int, slack: float, best: float = math.inf) -> tuple[Int, Float, float]:
+        """Return what blocks the ways from deployments, and how little is expected of each."""
+        blockers, costs, _best = self._arcs.evaluate(chosen, slack)
+        clear = blockers == 0
+        costs[clear] = -self._judge.expected(self._arcs, chosen[clear])
+        return blockers, costs, float(costs.min(initial=best))
+
+
+def are_separated(one: Plan, other: Plan, separation_mm: float) -> bool:
+    """Tell whether some point of what the costs of either plan are of is so far from the other's."""
+    a, b = (each.costed_poses(1.0)[0][:, :3, 3] for each in (one, other))
+    away = np.linalg.norm(a[:, None] - b, axis=2)
+    return bool(max(away.min(axis=1).max(), away.min(axis=0).max()) >= separation_mm)
 
 
 def criteria(plan: Plan) -> dict[str, float]:

@@ -1,0 +1,167 @@
+"""The driver of all searches, whatever the goal and the constraints, within the limits of a request."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from anatomy.base.kernel_clock import working_cpu_s, working_s
+from anatomy.base.records import frozen_record, frozen_value
+from lungaccess.planning.constraints import holds
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.request import Request
+
+PROGRESS_EVERY_S = 0.1
+"""Time between two progress reports: a display looks smooth, and the reports cost no time worth mention."""
+
+
+@frozen_value
+class ProgressEvent:
+    """The progress of a search.
+
+    Parameters
+    ----------
+    elapsed_s : float
+        Planning time, without that of the atlas.
+    best_cost : float or None
+        What is left to improve of the best plan, see `Goal.loss`; None as long as there is no plan.
+    phase, message : str
+        What the search does; the message replaces the phase where it is not empty.
+    """
+
+    iteration: int
+    elapsed_s: float
+    best_cost: float | None
+    phase: str
+    message: str = ""
+
+
+@frozen_record
+class Turn:
+    """One step of a finder.
+
+    Parameters
+    ----------
+    iteration : int
+        0 for what comes before the iterations, then counted from 1.
+    phase, message : str
+        See `ProgressEvent`.
+    make : callable, optional
+        Returns a plan that is better than all before, of the planning time in seconds.
+    """
+
+    iteration: int
+    phase: str
+    message: str = ""
+    make: Callable[[float], Plan] | None = None
+
+
+class Finder(Protocol):
+    """What the driver drives: it finds better and better plans of one request."""
+
+    def turns(self) -> Iterator[Turn]:
+        """Search until the caller stops, or all is tried; the same request gives the same turns."""
+
+    def is_met(self, best: Plan, iteration: int) -> bool:
+        """Tell whether the best plan is good enough to stop."""
+
+    def last(self, best: Plan, iteration: int, elapsed_s: float) -> Plan | None:
+        """Return what comes at the end, after the best plan; None for nothing."""
+
+    def no_plan(self, iteration: int) -> NoPlan:
+        """Return what is raised after so many iterations without a plan."""
+
+
+def atlas_event(share: float) -> ProgressEvent:
+    """Return the progress event of an atlas of which a share is made."""
+    return ProgressEvent(
+        iteration=0,
+        elapsed_s=0.0,
+        best_cost=None,
+        phase="atlas",
+        message=f"deployment atlas, {share:.0%} of the scope tips",
+    )
+
+
+def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None]) -> Iterator[Plan]:
+    """Drive a finder within the limits of a request; yield the plans that keep its constraints."""
+    clock, limits = Clock(), request.limits
+    best: Plan | None = None
+    loss: float | None = None
+    iteration = beside = 0
+    for turn in finder.turns():
+        if limits.iterations is not None and turn.iteration > limits.iterations:
+            break
+        iteration = turn.iteration
+        if turn.make is not None:
+            made = turn.make(clock.elapsed_s)
+            if holds(request, made):
+                best, loss = made, request.goal.loss(made)
+                yield best
+            else:
+                beside += 1
+        if best is not None and finder.is_met(best, iteration):
+            break
+        if limits.are_reached(iteration, clock.elapsed_s, clock.cpu_s, best is not None):
+            break
+        if clock.due():
+            known = loss if loss is not None and math.isfinite(loss) else None
+            tell(
+                ProgressEvent(
+                    iteration=iteration, elapsed_s=clock.elapsed_s, best_cost=known, phase=turn.phase,
+                    message=turn.message,
+                )
+            )  # fmt: skip
+    if best is None:
+        raise _beside(request) if beside else finder.no_plan(iteration)
+    last = finder.last(best, iteration, clock.elapsed_s)
+    if last is not None:
+        yield last
+
+
+def _beside(request: Request) -> NoPlan:
+    """Return why there is no plan where all that were found miss a constraint."""
+    place = request.place
+    if place is None:
+        return NoPlan(
+            "Every plan that was found leaves the phases of the breath that are asked for",
+            reasons={"window: every plan found has another one": 1},
+            advice="Leave out --method, or ask for fewer phases",
+        )
+    does = "leaves the airway" if place.kind == "exit" else "has its scope tip"
+    return NoPlan(
+        f"No plan was found that {does} within {place.within_mm:g} mm of the stated {place.kind}",
+        reasons={f"{place.kind}: every plan found {does} elsewhere": 1},
+        advice=f"Allow a larger distance, or move the {place.kind}",
+    )
+
+
+class Clock:
+    """Measures planning time, in which kernels are neither compiled nor loaded.
+
+    Time in which the caller holds a yielded plan counts too.
+    """
+
+    def __init__(self) -> None:
+        self._began, self._cpu_began = working_s(), working_cpu_s()
+        self._reported = self._began
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the start."""
+        return working_s() - self._began
+
+    @property
+    def cpu_s(self) -> float:
+        """Seconds of this process's processor time since the start."""
+        return working_cpu_s() - self._cpu_began
+
+    def due(self) -> bool:
+        """Tell whether the next progress report is due, and start counting anew if so."""
+        now = working_s()
+        if now - self._reported < PROGRESS_EVERY_S:
+            return False
+        self._reported = now
+        return True

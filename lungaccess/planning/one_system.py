@@ -1,0 +1,62 @@
+"""From a request for one system to plans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from lungaccess.planning.constraints import place_part
+from lungaccess.planning.coupled.atlas import Atlas, build_atlas, require_same
+from lungaccess.planning.driver import Finder, ProgressEvent, atlas_event, drive
+from lungaccess.planning.searches import CostFinder, require_method
+from lungaccess.planning.success.finder import ContestFinder
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.request import Request
+from lungaccess.problem.task import Task
+
+
+def run(
+    request: Request,
+    *,
+    atlas: Atlas | None = None,
+    counterfactuals: bool = True,
+    on_progress: Callable[[ProgressEvent], None] | None = None,
+) -> Iterator[Plan]:
+    """Answer a request for one system; yield each plan that is better than the one before.
+
+    Parameters
+    ----------
+    atlas : Atlas, optional
+        Made with `build_atlas` beforehand; made here if None.
+    counterfactuals : bool
+        Whether a `NoPlan` looks for the change of device that would help, which takes up to some ten seconds.
+    on_progress : callable, optional
+        Gets a `ProgressEvent` about ten times a second.
+
+    Raises
+    ------
+    NoPlan
+        If the search ends without a plan; counts the reasons.
+    SettingsError
+        If there is no such method, it needs a needle that the system does not have, or the atlas belongs to
+        another lung or system.
+    TargetError
+        If the target lies outside the lung or inside an obstacle, or nothing of the atlas comes near the
+        stated place.
+    """
+    require_method(request)
+    task = request.task
+    tell = on_progress or (lambda _event: None)
+    if atlas is not None:
+        require_same(atlas, request.lung, request.system)
+    atlas = atlas or build_atlas(
+        request.lung, request.system, progress=lambda share: tell(atlas_event(share))
+    )
+    finder = finder_of(request, task, place_part(request, atlas), counterfactuals)
+    return drive(finder, request, tell)
+
+
+def finder_of(request: Request, task: Task, atlas: Atlas, counterfactuals: bool) -> Finder:
+    """Return what finds plans of a request."""
+    if request.counts:
+        return ContestFinder(request, task, atlas, counterfactuals)
+    return CostFinder(request, task, atlas, counterfactuals)

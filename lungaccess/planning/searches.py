@@ -1,0 +1,168 @@
+"""The searches for whole plans by their names, and the plans of what they find."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from anatomy.base.errors import SettingsError
+from anatomy.base.suggestion import did_you_mean
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.cost_bound import CostBound, GapGoal, guided
+from lungaccess.planning.coupled.explanation import explain
+from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
+from lungaccess.planning.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
+from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
+from lungaccess.planning.coupled.search.tube_search import TubeSearch
+from lungaccess.planning.coupled.search.window_search import WindowSearch
+from lungaccess.planning.coupled.window_explanation import explain_window
+from lungaccess.planning.driver import Turn
+from lungaccess.plans.assemble import assemble
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.plans.window import BreathingAim
+from lungaccess.problem import plugins
+from lungaccess.problem.goals import WINDOW
+from lungaccess.problem.request import ATLAS, Request
+from lungaccess.problem.task import Task
+from lungaccess.uncertainty.breathing.window import breathing_window
+
+
+def _over_the_atlas(task: Task, atlas: Atlas) -> PlanSearch:
+    """Return the search over the atlas: for paths of the needle, or without one for the tubes alone."""
+    return TubeSearch(task, atlas) if task.system.needle is None else AtlasSearch(task, atlas)
+
+
+_OWN: dict[str, SearchFactory] = {
+    ATLAS: _over_the_atlas,
+    "kuntz2015": KuntzSearch,
+    "kuntz2015-without-rejection": partial(KuntzSearch, rejects=False),
+    "reference": ReferenceSearch,
+    "reference-without-rejection": partial(ReferenceSearch, rejects=False),
+}
+NEED_A_NEEDLE = tuple(name for name in _OWN if name != ATLAS)
+"""The methods that draw paths of a needle from placements of the tubes."""
+
+
+def planners() -> dict[str, SearchFactory]:
+    """Return the searches for whole plans by their names, those of other packages with them.
+
+    A package adds one by an entry point of the group `lungaccess.planners`: something that makes a
+    `lungaccess.planning.coupled.search.base.PlanSearch` of a task and an atlas.
+    """
+    return _OWN | plugins.registered(plugins.PLANNERS)
+
+
+def require_method(request: Request) -> None:
+    """Raise SettingsError unless the request's method exists and can plan with its systems."""
+    method = request.method
+    if method not in planners():
+        raise unknown_method(method)
+    for system in request.systems:
+        if request.needle_planner:
+            system.require_needle(f"The needle planner {request.needle_planner}")
+        if method in NEED_A_NEEDLE:
+            system.require_needle(f"The method {method}")
+
+
+def unknown_method(method: str) -> SettingsError:
+    """Return the error of a method that does not exist."""
+    known = planners()
+    return SettingsError(
+        f"There is no method {method!r}",
+        expected=f"one of {', '.join(known)}",
+        remedy=did_you_mean(method, known) or "Choose one of them",
+    )
+
+
+def search_of(request: Request, task: Task, atlas: Atlas) -> PlanSearch:
+    """Return the search by cost, or for the widest window, of a request."""
+    if request.is_for_window and request.method == ATLAS:
+        return WindowSearch(task, atlas, request.phases, widest=request.goal is WINDOW)
+    return planners()[request.method](task, atlas)
+
+
+class CostFinder:
+    """Finds plans of small cost or, among those of a wide window, the widest."""
+
+    def __init__(self, request: Request, task: Task, atlas: Atlas, counterfactuals: bool) -> None:
+        self._request, self._task, self._atlas = request, task, atlas
+        self._counterfactuals = counterfactuals
+        self.search = search_of(request, task, atlas)
+        self._gap = None if request.gap is None else GapGoal(CostBound(task, atlas), request.gap)
+
+    def turns(self) -> Iterator[Turn]:
+        """Yield the steps of the search as turns."""
+        search, processes = self.search, self._request.processes
+        steps = search.steps() if processes == 1 else _parallel(search, self._request.method, processes)
+        if self._gap is not None and processes == 1 and isinstance(search, AtlasSearch):
+            steps = guided(search, steps, self._gap.bound)
+        for step in steps:
+            made = None
+            if step.candidate is not None:
+                made = partial(self._made, step.candidate, step.iteration)
+            yield Turn(iteration=step.iteration, phase=step.phase, make=made)
+
+    def _made(self, candidate: Candidate, iteration: int, elapsed_s: float) -> Plan:
+        return plan_of(self._request, self._task, self._atlas, candidate, iteration, elapsed_s)
+
+    def is_met(self, best: Plan, iteration: int) -> bool:
+        """Tell whether the gap is proved."""
+        return self._gap is not None and iteration > 0 and self._gap.is_met(best.cost)
+
+    def last(self, best: Plan, iteration: int, elapsed_s: float) -> Plan | None:
+        """Return the best plan with its bound, where a gap was asked for."""
+        if self._gap is None:
+            return None
+        timing = dict(best.timing) | {"planning_s": elapsed_s}
+        return replace(best, cost_bound=self._gap.bound.value, iterations=iteration, timing=timing)
+
+    def no_plan(self, iteration: int) -> NoPlan:
+        """Return why there is no plan."""
+        return why_none(self._task, self._atlas, self.search, iteration, self._counterfactuals)
+
+
+def why_none(task: Task, atlas: Atlas, search: PlanSearch, iteration: int, counterfactuals: bool) -> NoPlan:
+    """Return why a search has found nothing, after so many iterations."""
+    if isinstance(search, WindowSearch):
+        stopped = explain_window(search, iteration)
+        if stopped is not None:
+            return stopped
+    blocked: Counter[str] = search.blocked
+    return explain(task, atlas, blocked, iteration, counterfactuals=counterfactuals)
+
+
+def plan_of(
+    request: Request, task: Task, atlas: Atlas, candidate: Candidate, iteration: int, elapsed_s: float
+) -> Plan:
+    """Return the plan of a candidate, with aim and window where it is for a window of the breath."""
+    timing = {"planning_s": elapsed_s, "atlas_s": atlas.build_s}
+    made = assemble(task, candidate, iteration=iteration, timing=timing)
+    return with_aim(made, request) if request.is_for_window else made
+
+
+def with_aim(plan: Plan, request: Request) -> Plan:
+    """Return a plan that was made for a window with where its devices end as its aim, and its window."""
+    asked = np.array([] if request.phases is None else [request.phases]).reshape(-1, 2)
+    end = plan.tube.lps_from_tip[:3, 3] if plan.needle is None else plan.needle.end_lps
+    aimed = replace(plan, aim=BreathingAim(point_lps=end, phases=asked))
+    return replace(aimed, window=breathing_window(aimed, request.lung))
+
+
+def _parallel(search: PlanSearch, method: str, processes: int) -> Iterator[Step]:
+    """Return the steps of a search in several processes."""
+    from lungaccess.planning.coupled.parallel import parallel_steps
+
+    if not isinstance(search, ParallelSearch):
+        raise SettingsError(
+            f"{processes} processes are asked for with {method}, each of whose samples depends on all before",
+            expected="one process, or method atlas",
+            remedy="Leave out --processes, or choose --method atlas",
+        )
+    return parallel_steps(search, processes)

@@ -1,0 +1,314 @@
+"""The contest: the plan that is best by draws of its success, or by any function of a plan.
+
+Candidates come from all clear direct ways of the atlas and from the search by cost, whose first plan, best
+plan and plans of several arcs take part and stay to the end: no winner is worse than any of them but by the
+error of the draws that all have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import count, islice, zip_longest
+from typing import Any
+
+import numpy as np
+
+from anatomy.base.records import frozen_record
+from lungaccess.planning import searches
+from lungaccess.planning.constraints import holds
+from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.search.base import AtlasBound, Step
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
+from lungaccess.planning.coupled.search.variation import SHIFT_MM, SMALLEST, TURN_RAD, varied
+from lungaccess.planning.driver import Turn
+from lungaccess.planning.success.judges import (
+    ChanceJudge,
+    FunctionJudge,
+    Judge,
+    Scorer,
+    judge_of,
+    ranked,
+    standard_error,
+)
+from lungaccess.plans.assemble import with_devices
+from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.request import Request
+from lungaccess.problem.task import Task
+
+BY_COST = 300
+"""Iterations of the search by cost whose plans take part: more make them only a little cheaper."""
+OF_COST = 6
+"""So many of its plans take part: the first, and the last ones, which are the cheapest."""
+SCREENED = 3
+"""So many of the best in open loop take part where a procedure measures."""
+SHRINK = 0.98
+"""Variations become smaller with every one that fails: after 35 they are half as large."""
+RARE, ENOUGH = 0.05, 0.3
+"""Where hardly a draw succeeds, the errors are made smaller until so many do: few successes tell nothing."""
+SMALLER, LEAST_FACTOR = 0.7, 0.1
+"""The step by which the errors are made smaller, and the least size."""
+SHRUNKEN_ROUNDS = 2
+"""Rounds that smaller errors decide where successes are rare: later ones have enough draws."""
+STEPS = 20
+"""Steps of the search by cost for one challenge, which take as long as some thousand draws."""
+
+
+@frozen_record
+class Contender:
+    """A candidate in the contest.
+
+    Parameters
+    ----------
+    plan : Plan
+        For chances, without what takes long to state: clearances and costs are those of another plan.
+    gained, draws
+        What it has gained in all batches so far: successes, or the value of a function.
+    shrunken : float
+        Its successes with smaller errors, by which the first rounds go where successes are rare.
+    stays : bool
+        Whether it takes part to the end.
+    """
+
+    candidate: Candidate
+    plan: Plan
+    scorer: Scorer
+    gained: float = 0.0
+    draws: int = 0
+    shrunken: float = 0.0
+    stays: bool = False
+
+    @property
+    def share(self) -> float:
+        """What it gains a draw."""
+        return self.gained / max(self.draws, 1)
+
+    @property
+    def order(self) -> tuple[float, float]:
+        """By which contenders are put in order."""
+        return self.shrunken, self.gained
+
+
+class ContestFinder:
+    """Finds plans that are better and better by a judge; see `lungaccess.planning.driver.Finder`."""
+
+    def __init__(self, request: Request, task: Task, atlas: Atlas, counterfactuals: bool) -> None:
+        self._request, self._task, self._atlas = request, task, atlas
+        self._counterfactuals = counterfactuals
+        self._judge = judge_of(request) or FunctionJudge(request)
+        self._search = searches.search_of(request, task, atlas)
+        self._steps = self._search.steps()
+        self._model: Plan | None = None
+        self._leader: Contender | None = None
+        self._shown: Plan | None = None
+
+    @property
+    def _direct(self) -> DirectCandidates | None:
+        """The direct ways of the atlas; None for a search that draws its own."""
+        return self._search.arcs if isinstance(self._search, AtlasBound) else None
+
+    def turns(self) -> Iterator[Turn]:
+        """Yield the first clear plan, then what wins each contest, then what beats the winner."""
+        first = yield from self._first()
+        if first is None:
+            return
+        self._leader = first
+        yield Turn(iteration=0, phase="search", make=partial(self._unstated, first))
+        of_cost = yield from self._by_cost(first)
+        entries = [] if self._direct is None else ranked(self._judge, self._direct).tolist()
+        pool = (made for made in map(self._entry, entries) if made)
+        screened = (yield from self._screened(of_cost)) if self._measures else []
+        started = [*of_cost, *screened, *islice(pool, self._judge.rounds.pool)]
+        order = yield from self._halved(self._judge, started)
+        yield self._turn(0)
+        yield from self._challenged(order[0], pool)
+
+    @property
+    def _measures(self) -> bool:
+        """Whether procedures are simulated that measure on their way."""
+        return isinstance(self._judge, ChanceJudge) and not self._judge.procedure.is_open_loop
+
+    def _first(self) -> Generator[Turn, None, Contender | None]:
+        """Return the first plan of the search by cost that keeps the constraints, None if there is none."""
+        for step in self._steps:
+            found = self._of_step(step)
+            if found is not None:
+                return found
+            yield Turn(iteration=max(step.iteration - BY_COST, 0), phase=step.phase)
+        return None
+
+    def _by_cost(self, first: Contender) -> Generator[Turn, None, list[Contender]]:
+        """Return plans of the search by cost: the first and the last ones, which stay to the end."""
+        found = [first]
+        for step in self._steps:
+            if step.iteration > BY_COST:
+                break
+            made = self._of_step(step)
+            found += [] if made is None else [made]
+            yield Turn(iteration=0, phase=step.phase)
+        some = [first, *found[1:][-OF_COST + 1 :]]
+        return [replace(each, stays=each in (some[0], some[-1])) for each in some]
+
+    def _screened(self, of_cost: Sequence[Contender]) -> Generator[Turn, None, list[Contender]]:
+        """Return those that do best in open loop; the first of them stays to the end."""
+        judge = ChanceJudge(self._request, open_loop=True)
+        direct = self._direct
+        entries = [] if direct is None else ranked(judge, direct).tolist()
+        others = (made for made in map(partial(self._entry, judge=judge), entries) if made)
+        again = [self._contender(each.candidate, judge) for each in of_cost]
+        order = yield from self._halved(judge, [*again, *islice(others, judge.rounds.pool)], leads=False)
+        best = [self._contender(each.candidate) for each in order[:SCREENED]]
+        return [replace(each, stays=n == 0) for n, each in enumerate(best)]
+
+    def _of_step(self, step: Step) -> Contender | None:
+        """Return what a step of the search by cost has found, if it keeps the constraints."""
+        return None if step.candidate is None else self._contender(step.candidate)
+
+    def _entry(self, entry: int, judge: Judge | None = None) -> Contender | None:
+        direct = self._direct
+        candidate = None if direct is None else direct.proved(entry)
+        return None if candidate is None else self._contender(candidate, judge)
+
+    def _contender(self, candidate: Candidate, judge: Judge | None = None) -> Any:
+        """Return a candidate as a contender, None if it misses a constraint."""
+        plan = self._plan(candidate)
+        if not holds(self._request, plan):
+            return None
+        return Contender(candidate=candidate, plan=plan, scorer=(judge or self._judge).scorer(plan))
+
+    def _plan(self, candidate: Candidate) -> Plan:
+        """Return a plan with the devices of a candidate, a whole one for a judge that may ask for all."""
+        if isinstance(self._judge, FunctionJudge) or self._model is None:
+            self._model = searches.plan_of(self._request, self._task, self._atlas, candidate, 0, 0.0)
+            return self._model
+        made = with_devices(self._task, candidate, self._model)
+        return searches.with_aim(made, self._request) if self._request.is_for_window else made
+
+    def _halved(
+        self, judge: Judge, contenders: Sequence[Contender], *, leads: bool = True
+    ) -> Generator[Turn, None, list[Contender]]:
+        """Return contenders, the best first: in each round fewer of them have more draws."""
+        left, factor = list(contenders), 1.0
+        for number, (draws, kept) in enumerate(zip_longest(judge.rounds.draws, judge.rounds.kept)):
+            counted = []
+            for each in left:
+                counted.append(_counted(each, number, draws))
+                yield Turn(iteration=0, phase="contest", message=self._message)
+            if draws > 1 and number < SHRUNKEN_ROUNDS and max(each.share for each in counted) < RARE:
+                factor = factor if factor < 1.0 else _factor(counted, number, draws)
+                counted = [replace(each, shrunken=each.scorer(number, draws, factor)) for each in counted]
+            order = sorted(counted, key=lambda each: each.order, reverse=True)
+            left = order[:kept] + [each for each in order[kept:] if kept and each.stays]
+            if leads:
+                self._leader = max(left, key=lambda each: each.gained)
+            left = [replace(each, shrunken=0.0) for each in left]
+        return left
+
+    def _challenged(self, best: Contender, pool: Iterator[Contender]) -> Iterator[Turn]:
+        """Let the rest of the pool, variations of the best, and the search by cost challenge the best."""
+        rng = np.random.Generator(np.random.PCG64(self._task.seed))
+        size, varies = 1.0, not (isinstance(self._judge, ChanceJudge) and self._judge.replans)
+        for tried in count(1):
+            other = None
+            if tried % 3 == 0:
+                other = self._cheaper()
+            elif tried % 3 == 1 or not varies or size < SMALLEST:
+                other = next(pool, None)
+            elif (shifted := self._varied(best, rng, size)) is not None:
+                other, size = shifted, SHRINK * size
+            better = None if other is None else self._beats(best, other)
+            if better is None:
+                yield Turn(iteration=tried, phase="challenge", message=self._message)
+                continue
+            best, self._leader, size = better, better, 1.0
+            yield self._turn(tried)
+
+    def _cheaper(self) -> Contender | None:
+        """Return what the search by cost finds next, in a few of its steps."""
+        for step in islice(self._steps, STEPS):
+            found = self._of_step(step)
+            if found is not None:
+                return found
+        return None
+
+    def _varied(self, best: Contender, rng: np.random.Generator, size: float) -> Contender | None:
+        """Return the best with other rotation and insertions, if it is proved."""
+        turn, *shifts = (rng.standard_normal(3) * (TURN_RAD, SHIFT_MM, SHIFT_MM) * size).tolist()
+        direct = self._direct
+        evaluator = CandidateEvaluator(self._task) if direct is None else direct.evaluator
+        made = varied(evaluator, best.candidate, turn, shifts)
+        return self._contender(made) if made is not None and evaluator.accepts(made) else None
+
+    def _beats(self, best: Contender, other: Contender) -> Contender | None:
+        """Return another contender if it gains more: after each round it has to be near the best."""
+        for number, draws in enumerate(self._judge.rounds.draws):
+            other = _counted(other, number, draws)
+            error = standard_error(best.share, other.draws) if draws > 1 else 0.0
+            if other.share < best.share - 2.0 * error:
+                return None
+        return other if other.gained > best.gained else None
+
+    @property
+    def _message(self) -> str:
+        leader = self._leader
+        if leader is None or not leader.draws or isinstance(self._judge, FunctionJudge):
+            return ""
+        return f"succeeds in {leader.share:.0%} of the draws"
+
+    def _turn(self, iteration: int) -> Turn:
+        """Return a turn with the leader, if what it states is better than what was shown before."""
+        leader = self._leader
+        made = None if leader is None else self._stated(leader, iteration, 0.0)
+        goal = self._request.goal
+        if made is None or (self._shown is not None and goal.loss(made) >= goal.loss(self._shown)):
+            return Turn(iteration=iteration, phase="contest", message=self._message)
+        return Turn(
+            iteration=iteration, phase="contest", message=self._message, make=partial(self._show, made)
+        )
+
+    def _show(self, plan: Plan, elapsed_s: float) -> Plan:
+        self._shown = replace(plan, timing=dict(plan.timing) | {"planning_s": elapsed_s})
+        return self._shown
+
+    def _unstated(self, contender: Contender, elapsed_s: float) -> Plan:
+        return searches.plan_of(self._request, self._task, self._atlas, contender.candidate, 0, elapsed_s)
+
+    def _stated(self, contender: Contender, iteration: int, elapsed_s: float) -> Plan:
+        """Return the whole plan of a contender with what it states of the goal."""
+        made = searches.plan_of(
+            self._request, self._task, self._atlas, contender.candidate, iteration, elapsed_s
+        )
+        return self._judge.stated(made)
+
+    def is_met(self, best: Plan, iteration: int) -> bool:
+        """Tell that nothing is good enough: the best possible is not known."""
+        return False
+
+    def last(self, best: Plan, iteration: int, elapsed_s: float) -> Plan | None:
+        """Return the leader with what it states, where the search ended before that was shown."""
+        if self._shown is not None or self._leader is None:
+            return None
+        return self._stated(self._leader, iteration, elapsed_s)
+
+    def no_plan(self, iteration: int) -> NoPlan:
+        """Return why there is no plan."""
+        return searches.why_none(self._task, self._atlas, self._search, iteration, self._counterfactuals)
+
+
+def _counted(contender: Contender, batch: int, draws: int) -> Contender:
+    """Return a contender with what it gains in one more batch."""
+    gained = contender.scorer(batch, draws, 1.0)
+    return replace(contender, gained=contender.gained + gained, draws=contender.draws + draws)
+
+
+def _factor(contenders: Sequence[Contender], batch: int, draws: int) -> float:
+    """Return by how much errors have to be made smaller so that enough draws of the best succeed."""
+    best = max(contenders, key=lambda each: each.gained)
+    factor = 1.0
+    while factor > LEAST_FACTOR and best.scorer(batch, draws, factor) < ENOUGH * draws:
+        factor *= SMALLER
+    return factor

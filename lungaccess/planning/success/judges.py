@@ -1,0 +1,203 @@
+"""Judges of a contest of plans: by draws of their chance of success, or by a function of the plan."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, Int
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
+from lungaccess.planning.procedure import Procedure, Simulator, load_procedure
+from lungaccess.planning.procedure.spread import Spread
+from lungaccess.planning.success.estimate import FRESH_SEED, MEASURED_PROCEDURE, chance_of, estimate_success
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.goals import SUCCESS, Goal
+from lungaccess.problem.request import Request
+from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, goal_radius, load_errors
+from lungaccess.uncertainty.risk.breathing import model_for
+
+BATCH_SEED = 1 << 24
+"""Distance between the seeds of two batches of draws: no seed of a search comes to that of another batch."""
+MANY = 10.0
+"""Clear deployments that a scope tip needs so that one is likely to be left after measuring: ten lie some
+millimetres or degrees apart, as far as the errors move the tip.  It only ranks."""
+
+Scorer = Callable[[int, int, float], float]
+"""Returns what a plan gains: the successes of so many draws of a batch, with errors of a factor times their
+size."""
+
+
+@frozen_value
+class Rounds:
+    """Successive halving: how many candidates take part, and with how many draws [Jamieson2016].
+
+    Parameters
+    ----------
+    pool : int
+        Candidates that it begins with.
+    of_a_tip : int
+        So many of one scope tip: its deployments are alike, and other tips fail otherwise.
+    draws : tuple of int
+        Draws that each round adds.
+    kept : tuple of int
+        Contenders that are left after each round but the last.
+    fresh : int
+        Draws of the estimate that a plan states, which decide nothing in the search.
+    """
+
+    pool: int
+    of_a_tip: int
+    draws: tuple[int, ...]
+    kept: tuple[int, ...]
+    fresh: int
+
+
+OPEN_LOOP = Rounds(pool=150, of_a_tip=8, draws=(256, 768, 3072, 16384), kept=(24, 8, 4), fresh=20_000)
+"""The order of first order is rough, so the pool is several times what is kept; after 20,000 draws a share of
+one half is known to a third of a percent."""
+MEASURED = Rounds(pool=24, of_a_tip=1, draws=(48, 144, 448, 640), kept=(10, 6, 4), fresh=2000)
+"""A procedure that plans again takes a hundred times as long as one that does not, and the deployment is
+chosen anew at the tip as measured: tips compete, with few draws."""
+SCREENING = Rounds(pool=60, of_a_tip=4, draws=(256, 768), kept=(12,), fresh=0)
+"""The contest in open loop before one under a procedure: its best take part in that."""
+EXACT = Rounds(pool=150, of_a_tip=8, draws=(1,), kept=(), fresh=0)
+"""What a function says of a plan is certain."""
+
+
+class Judge(Protocol):
+    """Says how good plans are; larger is better."""
+
+    rounds: Rounds
+
+    def expected(self, direct: DirectCandidates, entries: Int) -> Float:
+        """Return what is expected of the ways from entries `(E,)` of an atlas: it only ranks them."""
+
+    def scorer(self, plan: Plan) -> Scorer:
+        """Return what scores a plan; what it prepares serves all batches."""
+
+    def stated(self, plan: Plan) -> Plan:
+        """Return a plan with what it states of the goal."""
+
+
+class ChanceJudge:
+    """Counts successes under errors and a procedure.
+
+    Parameters
+    ----------
+    open_loop : bool
+        Whether the request's procedure is left out, and only few draws are made, to find who takes part.
+    """
+
+    def __init__(self, request: Request, *, open_loop: bool = False) -> None:
+        self._lung, self._seed, self._given_mm = request.lung, request.seed, request.radius_mm
+        self.errors: ErrorModel = request.errors or load_errors()
+        stated: Procedure = request.procedure or load_procedure(MEASURED_PROCEDURE)
+        self.procedure = load_procedure() if open_loop else stated
+        self._target = request.target.lps_mm
+        self._radius_mm = goal_radius(request.lung, self._target, request.radius_mm)[0]
+        of_procedure = OPEN_LOOP if self.procedure.is_open_loop else MEASURED
+        self.rounds = SCREENING if open_loop else of_procedure
+        self._processes = request.processes
+
+    @property
+    def replans(self) -> bool:
+        """Whether the tubes are planned anew from a measured scope: variations of them then change little."""
+        return self.procedure.scope.measured
+
+    def expected(self, direct: DirectCandidates, entries: Int) -> Float:
+        """Return the chances of entries to first order."""
+        atlas = direct.atlas
+        chosen = atlas.deployments.only(entries)
+        chances = Spread(
+            self._lung, atlas.system, atlas.motions.tips[chosen.site], chosen, self._target, self.errors,
+            self.procedure, self._radius_mm,
+        ).chances  # fmt: skip
+        if self.procedure.scope.measured:
+            _sites, which, counts = np.unique(chosen.site, return_inverse=True, return_counts=True)
+            chances = chances * -np.expm1(-counts[which] / MANY)
+        return chances
+
+    def scorer(self, plan: Plan) -> Scorer:
+        """Return what counts the successes of a plan in a batch of draws that all plans have in common."""
+        if self.procedure.is_open_loop:
+            assessor, model = RiskAssessor(plan, self._lung, radius_mm=self._radius_mm), self._model(plan)
+
+            def deviated(batch: int, draws: int, factor: float) -> float:
+                errors = model if factor == 1.0 else model.scaled(factor)
+                return assessor.success(assessor.draws(draws, self._batch_seed(batch)), errors).count
+
+            return deviated
+        simulator = Simulator(plan, self._lung, self.errors, self.procedure, radius_mm=self._radius_mm)
+
+        def simulated(batch: int, draws: int, _factor: float) -> float:
+            return simulator.report(draws, self._batch_seed(batch), self._processes).succeeds.count
+
+        return simulated
+
+    def _model(self, plan: Plan) -> ErrorModel:
+        return model_for(self.errors, plan, self._lung)
+
+    def _batch_seed(self, batch: int) -> int:
+        return self._seed + BATCH_SEED * (batch + 1)
+
+    def stated(self, plan: Plan) -> Plan:
+        """Return a plan with its chance, counted on draws that no round has seen."""
+        found = estimate_success(
+            plan, self._lung, errors=self.errors, procedure=self.procedure, samples=self.rounds.fresh,
+            seed=self._seed + FRESH_SEED, radius_mm=self._given_mm, processes=self._processes,
+        )  # fmt: skip
+        return replace(plan, chance=chance_of(found))
+
+
+class FunctionJudge:
+    """Asks a function of the plan, or what the plan states of a goal."""
+
+    def __init__(self, request: Request) -> None:
+        self._goal: Goal = request.goal
+        self._lung, self.rounds = request.lung, EXACT
+
+    def expected(self, direct: DirectCandidates, entries: Int) -> Float:
+        """Return the same of all: nothing is known of a function."""
+        return np.zeros(len(entries))
+
+    def scorer(self, plan: Plan) -> Scorer:
+        """Return what says the value of a plan; it is certain."""
+        goal = self._goal
+        value = goal.computed(plan, self._lung) if goal.is_function else goal.value(plan)
+        signed = -np.inf if value is None else value if goal.larger_is_better else -value
+        return lambda _batch, _draws, _factor: float(signed)
+
+    def stated(self, plan: Plan) -> Plan:
+        """Return a plan with the value of its function."""
+        if not self._goal.is_function:
+            return plan
+        return replace(plan, goals={self._goal.name: self._goal.computed(plan, self._lung)})
+
+
+def judge_of(request: Request) -> Judge | None:
+    """Return the judge of a request's goal; None where cost or window decide."""
+    if request.goal is SUCCESS:
+        return ChanceJudge(request)
+    return FunctionJudge(request) if request.counts else None
+
+
+def ranked(judge: Judge, direct: DirectCandidates) -> Int:
+    """Return entries (E,) of an atlas with a clear way, the most promising first, some of each scope tip."""
+    clear, taken, kept = direct.clear(), Counter[int](), []
+    order = clear[np.argsort(-judge.expected(direct, clear), kind="stable")]
+    sites = direct.atlas.deployments.site[order].tolist()
+    for entry, site in zip(order.tolist(), sites, strict=True):
+        taken[site] += 1
+        if taken[site] <= judge.rounds.of_a_tip:
+            kept.append(entry)
+    return np.array(kept, dtype=np.int64)
+
+
+def standard_error(share: Float | float, draws: int) -> float:
+    """Return the standard error of a share of so many draws, never 0."""
+    return float(np.sqrt(max(float(share) * (1.0 - float(share)), 0.25 / draws) / draws))

@@ -1,0 +1,179 @@
+"""Goals: what a plan is to be good at, each stated in one place.
+
+A goal is a cost or a weighted sum of costs, the chance of success, the window of the breath, or a function of
+the plan that a user writes.  Searches, the check, tables, studies and pages ask the goal alone what it is
+called, which way is better and how large it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_record
+from anatomy.base.suggestion import did_you_mean
+from anatomy.organ import Organ
+from lungaccess.problem import plugins
+from lungaccess.problem.task import objective_of
+from stages.needle import TERMS, Objective
+
+PlanFunction = Callable[[Any, Any], float]
+"""A number of a `lungaccess.plans.plan.Plan` in a `anatomy.lung.Lung`."""
+
+
+@frozen_record
+class Goal:
+    """What is made small, or large.
+
+    Parameters
+    ----------
+    name : str
+        What the command line, studies and plans call it.
+    words : str
+        What people call it.
+    unit : str
+        "" for a pure number.
+    larger_is_better : bool
+    of : callable, optional
+        Returns its value of a plan in a lung, finite; the plan states it, and the check computes it again.
+        None for costs, success and windows, which a plan states by itself.
+    objective : Objective, optional
+        The costs that it weighs, where it is a cost.
+    """
+
+    name: str
+    words: str
+    unit: str = ""
+    larger_is_better: bool = False
+    of: PlanFunction | None = None
+    objective: Objective | None = None
+
+    @classmethod
+    def of_costs(cls, objective: Objective) -> Goal:
+        """Return the goal to make a weighted sum of costs small."""
+        return cls(name=str(objective), words=objective.words, objective=objective)
+
+    @property
+    def is_function(self) -> bool:
+        """Whether it is a function that is written in Python."""
+        return self.of is not None
+
+    @property
+    def words_with_unit(self) -> str:
+        """The words for figures and tables."""
+        return f"{self.words} ({self.unit})" if self.unit else self.words
+
+    def value(self, plan: Any) -> float | None:
+        """Return what a plan states of it; None where it states nothing."""
+        if self.is_function:
+            stated: dict[str, float] = plan.goals
+            return stated.get(self.name)
+        if self.name == SUCCESS.name:
+            return None if plan.chance is None else float(plan.chance.share)
+        if self.name == WINDOW.name:
+            return None if plan.window is None else float(plan.window.share)
+        return None if self.objective is None else plan.costs.get(str(self.objective))
+
+    def computed(self, plan: Any, lung: Any) -> float:
+        """Return the value of its function of a plan.
+
+        Raises
+        ------
+        SettingsError
+            If the function fails, or its value is no finite number.
+        """
+        try:
+            value = float(self.of(plan, lung)) if self.of is not None else math.nan
+        except Exception as error:
+            raise SettingsError(
+                f"The function of the goal {self.name!r} fails: {type(error).__name__}: {error}",
+                expected="a function of a plan and its lung that returns a number",
+                remedy="Mend the function",
+            ) from error
+        if not math.isfinite(value):
+            raise SettingsError(f"The goal {self.name!r} is {value}", expected="a finite number")
+        return value
+
+    def loss(self, plan: Any) -> float:
+        """Return what is left to improve of a plan, which falls: the cost, or what a share lacks of 1."""
+        value = self.value(plan)
+        if value is None:
+            return math.inf
+        if self.is_function:
+            return -value if self.larger_is_better else value
+        return 1.0 - value if self.larger_is_better else value
+
+    @property
+    def loss_words(self) -> str:
+        """What figures call the loss."""
+        if self.larger_is_better:
+            return LOSSES.get(self.name, f"minus {self.words_with_unit}")
+        return self.words_with_unit
+
+
+SUCCESS = Goal(name="success", words="chance of success", larger_is_better=True)
+"""The chance that the procedure ends well under the stated errors: the goal of whoever states none."""
+WINDOW = Goal(name="window", words="share of the breath in which the plan is proved", larger_is_better=True)
+"""The widest window of the breath."""
+LOSSES = {SUCCESS.name: "chance of failure", WINDOW.name: "share of the breath outside the window"}
+"""What is left to improve of shares, in words."""
+_OWN: dict[str, Goal] = {}
+
+
+def register_goal(goal: Goal) -> Goal:
+    """Make a goal known by its name in this process, and return it; a package does so by an entry point.
+
+    Raises
+    ------
+    SettingsError
+        If the name is that of another goal or of a cost.
+    """
+    taken = {SUCCESS.name, WINDOW.name, *(name for term in TERMS for name in (term.key, term.option))}
+    if goal.name in taken or not goal.name.isidentifier():
+        raise SettingsError(
+            f"A goal cannot be called {goal.name!r}",
+            expected=f"a name of letters, digits and _, and none of {', '.join(sorted(taken))}",
+        )
+    _OWN[goal.name] = goal
+    return goal
+
+
+def goals() -> dict[str, Goal]:
+    """Return all goals but costs, by their names: those of the package, of other packages, and registered."""
+    return {each.name: each for each in (SUCCESS, WINDOW)} | plugins.registered(plugins.GOALS) | _OWN
+
+
+def goal_of(stated: str | Goal | Objective | PlanFunction, lung: Organ | None = None) -> Goal:
+    """Return the goal that is stated: by its name, as costs, or as a function of plan and lung.
+
+    Parameters
+    ----------
+    stated : str, Goal, Objective or callable
+        A name of `goals`; a cost or a weighted sum of costs as `stages.needle.objective.Objective.of` reads
+        them; or a function, which is made small and named as in the code.
+    lung : Lung, optional
+        The default cost weighs a cost map only where the patient has one.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such goal.
+    """
+    if isinstance(stated, Goal):
+        return stated
+    if isinstance(stated, str) and stated in goals():
+        return goals()[stated]
+    if callable(stated):
+        name = getattr(stated, "__name__", "function")
+        name = name if name.isidentifier() else "function"
+        return Goal(name=name, words=name.replace("_", " "), of=stated)
+    try:
+        weighed = Objective.of(stated) if lung is None else objective_of(lung, stated)
+    except SettingsError as error:
+        near = did_you_mean(str(stated), list(goals()))
+        raise SettingsError(
+            error.found, expected=f"{error.expected}; or {', '.join(goals())}", remedy=near or error.remedy
+        ) from None
+    return Goal.of_costs(weighed)

@@ -1,0 +1,313 @@
+"""The request: everything that is asked of the planner, as one thing.
+
+Commands, studies, the explorer and Python make one, and one driver answers it
+(`lungaccess.planning.driver`).  Goal and constraints compose: what cannot be is refused here, or where the
+search is made, and only for a reason of physics or mathematics, which the error states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from anatomy.motion.motion import require_phase
+from lungaccess.problem.goals import SUCCESS, WINDOW, Goal, PlanFunction, goal_of
+from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
+from lungaccess.problem.system import System, load_system, require_own_name, with_fissure_rule
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task, objective_of
+from stages.needle import OMPL_PLANNERS, Objective, require_planner
+
+if TYPE_CHECKING:
+    from lungaccess.planning.procedure import Procedure
+    from lungaccess.uncertainty.risk import ErrorModel
+
+ATLAS = "atlas"
+"""The method of whoever states none: the search over all that scope and tubes can do."""
+AUTO = "auto"
+"""Stands for all presets, of which the least invasive that reaches the target is chosen."""
+
+
+@frozen_value
+class Limits:
+    """How long a search may take; None is no limit.
+
+    Parameters
+    ----------
+    iterations : int, optional
+        The only limit with which the same request gives the same plans.
+    time_s, cpu_s : float, optional
+        Seconds of the clock, and of this process's processor time; neither counts compiling kernels.
+    first_plan_s : float, optional
+        Seconds of the clock without a plan.
+    """
+
+    iterations: int | None = None
+    time_s: float | None = None
+    cpu_s: float | None = None
+    first_plan_s: float | None = None
+
+    def are_reached(self, iteration: int, elapsed_s: float, cpu_s: float, found: bool) -> bool:
+        """Tell whether the search ends; never without a plan before the direct arcs have been tried."""
+        time_s, most_cpu_s, first_s = (
+            math.inf if each is None else each for each in (self.time_s, self.cpu_s, self.first_plan_s)
+        )
+        if not found:
+            time_s = min(time_s, first_s)
+        return (found or iteration > 0) and (elapsed_s > time_s or cpu_s > most_cpu_s)
+
+
+@frozen_record
+class StatedPlace:
+    """A point that a plan has to go through.
+
+    Parameters
+    ----------
+    kind : str
+        "exit", where the tubes leave the lumen, or "scope tip".
+    lps_mm : (3,) float64
+    within_mm : float
+        How far from it the plan's may be.
+    """
+
+    kind: Literal["exit", "scope tip"]
+    lps_mm: Float
+    within_mm: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.within_mm < np.inf:
+            raise SettingsError(
+                f"The {self.kind} may be {self.within_mm} mm away", expected="a distance above 0"
+            )
+
+
+@frozen_record
+class Request:
+    """What is asked: a target in a lung, devices, a goal, constraints, and how to search.
+
+    `Request.of` makes one from names and plain values.
+
+    Parameters
+    ----------
+    systems : tuple of System
+        One, or several of which the least invasive that reaches the target is chosen.
+    goal : Goal
+    errors, procedure : optional
+        Under which success is counted; presets `breath-hold` and `measured-tip` if None.
+    radius_mm : float, optional
+        Radius within which a procedure has to end; see `lungaccess.uncertainty.risk.RiskAssessor`.
+    phases : tuple of 2 floats, optional
+        Phases of the breath, 0 end-exhale to 1 end-inhale, in all of which the plan is proved.
+    place : StatedPlace, optional
+    gap : float, optional
+        The search ends once the cost is proved to be at most this share above the least.
+    method, needle_planner : str
+        The searches for plans and for the needle's path; see `lungaccess.planning.driver.planners`.
+    seed, processes : int
+
+    Raises
+    ------
+    SettingsError
+        If a value is wrong, or goal and constraints exclude each other; says why.
+    AnatomyError
+        If phases or a window are asked of a patient without a motion.
+    """
+
+    lung: Lung
+    target: Target
+    systems: tuple[System, ...]
+    goal: Goal = SUCCESS
+    errors: ErrorModel | None = None
+    procedure: Procedure | None = None
+    radius_mm: float | None = None
+    phases: tuple[float, float] | None = None
+    place: StatedPlace | None = None
+    gap: float | None = None
+    method: str = ATLAS
+    needle_planner: str = ""
+    seed: int = 0
+    processes: int = 1
+    limits: Limits = Limits()
+
+    @classmethod
+    def of(
+        cls,
+        lung: Lung,
+        system: System | str | Sequence[System | str],
+        target: Target,
+        *,
+        goal: str | Goal | Objective | PlanFunction = SUCCESS,
+        fissures_allowed: bool | None = None,
+        least_clearance_mm: float = 0.0,
+        phases: Sequence[float] | None = None,
+        iterations: int | None = None,
+        time_s: float | None = None,
+        cpu_s: float | None = None,
+        first_plan_s: float | None = None,
+        **others: Any,
+    ) -> Request:
+        """Return the request that plain values state.
+
+        Parameters
+        ----------
+        system : System, str, or sequence of them
+            Devices, the name of a preset, the path of a file, or "auto" for all presets.
+        goal
+            See `lungaccess.problem.goals.goal_of`.
+        fissures_allowed : bool, optional
+            Whether fissures may be crossed, instead of what the systems say.
+        least_clearance_mm : float
+            Every axis in tissue keeps at least this distance from every obstacle.
+        **others
+            Fields of `Request`.
+        """
+        return cls(
+            lung=lung, target=target, goal=goal_of(goal, lung),
+            systems=systems_of(system, fissures_allowed, least_clearance_mm),
+            phases=None if phases is None else require_phases(*phases),
+            limits=Limits(iterations=iterations, time_s=time_s, cpu_s=cpu_s, first_plan_s=first_plan_s),
+            **others,
+        )  # fmt: skip
+
+    @classmethod
+    def by_cost(cls, task: Task, **others: Any) -> Request:
+        """Return the request of a task: small costs, with other fields of `Request`."""
+        return cls(
+            lung=task.lung, target=task.target, systems=(task.system,), goal=Goal.of_costs(task.objective),
+            seed=task.seed, **others,
+        )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        for system in self.systems:
+            require_own_name(system)
+        if self.needle_planner:
+            require_planner(self.needle_planner)
+        if self.processes < 1:
+            raise SettingsError(f"{self.processes} processes are asked for", expected="at least 1")
+        if (self.phases is not None or self.goal is WINDOW) and self.lung.motion is None:
+            raise AnatomyError(
+                f"How {self.lung.name} breathes is not known, and a window of the breath is asked for",
+                expected="a patient with a motion: [motion] in its patient.toml",
+                remedy="Leave phases and window out, or state a motion; see docs/how_to/breathing.md",
+            )
+        self._require_bound()
+        self._require_systems()
+
+    def _require_bound(self) -> None:
+        """Refuse a gap where no bound can be known."""
+        if self.gap is None or (self.goal.objective is not None and self.phases is None):
+            return
+        why = (
+            "in a window every scope tip has an aim of its own, so that a bound for one target says nothing"
+            if self.phases is not None
+            else f"nothing bounds {self.goal.words} but what is computed of each plan"
+        )
+        raise SettingsError(
+            f"A gap is asked for with the goal {self.goal.name}: {why}",
+            expected="a gap with a cost, and no phases",
+            remedy="Leave out the gap, or choose a cost such as inverse-clearance",
+        )
+
+    def _require_systems(self) -> None:
+        if len({system.name for system in self.systems}) < len(self.systems):
+            raise SettingsError("Two systems have the same name", expected="a name of its own for each")
+        if len(self.systems) > 1 and self.needle_planner in OMPL_PLANNERS:
+            raise SettingsError(
+                f"{self.needle_planner} is to plan with {len(self.systems)} systems, one after the other",
+                expected="one system: OMPL can be seeded once in a process",
+                remedy="Name the system, or choose another needle planner",
+            )
+
+    @property
+    def system(self) -> System:
+        """The first system."""
+        return self.systems[0]
+
+    @property
+    def is_for_window(self) -> bool:
+        """Whether plans end at an aim for the moving target."""
+        return self.phases is not None or self.goal is WINDOW
+
+    @property
+    def counts(self) -> bool:
+        """Whether whole plans compete, by chance or by a function, and no cost."""
+        return self.goal is SUCCESS or self.goal.is_function or (self.goal is WINDOW and self.method != ATLAS)
+
+    @property
+    def task(self) -> Task:
+        """What a search by cost is asked with the first system.
+
+        Raises
+        ------
+        TargetError
+            If the target lies outside the lung or inside an obstacle.
+        """
+        named = self.goal.name if self.counts else WINDOW.name if self.is_for_window else self.method
+        return Task(
+            lung=self.lung, system=self.system, target=self.target,
+            objective=self.goal.objective or objective_of(self.lung), method=named,
+            needle_planner=self.needle_planner, seed=self.seed,
+        )  # fmt: skip
+
+    def with_system(self, system: System) -> Request:
+        """Return the request for one system alone."""
+        return replace(self, systems=(system,))
+
+
+def systems_of(
+    stated: System | str | Sequence[System | str],
+    fissures_allowed: bool | None = None,
+    least_clearance_mm: float = 0.0,
+) -> tuple[System, ...]:
+    """Return the systems that are stated, the least invasive first; see `Request.of`."""
+    if stated == AUTO:
+        found = presets_by_invasiveness(fissures_allowed=fissures_allowed)
+    else:
+        several = [stated] if isinstance(stated, System | str) else list(stated)
+        loaded = [load_system(each) if isinstance(each, str) else each for each in several]
+        found = tuple(with_fissure_rule(each, fissures_allowed) for each in loaded)
+    kept = tuple(with_least_clearance(each, least_clearance_mm) for each in found)
+    return kept if len(kept) == 1 else least_invasive_first(kept)
+
+
+def with_least_clearance(system: System, least_clearance_mm: float) -> System:
+    """Return a system whose margins keep every axis in tissue so far from obstacles, under a name of its own.
+
+    Raises
+    ------
+    SettingsError
+        If the distance is negative, not finite or absurd.
+    """
+    thinnest = system.track_radius_mm if system.needle is None else system.needle.radius_mm
+    more = least_clearance_mm - thinnest - system.margins.total_mm
+    if not 0.0 <= least_clearance_mm < math.inf:
+        raise SettingsError(
+            f"The least clearance is {least_clearance_mm} mm", expected="a distance of 0 or more, in mm"
+        )
+    if more <= 0.0:
+        return system
+    margin_mm = system.margins.registration_margin_mm + more
+    return replace(
+        system,
+        name=f"{system.name} (at least {least_clearance_mm:g} mm from obstacles)",
+        margins=replace(system.margins, registration_margin_mm=margin_mm),
+    )
+
+
+def require_phases(first: float, last: float) -> tuple[float, float]:
+    """Return two phases, or raise SettingsError unless they are two of 0 to 1 in order."""
+    if not require_phase(first) < require_phase(last):
+        raise SettingsError(
+            f"The phases are {first:g} to {last:g}",
+            expected="the first before the last",
+            remedy="Write 0.0:0.3 for the first 30 % of the breath from end-exhale",
+        )
+    return float(first), float(last)

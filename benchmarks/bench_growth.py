@@ -121,7 +121,12 @@ class CostByIterations:
         for point in targets:
             try:
                 *_, best = la.plan(
-                    lung, system, point_target(lung, point), atlas=atlas, iterations=iterations
+                    lung,
+                    system,
+                    point_target(lung, point),
+                    atlas=atlas,
+                    iterations=iterations,
+                    goal="default",
                 )
             except la.NoPlan:
                 continue

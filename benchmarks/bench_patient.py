@@ -77,7 +77,7 @@ class Planning:
         )
 
     def _plans(self) -> Any:
-        return la.plan(self.lung, self.system, self.target, atlas=self.atlas)
+        return la.plan(self.lung, self.system, self.target, atlas=self.atlas, goal="default")
 
     def time_atlas(self, target: list[float]) -> None:
         """Find motions of the scope, enumerate deployments."""
@@ -93,7 +93,9 @@ class Planning:
 
     def time_500_iterations(self, target: list[float]) -> None:
         """Improve a plan."""
-        for _ in la.plan(self.lung, self.system, self.target, atlas=self.atlas, iterations=500):
+        for _ in la.plan(
+            self.lung, self.system, self.target, atlas=self.atlas, iterations=500, goal="default"
+        ):
             pass
 
     def time_workspace_scan(self, target: list[float]) -> None:

@@ -31,7 +31,7 @@ class Chances:
         self.target = la.resolve_target(self.lung, nodule=1)
         self.errors = la.load_errors("gated-ct")
         self.atlas = la.build_atlas(self.lung, self.system)
-        plan = next(la.plan(self.lung, self.system, self.target, atlas=self.atlas))
+        plan = next(la.plan(self.lung, self.system, self.target, atlas=self.atlas, goal="default"))
         self.assessor = RiskAssessor(plan, self.lung, radius_mm=RADIUS_MM)
         procedure = la.load_procedure("measured-tip")
         self.simulator = Simulator(plan, self.lung, self.errors, procedure, radius_mm=RADIUS_MM)

@@ -10,7 +10,7 @@ from lungaccess.showing.report import overview_png
 lung = la.load_patient("phantom-3")
 system = la.load_system("ultrathin")
 target = la.resolve_target(lung, nodule=1)
-for plan in la.plan(lung, system, target, iterations=100, seed=0):
+for plan in la.plan(lung, system, target, iterations=100, seed=0, goal="default"):
     print(f"integral of 1 / clearance: {plan.costs['inverse_clearance']:.2f}")
 
 print("accepted by the check:", la.check(plan, lung).accepted)

@@ -17,7 +17,7 @@ figure, ax = plt.subplots(figsize=(6, 4))
 for device in ["ultrathin", Path(__file__).with_name("my_device.toml")]:
     system = la.load_system(device)
     atlas = la.open_atlas(lung, system)  # what scope and tubes can do; it is kept
-    plans = la.plan(lung, system, target, atlas=atlas, iterations=100)
+    plans = la.plan(lung, system, target, atlas=atlas, iterations=100, goal="default")
     costs = [plan.costs["inverse_clearance"] for plan in plans]
     radius_mm = 1.0 / system.needle.max_curvature_per_mm
     ax.plot(costs, "o-", label=f"{system.name}: needle radius {radius_mm:.0f} mm")

@@ -15,7 +15,7 @@ atlas = la.open_atlas(lung, system)  # what scope and tubes can do, for all sear
 figure, ax = plt.subplots(figsize=(6, 4))
 for weight in [0.0, 0.05, 0.2, 1.0]:
     objective = la.Objective(inverse_clearance=1.0, length=weight)
-    *_worse, plan = la.plan(lung, system, target, objective=objective, atlas=atlas, iterations=100)
+    *_worse, plan = la.plan(lung, system, target, goal=objective, atlas=atlas, iterations=100)
     ax.plot(plan.costs["length_mm"], plan.costs["inverse_clearance"], "o", label=f"{objective}")
 ax.set(xlabel="length of the needle, mm", ylabel="integral of 1 / clearance", title="Weighted objectives")
 ax.legend()

@@ -34,7 +34,7 @@ lung, system = la.load_patient("phantom-3"), la.load_system("ultrathin")
 target, atlas = la.resolve_target(lung, nodule=1), la.open_atlas(lung, system)
 figure, ax = plt.subplots(figsize=(6, 4))
 for method in ["random-arcs", "atlas"]:
-    plans = list(la.plan(lung, system, target, method=method, atlas=atlas, iterations=300))
+    plans = list(la.plan(lung, system, target, method=method, atlas=atlas, iterations=300, goal="default"))
     ax.step(
         [plan.iterations for plan in plans], [plan.cost for plan in plans], "o-", where="post", label=method
     )

@@ -17,7 +17,7 @@ system = la.load_system("ultrathin", fissures_allowed=True)
 target = la.resolve_target(lung, nodule=1)
 errors, procedure = la.load_errors("gated-ct"), la.load_procedure("open-loop")
 atlas = la.open_atlas(lung, system)
-*_, cheapest = la.plan(lung, system, target, atlas=atlas, iterations=50)
+*_, cheapest = la.plan(lung, system, target, atlas=atlas, iterations=50, goal="default")
 *_, likeliest = la.plan_for_success(lung, system, target, errors=errors, atlas=atlas, iterations=10)
 several = la.alternatives_for_success(lung, system, target, errors=errors, atlas=atlas, count=8)
 plans = [cheapest, likeliest.plan, *(each.plan for each in several)]

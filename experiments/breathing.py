@@ -60,7 +60,7 @@ def rigid_plan(lung: la.Lung, atlas: la.Atlas, place: Float, seed: int) -> la.Pl
     """Return the plan of least cost in the masks' phase."""
     options = {"atlas": atlas, "iterations": ITERATIONS, "seed": seed, "counterfactuals": False}
     try:
-        *_, best = la.plan(lung, atlas.system, point_target(lung, place), **options)
+        *_, best = la.plan(lung, atlas.system, point_target(lung, place), **options, goal="default")
     except la.NoPlan:
         return None
     return best

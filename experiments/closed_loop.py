@@ -79,7 +79,15 @@ def cases_of(
     for point in np.random.default_rng(seed).permutation(peripheral_targets(lung, 10 * count, seed)):
         try:
             found = next(
-                la.plan(lung, system, point_target(lung, point), atlas=atlas, iterations=100, time_s=60.0)
+                la.plan(
+                    lung,
+                    system,
+                    point_target(lung, point),
+                    atlas=atlas,
+                    iterations=100,
+                    time_s=60.0,
+                    goal="default",
+                )
             )
         except la.NoPlan:
             continue

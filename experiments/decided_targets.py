@@ -64,6 +64,7 @@ class Decider:
             seed=seed,
             first_plan_s=PLAN_S,
             counterfactuals=False,
+            goal="default",
         )
         try:
             plan = next(found)

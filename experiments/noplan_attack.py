@@ -58,7 +58,13 @@ class Attack:
         try:
             next(
                 la.plan(
-                    self.atlas.lung, system, target, atlas=self.atlas, seed=self.seed, time_s=self.planner_s
+                    self.atlas.lung,
+                    system,
+                    target,
+                    atlas=self.atlas,
+                    seed=self.seed,
+                    time_s=self.planner_s,
+                    goal="default",
                 )
             )
         except la.NoPlan as reason:

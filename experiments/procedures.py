@@ -33,7 +33,9 @@ def plans_of(lung: Lung, atlas: la.Atlas, count: int, seed: int) -> list[la.Plan
         if len(plans) == count:
             break
         try:
-            *_, best = la.plan(lung, system, point_target(lung, point), atlas=atlas, iterations=ITERATIONS)
+            *_, best = la.plan(
+                lung, system, point_target(lung, point), atlas=atlas, iterations=ITERATIONS, goal="default"
+            )
         except la.NoPlan:
             continue
         plans.append(best)

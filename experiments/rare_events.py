@@ -49,7 +49,9 @@ class Case:
     def assessor(self) -> RiskAssessor:
         """Make the patient and the plan."""
         lung = build_lung(make_phantom(seed=self.phantom_seed, size="small").images)
-        found = la.plan(lung, la.load_system(self.system), la.resolve_target(lung), iterations=30)
+        found = la.plan(
+            lung, la.load_system(self.system), la.resolve_target(lung), iterations=30, goal="default"
+        )
         return RiskAssessor(list(found)[-1], lung)
 
 

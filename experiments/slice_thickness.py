@@ -61,7 +61,13 @@ def planned(lung: Lung, system: System, targets: Float, seed: int) -> list[bool]
         try:
             next(
                 la.plan(
-                    lung, system, point_target(lung, target), atlas=atlas, seed=seed, iterations=ITERATIONS
+                    lung,
+                    system,
+                    point_target(lung, target),
+                    atlas=atlas,
+                    seed=seed,
+                    iterations=ITERATIONS,
+                    goal="default",
                 )
             )
         except LungaccessError:

@@ -65,7 +65,9 @@ def plans_of(lung: Lung, system: la.System, count: int, iterations: int, seed: i
     made = 0
     for point in la.peripheral_targets(lung, count, seed):
         try:
-            *_, plan = la.plan(lung, system, la.point_target(lung, point), iterations=iterations, seed=0)
+            *_, plan = la.plan(
+                lung, system, la.point_target(lung, point), iterations=iterations, seed=0, goal="default"
+            )
         except la.NoPlan:
             continue
         yield plan

@@ -61,7 +61,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lung = la.load_patient(here / "PATIENT", cache=here / "cache")
     atlas = la.open_atlas(lung, la.load_system("lung-default"), cache=here / "cache")
     target = la.resolve_target(lung)
-    *_, plan = la.plan(lung, atlas.system, target, atlas=atlas, iterations=5)
+    *_, plan = la.plan(lung, atlas.system, target, atlas=atlas, iterations=5, goal="default")
     (here / "plan").mkdir()
     plan.save(here / "plan" / "plan.json")
     np.savetxt(here / "pose.txt", LPS_FROM_RAS @ plan.tube.lps_from_tip)

@@ -15,7 +15,9 @@ from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, 
 @pytest.mark.slow
 def test_tubes_without_errors_end_where_the_plan_says(small_lung: Lung, small_atlas: la.Atlas) -> None:
     target = la.resolve_target(small_lung)
-    plan = next(la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=1))
+    plan = next(
+        la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=1, goal="default")
+    )
     assessor = RiskAssessor(plan, small_lung)
     none = Deviations(**assessor.no_deviations(1))
     start, pieces = deviated_starts(plan, small_lung, none)[0], deviated_pieces(plan, none)[0]

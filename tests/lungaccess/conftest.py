@@ -68,7 +68,9 @@ def breathing_atlas(breathing_lung: Lung, small_atlas: la.Atlas) -> la.Atlas:
 def small_plan(breathing_atlas: la.Atlas) -> Plan:
     """A plan to the nodule of the small phantom, which the check accepts."""
     lung, system = breathing_atlas.lung, breathing_atlas.system
-    *_, best = la.plan(lung, system, la.resolve_target(lung), atlas=breathing_atlas, iterations=20)
+    *_, best = la.plan(
+        lung, system, la.resolve_target(lung), atlas=breathing_atlas, iterations=20, goal="default"
+    )
     return best
 
 

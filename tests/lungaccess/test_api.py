@@ -95,7 +95,7 @@ def test_from_files_to_a_checked_plan_and_back(small_phantom: Phantom, tmp_path:
     lung = la.load_patient(tmp_path / "patient", cache=tmp_path / "cache", progress=steps.append)
     assert steps
     system = la.load_system("ultrathin")
-    plans = list(la.plan(lung, system, la.resolve_target(lung), iterations=20))
+    plans = list(la.plan(lung, system, la.resolve_target(lung), iterations=20, goal="default"))
     plans[-1].save(tmp_path / "plan.json")
     stored = la.Plan.load(tmp_path / "plan.json")
     assert stored.digest == plans[-1].digest

@@ -48,7 +48,7 @@ def answer_for(scenes: Scenes, case: Case, target_lps: Sequence[float]) -> Answe
         plans = list(
             la.plan(
                 lung, system, point_target(lung, np.array(target_lps)), atlas=scenes.atlas(case),
-                method=planner.method, objective=planner.objective, iterations=planner.iterations,
+                method=planner.method, goal=planner.objective, iterations=planner.iterations,
             )
         )  # fmt: skip
     except la.NoPlan as refusal:

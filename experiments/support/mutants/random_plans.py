@@ -141,7 +141,7 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
         method = "kuntz2015" if paper else "atlas"
         iterations = 200 if method == "kuntz2015" else int(rng.choice([1, 40, 150, JOINT_ITERATIONS]))
         found = la.plan(
-            lung, system, target, objective=objective, method=method, seed=seed, iterations=iterations,
+            lung, system, target, goal=objective, method=method, seed=seed, iterations=iterations,
             atlas=atlas,
         )  # fmt: skip
         yield from list(found)[-AT_A_TIME:]

@@ -50,7 +50,14 @@ def test_the_plan_is_that_of_the_system_alone(small_lung: Lung, atlas_of: Any) -
     """Only the words about the choice are added, and they survive in the file."""
     chosen = planned(small_lung, [SHORT, SYSTEM], atlas_of=atlas_of)[-1]
     alone = list(
-        la.plan(small_lung, SYSTEM, la.resolve_target(small_lung), iterations=5, atlas=atlas_of(SYSTEM))
+        la.plan(
+            small_lung,
+            SYSTEM,
+            la.resolve_target(small_lung),
+            iterations=5,
+            atlas=atlas_of(SYSTEM),
+            goal="default",
+        )
     )[-1]
     assert replace(chosen, system_choice=()).digest == alone.digest != chosen.digest
     assert la.Plan.from_json(chosen.to_json()).system_choice == chosen.system_choice

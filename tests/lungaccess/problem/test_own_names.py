@@ -28,9 +28,9 @@ def test_a_preset_is_known_by_the_name_it_was_loaded_with(name: str, allowed: bo
 def test_a_changed_preset_that_keeps_its_name_is_refused_before_planning(small_lung, tmp_path: Path) -> None:
     target = Target(lps_mm=np.zeros(3), origin="made")
     with pytest.raises(SettingsError, match="differs from it"):
-        next(la.plan(small_lung, CHANGED, target))
+        next(la.plan(small_lung, CHANGED, target, goal="default"))
     with pytest.raises(SettingsError, match="differs from it"):
-        la.alternatives(small_lung, CHANGED, target)
+        la.alternatives(small_lung, CHANGED, target, goal="default")
     file = tmp_path / "mine.toml"
     file.write_text(
         preset_text("ultrathin").replace("segmentation_margin_mm = 0.5", "segmentation_margin_mm = 0")

@@ -49,7 +49,9 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
-    *_, best = la.plan(small_lung, SYSTEM, la.resolve_target(small_lung), atlas=small_atlas, iterations=60)
+    *_, best = la.plan(
+        small_lung, SYSTEM, la.resolve_target(small_lung), atlas=small_atlas, iterations=60, goal="default"
+    )
     return best
 
 

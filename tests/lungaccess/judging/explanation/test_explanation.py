@@ -50,7 +50,7 @@ def atlas_of(small_lung: Lung) -> AtlasOf:
 
 def no_plan(lung: Lung, system: System, target: Target, atlas: la.Atlas) -> la.NoPlan:
     with pytest.raises(la.NoPlan) as caught:
-        list(la.plan(lung, system, target, atlas=atlas, iterations=5, counterfactuals=False))
+        list(la.plan(lung, system, target, atlas=atlas, iterations=5, counterfactuals=False, goal="default"))
     return caught.value
 
 

@@ -31,7 +31,11 @@ def explanation(small_lung: Lung) -> Explanation:
     target = la.resolve_target(small_lung, FAR_TARGET)
     atlas = la.build_atlas(small_lung, SYSTEM, rotations=12, stop_spacing_mm=4.0, site_spacing_mm=2.0)
     with pytest.raises(la.NoPlan) as caught:
-        list(la.plan(small_lung, SYSTEM, target, atlas=atlas, iterations=5, counterfactuals=False))
+        list(
+            la.plan(
+                small_lung, SYSTEM, target, atlas=atlas, iterations=5, counterfactuals=False, goal="default"
+            )
+        )
 
     def none(*_: object, **__: object) -> la.Atlas:
         from lungaccess.judging.explanation.explain import OutOfTime

@@ -25,7 +25,9 @@ TARGET = "lps:-45.6,47.0,-65.1"
 
 
 def plans_of(lung: Lung, target: Target, atlas: la.Atlas, **options: Any) -> list[Plan]:
-    return list(la.plan(lung, SYSTEM, target, atlas=atlas, **{"iterations": ITERATIONS, **options}))
+    return list(
+        la.plan(lung, SYSTEM, target, atlas=atlas, **{"iterations": ITERATIONS, "goal": "default", **options})
+    )
 
 
 def mapped(lung: Lung) -> Lung:

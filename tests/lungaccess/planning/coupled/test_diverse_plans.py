@@ -48,7 +48,7 @@ def test_where_no_arc_leads_the_planner_searches(
     monkeypatch.setattr(diverse_plans, "separated_candidates", lambda *_: iter(()))
     monkeypatch.setitem(diverse_plans.separated_plans.__kwdefaults__, "iterations", 3)
     (only,) = alternatives(small_lung, SYSTEM, target, atlas=atlas)
-    *_, best = la.plan(small_lung, SYSTEM, target, atlas=atlas, iterations=3)
+    *_, best = la.plan(small_lung, SYSTEM, target, atlas=atlas, iterations=3, goal="default")
     assert only.plan.digest == best.digest and only.on_front
 
 
@@ -75,7 +75,7 @@ def test_the_cheapest_under_the_objective_come_first(
     """Of each branch first, then of all; the order is that of estimates, which are some per cent off."""
     lung = patchy(small_lung)
     found = alternatives(
-        lung, SYSTEM, la.resolve_target(lung), objective=objective, atlas=atlas, count=8, separation_mm=3.0
+        lung, SYSTEM, la.resolve_target(lung), goal=objective, atlas=atlas, count=8, separation_mm=3.0
     )
     by_branch: dict[int, list[float]] = {}
     for each in found:

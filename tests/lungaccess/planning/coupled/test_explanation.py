@@ -50,7 +50,7 @@ def atlas_of(small_lung: Lung) -> Callable[[System], la.Atlas]:
 
 def explained(lung: Lung, system: System, target: Target, **options: Any) -> NoPlan:
     with pytest.raises(la.NoPlan) as caught:
-        list(la.plan(lung, system, target, **{"iterations": 60, **options}))
+        list(la.plan(lung, system, target, **{"iterations": 60, "goal": "default", **options}))
     return caught.value
 
 
@@ -153,7 +153,7 @@ class TestNeedle:
             small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), method="kuntz2015", iterations=1
         )
         assert "too short" in error.advice
-        assert next(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM))) is not None
+        assert next(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), goal="default")) is not None
 
 
 @pytest.mark.slow
@@ -163,7 +163,7 @@ class TestAdvice:
     @staticmethod
     def accepted(lung: Lung, system: System, target: Target, atlas: la.Atlas) -> bool:
         try:
-            found = next(la.plan(lung, system, target, atlas=atlas, iterations=0))
+            found = next(la.plan(lung, system, target, atlas=atlas, iterations=0, goal="default"))
         except la.NoPlan:
             return False
         report = la.check(found, lung, system)
@@ -175,7 +175,9 @@ class TestAdvice:
         seen = 0
         for target in random_targets(small_lung, 25, 0):
             try:
-                list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
+                list(
+                    la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0, goal="default")
+                )
             except la.NoPlan as error:
                 named = [
                     (float(re.search(r"curvature of (\d+) mm instead of 121 mm", change)[1]), made)
@@ -202,7 +204,7 @@ class TestAdvice:
             if seen >= {"needle", "fissure"}:
                 break
             try:
-                list(la.plan(small_lung, THICK, target, atlas=atlas_of(THICK), iterations=0))
+                list(la.plan(small_lung, THICK, target, atlas=atlas_of(THICK), iterations=0, goal="default"))
             except la.NoPlan as error:
                 for change, made in error.counterfactuals.items():
                     seen.add("needle" if "needle" in change else "scope")
@@ -220,7 +222,7 @@ class TestAdvice:
         atlas = la.build_atlas(small_lung, thick, **COARSE)
         for target in random_targets(small_lung, 40, 1):
             try:
-                list(la.plan(small_lung, thick, target, atlas=atlas, iterations=0))
+                list(la.plan(small_lung, thick, target, atlas=atlas, iterations=0, goal="default"))
             except la.NoPlan as error:
                 changes = [change for change in error.counterfactuals if "bronchoscope" in change]
                 if not changes:
@@ -239,7 +241,9 @@ class TestAdvice:
     def test_changes_are_named_smallest_first(self, small_lung: Lung, atlas_of: Any) -> None:
         for target in random_targets(small_lung, 25, 0):
             try:
-                list(la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0))
+                list(
+                    la.plan(small_lung, SYSTEM, target, atlas=atlas_of(SYSTEM), iterations=0, goal="default")
+                )
             except la.NoPlan as error:
                 shares = []
                 for change in error.counterfactuals:

@@ -91,7 +91,7 @@ def test_a_part_of_the_atlas_plans_from_it_alone(
 ) -> None:
     entry = int(answers[-1].entries[-1])
     part = atlas_part(atlas, np.array([entry]))
-    *_, plan = la.plan(small_lung, SYSTEM, target, atlas=part, iterations=0)
+    *_, plan = la.plan(small_lung, SYSTEM, target, atlas=part, iterations=0, goal="default")
     assert plan.tube.rotation_rad == pytest.approx(float(atlas.deployments.rotation_rad[entry]))
     assert la.check(plan, small_lung).accepted
 

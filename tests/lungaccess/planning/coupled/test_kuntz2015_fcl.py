@@ -71,7 +71,7 @@ def plans(small_lung: Lung, atlas: la.Atlas, target: Target) -> dict[str, list[P
 
     def of(method: str, seed: int) -> list[Plan]:
         options = {"atlas": atlas, "method": method, "seed": seed, "iterations": ITERATIONS}
-        return list(la.plan(small_lung, SYSTEM, target, **options))
+        return list(la.plan(small_lung, SYSTEM, target, **options, goal="default"))
 
     return {
         "once": of("reference", 1),

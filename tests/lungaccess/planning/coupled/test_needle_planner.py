@@ -60,9 +60,17 @@ class TestNeedlePlanner:
 
     def test_what_cannot_be_is_refused(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
         with pytest.raises(SettingsError, match=r"Did you mean 'control\.RRT'"):
-            la.plan(small_lung, SYSTEM, target, atlas=atlas, needle_planner="control.RTT")
+            la.plan(small_lung, SYSTEM, target, atlas=atlas, needle_planner="control.RTT", goal="default")
         with pytest.raises(SettingsError, match="reference mode"):
-            la.plan(small_lung, SYSTEM, target, atlas=atlas, method="reference", needle_planner="rrt")
+            la.plan(
+                small_lung,
+                SYSTEM,
+                target,
+                atlas=atlas,
+                method="reference",
+                needle_planner="rrt",
+                goal="default",
+            )
         with pytest.raises(SettingsError, match=f"with {len(preset_names())} systems"):
             next(la.plan_with_presets(small_lung, target, needle_planner="control.EST"))
 

@@ -44,7 +44,17 @@ def plans(small_lung: Lung, system: System, atlas: la.Atlas) -> list[list[la.Pla
         try:
             target = point_target(small_lung, atlas.deployments.positions[entry] + OFF_MM)
             found.append(
-                list(la.plan(small_lung, system, target, atlas=atlas, iterations=5, counterfactuals=False))
+                list(
+                    la.plan(
+                        small_lung,
+                        system,
+                        target,
+                        atlas=atlas,
+                        iterations=5,
+                        counterfactuals=False,
+                        goal="default",
+                    )
+                )
             )
         except la.LungaccessError:
             continue
@@ -77,7 +87,14 @@ def test_plans_become_better_and_are_the_same_again(
         costs = [plan.cost for plan in found]
         assert costs == sorted(costs, reverse=True)
     last = plans[0][-1]
-    again = la.plan(small_lung, system, point_target(small_lung, last.target_lps), atlas=atlas, iterations=5)
+    again = la.plan(
+        small_lung,
+        system,
+        point_target(small_lung, last.target_lps),
+        atlas=atlas,
+        iterations=5,
+        goal="default",
+    )
     assert [plan.digest for plan in again] == [plan.digest for plan in plans[0]]
 
 
@@ -126,7 +143,16 @@ def test_no_plan_says_how_near_the_tip_comes(small_lung: Lung, system: System, a
     far = points[np.argsort(away)[-len(points) // 4]]
     nearest = np.linalg.norm(tips - far, axis=1).min()
     with pytest.raises(la.NoPlan, match=f"within {nearest:.1f} mm of the target") as caught:
-        next(la.plan(small_lung, system, point_target(small_lung, far), atlas=atlas, counterfactuals=False))
+        next(
+            la.plan(
+                small_lung,
+                system,
+                point_target(small_lung, far),
+                atlas=atlas,
+                counterfactuals=False,
+                goal="default",
+            )
+        )
     assert "needle" in caught.value.advice
     assert caught.value.reasons["tube: scope tips with a deployment that ends near the target"] == 0
 
@@ -137,9 +163,9 @@ def test_what_needs_a_needle_says_so(
     target = point_target(small_lung, plans[0][0].target_lps)
     for options in ({"method": "kuntz2015"}, {"method": "reference"}, {"needle_planner": "rrt"}):
         with pytest.raises(SettingsError, match="needs a needle"):
-            la.plan(small_lung, system, target, atlas=atlas, **options)
+            la.plan(small_lung, system, target, atlas=atlas, **options, goal="default")
     with pytest.raises(SettingsError, match="a system that has a needle"):
-        la.plan(small_lung, system, target, atlas=atlas, processes=2)
+        la.plan(small_lung, system, target, atlas=atlas, processes=2, goal="default")
 
 
 def test_straight_or_single_tubes_need_a_needle(system: System) -> None:
@@ -174,7 +200,9 @@ def test_alternatives_are_separated_and_accepted(
     small_lung: Lung, system: System, atlas: la.Atlas, plans: list[list[la.Plan]]
 ) -> None:
     target = point_target(small_lung, plans[0][0].target_lps)
-    found = la.alternatives(small_lung, system, target, atlas=atlas, count=3, separation_mm=1.0)
+    found = la.alternatives(
+        small_lung, system, target, atlas=atlas, count=3, separation_mm=1.0, goal="default"
+    )
     lines = [each.plan.costed_poses()[0][:, :3, 3] for each in found]
     for n, line in enumerate(lines):
         assert la.check(found[n].plan, small_lung).accepted

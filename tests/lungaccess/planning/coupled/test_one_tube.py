@@ -41,7 +41,14 @@ def plans(small_lung: Lung, system: System, atlas: la.Atlas) -> list[la.Plan]:
         try:
             target = point_target(small_lung, point)
             made = la.plan(
-                small_lung, system, target, atlas=atlas, seed=0, iterations=10, counterfactuals=False
+                small_lung,
+                system,
+                target,
+                atlas=atlas,
+                seed=0,
+                iterations=10,
+                counterfactuals=False,
+                goal="default",
             )
             found.append(next(made))
         except la.LungaccessError:

@@ -59,7 +59,7 @@ class TestRepeatability:
     def test_the_atlas_made_inside_gives_the_same_plans(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
-        inside = list(la.plan(small_lung, SYSTEM, target, iterations=20))
+        inside = list(la.plan(small_lung, SYSTEM, target, iterations=20, goal="default"))
         assert same_run(inside) == same_run(plans_of(small_lung, target, atlas, iterations=20))
 
     def test_more_iterations_continue_the_same_run(
@@ -91,7 +91,7 @@ class TestBudget:
     def test_no_time_still_gives_the_first_direct_arc(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
-        (plan,) = la.plan(small_lung, SYSTEM, target, atlas=atlas, time_s=0.0)
+        (plan,) = la.plan(small_lung, SYSTEM, target, atlas=atlas, time_s=0.0, goal="default")
         assert plan.iterations == 0
         assert plan.digest == plans_of(small_lung, target, atlas, iterations=0)[0].digest
 
@@ -99,10 +99,14 @@ class TestBudget:
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
         with pytest.raises(la.NoPlan, match="after 1 iterations"):
-            list(la.plan(small_lung, SYSTEM, target, atlas=atlas, method="kuntz2015", time_s=0.0))
+            list(
+                la.plan(
+                    small_lung, SYSTEM, target, atlas=atlas, method="kuntz2015", time_s=0.0, goal="default"
+                )
+            )
 
     def test_the_caller_may_stop_at_any_time(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
-        plans = la.plan(small_lung, SYSTEM, target, atlas=atlas)
+        plans = la.plan(small_lung, SYSTEM, target, atlas=atlas, goal="default")
         costs = [next(plans).costs["inverse_clearance"] for _ in range(3)]
         plans.close()  # type: ignore[attr-defined]
         assert costs[0] > costs[1] > costs[2]
@@ -111,12 +115,12 @@ class TestBudget:
     def test_a_futile_search_without_budget_ends(self, small_lung: Lung, atlas: la.Atlas) -> None:
         far = la.resolve_target(small_lung, FAR_TARGET)
         with pytest.raises(la.NoPlan, match="outside the needle's workspace"):
-            list(la.plan(small_lung, SYSTEM, far, atlas=atlas))
+            list(la.plan(small_lung, SYSTEM, far, atlas=atlas, goal="default"))
 
     @pytest.mark.slow
     def test_progress(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
         told: list[ProgressEvent] = []
-        list(la.plan(small_lung, SYSTEM, target, time_s=0.6, on_progress=told.append))
+        list(la.plan(small_lung, SYSTEM, target, time_s=0.6, on_progress=told.append, goal="default"))
         assert {"atlas"} < {event.phase for event in told}
         searching = [event for event in told if event.phase != "atlas"]
         assert [e.elapsed_s for e in searching] == sorted(e.elapsed_s for e in searching)
@@ -200,24 +204,24 @@ class TestSearchSettings:
 class TestBadInput:
     """Typed errors, before any work."""
 
-    @pytest.mark.parametrize("option", [{"objective": "speed"}, {"method": "magic"}])
+    @pytest.mark.parametrize("option", [{"goal": "speed"}, {"method": "magic"}])
     def test_unknown_words(self, small_lung: Lung, target: Target, option: dict[str, str]) -> None:
         with pytest.raises(SettingsError, match="one of"):
-            la.plan(small_lung, SYSTEM, target, **option)  # type: ignore[arg-type]
+            la.plan(small_lung, SYSTEM, target, **{"goal": "default", **option})
 
     def test_an_atlas_of_another_device_or_patient(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
         other = replace(SYSTEM, name="other", scope=replace(SYSTEM.scope, outer_diameter_mm=2.5))
         with pytest.raises(SettingsError, match="build_atlas"):
-            la.plan(small_lung, other, target, atlas=atlas)
+            la.plan(small_lung, other, target, atlas=atlas, goal="default")
         with pytest.raises(SettingsError, match="build_atlas"):
-            la.plan(replace(small_lung, key="other"), SYSTEM, target, atlas=atlas)
+            la.plan(replace(small_lung, key="other"), SYSTEM, target, atlas=atlas, goal="default")
 
     def test_a_target_of_another_patient(self, small_lung: Lung, atlas: la.Atlas) -> None:
         far = Target(lps_mm=np.array([900.0, 0.0, 0.0]), origin="point")
         with pytest.raises(TargetError, match="outside the images"):
-            la.plan(small_lung, SYSTEM, far, atlas=atlas)
+            la.plan(small_lung, SYSTEM, far, atlas=atlas, goal="default")
 
 
 @pytest.mark.slow

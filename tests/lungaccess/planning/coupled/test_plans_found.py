@@ -22,7 +22,7 @@ from tests.lungaccess.resample import needle_walk, problems
 def by_objective(small_lung: Lung, target: Target, atlas: la.Atlas) -> dict[str, list[Plan]]:
     """Plans under every objective, on a lung with a cost map that falls to the patient's left."""
     lung = mapped(small_lung)
-    return {name: plans_of(lung, target, atlas, objective=name, iterations=600) for name in KEYS}
+    return {name: plans_of(lung, target, atlas, goal=name, iterations=600) for name in KEYS}
 
 
 class TestPlans:
@@ -66,7 +66,7 @@ class TestPlans:
     def test_a_sum_of_one_cost_is_that_cost(
         self, by_objective: dict[str, list[Plan]], small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
-        found = plans_of(mapped(small_lung), target, atlas, objective="cost-map=1", iterations=600)
+        found = plans_of(mapped(small_lung), target, atlas, goal="cost-map=1", iterations=600)
         assert [plan.digest for plan in found] == [plan.digest for plan in by_objective["cost_map"]]
 
     def test_a_sum_of_two_lies_between_them(
@@ -77,7 +77,7 @@ class TestPlans:
         Exactly so for optima; a search of few iterations comes within some per cent of them.
         """
         lung = mapped(small_lung)
-        plans = plans_of(lung, target, atlas, objective=Objective(inverse_clearance=1.0, length=0.2))
+        plans = plans_of(lung, target, atlas, goal=Objective(inverse_clearance=1.0, length=0.2))
         best = plans[-1]
         text = "inverse_clearance=1,length_mm=0.2"
         assert best.objective == text
@@ -97,8 +97,8 @@ class TestPlans:
     def test_a_sum_without_its_map_weighs_the_rest(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
-        summed = plans_of(small_lung, target, atlas, objective="length,cost-map=3")
-        alone = plans_of(small_lung, target, atlas, objective="length")
+        summed = plans_of(small_lung, target, atlas, goal="length,cost-map=3")
+        alone = plans_of(small_lung, target, atlas, goal="length")
         assert [plan.cost for plan in summed] == [plan.cost for plan in alone]
 
     def test_they_state_what_they_are(self, by_objective: dict[str, list[Plan]], small_lung: Lung) -> None:
@@ -124,8 +124,8 @@ def test_the_default_objective_weighs_a_map_where_there_is_one(
     stated = "inverse_clearance=1,cost_map=1" if has_map else "inverse_clearance"
     found = plans_of(lung, target, atlas, iterations=10)
     assert {plan.objective for plan in found} == {stated}
-    assert same_run(found) == same_run(plans_of(lung, target, atlas, iterations=10, objective=stated))
-    for each in la.alternatives(lung, SYSTEM, target, atlas=atlas, count=2):
+    assert same_run(found) == same_run(plans_of(lung, target, atlas, iterations=10, goal=stated))
+    for each in la.alternatives(lung, SYSTEM, target, atlas=atlas, count=2, goal="default"):
         assert each.plan.objective == stated
         assert la.check(each.plan, lung).accepted
 
@@ -142,7 +142,7 @@ class TestInfiniteCost:
             values[tuple(np.rint(small_lung.grid.ijk(point)).astype(int))] = np.inf
         lung = replace(small_lung, cost=Volume(grid=small_lung.grid, array=values))
         for objective in KEYS:
-            plans = plans_of(lung, target, atlas, objective=objective, iterations=60)
+            plans = plans_of(lung, target, atlas, goal=objective, iterations=60)
             assert plans and all(math.isfinite(plan.costs["cost_map"]) for plan in plans)
             for plan in plans:
                 index = np.rint(lung.grid.ijk(needle_walk(plan).points)).astype(int)

@@ -36,7 +36,11 @@ def patient2(data_dir: Path, cache: Path) -> Lung:
 @pytest.fixture(scope="module")
 def plan2(patient2: Lung) -> la.Plan:
     *_, best = la.plan(
-        patient2, la.load_system("lung-default"), la.resolve_target(patient2), iterations=ITERATIONS
+        patient2,
+        la.load_system("lung-default"),
+        la.resolve_target(patient2),
+        iterations=ITERATIONS,
+        goal="default",
     )
     return best
 
@@ -113,7 +117,11 @@ def test_patient2_plan_is_refused_where_a_vessel_is_put_back(patient2: Lung, pla
 @pytest.mark.slow
 def test_patient2_plan_is_the_same_again(patient2: Lung, plan2: la.Plan) -> None:
     *_, again = la.plan(
-        patient2, la.load_system("lung-default"), la.resolve_target(patient2), iterations=ITERATIONS
+        patient2,
+        la.load_system("lung-default"),
+        la.resolve_target(patient2),
+        iterations=ITERATIONS,
+        goal="default",
     )
     assert again.digest == plan2.digest
     assert replace(again, timing={}).to_json() == replace(plan2, timing={}).to_json()
@@ -136,7 +144,7 @@ def test_patient1_nodule_is_reached_around_fissures_and_through_them(
     lung = la.load_patient(data_dir / "med-rad" / "Patient1", cache=cache)
     system = replace(la.load_system("lung-default"), name="own", fissures_allowed=fissures_allowed)
     target = la.resolve_target(lung)
-    *_, found = la.plan(lung, system, target, iterations=ITERATIONS)
+    *_, found = la.plan(lung, system, target, iterations=ITERATIONS, goal="default")
     assert la.check(found, lung, system, target_lps=target.lps_mm).accepted
     assert found.fissures_are_obstacles is not fissures_allowed
     least = found.least_required_clearance_mm("needle")
@@ -152,7 +160,9 @@ def test_random_peripheral_targets(data_dir: Path, cache: Path, patient: str) ->
     reached = 0
     for point in peripheral_targets(lung, 15, seed=1):
         try:
-            plans = la.plan(lung, system, point_target(lung, point), atlas=atlas, iterations=50)
+            plans = la.plan(
+                lung, system, point_target(lung, point), atlas=atlas, iterations=50, goal="default"
+            )
             for found in plans:
                 report = la.check(found, lung, system, target_lps=point)
                 assert report.accepted, str(report)

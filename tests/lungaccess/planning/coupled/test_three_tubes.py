@@ -65,7 +65,7 @@ def plan(small_lung: Lung, system: System, atlas: la.Atlas) -> la.Plan:
         try:
             found = la.plan(
                 small_lung, system, point_target(small_lung, point), atlas=atlas, iterations=40,
-                counterfactuals=False,
+                counterfactuals=False, goal="default",
             )  # fmt: skip
             best = list(found)[-1]
         except la.LungaccessError:

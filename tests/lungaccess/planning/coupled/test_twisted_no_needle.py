@@ -43,7 +43,17 @@ def plans(small_lung: Lung, system: System, atlas: la.Atlas) -> list[list[la.Pla
         try:
             target = point_target(small_lung, atlas.deployments.positions[entry] + OFF_MM)
             found.append(
-                list(la.plan(small_lung, system, target, atlas=atlas, iterations=5, counterfactuals=False))
+                list(
+                    la.plan(
+                        small_lung,
+                        system,
+                        target,
+                        atlas=atlas,
+                        iterations=5,
+                        counterfactuals=False,
+                        goal="default",
+                    )
+                )
             )
         except la.LungaccessError:
             continue
@@ -70,7 +80,7 @@ def test_the_same_seed_gives_the_same_plan(
     small_lung: Lung, system: System, atlas: la.Atlas, plans: list[list[la.Plan]]
 ) -> None:
     target = point_target(small_lung, plans[0][-1].target_lps)
-    again = list(la.plan(small_lung, system, target, atlas=atlas, iterations=5))
+    again = list(la.plan(small_lung, system, target, atlas=atlas, iterations=5, goal="default"))
     assert [plan.digest for plan in again] == [plan.digest for plan in plans[0]]
 
 

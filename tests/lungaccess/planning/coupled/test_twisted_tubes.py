@@ -56,7 +56,9 @@ def plans(small_lung: Lung, system: System, atlas: la.Atlas) -> list[la.Plan]:
         point = entries.positions[entry] + 20.0 * entries.tangents[entry]
         try:
             target = point_target(small_lung, point)
-            found += list(la.plan(small_lung, system, target, atlas=atlas, seed=0, iterations=3))[-1:]
+            found += list(
+                la.plan(small_lung, system, target, atlas=atlas, seed=0, iterations=3, goal="default")
+            )[-1:]
         except la.LungaccessError:
             continue
     return [plan for plan in found if plan.tube.outer_insertion_mm > 0.0]
@@ -211,6 +213,8 @@ def test_what_needs_a_closed_form_says_so(
     target = point_target(small_lung, case.plan.target_lps)
     for method in ("kuntz2015", "reference"):
         with pytest.raises(SettingsError, match="closed form"):
-            next(la.plan(small_lung, system, target, atlas=atlas, method=method, iterations=1))
+            next(
+                la.plan(small_lung, system, target, atlas=atlas, method=method, iterations=1, goal="default")
+            )
     with pytest.raises(SettingsError, match="closed form"):
         UnreachableProof(small_lung, system, with_fissures=False)

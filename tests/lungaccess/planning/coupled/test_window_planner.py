@@ -37,8 +37,9 @@ def breathing(small_lung: Lung) -> Lung:
 
 
 def planned(lung: Lung, target: Target, atlas: la.Atlas, phases: Any = None, **options: Any) -> list[la.Plan]:
-    options = {"iterations": 3, "atlas": atlas, "counterfactuals": False} | options
-    return list(la.plan_for_window(lung, SYSTEM, target, phases, **options))
+    goal = "window" if phases is None else "default"
+    options = {"iterations": 3, "atlas": atlas, "counterfactuals": False, "goal": goal} | options
+    return list(la.plan(lung, SYSTEM, target, phases=phases, **options))
 
 
 def window_of(plan: la.Plan) -> la.BreathingWindow:
@@ -53,7 +54,7 @@ def test_the_widest_window_is_wider_than_that_of_the_least_cost(
     plans = planned(breathing, target, atlas)
     shares = [window_of(each).share for each in plans]
     assert all(b > a - 0.005 for a, b in zip(shares, shares[1:], strict=False))
-    *_, cheapest = la.plan(breathing, SYSTEM, target, iterations=3, atlas=atlas)
+    *_, cheapest = la.plan(breathing, SYSTEM, target, iterations=3, atlas=atlas, goal="default")
     assert shares[-1] > la.breathing_window(cheapest, breathing).share + 0.1
     last = plans[-1]
     assert window_of(last).beside_target_mm > 0.1 and np.allclose(last.target_lps, target.lps_mm)
@@ -130,11 +131,13 @@ def test_what_cannot_be_asked_for(small_lung: Lung, breathing: Lung, target: Tar
         planned(breathing, target, atlas, widest=False)
 
 
-@pytest.mark.parametrize("asked", [{}, {"phases": (0.0, 0.3)}, {"widest": True}])
+@pytest.mark.parametrize("asked", [{}, {"phases": (0.0, 0.3)}, {"goal": "window"}])
 def test_alternatives_have_windows_and_trade_them(
     breathing: Lung, target: Target, atlas: la.Atlas, asked: Any
 ) -> None:
-    found = la.alternatives(breathing, SYSTEM, target, atlas=atlas, count=3, counterfactuals=False, **asked)
+    found = la.alternatives(
+        breathing, SYSTEM, target, atlas=atlas, count=3, counterfactuals=False, **{"goal": "default", **asked}
+    )
     for each in found:
         assert each.criteria["window_share"] == window_of(each.plan).share
         assert (each.plan.aim is None) == (not asked)

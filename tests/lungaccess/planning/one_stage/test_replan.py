@@ -34,7 +34,7 @@ def target(small_lung: Lung) -> Target:
 
 @pytest.fixture(scope="module")
 def plan(small_lung: Lung, small_atlas: la.Atlas, target: Target) -> Plan:
-    return list(la.plan(small_lung, SYSTEM, target, atlas=small_atlas, iterations=30))[-1]
+    return list(la.plan(small_lung, SYSTEM, target, atlas=small_atlas, iterations=30, goal="default"))[-1]
 
 
 def moved(pose: Float, seed: int, mm: float = 0.5, degrees: float = 2.0) -> Float:

@@ -19,7 +19,9 @@ from stages.needle import REACHING
 @pytest.fixture(scope="module")
 def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
     target = la.resolve_target(small_lung)
-    return next(la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=1))
+    return next(
+        la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=1, goal="default")
+    )
 
 
 def test_what_is_told_of_a_tip_is_what_planning_gives(plan: Plan, small_lung: Lung) -> None:

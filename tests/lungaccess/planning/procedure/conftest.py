@@ -12,5 +12,7 @@ from lungaccess.plans.plan import Plan
 @pytest.fixture(scope="session")
 def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
     target = la.resolve_target(small_lung)
-    *_, best = la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=100)
+    *_, best = la.plan(
+        small_lung, small_atlas.system, target, atlas=small_atlas, iterations=100, goal="default"
+    )
     return best

@@ -90,7 +90,7 @@ def plans(small_lung: Lung, system: System) -> list[la.Plan]:
             break
         try:
             target = point_target(small_lung, point)
-            found.append(next(la.plan(small_lung, system, target, **options)))
+            found.append(next(la.plan(small_lung, system, target, **options, goal="default")))
         except la.LungaccessError:
             continue
     return found
@@ -343,7 +343,16 @@ def test_a_weak_system_is_proved_not_to_reach_what_it_does_not(small_lung: Lung,
                 again = proof.prove(point, most_boxes=300_000)
                 assert (again.proved, again.boxes) == (True, verdict.boxes)
             with pytest.raises(la.LungaccessError):
-                next(la.plan(small_lung, weak, point_target(small_lung, point), atlas=atlas, iterations=50))
+                next(
+                    la.plan(
+                        small_lung,
+                        weak,
+                        point_target(small_lung, point),
+                        atlas=atlas,
+                        iterations=50,
+                        goal="default",
+                    )
+                )
         if proved == 2:
             break
     assert proved == 2

@@ -37,7 +37,17 @@ def test_a_target_has_exits_a_checked_plan_and_the_command(page: Page, patient: 
     assert costs == sorted(costs, reverse=True)
     lung, system = la.load_patient(patient, cache=patient.parent / "cache"), la.load_system("ultrathin")
     atlas = la.open_atlas(lung, system, cache=patient.parent / "cache")
-    plans = list(la.plan(lung, system, la.resolve_target(lung, TARGET), atlas=atlas, iterations=1000, seed=0))
+    plans = list(
+        la.plan(
+            lung,
+            system,
+            la.resolve_target(lung, TARGET),
+            atlas=atlas,
+            iterations=1000,
+            seed=0,
+            goal="default",
+        )
+    )
     assert plans[-1].digest == state["plan"]["digest"]
     assert "--iterations 1000 --seed 0" in page.text("command")
     assert page.run("return document.title") == f"{lung.name} - lungaccess"

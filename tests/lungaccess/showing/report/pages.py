@@ -24,7 +24,7 @@ SIZE_LIMIT = 15_000_000
 
 def make_plans(lung: Lung, atlas: la.Atlas) -> tuple[Plan, ...]:
     """Return the best plan to a nodule, and the first one that was found."""
-    found = list(la.plan(lung, SYSTEM, la.resolve_target(lung), atlas=atlas, iterations=60))
+    found = list(la.plan(lung, SYSTEM, la.resolve_target(lung), atlas=atlas, iterations=60, goal="default"))
     return found[-1], found[0]
 
 

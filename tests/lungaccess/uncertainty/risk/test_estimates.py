@@ -21,7 +21,9 @@ from lungaccess.uncertainty.risk.sensitivity import sensitivities
 @pytest.fixture(scope="module")
 def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
     target = la.resolve_target(small_lung)
-    *_, best = la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=30)
+    *_, best = la.plan(
+        small_lung, small_atlas.system, target, atlas=small_atlas, iterations=30, goal="default"
+    )
     return best
 
 

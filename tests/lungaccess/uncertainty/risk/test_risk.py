@@ -56,7 +56,7 @@ NOTHING = ErrorModel()
 @pytest.fixture(scope="module")
 def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
     target = la.resolve_target(small_lung)
-    *_, best = la.plan(small_lung, SYSTEM, target, atlas=small_atlas, iterations=100)
+    *_, best = la.plan(small_lung, SYSTEM, target, atlas=small_atlas, iterations=100, goal="default")
     return best
 
 

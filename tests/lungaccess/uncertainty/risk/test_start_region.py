@@ -25,7 +25,9 @@ from stages.needle import Query, StartRegion, needle_environment, violation
 @pytest.fixture(scope="module")
 def plan(small_lung: Lung, small_atlas: la.Atlas) -> Plan:
     target = la.resolve_target(small_lung)
-    *_, best = la.plan(small_lung, small_atlas.system, target, atlas=small_atlas, iterations=20)
+    *_, best = la.plan(
+        small_lung, small_atlas.system, target, atlas=small_atlas, iterations=20, goal="default"
+    )
     return best
 
 

@@ -22,6 +22,7 @@ CHECK_MAY_USE = (
     "lungaccess.plans.parts",
     "lungaccess.plans.plan",
     "lungaccess.plans.version",
+    "lungaccess.problem.goals",
     "lungaccess.problem.system",
     "lungaccess.judging.checking*",
     "stages.tube.casadi_shape",

@@ -15,8 +15,8 @@ from anatomy.base.files import require_writable_folder
 from anatomy.base.records import frozen_value
 from lungaccess.cli.numbers import Count, NotNegative, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
-from lungaccess.problem.goals import SUCCESS, WINDOW, goal_of
-from lungaccess.problem.request import ATLAS, AUTO, Request, StatedPlace, require_phases
+from lungaccess.problem.goals import SUCCESS, WINDOW
+from lungaccess.problem.request import ATLAS, AUTO, Request, StatedPlace, goal_of, require_phases
 from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS
 
 if TYPE_CHECKING:

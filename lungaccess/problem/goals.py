@@ -13,10 +13,7 @@ from typing import Any
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.base.suggestion import did_you_mean
-from anatomy.organ import Organ
 from lungaccess.problem import plugins
-from lungaccess.problem.task import objective_of
 from stages.needle import TERMS, Objective
 
 PlanFunction = Callable[[Any, Any], float]
@@ -143,37 +140,3 @@ def register_goal(goal: Goal) -> Goal:
 def goals() -> dict[str, Goal]:
     """Return all goals but costs, by their names: those of the package, of other packages, and registered."""
     return {each.name: each for each in (SUCCESS, WINDOW)} | plugins.registered(plugins.GOALS) | _OWN
-
-
-def goal_of(stated: str | Goal | Objective | PlanFunction, lung: Organ | None = None) -> Goal:
-    """Return the goal that is stated: by its name, as costs, or as a function of plan and lung.
-
-    Parameters
-    ----------
-    stated : str, Goal, Objective or callable
-        A name of `goals`; a cost or a weighted sum of costs as `stages.needle.objective.Objective.of` reads
-        them; or a function, which is made small and named as in the code.
-    lung : Lung, optional
-        The default cost weighs a cost map only where the patient has one.
-
-    Raises
-    ------
-    SettingsError
-        If there is no such goal.
-    """
-    if isinstance(stated, Goal):
-        return stated
-    if isinstance(stated, str) and stated in goals():
-        return goals()[stated]
-    if callable(stated):
-        name = getattr(stated, "__name__", "function")
-        name = name if name.isidentifier() else "function"
-        return Goal(name=name, words=name.replace("_", " "), of=stated)
-    try:
-        weighed = Objective.of(stated) if lung is None else objective_of(lung, stated)
-    except SettingsError as error:
-        near = did_you_mean(str(stated), list(goals()))
-        raise SettingsError(
-            error.found, expected=f"{error.expected}; or {', '.join(goals())}", remedy=near or error.remedy
-        ) from None
-    return Goal.of_costs(weighed)

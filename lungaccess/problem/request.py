@@ -16,10 +16,12 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.suggestion import did_you_mean
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.motion import require_phase
-from lungaccess.problem.goals import SUCCESS, WINDOW, Goal, PlanFunction, goal_of
+from anatomy.organ import Organ
+from lungaccess.problem.goals import SUCCESS, WINDOW, Goal, PlanFunction, goals
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.system import System, load_system, require_own_name, with_fissure_rule
 from lungaccess.problem.target import Target
@@ -161,7 +163,7 @@ class Request:
         system : System, str, or sequence of them
             Devices, the name of a preset, the path of a file, or "auto" for all presets.
         goal
-            See `lungaccess.problem.goals.goal_of`.
+            See `goal_of`.
         fissures_allowed : bool, optional
             Whether fissures may be crossed, instead of what the systems say.
         least_clearance_mm : float
@@ -260,6 +262,40 @@ class Request:
     def with_system(self, system: System) -> Request:
         """Return the request for one system alone."""
         return replace(self, systems=(system,))
+
+
+def goal_of(stated: str | Goal | Objective | PlanFunction, lung: Organ | None = None) -> Goal:
+    """Return the goal that is stated: by its name, as costs, or as a function of plan and lung.
+
+    Parameters
+    ----------
+    stated : str, Goal, Objective or callable
+        A name of `goals`; a cost or a weighted sum of costs as `stages.needle.objective.Objective.of` reads
+        them; or a function, which is made small and named as in the code.
+    lung : Lung, optional
+        The default cost weighs a cost map only where the patient has one.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such goal.
+    """
+    if isinstance(stated, Goal):
+        return stated
+    if isinstance(stated, str) and stated in goals():
+        return goals()[stated]
+    if callable(stated):
+        name = getattr(stated, "__name__", "function")
+        name = name if name.isidentifier() else "function"
+        return Goal(name=name, words=name.replace("_", " "), of=stated)
+    try:
+        weighed = Objective.of(stated) if lung is None else objective_of(lung, stated)
+    except SettingsError as error:
+        near = did_you_mean(str(stated), list(goals()))
+        raise SettingsError(
+            error.found, expected=f"{error.expected}; or {', '.join(goals())}", remedy=near or error.remedy
+        ) from None
+    return Goal.of_costs(weighed)
 
 
 def systems_of(

@@ -134,9 +134,9 @@ def _text_targets() -> dict[str, Target]:
     from anatomy.io.motion_files import read_landmarks
     from anatomy.io.own_masks import _read_description, thick_slices_mm
     from anatomy.segmentation.nodules import nodule_from_contours
-    from lungaccess.planning.tour import read_lesions
     from lungaccess.planning.one_stage.tubes import load_tubes
     from lungaccess.planning.procedure.settings import load_procedure
+    from lungaccess.planning.tour import read_lesions
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
     from lungaccess.running.study.settings import read_study

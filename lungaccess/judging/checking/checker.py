@@ -11,6 +11,7 @@ from lungaccess.judging.checking.completion import Motions, completed_plan
 from lungaccess.judging.checking.deployment import check_deployment
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.findings import CheckReport, Findings
+from lungaccess.judging.checking.functions import check_functions
 from lungaccess.judging.checking.outcome import check_tubes_at_target
 from lungaccess.judging.checking.record import check_record
 from lungaccess.judging.checking.scope import check_scope
@@ -50,6 +51,7 @@ class Checker:
             else:
                 check_needle(plan, needle, device, self._environment, tube_tip, found)
             check_window(plan, self._environment, found)
+            check_functions(plan, self._environment.lung, found)
         return found.report()
 
     def completed(self, motions: Motions, system: System, target_lps: ArrayLike, *, method: str) -> Plan:

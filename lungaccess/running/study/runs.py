@@ -17,8 +17,8 @@ from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
 from lungaccess.planning.procedure import Procedure, load_procedure
 from lungaccess.plans.version import software_version
-from lungaccess.problem.goals import goal_of
 from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.request import goal_of
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
 from lungaccess.running.study.patients import Patient, open_patient, patient_of

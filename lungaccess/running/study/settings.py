@@ -14,7 +14,8 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.files import read_toml
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, parse, quantity, settings, switch, text
-from lungaccess.problem.goals import SUCCESS, goal_of
+from lungaccess.problem.goals import SUCCESS
+from lungaccess.problem.request import goal_of
 from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
@@ -61,7 +62,7 @@ class Case:
     fissures_allowed : bool or None
         Whether fissures may be crossed; None for what the system says.
     objective : str
-        What plans are made good at, unless a planner states a goal; see `lungaccess.problem.goals.goal_of`.
+        What plans are made good at, unless a planner states a goal; see `lungaccess.problem.request.goal_of`.
     errors, procedure : str
         Error model and procedure under which the chance of success of each plan is counted: presets, or TOML
         files relative to the study's file.  Without errors no chance is counted.

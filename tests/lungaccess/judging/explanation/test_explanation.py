@@ -16,11 +16,11 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, OUTSIDE, VESSEL
+from lungaccess.judging.answering import Attempt
 from lungaccess.judging.explanation import FAILS, explain, explain_no_plan, explanation_record, sections
 from lungaccess.judging.explanation.blocking import MOST_ARCS
 from lungaccess.judging.explanation.explanation import Explanation
 from lungaccess.judging.explanation.kernels import STEP_MM
-from lungaccess.judging.answering import Attempt
 from lungaccess.planning.coupled import DirectArcs
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target

@@ -13,8 +13,8 @@ from numba.core.compiler_lock import global_compiler_lock
 import lungaccess as la
 from anatomy.base import kernel_clock
 from anatomy.lung import Lung
-from lungaccess.judging.explanation import Explanation, explain, explain_no_plan, explanation_record, sections
 from lungaccess.judging.answering import Attempt
+from lungaccess.judging.explanation import Explanation, explain, explain_no_plan, explanation_record, sections
 from lungaccess.problem.preset_order import presets_by_invasiveness
 from lungaccess.problem.system import System
 from tests.lungaccess.points import FAR_TARGET

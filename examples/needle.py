@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from anatomy import VESSEL, Grid
-from stages.needle import PLANNERS, Needle, Objective, Query, environment_of_labels
+from stages.needle import Needle, Objective, Query, environment_of_labels, searches
 
 grid = Grid.from_spacing((64, 64, 64), (1.0, 1.0, 1.0), (-31.5, -31.5, -31.5))
 i, j, k = np.meshgrid(*[np.arange(64) - 31.5] * 3, indexing="ij")
@@ -24,7 +24,7 @@ objectives = {"length": Objective(length=1.0), "1 / clearance": Objective(invers
 figure, ax = plt.subplots(figsize=(8, 3))
 ax.add_patch(plt.Circle((0.0, 0.0), 4.0, color="C3", alpha=0.5, label="vessel"))
 for name, objective in objectives.items():
-    search = PLANNERS["optimal"](environment, query, 0, objective)
+    search = searches()["optimal"](environment, query, 0, objective)
     for _slice in range(10):
         search.advance(500)
     points, _lengths = search.path.sample(step_mm=0.5)

@@ -44,7 +44,7 @@ from experiments.support.needle.runs import (
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.running.benchmark import UncObstacles, unc_obstacles
 from lungaccess.showing.report import style
-from stages.needle.search.planners import PLANNERS
+from stages.needle.search.planners import searches
 
 NAMES = ("rrt", "optimal", "resolution", "decide")
 COLOURS = (style.SCOPE, style.TUBE, style.NODULE, style.FISSURE)
@@ -85,7 +85,7 @@ def run_all_planners(found: Problem, numbers: dict[str, Any], seed: int) -> dict
     query, environment, validator = found
     runs = {
         name: [
-            run(PLANNERS[name], environment, query, each, numbers["time_s"], validator)
+            run(searches()[name], environment, query, each, numbers["time_s"], validator)
             for each in range(seed, seed + (1 if name == "resolution" else numbers["seeds"]))
         ]
         for name in NAMES
@@ -104,7 +104,7 @@ def run_queries(found: Iterable[Problem], numbers: dict[str, Any], seed: int) ->
     for number, problem in enumerate(found):
         if number == 0:
             for name in NAMES:
-                PLANNERS[name](problem[1], asked(problem[0]), 1).advance(SLICE)
+                searches()[name](problem[1], asked(problem[0]), 1).advance(SLICE)
         rows.append(run_all_planners(problem, numbers, seed))
         if rows[-1]["solved"]:
             solvable.append(problem)

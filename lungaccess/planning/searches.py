@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from anatomy.base.errors import SettingsError
+from anatomy.base.plugins import registered
 from anatomy.base.suggestion import did_you_mean
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.cost_bound import CostBound, GapGoal, guided
@@ -27,7 +28,6 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim
-from lungaccess.problem import plugins
 from lungaccess.problem.goals import WINDOW
 from lungaccess.problem.request import ATLAS, Request
 from lungaccess.problem.task import Task
@@ -46,6 +46,8 @@ _OWN: dict[str, SearchFactory] = {
     "reference": ReferenceSearch,
     "reference-without-rejection": partial(ReferenceSearch, rejects=False),
 }
+PLUGINS = "lungaccess.planners"
+"""The group of entry points by which packages add searches."""
 NEED_A_NEEDLE = tuple(name for name in _OWN if name != ATLAS)
 """The methods that draw paths of a needle from placements of the tubes."""
 
@@ -56,7 +58,7 @@ def planners() -> dict[str, SearchFactory]:
     A package adds one by an entry point of the group `lungaccess.planners`: something that makes a
     `lungaccess.planning.coupled.search.base.PlanSearch` of a task and an atlas.
     """
-    return _OWN | plugins.registered(plugins.PLANNERS)
+    return _OWN | registered(PLUGINS)
 
 
 def require_method(request: Request) -> None:

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any
 
 from anatomy.base.errors import SettingsError
+from anatomy.base.plugins import registered
 from anatomy.base.records import frozen_record
-from lungaccess.problem import plugins
 from stages.needle import TERMS, Objective
 
 PlanFunction = Callable[[Any, Any], float]
@@ -116,6 +116,8 @@ WINDOW = Goal(name="window", words="share of the breath in which the plan is pro
 """The widest window of the breath."""
 LOSSES = {SUCCESS.name: "chance of failure", WINDOW.name: "share of the breath outside the window"}
 """What is left to improve of shares, in words."""
+PLUGINS = "lungaccess.goals"
+"""The group of entry points by which packages add goals."""
 _OWN: dict[str, Goal] = {}
 
 
@@ -139,4 +141,4 @@ def register_goal(goal: Goal) -> Goal:
 
 def goals() -> dict[str, Goal]:
     """Return all goals but costs, by their names: those of the package, of other packages, and registered."""
-    return {each.name: each for each in (SUCCESS, WINDOW)} | plugins.registered(plugins.GOALS) | _OWN
+    return {each.name: each for each in (SUCCESS, WINDOW)} | registered(PLUGINS) | _OWN

@@ -1,6 +1,6 @@
 """The steerable needle: paths of arcs, searches for them, and proofs that there are none.
 
-A `Query` in a `NeedleEnvironment` is answered by a `Search`, by name in `PLANNERS`, which looks for an
+A `Query` in a `NeedleEnvironment` is answered by a `Search`, by name in `searches`, which looks for an
 `ArcPath` of low `Objective`; `violation` and `path_costs` tell how good a path is, whoever found it.
 `NoPathProof` proves that there is none, `Replanner` plans again during the insertion, `ReachScan` asks
 about many points at once, and `StartRegion` about many start poses.  The planners of OMPL are in
@@ -78,7 +78,7 @@ if TYPE_CHECKING:
     from stages.needle.search.base import RestartingRRT, Search, first_path
     from stages.needle.search.decision import Decision
     from stages.needle.search.optimal import OptimalSearch
-    from stages.needle.search.planners import PLANNERS, MakeSearch
+    from stages.needle.search.planners import MakeSearch, searches
     from stages.needle.search.portfolio import PortfolioSearch
     from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
     from stages.needle.search.successive_halving import successive_halving

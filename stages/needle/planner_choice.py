@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 from anatomy.base.errors import MissingLibraryError, SettingsError
+from anatomy.base.plugins import registered
 from anatomy.base.suggestion import did_you_mean
-from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS
+from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS, PLUGINS
 
 
 @cache
@@ -20,12 +21,13 @@ def has_ompl() -> bool:
 
 
 def require_planner(name: str) -> None:
-    """Raise SettingsError unless a name is one of NEEDLE_PLANNERS, and OMPL is there for its own."""
+    """Raise SettingsError unless a name is that of a planner, and OMPL is there for its own."""
     if name in OMPL_PLANNERS:
         import stages.needle.ompl  # noqa: F401  # Raises where OMPL is missing.
-    if name not in NEEDLE_PLANNERS:
+    known = (*NEEDLE_PLANNERS, *registered(PLUGINS))
+    if name not in known:
         raise SettingsError(
             f"There is no needle planner {name!r}",
-            expected=f"one of {', '.join(NEEDLE_PLANNERS)}",
-            remedy=did_you_mean(name, NEEDLE_PLANNERS) or "Choose one of them",
+            expected=f"one of {', '.join(known)}",
+            remedy=did_you_mean(name, known) or "Choose one of them",
         )

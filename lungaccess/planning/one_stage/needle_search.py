@@ -11,7 +11,6 @@ from anatomy.base.records import frozen_record
 from stages.needle import (
     OMPL_PLANNERS,
     OMPL_TOLERANCE_MM,
-    PLANNERS,
     SHORTEST,
     ArcPath,
     NeedleEnvironment,
@@ -22,6 +21,7 @@ from stages.needle import (
     Search,
     easiest_obstruction,
     find_obstruction,
+    searches,
 )
 
 SLICE = 500
@@ -95,7 +95,7 @@ def search_path(
     if planner in OMPL_PLANNERS:
         found = _by_ompl(environment, query, planner, seed, time_s or 0.0, clock)
     else:
-        search = PLANNERS[planner](environment, query, seed or 0, objective)
+        search = searches()[planner](environment, query, seed or 0, objective)
         found = _advance(search, iterations, time_s, clock, portion)
     if found.path is not None:
         return found

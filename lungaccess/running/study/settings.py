@@ -16,7 +16,7 @@ from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, parse, quantity, settings, switch, text
 from lungaccess.problem.goals import SUCCESS
 from lungaccess.problem.request import goal_of
-from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS
+from stages.needle import DEFAULT, NEEDLE_PLANNERS, OMPL_PLANNERS, require_planner
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 T = TypeVar("T")
@@ -139,9 +139,10 @@ class PlannerChoice:
             raise impossible("goal", self.goal, "none, for a planner of the needle alone")
         if self.goal:
             goal_of(self.goal)
-        if self.needle_planner and (self.kind == "needle" or self.needle_planner not in NEEDLE_PLANNERS):
-            expected = f"one of {', '.join(NEEDLE_PLANNERS)}, for a planner of the kind plan"
-            raise impossible("needle_planner", self.needle_planner, expected)
+        if self.needle_planner and self.kind == "needle":
+            raise impossible("needle_planner", self.needle_planner, "none, for a planner of the needle")
+        if self.needle_planner:
+            require_planner(self.needle_planner)
 
     @property
     def of_the_needle(self) -> str:

@@ -22,7 +22,6 @@ from stages.needle.path import ArcPath, direct_path
 from stages.needle.planner_names import OMPL_PLANNERS
 from stages.needle.query import Query
 from stages.needle.search.base import Search
-from stages.needle.search.planners import PLANNERS
 from stages.needle.violations import violation
 
 util.setLogLevel(util.LogLevel.LOG_ERROR)
@@ -63,7 +62,7 @@ class NeedleProblem:
         objective: Objective = SHORTEST,
     ) -> None:
         self.environment = environment
-        ours = {name: partial(make, objective=objective) for name, make in PLANNERS.items()}
+        ours = {name: partial(make, objective=objective) for name, make in planners.searches().items()}
         self._searches: dict[str, SearchFactory] = dict(searches or ours)
         self._question = Question()
         self._own: dict[str, Any] = {}

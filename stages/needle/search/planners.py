@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from anatomy.base.plugins import registered
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.planner_names import OUR_PLANNERS
+from stages.needle.planner_names import PLUGINS
 from stages.needle.query import Query
 from stages.needle.search.base import RestartingRRT, Search
 from stages.needle.search.decision import Decision
@@ -39,8 +40,19 @@ def _makes(
     return make
 
 
-SEARCHES = (RestartingRRT, OptimalSearch, PortfolioSearch, ResolutionSearch, Decision)
-PLANNERS: dict[str, MakeSearch] = {
-    name: _makes(cls) for name, cls in zip(OUR_PLANNERS, SEARCHES, strict=True)
+_OWN: dict[str, MakeSearch] = {
+    "rrt": _makes(RestartingRRT),
+    "ao-rrt": _makes(OptimalSearch),
+    "optimal": _makes(PortfolioSearch),
+    "resolution": _makes(ResolutionSearch),
+    "decide": _makes(Decision),
 }
-"""See docs/explanation/needle.md."""
+"""See docs/explanation/needle.md; `stages.needle.planner_names` states the names where nothing is searched."""
+
+
+def searches() -> dict[str, MakeSearch]:
+    """Return what makes the searches by their names, those of other packages with them.
+
+    A package adds one by an entry point of the group `lungaccess.needle_planners`: a `MakeSearch`.
+    """
+    return _OWN | registered(PLUGINS)

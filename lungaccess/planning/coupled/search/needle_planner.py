@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from anatomy.base.typed import Float
 from lungaccess.plans.evaluator import CandidateEvaluator
-from stages.needle import OMPL_PLANNERS, PLANNERS, ArcPath, first_path, has_ompl
+from stages.needle import OMPL_PLANNERS, ArcPath, first_path, has_ompl, searches
 from stages.tube import Deployment
 
 if TYPE_CHECKING:
@@ -52,7 +52,9 @@ class NamedNeedlePlanner:
         """
         query = self._evaluator.query(deployment, end)
         if self._name not in OMPL_PLANNERS and not has_ompl():
-            search = PLANNERS[self._name](self._evaluator.environment, query, seed, self._evaluator.objective)
+            search = searches()[self._name](
+                self._evaluator.environment, query, seed, self._evaluator.objective
+            )
             return first_path(search, iterations, cost_limit)
         return self._problem.plan(
             query, seed=seed, iterations=iterations, method=self._name, cost_limit=cost_limit

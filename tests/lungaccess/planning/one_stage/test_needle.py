@@ -24,7 +24,7 @@ from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, nodule_target
 from stages.needle import Passage
 from stages.needle.path import blocker_on_path
-from stages.needle.search.planners import PLANNERS
+from stages.needle.search.planners import searches
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def start_beside(lung: Lung, away_mm: float) -> np.ndarray:
     raise AssertionError("no free start")
 
 
-@pytest.mark.parametrize("planner", list(PLANNERS))
+@pytest.mark.parametrize("planner", list(searches()))
 def test_every_planner_finds_a_short_way(small_lung: Lung, system: System, planner: str) -> None:
     start = start_beside(small_lung, 8.0)
     target = nodule_target(small_lung, 1)
@@ -118,7 +118,7 @@ def wall_starts(lung: Lung, reach_mm: float) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("planner", list(searches()))
 def test_a_needle_that_begins_at_the_wall_leaves_the_lumen(
     small_lung: Lung, system: System, planner: str
 ) -> None:

@@ -15,7 +15,7 @@ from stages.needle import NEEDLE_PLANNERS, OUR_PLANNERS, Objective, map_integral
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.ompl import NeedleProblem
 from stages.needle.path import ArcPath
-from stages.needle.search.planners import PLANNERS
+from stages.needle.search.planners import searches
 from tests.stages.needle.ompl.problems import NEAR, OMPL_PLANNERS, query, require
 
 EASY_ITERATIONS = 20_000
@@ -29,7 +29,7 @@ def places(environment: NeedleEnvironment) -> Float:
 
 
 def test_there_is_one_list_of_names(problem: NeedleProblem) -> None:
-    assert tuple(PLANNERS) == OUR_PLANNERS
+    assert tuple(searches()) == OUR_PLANNERS
     assert tuple(problem.planners()) == NEEDLE_PLANNERS
     with pytest.raises(SettingsError, match=r"control\.RRT"):
         require_planner("control.RTT")
@@ -38,7 +38,7 @@ def test_there_is_one_list_of_names(problem: NeedleProblem) -> None:
 @pytest.mark.parametrize("name", OUR_PLANNERS)
 def test_ours_give_through_ompl_what_they_give_alone(environment: NeedleEnvironment, name: str) -> None:
     shorter = Objective(length=1.0, inverse_clearance=0.5)
-    alone = PLANNERS[name](environment, query(), 5, shorter)
+    alone = searches()[name](environment, query(), 5, shorter)
     while alone.path is None:
         alone.advance(200)
     through = NeedleProblem(environment, objective=shorter).plan(

@@ -16,9 +16,6 @@ from typing import Any
 
 from anatomy.base.errors import SettingsError
 
-GOALS, PLANNERS, NEEDLE_PLANNERS = "lungaccess.goals", "lungaccess.planners", "lungaccess.needle_planners"
-"""The groups of entry points: goals of plans, searches for whole plans, and planners of the needle's path."""
-
 
 @cache
 def registered(group: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import BITS
-from lungaccess.plans.candidate import Candidate, wall_in_path_mm
+from lungaccess.plans.candidate import Candidate, parts_in_tissue, wall_in_path_mm
 from lungaccess.plans.costs import path_costs
 from lungaccess.plans.insertion import scope_insertion
 from lungaccess.plans.parts import (
@@ -28,7 +28,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_kernels, software_version
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.task import Task
-from stages.needle import ArcPath
+from stages.needle import ArcPath, InTissue
 from stages.scope import ScopeTip, prove_motion
 from stages.tube import ConcentricTubes, Deployment, TubeShape
 
@@ -74,7 +74,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         ),
         required_clearance_mm=required_clearance_mm(system),
         clearance_mm={"tube": tube_clearance_mm(task, frame, deployment)} | of_needle,
-        costs=stated_costs(task, deployment, candidate.path),
+        costs=stated_costs(task, frame, deployment, candidate.path),
         method=task.method,
         needle_planner=task.needle_planner,
         seed=task.seed,
@@ -107,10 +107,19 @@ def required_clearance_mm(system: System) -> dict[str, float]:
     return required
 
 
-def stated_costs(task: Task, deployment: Deployment | None, path: ArcPath) -> dict[str, float]:
-    """Return the costs of a path beyond a deployment, or of its tubes, as a plan states them."""
+def stated_costs(
+    task: Task, lps_from_scope_tip: Float, deployment: Deployment | None, path: ArcPath
+) -> dict[str, float]:
+    """Return the costs of a path beyond a deployment, or of its tubes, as a plan states them.
+
+    Without a deployment they are those of a needle alone, from tubes of which nothing is known.
+    """
     wall_mm = 0.0 if deployment is None else wall_in_path_mm(task.system, deployment)
-    found = path_costs(task.lung, path, with_fissures=task.with_fissures, wall_mm=wall_mm)
+    if deployment is not None:
+        parts = parts_in_tissue(task.system, lps_from_scope_tip, deployment, path)
+    else:
+        parts = [InTissue(path, task.system.require_needle("A path of the needle alone").diameter_mm)]
+    found = path_costs(task.lung, path, with_fissures=task.with_fissures, wall_mm=wall_mm, parts=parts)
     return task.objective.stated(found)
 
 

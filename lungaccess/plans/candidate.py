@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
-from lungaccess.plans.curves import deployed_pieces, pieces_beyond
+from lungaccess.plans.curves import SHORTEST_MM, deployed_pieces, pieces_beyond, radii_at
 from lungaccess.problem.system import System
-from stages.needle import ArcPath
+from stages.needle import LENGTH, ArcPath, InTissue
 from stages.scope import ScopeTip
 from stages.tube import Deployment, pieces_of_arcs
 
@@ -33,12 +35,41 @@ class Candidate:
 
 def tubes_in_tissue(system: System, lps_from_scope_tip: Float, deployment: Deployment) -> ArcPath:
     """Return the tubes of a deployment, from where they leave the lumen to their tip, as a path."""
+    return _tubes_beyond(system, lps_from_scope_tip, deployment, deployment.exit_mm)
+
+
+def parts_in_tissue(
+    system: System, lps_from_scope_tip: Float, deployment: Deployment, path: ArcPath
+) -> list[InTissue]:
+    """Return all of a candidate that lies in tissue: its tubes from the wall on, and the path of the needle.
+
+    The tubes count where they have left the wall that they pierce.  Each part has the width of one device:
+    of tubes in each other that of the outermost.
+    """
+    begin_mm, parts = deployment.exit_mm + deployment.wall_run_mm, []
+    if begin_mm < deployment.inner_mm - SHORTEST_MM:
+        tubes = _tubes_beyond(system, lps_from_scope_tip, deployment, begin_mm)
+        ends_mm = begin_mm + np.cumsum(tubes.arcs[:, LENGTH])
+        middles_mm = ends_mm - 0.5 * tubes.arcs[:, LENGTH]
+        shape, both_mm = deployment.shape, (deployment.outer_mm, deployment.inner_mm)
+        inserted = both_mm[-len(system.tubes.named) :] if shape is None else shape.insertions_mm[::-1]
+        radii = radii_at(system.tubes, inserted, middles_mm)
+        for frame, arc, radius in zip(tubes.frames(), tubes.arcs, radii.tolist(), strict=False):
+            parts.append(InTissue(ArcPath(lps_from_start=frame, arcs=arc), 2.0 * radius))
+    if system.needle is not None:
+        parts.append(InTissue(path, system.needle.diameter_mm))
+    return parts
+
+
+def _tubes_beyond(
+    system: System, lps_from_scope_tip: Float, deployment: Deployment, begin_mm: float
+) -> ArcPath:
     outer_mm, inner_mm, shape = deployment.outer_mm, deployment.inner_mm, deployment.shape
     if shape is None:
         pieces = deployed_pieces(system.tubes, deployment.rotation_rad, outer_mm, inner_mm)
     else:
         pieces = pieces_of_arcs(shape.arcs, deployment.rotation_rad)
-    start, arcs = pieces_beyond(lps_from_scope_tip, pieces, deployment.exit_mm)
+    start, arcs = pieces_beyond(lps_from_scope_tip, pieces, begin_mm)
     return ArcPath(lps_from_start=start, arcs=arcs)
 
 

@@ -1,7 +1,8 @@
-"""What a path of the needle costs in a lung; without a needle, that of the tubes."""
+"""What devices in tissue cost in a lung: the path of the needle, or without one of the tubes, and both."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from anatomy.base.typed import Float
@@ -9,14 +10,20 @@ from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from lungaccess.plans.curves import pieces_beyond
 from stages import needle
-from stages.needle import TERMS, ArcPath, Objective, Obstacles, Term
+from stages.needle import TERMS, ArcPath, InTissue, Objective, Obstacles, Term
 
 LEAST_MM = 1e-6
 """So much of a path is left where all of it lies in the wall: the voxel of its end still counts."""
 
 
 def path_cost(
-    lung: Lung, path: ArcPath, objective: str | Objective, *, with_fissures: bool, wall_mm: float = 0.0
+    lung: Lung,
+    path: ArcPath,
+    objective: str | Objective,
+    *,
+    with_fissures: bool,
+    wall_mm: float = 0.0,
+    parts: Sequence[InTissue] = (),
 ) -> float:
     """Return the cost of a path under an objective.
 
@@ -31,25 +38,40 @@ def path_cost(
     wall_mm : float
         Length at the beginning of the path that lies in the wall which the tubes pierce.  The costs of the
         map, which forbids walls, count beyond it.
+    parts : sequence of InTissue
+        All that lies in tissue, the path too; see `lungaccess.plans.candidate.parts_in_tissue`.
     """
     weighed = Objective.of(objective)
     terms = [term for term, _weight in weighed.weighed]
-    return weighed.total(_costs(lung, path, terms, with_fissures, wall_mm))
+    return weighed.total(_costs(lung, path, terms, with_fissures, wall_mm, parts))
 
 
-def path_costs(lung: Lung, path: ArcPath, *, with_fissures: bool, wall_mm: float = 0.0) -> dict[str, float]:
-    """Return every cost of a path by its key; see `path_cost`."""
-    return _costs(lung, path, TERMS, with_fissures, wall_mm)
+def path_costs(
+    lung: Lung, path: ArcPath, *, with_fissures: bool, wall_mm: float = 0.0, parts: Sequence[InTissue] = ()
+) -> dict[str, float]:
+    """Return every cost of a path by its key; see `path_cost`.
+
+    A cost of all in tissue is left out where nothing is said of that, and where it is infinite: tubes may
+    cross voxels that the map forbids to the needle.
+    """
+    found = _costs(lung, path, TERMS, with_fissures, wall_mm, parts)
+    unknown = {term.key for term in TERMS if term.of_all and not (parts and math.isfinite(found[term.key]))}
+    return {key: cost for key, cost in found.items() if key not in unknown}
 
 
 def _costs(
-    lung: Lung, path: ArcPath, terms: Sequence[Term], with_fissures: bool, wall_mm: float
+    lung: Lung,
+    path: ArcPath,
+    terms: Sequence[Term],
+    with_fissures: bool,
+    wall_mm: float,
+    parts: Sequence[InTissue],
 ) -> dict[str, float]:
     obstacles, beyond = _obstacles(lung, with_fissures), path_beyond(path, wall_mm)
-    return {
-        term.key: needle.path_costs(obstacles, lung.cost, beyond if term.of_map else path, [term])[term.key]
-        for term in terms
-    }
+    found = {}
+    for term in terms:
+        found |= needle.path_costs(obstacles, lung.cost, beyond if term.of_map else path, parts, [term])
+    return found
 
 
 def path_beyond(path: ArcPath, begin_mm: float) -> ArcPath:

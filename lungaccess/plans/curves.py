@@ -5,6 +5,7 @@ Reports and exports use these curves.  The independent check integrates the devi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -131,7 +132,12 @@ def deployed_pieces(tubes: ConcentricTubes, rotation_rad: float, outer_mm: float
 
 def tube_radii(tube: TubeDeployment, tubes: ConcentricTubes, arc_mm: Float) -> Float:
     """Return the radius in mm `(N,)` of the outermost tube at arc lengths `(N,)` from the scope tip."""
-    ends = np.array(tube.insertions_mm(tubes)) + SHORTEST_MM
+    return radii_at(tubes, tube.insertions_mm(tubes), arc_mm)
+
+
+def radii_at(tubes: ConcentricTubes, insertions_mm: Sequence[float], arc_mm: Float) -> Float:
+    """Return the same for insertions, the outermost tube first."""
+    ends = np.array(insertions_mm) + SHORTEST_MM
     radii = np.array([each.radius_mm for _name, each in tubes.named])
     return np.asarray(radii[np.minimum(np.searchsorted(ends, arc_mm), len(radii) - 1)])
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.base.typed import Float, Float32, Int
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from lungaccess.plans.candidate import Candidate, tubes_in_tissue, wall_in_path_mm
+from lungaccess.plans.candidate import Candidate, parts_in_tissue, tubes_in_tissue, wall_in_path_mm
 from lungaccess.plans.costs import path_beyond, path_cost
 from lungaccess.plans.tip_rows import TipRows
 from lungaccess.problem.task import Task
@@ -44,6 +44,8 @@ class NeedleArrays(NamedTuple):
         Whether a cost map forbids voxels, by infinite costs, that the objective does not weigh.
     forbidden_map : (ni, nj, nk) float32
         That cost map.
+    of_tubes : ObjectiveArrays
+        What the tubes in tissue cost for each mm of their width.
     """
 
     obstacles: Obstacles
@@ -51,6 +53,7 @@ class NeedleArrays(NamedTuple):
     objective: ObjectiveArrays
     has_forbidden_voxels: bool
     forbidden_map: Float32
+    of_tubes: ObjectiveArrays
 
 
 BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"), (AIRWAY, "an airway"))
@@ -84,16 +87,25 @@ class CandidateEvaluator:
         needle = task.system.require_needle("A search for paths of the needle")
         return needle_environment(task.lung, needle, task.system.margins, with_fissures=task.with_fissures)
 
-    def cost(self, path: ArcPath, wall_mm: float = 0.0) -> float:
-        """Return the cost of a path, which begins with so much wall, under the task's objective."""
+    def cost(self, candidate: Candidate) -> float:
+        """Return the cost of a candidate, proved or not, under the task's objective."""
+        return self.cost_from(candidate.tip.lps_from_scope_tip, candidate.deployment, candidate.path)
+
+    def cost_from(self, lps_from_scope_tip: Float, deployment: Deployment, path: ArcPath) -> float:
+        """Return the cost of tubes from a scope tip, and a path beyond them, under the task's objective."""
         task = self.task
-        return path_cost(task.lung, path, task.objective, with_fissures=task.with_fissures, wall_mm=wall_mm)
+        return path_cost(
+            task.lung,
+            path,
+            task.objective,
+            with_fissures=task.with_fissures,
+            wall_mm=wall_in_path_mm(task.system, deployment),
+            parts=parts_in_tissue(task.system, lps_from_scope_tip, deployment, path),
+        )
 
     def evaluate(self, candidate: Candidate) -> float:
         """Return the cost of a candidate, infinite if its proof fails."""
-        if not self.accepts(candidate):
-            return math.inf
-        return self.cost(candidate.path, wall_in_path_mm(self.task.system, candidate.deployment))
+        return self.cost(candidate) if self.accepts(candidate) else math.inf
 
     def aim(self, tip: ScopeTip) -> Float:
         """Return where the needle is to end, `(3,)` LPS mm, if it starts from a scope tip: at the target."""
@@ -104,8 +116,15 @@ class CandidateEvaluator:
         return self.task.target.lps_mm
 
     def accepts(self, candidate: Candidate) -> bool:
-        """Tell whether a candidate is proved; its cost does not matter."""
-        return self.proves(candidate.deployment, candidate.path)
+        """Tell whether a candidate is proved; its cost does not matter as long as it is finite."""
+        return self.allows(candidate.tip.lps_from_scope_tip, candidate.deployment, candidate.path)
+
+    def allows(self, lps_from_scope_tip: Float, deployment: Deployment, path: ArcPath) -> bool:
+        """Tell whether a path is proved, and no tube enters an infinite cost that the objective weighs."""
+        if not self.proves(deployment, path):
+            return False
+        weighs_tubes = self.task.lung.cost is not None and self.objective.tissue > 0.0
+        return not weighs_tubes or math.isfinite(self.cost_from(lps_from_scope_tip, deployment, path))
 
     def proves(self, deployment: Deployment, path: ArcPath) -> bool:
         """Tell whether a path ends at the target, keeps all limits, is clear, and enters no infinite cost.
@@ -193,7 +212,7 @@ class CandidateEvaluator:
     def needle_arrays(self) -> NeedleArrays:
         """The needle, its environment and the objective for the kernels."""
         costs, objective = self.task.lung.cost, self.objective
-        unseen = costs is not None and not objective.weighs_map and not np.isfinite(costs.array).all()
+        unseen = costs is not None and not objective.looks_at_map and not np.isfinite(costs.array).all()
         forbidden = costs.array if unseen and costs is not None else NO_MAP
         return NeedleArrays(
             self.environment.obstacles,
@@ -201,6 +220,7 @@ class CandidateEvaluator:
             self.environment.objective_arrays(objective),
             unseen,
             forbidden,
+            objective.arrays_of_tubes(None if costs is None else costs.array),
         )
 
 

@@ -15,6 +15,7 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.needle.costs import (
+        InTissue,
         inverse_clearance,
         map_integral,
         obstacle_clearance_mm,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from stages.needle.kernels.cost import ObjectiveArrays
     from stages.needle.kernels.limits import Limits
     from stages.needle.kernels.proof import Obstacles, blocker_on_arc
-    from stages.needle.objective import DEFAULT, NO_MAP, SHORTEST, TERMS, Objective, Term
+    from stages.needle.objective import DEFAULT, DEFAULT_COST, NO_MAP, SHORTEST, TERMS, Objective, Term
     from stages.needle.obstruction import Obstruction, easiest_obstruction, find_obstruction
     from stages.needle.path import (
         CURVATURE,

@@ -1,9 +1,10 @@
-"""What a needle path costs, evaluated exactly: 1 / clearance, the cost map by mm and by voxel, length."""
+"""What a plan costs, evaluated exactly: 1 / clearance, the cost map by mm and by voxel, length, tissue."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,16 +103,43 @@ def voxel_sum(cost_map: Volume | None, path: ArcPath) -> float:
     return float(_costs_of(cost_map, np.unique(voxels)).sum())
 
 
-_EVALUATED: dict[str, Callable[[Obstacles, Volume | None, ArcPath], float]] = {
-    "inverse_clearance": lambda obstacles, _map, path: inverse_clearance(obstacles, path),
-    "cost_map": lambda _arrays, cost_map, path: map_integral(cost_map, path),
-    "voxel_sum": lambda _arrays, cost_map, path: voxel_sum(cost_map, path),
-    "length_mm": lambda _arrays, _map, path: path.length_mm,
+class InTissue(NamedTuple):
+    """A part of the devices that lies in tissue: its axis, and its outer diameter in mm all along it."""
+
+    path: ArcPath
+    width_mm: float
+
+
+def tissue(obstacles: Obstacles, cost_map: Volume | None, parts: Sequence[InTissue]) -> float:
+    """Return the integral over all in tissue of width times the sum of 1 / clearance and the cost map, mm.
+
+    Clearance is that of `inverse_clearance`, in mm.  The map, whose costs are per mm, counts as much as
+    1 / clearance: a mm in a thin vessel as one at 1 mm from an obstacle.  Without a map it is left out.  The
+    integral is infinite if a part meets a voxel of infinite cost or leaves the grid of the map.
+    """
+    each = (
+        part.width_mm * (inverse_clearance(obstacles, part.path) + map_integral(cost_map, part.path))
+        for part in parts
+    )
+    return sum(each, 0.0)
+
+
+Evaluation = Callable[[Obstacles, Volume | None, ArcPath, Sequence[InTissue]], float]
+_EVALUATED: dict[str, Evaluation] = {
+    "inverse_clearance": lambda obstacles, _map, path, _parts: inverse_clearance(obstacles, path),
+    "cost_map": lambda _arrays, cost_map, path, _parts: map_integral(cost_map, path),
+    "voxel_sum": lambda _arrays, cost_map, path, _parts: voxel_sum(cost_map, path),
+    "length_mm": lambda _arrays, _map, path, _parts: path.length_mm,
+    "tissue": lambda obstacles, cost_map, _path, parts: tissue(obstacles, cost_map, parts),
 }
 
 
 def path_costs(
-    obstacles: Obstacles, cost_map: Volume | None, path: ArcPath, terms: Iterable[Term] = TERMS
+    obstacles: Obstacles,
+    cost_map: Volume | None,
+    path: ArcPath,
+    parts: Sequence[InTissue],
+    terms: Iterable[Term] = TERMS,
 ) -> dict[str, float]:
     """Return costs of a path by their keys, exactly; see `stages.needle.objective.TERMS`.
 
@@ -121,10 +149,12 @@ def path_costs(
         See `NeedleEnvironment`.
     cost_map : Volume or None
         Without a map its costs are 0.
+    parts : sequence of InTissue
+        All that lies in tissue: the tubes beyond the wall, and the path of the needle.
     terms : iterable of Term
         Which costs.
     """
-    return {term.key: _EVALUATED[term.key](obstacles, cost_map, path) for term in terms}
+    return {term.key: _EVALUATED[term.key](obstacles, cost_map, path, parts) for term in terms}
 
 
 def _crossings(grid: Grid, path: ArcPath) -> tuple[Int, Float]:

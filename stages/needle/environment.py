@@ -52,7 +52,7 @@ class NeedleEnvironment:
         """Return an objective for the kernels; made once, because the least cost of a map takes a while."""
         if objective not in self._objectives:
             costs = None if self.cost_map is None else self.cost_map.array
-            self._objectives[objective] = objective.arrays(costs)
+            self._objectives[objective] = objective.arrays(costs, self.needle.diameter_mm)
         return self._objectives[objective]
 
 

@@ -1,4 +1,4 @@
-"""What a needle path is to keep small: the costs that there are, and their weighted sum."""
+"""What a plan is to keep small: the costs that there are, and their weighted sum."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ MAX_CLEARANCE_MM = 256.0
 
 DEFAULT = "default"
 """The objective of whoever states none: far from obstacles, and from thin vessels where there is a map."""
+DEFAULT_COST = "tissue"
+"""The cost of a plan of least cost where none is named: it alone sees the tubes in the tissue."""
 DEFAULT_MAP_WEIGHT = 1.0
 """A mm in a thin vessel costs as much as one at 1 mm from an obstacle: hardly any axis may lie nearer."""
 
@@ -31,7 +33,7 @@ NO_MAP = read_only(np.zeros((2, 2, 2), dtype=np.float32, order="F"))
 
 @frozen_value
 class Term:
-    """One cost of a needle path, which an objective can weigh.
+    """One cost of a plan, which an objective can weigh.
 
     Parameters
     ----------
@@ -44,7 +46,9 @@ class Term:
     unit : str
         "" for a pure number, or the unit of the cost map.
     of_map : bool
-        Whether it is a cost of the map.
+        Whether it is a cost of the map, so that there is none without a map.
+    of_all : bool
+        Whether it is of all that lies in tissue, the tubes too; other costs are of the needle's path alone.
     """
 
     key: str
@@ -52,6 +56,7 @@ class Term:
     words: str
     unit: str = ""
     of_map: bool = False
+    of_all: bool = False
 
     @property
     def option(self) -> str:
@@ -69,15 +74,22 @@ TERMS = (
     Term(key="cost_map", weight="cost_map", words="integral of the cost map", unit="mm", of_map=True),
     Term(key="voxel_sum", weight="voxel_sum", words="sum of the cost map over voxels", of_map=True),
     Term(key="length_mm", weight="length", words="length of the path", unit="mm"),
+    Term(
+        key="tissue",
+        weight="tissue",
+        words="integral of width/clearance over all in tissue",
+        unit="mm",
+        of_all=True,
+    ),
 )
-"""Every cost of a needle path."""
+"""Every cost of a plan."""
 
 _BY_NAME = {name: term for term in TERMS for name in (term.key, term.option, term.weight)}
 
 
 @frozen_value
 class Objective:
-    """A weighted sum of costs of a path.
+    """A weighted sum of costs of a plan.
 
     The text of an objective is the key of a cost, or a sum such as ``cost_map=0.5,length_mm=1``; `of` reads
     it and `str` writes it.
@@ -94,6 +106,9 @@ class Objective:
         Weight of the sum of the cost map over the set of voxels that the path crosses, each counted once
         [Fu2018, eq. 1].  The searches add it up arc by arc: a voxel that the path leaves and meets again
         on another arc counts again, which `stages.needle.costs.voxel_sum` does not.
+    tissue : float
+        Weight of the integral, over tubes and needle in tissue, of their width times the sum of 1 / clearance
+        and the cost map, 1/mm; see `stages.needle.costs.tissue`.
 
     Raises
     ------
@@ -112,9 +127,10 @@ class Objective:
     cost_map: float = 0.0
     length: float = 0.0
     voxel_sum: float = 0.0
+    tissue: float = 0.0
 
     def __post_init__(self) -> None:
-        weights = np.array([self.inverse_clearance, self.cost_map, self.length, self.voxel_sum])
+        weights = np.array([getattr(self, term.weight) for term in TERMS])
         if not (np.isfinite(weights).all() and (weights >= 0.0).all() and weights.any()):
             raise SettingsError(
                 f"The weights of an objective are {weights.tolist()}",
@@ -182,9 +198,14 @@ class Objective:
         return any(term.of_map for term, _weight in self.weighed)
 
     @property
+    def looks_at_map(self) -> bool:
+        """Whether a cost map, where there is one, counts for it."""
+        return self.weighs_map or self.tissue > 0.0
+
+    @property
     def is_length(self) -> bool:
         """Whether it weighs nothing but length."""
-        return self.inverse_clearance == 0.0 and not self.weighs_map
+        return self.weighed == ((_BY_NAME["length"], self.length),)
 
     @property
     def without_map(self) -> Objective:
@@ -192,28 +213,31 @@ class Objective:
 
         One that weighs nothing else becomes the length.
         """
-        if self.inverse_clearance == 0.0 and self.length == 0.0:
+        if all(term.of_map for term, _weight in self.weighed):
             return SHORTEST
-        return replace(self, cost_map=0.0, voxel_sum=0.0)
+        return replace(self, **{term.weight: 0.0 for term in TERMS if term.of_map})
 
     def total(self, costs: Mapping[str, float]) -> float:
-        """Return the weighted sum of the costs of a path, given by their keys."""
+        """Return the weighted sum of the costs of a plan, given by their keys."""
         return sum(weight * costs[term.key] for term, weight in self.weighed)
 
     def stated(self, costs: Mapping[str, float]) -> dict[str, float]:
-        """Return the costs of a path by their keys, and their weighted sum by the text of the objective."""
+        """Return the costs of a plan by their keys, and their weighted sum by the text of the objective."""
         return {**costs, str(self): self.total(costs)}
 
-    def arrays(self, cost_map: Float32 | None) -> ObjectiveArrays:
+    def arrays(self, cost_map: Float32 | None, width_mm: float) -> ObjectiveArrays:
         """Return the weights and the map for the kernels, see `stages.needle.kernels.cost`.
 
-        The least cost of a mm is a proved lower bound.  The voxel sum adds nothing to it: however small the
-        cost, an arc can be so short that it enters no other voxel.
+        They are those of a needle, whose width is the same everywhere.  The least cost of a mm is a proved
+        lower bound.  The voxel sum adds nothing to it: however small the cost, an arc can be so short that
+        it enters no other voxel.
 
         Parameters
         ----------
         cost_map : (ni, nj, nk) float32 or None
             Not negative; infinite is an obstacle.
+        width_mm : float
+            Outer diameter of the needle.
 
         Raises
         ------
@@ -221,35 +245,57 @@ class Objective:
             If the objective weighs a map, and there is none, or one with negative costs, NaN, or no finite
             cost.
         """
-        from stages.needle.kernels.cost import ObjectiveArrays
-
-        least_of_map = 0.0
-        if not self.weighs_map:
-            cost_map = NO_MAP
-        elif cost_map is None:
+        if self.weighs_map and cost_map is None:
             raise SettingsError(
                 "The objective weighs a cost map, but the patient has none",
                 expected="a patient with a cost map, or another objective",
                 remedy="Choose inverse-clearance or length",
             )
-        else:
-            cost_map = read_only(np.asfortranarray(cost_map, dtype=np.float32))
-            least_of_map = float(cost_map.min())
-            if not 0.0 <= least_of_map < np.inf:
-                raise SettingsError(
-                    f"The least cost of the cost map is {least_of_map:g}",
-                    expected="costs of 0 or more, some of them finite, and no NaN",
-                    remedy="Correct the cost map of the patient",
-                )
-        least_rate = self.inverse_clearance / MAX_CLEARANCE_MM + self.cost_map * least_of_map + self.length
-        return ObjectiveArrays(
-            inverse_clearance=float(self.inverse_clearance),
-            map_integral=float(self.cost_map),
+        return _arrays(
+            cost_map if self.looks_at_map else None,
+            inverse_clearance=float(self.inverse_clearance + self.tissue * width_mm),
+            map_integral=float(self.cost_map + self.tissue * width_mm),
             length=float(self.length),
             voxel_sum=float(self.voxel_sum),
-            least_rate=float(least_rate),
-            cost_map=cost_map,
         )
+
+    def arrays_of_tubes(self, cost_map: Float32 | None) -> ObjectiveArrays:
+        """Return what tubes in tissue cost for each mm of their width, for the kernels as `arrays` does."""
+        weight = float(self.tissue)
+        return _arrays(cost_map if weight > 0.0 else None, inverse_clearance=weight, map_integral=weight)
+
+
+def _arrays(
+    cost_map: Float32 | None,
+    *,
+    inverse_clearance: float,
+    map_integral: float,
+    length: float = 0.0,
+    voxel_sum: float = 0.0,
+) -> ObjectiveArrays:
+    """Return weights for the kernels; those of the map are 0 where none is looked at."""
+    from stages.needle.kernels.cost import ObjectiveArrays
+
+    least_of_map = 0.0
+    if cost_map is None:
+        cost_map, map_integral = NO_MAP, 0.0
+    else:
+        cost_map = read_only(np.asfortranarray(cost_map, dtype=np.float32))
+        least_of_map = float(cost_map.min())
+        if not 0.0 <= least_of_map < np.inf:
+            raise SettingsError(
+                f"The least cost of the cost map is {least_of_map:g}",
+                expected="costs of 0 or more, some of them finite, and no NaN",
+                remedy="Correct the cost map of the patient",
+            )
+    return ObjectiveArrays(
+        inverse_clearance=inverse_clearance,
+        map_integral=map_integral,
+        length=length,
+        voxel_sum=voxel_sum,
+        least_rate=inverse_clearance / MAX_CLEARANCE_MM + map_integral * least_of_map + length,
+        cost_map=cost_map,
+    )
 
 
 def _term(name: str) -> Term:

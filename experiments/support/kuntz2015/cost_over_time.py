@@ -69,7 +69,7 @@ def joint_gain(search: AtlasSearch) -> dict[str, float]:
             continue
         better = refine(search.task, step.candidate)
         costs[name] = step.cost
-        costs[f"{name}, refined"] = step.cost if better is None else search.evaluator.cost(better.path)
+        costs[f"{name}, refined"] = step.cost if better is None else search.evaluator.cost(better)
     return costs
 
 

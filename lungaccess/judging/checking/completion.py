@@ -19,7 +19,7 @@ from anatomy.base.typed import Float
 from lungaccess.judging.checking import shapes
 from lungaccess.judging.checking.deployment import replayed_mm
 from lungaccess.judging.checking.environment import Environment
-from lungaccess.judging.checking.outcome import cost_map_integral_and_sum, inverse_clearance
+from lungaccess.judging.checking.outcome import recomputed_costs
 from lungaccess.judging.checking.record import wanted_clearance_mm
 from lungaccess.judging.checking.scope import beyond_carina_mm, branches_to
 from lungaccess.judging.checking.scope_motion import motion_of
@@ -190,11 +190,5 @@ def _needle(motions: Motions, curve: shapes.Curve) -> NeedlePath:
 
 
 def _with_costs(plan: Plan, environment: Environment, curve: shapes.Curve) -> Plan:
-    mapped, summed = cost_map_integral_and_sum(environment.lung, curve)
-    costs = {
-        "inverse_clearance": inverse_clearance(plan, environment, curve),
-        "cost_map": mapped,
-        "voxel_sum": summed,
-        "length_mm": float(curve.arc_mm[-1]),
-    }
-    return replace(plan, costs=costs)
+    found = recomputed_costs(plan, environment, curve)
+    return replace(plan, costs={name: cost.value for name, cost in found.items()})

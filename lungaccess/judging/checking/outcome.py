@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from lungaccess.judging.checking.clearances import REACH_MM
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.poses import LENGTH_TOLERANCE_MM, POSITION_TOLERANCE_MM
-from lungaccess.judging.checking.shapes import Curve, beyond, integrate, tube_pieces
+from lungaccess.judging.checking.shapes import Curve, beyond, cut_at, integrate, radius_at, tube_pieces, up_to
 from lungaccess.judging.checking.space import has, labels_at
 from lungaccess.plans.plan import Plan
 
@@ -32,7 +32,8 @@ GREATEST_VOXEL_COST = 1.0
 """Of one voxel: so much may two sums differ because one grazes a voxel that the other does not."""
 GRAZED_MM = 1e-9
 """A voxel that is crossed for less than this is met at an edge only, by rounding."""
-COSTS = ("inverse_clearance", "cost_map", "voxel_sum", "length_mm")
+LATER_COSTS = frozenset({"voxel_sum", "tissue"})
+"""Costs that a plan may leave out: one of an earlier version, or whose tubes cross an infinite cost."""
 ROUNDING = 1e-12
 """Sums of four numbers agree to this share of them, whatever the order."""
 
@@ -54,6 +55,30 @@ def check_tubes_at_target(
     way_out = plan.tube.exit
     in_tissue = beyond(curve, way_out.arc_length_mm)
     check_costs(plan, environment, in_tissue, found, beyond(in_tissue, way_out.wall_run_mm))
+
+
+class Recomputed(NamedTuple):
+    """A cost as the check finds it, by how much a stated one may differ, and its unit."""
+
+    value: float
+    tolerance: float
+    unit: str
+
+
+def recomputed_costs(
+    plan: Plan, environment: Environment, curve: Curve, mapped_curve: Curve | None = None
+) -> dict[str, Recomputed]:
+    """Return every cost by its name, of a re-integrated curve; those of the map of another if given."""
+    along = inverse_clearance(plan, environment, curve)
+    mapped, summed = cost_map_integral_and_sum(environment.lung, mapped_curve or curve)
+    crossed = tissue(plan, environment, curve)
+    return {
+        "inverse_clearance": Recomputed(along, COST_TOLERANCE * along, ""),
+        "cost_map": Recomputed(mapped, COST_TOLERANCE * mapped + 1e-6, "mm"),
+        "voxel_sum": Recomputed(summed, COST_TOLERANCE * summed + GREATEST_VOXEL_COST, ""),
+        "length_mm": Recomputed(float(curve.arc_mm[-1]), LENGTH_TOLERANCE_MM, "mm"),
+        "tissue": Recomputed(crossed, COST_TOLERANCE * crossed + 1e-6, "mm"),
+    }
 
 
 def check_target(plan: Plan, lung: Lung, end: Float, found: Findings) -> None:
@@ -96,26 +121,24 @@ def check_costs(
 ) -> None:
     """The stated costs are those of a re-integrated curve, those of the map of another if there is one."""
     stated: Mapping[str, float] = plan.costs
-    required = set(COSTS) - {"voxel_sum"}
-    named = required <= set(stated) <= {*COSTS, plan.objective}
+    costs = recomputed_costs(plan, environment, curve, mapped_curve)
+    named = set(costs) - LATER_COSTS <= set(stated) <= {*costs, plan.objective}
     if not found.true("costs.names", named, ", ".join(stated)):
         return
     weights = objective_weights(plan.objective)
-    known = plan.objective in stated and weights is not None and set(weights) <= set(stated)
-    is_sum = plan.objective not in COSTS
-    if found.true("costs.objective", known, plan.objective) and is_sum and weights is not None:
+    known = plan.objective in stated and weights is not None and set(weights) <= set(costs) & set(stated)
+    if (
+        found.true("costs.objective", known, plan.objective)
+        and plan.objective not in costs
+        and weights is not None
+    ):
         total = sum(weight * stated[name] for name, weight in weights.items())
         tolerance = ROUNDING * abs(total)
         found.agrees("costs.objective.sum", stated[plan.objective], total, tolerance, "")
-    found.agrees("costs.length_mm", stated["length_mm"], curve.arc_mm[-1], LENGTH_TOLERANCE_MM, "mm")
-    recomputed = inverse_clearance(plan, environment, curve)
-    tolerance = COST_TOLERANCE * recomputed
-    found.agrees("costs.inverse_clearance", stated["inverse_clearance"], recomputed, tolerance, "")
-    mapped, summed = cost_map_integral_and_sum(environment.lung, mapped_curve or curve)
-    found.agrees("costs.cost_map", stated["cost_map"], mapped, COST_TOLERANCE * mapped + 1e-6, "mm")
-    if "voxel_sum" in stated:
-        tolerance = COST_TOLERANCE * summed + GREATEST_VOXEL_COST
-        found.agrees("costs.voxel_sum", stated["voxel_sum"], summed, tolerance, "")
+    for name, (value, tolerance, unit) in costs.items():
+        if name in stated:
+            largest = tolerance if np.isfinite(value) else 0.0
+            found.agrees(f"costs.{name}", stated[name], value, largest, unit)
 
 
 def objective_weights(objective: str) -> dict[str, float] | None:
@@ -131,7 +154,7 @@ def objective_weights(objective: str) -> dict[str, float] | None:
         except ValueError:
             return None
     in_range = all(0.0 < weight < np.inf for weight in weights.values())
-    return weights if in_range and set(weights) <= set(COSTS) else None
+    return weights if in_range else None
 
 
 def inverse_clearance(plan: Plan, environment: Environment, curve: Curve) -> float:
@@ -149,6 +172,32 @@ def inverse_clearance(plan: Plan, environment: Environment, curve: Curve) -> flo
     if far.any():
         clearance[far] = environment.boxes(obstacles, COST_REACH_MM).distance_mm(points[far])
     return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
+
+
+def tissue(plan: Plan, environment: Environment, curve: Curve) -> float:
+    """Return the integral over all in tissue of the width times 1 / clearance and the cost map, in mm.
+
+    The tubes count from behind the wall, each stretch with the diameter of the tube that is outermost there,
+    then the needle, if there is one, whose curve is `curve`.  A map counts where there is one.
+    """
+    inserted = plan.tube.insertions_mm(plan.system.tubes)
+    begin_mm = plan.tube.exit.arc_length_mm + plan.tube.exit.wall_run_mm
+    pieces = tube_pieces(plan)
+    for end_mm in inserted:
+        pieces = cut_at(pieces, end_mm)
+    tubes = integrate(plan.scope.lps_from_scope_tip, pieces)
+    parts = [] if plan.system.needle is None else [(curve, plan.system.needle.diameter_mm)]
+    for end_mm in inserted:
+        if end_mm > begin_mm:
+            part = beyond(up_to(tubes, end_mm), begin_mm)
+            middle_mm = np.array([0.5 * (begin_mm + end_mm)])
+            parts.append((part, 2.0 * float(radius_at(plan, middle_mm)[0])))
+            begin_mm = end_mm
+    total = 0.0
+    for part, width_mm in parts:
+        mapped, _summed = cost_map_integral_and_sum(environment.lung, part)
+        total += width_mm * (inverse_clearance(plan, environment, part) + mapped)
+    return total
 
 
 def cost_map_integral_and_sum(lung: Lung, curve: Curve) -> tuple[float, float]:

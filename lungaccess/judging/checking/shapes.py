@@ -137,6 +137,14 @@ def beyond(curve: Curve, begin_mm: float) -> Curve:
     return Curve(frames=frames, arc_mm=arc_mm, sagitta_mm=curve.sagitta_mm[first:])
 
 
+def up_to(curve: Curve, end_mm: float) -> Curve:
+    """Return what lies before an arc length at which a curve has a frame, or nearly."""
+    last = int(np.abs(curve.arc_mm - end_mm).argmin())
+    return Curve(
+        frames=curve.frames[: last + 1], arc_mm=curve.arc_mm[: last + 1], sagitta_mm=curve.sagitta_mm[:last]
+    )
+
+
 @frozen_record
 class Bend:
     """Curvature of the deployed tubes along their length from the scope tip: `per_mm` between `edges_mm`."""

@@ -11,6 +11,7 @@ from anatomy.base.typed import Bool, Float, Int
 from lungaccess.planning.coupled.kernels.direct_arcs import cost_bounds, evaluate_arcs
 from lungaccess.planning.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
+from lungaccess.planning.coupled.search.direct_arcs import costs_of_tubes
 from lungaccess.planning.coupled.search.local_search import TubeChoice, path_through, tube_arguments
 from lungaccess.planning.one_stage.rest import RestOfPlan
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -137,7 +138,7 @@ class _FromScope:
         cost_bounds(
             self._evaluator.needle_arrays, self.entries.positions[near], self._near_mm, (x, y, z), bounds
         )
-        near = near[np.argsort(bounds, kind="stable")]
+        near = near[np.argsort(bounds + self._before(near), kind="stable")]
         # An arc that costs more than a clear one is of use only where the cheaper ones are not proved.
         for slack in (1.0, math.inf):
             blockers, costs = self._arcs(near, slack)
@@ -172,15 +173,20 @@ class _FromScope:
         blockers, costs = np.zeros(len(entries), dtype=np.int64), np.zeros(len(entries))
         evaluate_arcs(
             self._evaluator.needle_arrays, every.positions[entries], every.tangents[entries],
-            every.branch[entries], (x, y, z), slack, math.inf, blockers, costs,
+            every.branch[entries], self._before(entries), (x, y, z), slack, math.inf, blockers, costs,
         )  # fmt: skip
         return blockers, costs
+
+    def _before(self, entries: Int) -> Float:
+        """Return what the tubes of some deployments cost before their arcs."""
+        some = self.entries.only(entries)
+        return costs_of_tubes(self._evaluator, np.repeat(self._row, some.count, axis=0), some)
 
     def _first_proved(self, entries: Int) -> tuple[Deployment, ArcPath] | None:
         for entry in entries.tolist():
             deployment = self._deployment(entry)
             path = path_through(deployment, np.zeros((0, 3)), self._target)
-            if self._evaluator.proves(deployment, path):
+            if self._evaluator.allows(self._frame, deployment, path):
                 return deployment, path
         return None
 
@@ -195,7 +201,9 @@ class _FromScope:
                 objective=self._evaluator.objective,
             )
             search.advance(SEARCH_ITERATIONS)
-            if search.path is not None and self._evaluator.proves(deployment, search.path):
+            if search.path is None:
+                continue
+            if self._evaluator.allows(self._frame, deployment, search.path):
                 return deployment, search.path
         return None
 
@@ -220,8 +228,10 @@ class _FromScope:
         if isinstance(found, str):
             return deployment, path
         better = path_through(found, vias[:count], self._target)
-        cheaper = self._evaluator.cost(better) < self._evaluator.cost(path)
-        return (found, better) if cheaper and self._evaluator.proves(found, better) else (deployment, path)
+        before = self._evaluator.cost_from(self._frame, deployment, path)
+        if self._evaluator.cost_from(self._frame, found, better) >= before:
+            return deployment, path
+        return (found, better) if self._evaluator.proves(found, better) else (deployment, path)
 
     def _deployment(self, entry: int) -> Deployment:
         found = self._evaluator.tubes.choose(self._frame, *self.entries.choice(entry))

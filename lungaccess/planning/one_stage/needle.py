@@ -23,6 +23,7 @@ from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import (
     OMPL_PLANNERS,
+    InTissue,
     NeedleEnvironment,
     Objective,
     Query,
@@ -77,8 +78,9 @@ class NeedleAnswer(PathSearch):
         """
         if self.path is None:
             return {}
+        parts = [InTissue(self.path, self.environment.needle.diameter_mm)]
         return self.objective.stated(
-            path_costs(self.environment.obstacles, self.environment.cost_map, self.path)
+            path_costs(self.environment.obstacles, self.environment.cost_map, self.path, parts)
         )
 
     @property

@@ -70,7 +70,7 @@ class RestOfPlan:
     @cached_property
     def costs(self) -> Mapping[str, float]:
         """As those of a plan."""
-        return stated_costs(self.task, self.deployment, self.path)
+        return stated_costs(self.task, self.lps_from_measured, self.deployment, self.path)
 
     @property
     def objective(self) -> str:

@@ -180,6 +180,14 @@ class Geometry:
             [*shares, self._thicker_mm(self.exit)],
         )
 
+    def in_tissue(self) -> tuple[list[Any], list[Any]]:
+        """Return points of the tubes amid equal steps from the wall to the tip, and width times step."""
+        count, begin = self._layout.tube_points, self.exit + self._value("wall_mm")
+        step = casadi.fmax(self.inner - begin, 0.0) / count
+        places = [begin + (m + 0.5) * step for m in range(count)]
+        widths = [self._value("inner_width_mm") + 2.0 * self._thicker_mm(s) for s in places]
+        return [self.tube_point(s) for s in places], [step * width for width in widths]
+
     def before_exit(self) -> tuple[list[Any], list[Any]]:
         """Return the same for the last WALL_CONTACT_MM before the exit."""
         count = self._layout.wall_points

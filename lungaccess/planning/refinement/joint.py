@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lungaccess.planning.refinement.problem import ARC_COUNTS, Problem, program_weights
+from lungaccess.planning.refinement.problem import ARC_COUNTS, Problem, Weights, program_weights
 from lungaccess.planning.refinement.reconstruction import Reconstruction
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -45,14 +45,14 @@ def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) ->
 
 
 def _refined(
-    evaluator: CandidateEvaluator, candidate: Candidate, weights: tuple[float, float, float], iterations: int
+    evaluator: CandidateEvaluator, candidate: Candidate, weights: Weights, iterations: int
 ) -> Candidate | None:
     """Solve for everything, then for the needle alone from tubes that are proved."""
     from lungaccess.planning.refinement.program import program
 
     problem = Problem(evaluator, candidate, weights)
     reconstruction = Reconstruction(evaluator, problem)
-    limit = evaluator.cost(candidate.path) * (1.0 - BETTER)
+    limit = evaluator.cost(candidate) * (1.0 - BETTER)
     solver = program(problem.layout, iterations)
     _objective, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
     found = solver.solve(problem.start, problem.eased(values), problem.boxes)
@@ -63,7 +63,7 @@ def _refined(
             new = reconstruction.candidate(placement, placement.x + share * (aimed - placement.x))
             if new is None:
                 continue
-            if evaluator.cost(new.path) < limit:
+            if evaluator.cost(new) < limit:
                 return new
             break
     return None

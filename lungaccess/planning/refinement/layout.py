@@ -41,6 +41,8 @@ class Layout:
         Whether the objective looks at a cost map.
     tubes, turned : int
         Of tubes that are not planar how many there are, and how many of them are turned against the others.
+    weighs_tubes : bool
+        Whether the objective looks at the tubes, too.
     zone_points, tube_points, wall_points : int
         Samples of the needle's exempt length, and of the tubes behind and before the exit.
     """
@@ -49,6 +51,7 @@ class Layout:
     with_map: bool
     tubes: int = 0
     turned: int = 0
+    weighs_tubes: bool = False
     zone_points: int = ZONE_POINTS
     tube_points: int = TUBE_POINTS
     wall_points: int = WALL_POINTS
@@ -117,6 +120,8 @@ class Layout:
             "weigh_length": 1,
             "weigh_map": 1,
         }
+        if self.weighs_tubes:
+            sizes |= {"weigh_tubes": 1, "inner_width_mm": 1, "wall_mm": 1}
         if self.tubes:
             sizes |= {
                 "middle_radius_step_mm": 1,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -45,8 +46,20 @@ EASE = 1e-4
 """The candidate lies so far inside the eased constraints, so that it is a strictly feasible start."""
 
 
-def program_weights(task: Task) -> tuple[float, float, float] | None:
-    """Return the weights of 1 / clearance, length and cost map in the program of a task.
+class Weights(NamedTuple):
+    """The weights of a program: of 1 / clearance, length and cost map along the needle, and along the tubes.
+
+    That of the tubes counts for each mm of their width, for 1 / clearance and the cost map alike.
+    """
+
+    clear: float
+    length: float
+    mapped: float
+    tubes: float = 0.0
+
+
+def program_weights(task: Task) -> Weights | None:
+    """Return the weights in the program of a task.
 
     The program has no sum over voxels.  Where nothing else is weighed, the map's line integral stands for
     it.  Where it is one cost of several, the program cannot express the objective; where only a map is
@@ -56,11 +69,15 @@ def program_weights(task: Task) -> tuple[float, float, float] | None:
     if weighed.voxel_sum > 0.0:
         if len(weighed.weighed) > 1:
             return None
-        weights = (0.0, 0.0, weighed.voxel_sum)
+        weights = Weights(0.0, 0.0, weighed.voxel_sum)
     else:
-        weights = (weighed.inverse_clearance, weighed.length, weighed.cost_map)
+        needle = task.system.require_needle("The joint refinement")
+        by_width = weighed.tissue * needle.diameter_mm
+        weights = Weights(
+            weighed.inverse_clearance + by_width, weighed.length, weighed.cost_map + by_width, weighed.tissue
+        )
     if task.lung.cost is None:
-        weights = (*weights[:2], 0.0)
+        weights = weights._replace(mapped=0.0)
     return weights if any(weights) else None
 
 
@@ -71,7 +88,7 @@ class Problem:
     ----------
     candidate : Candidate
         With at most as many arcs as the last of ARC_COUNTS.
-    weights : tuple of 3 float
+    weights : Weights
         See `program_weights`.
 
     Attributes
@@ -84,9 +101,7 @@ class Problem:
     axis : LocalAxis
     """
 
-    def __init__(
-        self, evaluator: CandidateEvaluator, candidate: Candidate, weights: tuple[float, float, float]
-    ) -> None:
+    def __init__(self, evaluator: CandidateEvaluator, candidate: Candidate, weights: Weights) -> None:
         self.task = evaluator.task
         self._candidate, self._weights = candidate, weights
         self._needle = needle = self.task.system.require_needle("The joint refinement")
@@ -99,7 +114,8 @@ class Problem:
         self.model = self._model(deployment.shape)
         self.layout = Layout(
             arcs=arcs,
-            with_map=weights[2] > 0.0,
+            with_map=weights.mapped > 0.0,
+            weighs_tubes=weights.tubes > 0.0,
             tubes=0 if design is None else len(design.lengths),
             turned=0 if design is None else int(design.turned.sum()),
         )
@@ -181,14 +197,15 @@ class Problem:
         inside = self._tube_points(np.linspace(max(leaves - WALL_CONTACT_MM, 0.0), leaves, 6))
         needle, lengths = self._candidate.path.sample(1.0)
         near = np.concatenate([outside, needle[lengths <= self._exempt_mm]])
+        costed = np.concatenate([needle, outside]) if self.layout.weighs_tubes else needle
         boxes = [
-            fields.clearance_box(lung, needle, NEEDLE_MARGIN_MM, with_fissures=fissures),
+            fields.clearance_box(lung, costed, NEEDLE_MARGIN_MM, with_fissures=fissures),
             fields.spared_box(lung, near, TUBE_MARGIN_MM, bits=bits, branch=deployment.branch),
             fields.wall_box(lung, inside, TUBE_MARGIN_MM, with_fissures=fissures, kept_mm=margin),
             fields.lumen_box(lung, inside[-1:], TUBE_MARGIN_MM),
         ]
         if self.layout.with_map and lung.cost is not None:
-            boxes.append(fields.map_box(lung.cost, needle, NEEDLE_MARGIN_MM))
+            boxes.append(fields.map_box(lung.cost, costed, NEEDLE_MARGIN_MM))
         return tuple(boxes)
 
     def _tube_points(self, arc_lengths: Float) -> Float:
@@ -209,7 +226,7 @@ class Problem:
         """Return the parameters for an axis of the scope's tip given by coefficients and a model."""
         tubes = self.task.system.tubes
         constants = tube_constants(tubes, self.task.system.margins)
-        clear, length, mapped = self._weights
+        clear, length, mapped, by_width = self._weights
         values: dict[str, object] = {
             "axis_points": points,
             "axis_tangents": tangents,
@@ -225,6 +242,9 @@ class Problem:
             "weigh_clear": clear,
             "weigh_length": length,
             "weigh_map": mapped,
+            "weigh_tubes": by_width,
+            "inner_width_mm": tubes.inner.outer_diameter_mm,
+            "wall_mm": self._candidate.deployment.wall_run_mm,
         }
         if model is not None:
             radii = [

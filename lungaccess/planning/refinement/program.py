@@ -81,6 +81,12 @@ def _look_up(cell: Any, places: Any, shape: Any, numbers: Any, begin: int) -> An
     return casadi.vertcat(places, cell.map(count)(places - corner, stencil))
 
 
+def _floored(clearance: Any) -> Any:
+    """Return a clearance in mm that is no less than its floor, rounded there."""
+    over = clearance - CLEARANCE_FLOOR_MM
+    return CLEARANCE_FLOOR_MM + 0.5 * (over + casadi.sqrt(over**2 + FLOOR_WIDTH_MM**2))
+
+
 def _quadratic(places: Any, seen: Any) -> list[Any]:
     """Return the field at lattice coordinates by its expansion about the places looked up."""
     out = []
@@ -155,11 +161,15 @@ class Program:
         tubes, thicker = geometry.outside()
         walls, wall_thicker = geometry.before_exit()
         spared = needle[: layout.zone_points] + tubes
-        looked = [needle, spared, walls, geometry.at_exit()] + ([needle] if layout.with_map else [])
+        crossing, thick = geometry.in_tissue() if layout.weighs_tubes else ([], [])
+        costed = needle + crossing
+        looked = [costed, spared, walls, geometry.at_exit()] + ([costed] if layout.with_map else [])
         places = [self._on_lattice(p, n, points) for n, points in enumerate(looked)]
         seen = [casadi.SX.sym(f"seen{n}", LOOKED_UP, len(points)) for n, points in enumerate(looked)]
         fields = [_quadratic(*pair) for pair in zip(places, seen, strict=True)]
         f = self._objective(p, fields, steps)
+        if layout.weighs_tubes:
+            f += self._objective_of_tubes(p, fields, thick)
         g = self._constraints(p, geometry, fields, thicker + wall_thicker)
         self._solver = self._connect(x, p, f, g, places, seen, iterations)
 
@@ -171,13 +181,21 @@ class Program:
         clear, length, mapped = (p[self.layout.parameters[f"weigh_{n}"]] for n in ("clear", "length", "map"))
         total: Any = 0.0
         for n, step in enumerate(steps):
-            over = fields[CLEARANCE][n] - CLEARANCE_FLOOR_MM
-            floored = CLEARANCE_FLOOR_MM + 0.5 * (over + casadi.sqrt(over**2 + FLOOR_WIDTH_MM**2))
-            rate = clear / floored + length
+            rate = clear / _floored(fields[CLEARANCE][n]) + length
             if self.layout.with_map:
                 rate += mapped * fields[MAP][n]
             total += step * rate
         return total
+
+    def _objective_of_tubes(self, p: Any, fields: list[list[Any]], thick: list[Any]) -> Any:
+        """Return the part of the tubes in tissue, whose points follow those of the needle."""
+        total: Any = 0.0
+        for n, step in enumerate(thick, start=-len(thick)):
+            rate = 1.0 / _floored(fields[CLEARANCE][n])
+            if self.layout.with_map:
+                rate += fields[MAP][n]
+            total += step * rate
+        return p[self.layout.parameters["weigh_tubes"]] * total
 
     def _constraints(self, p: Any, geometry: Geometry, fields: list[list[Any]], thicker: list[Any]) -> Any:
         zone = self.layout.zone_points
@@ -203,7 +221,7 @@ class Program:
             at_exit,
             (before - behind) / (2.0 * SLOPE_MM),
             *fields[SPARED][:zone],
-            *fields[CLEARANCE][zone:],
+            *fields[CLEARANCE][zone : zone + self.layout.arcs * self.layout.arc_points],
             *[c - step for c, step in zip(tubes, thicker, strict=True)],
             *further,
         )

@@ -15,6 +15,7 @@ from anatomy.fields import CENTRES, corner_geometry
 from anatomy.grid import Grid, Volume
 from anatomy.structures import VESSEL
 from stages.needle.costs import (
+    InTissue,
     inverse_clearance,
     map_integral,
     obstacle_clearance_mm,
@@ -337,11 +338,12 @@ class TestSpaces:
     def test_every_cost_by_its_name(self) -> None:
         environment = scene()
         path = line([0.5, 8.5, 0.5], [0, 0, 1.0], 30.0)
-        costs = path_costs(environment.obstacles, environment.cost_map, path)
+        costs = path_costs(environment.obstacles, environment.cost_map, path, [InTissue(path, 0.5)])
         assert costs["length_mm"] == 30.0
         assert costs["cost_map"] == pytest.approx(0.9 * 30, rel=1e-6)
         assert costs["voxel_sum"] == pytest.approx(0.9 * 31, rel=1e-6)
         assert costs["inverse_clearance"] == inverse_clearance(environment.obstacles, path)
+        assert costs["tissue"] == pytest.approx(0.5 * (costs["inverse_clearance"] + costs["cost_map"]))
 
 
 class TestSearches:
@@ -357,7 +359,8 @@ class TestSearches:
         for _ in range(60):
             if search.advance(300):
                 assert search.path is not None
-                exact = objective.total(path_costs(environment.obstacles, environment.cost_map, search.path))
+                costs_of = path_costs(environment.obstacles, environment.cost_map, search.path, [])
+                exact = objective.total(costs_of)
                 assert search.cost == pytest.approx(exact, rel=1e-6) or (
                     objective.voxel_sum > 0.0 and exact < search.cost < 1.2 * exact
                 )

@@ -82,7 +82,9 @@ def test_a_sum_is_written_with_its_weights() -> None:
 
 
 @given(
-    st.lists(st.just(0.0) | st.floats(0.0, 1e9, allow_subnormal=False), min_size=4, max_size=4).filter(any)
+    st.lists(
+        st.just(0.0) | st.floats(0.0, 1e9, allow_subnormal=False), min_size=len(NAMES), max_size=len(NAMES)
+    ).filter(any)
 )
 def test_a_text_restores_every_weight(weights: list[float]) -> None:
     objective = Objective(**dict(zip(NAMES, weights, strict=True)))
@@ -129,7 +131,7 @@ def test_what_weighs_a_map_needs_one(name: str) -> None:
     objective = Objective(**{name: 1.0})
     assert objective.weighs_map
     with pytest.raises(SettingsError, match="has none"):
-        objective.arrays(None)
+        objective.arrays(None, 1.0)
 
 
 @pytest.mark.parametrize("name", ["cost_map", "voxel_sum"])
@@ -138,29 +140,29 @@ def test_costs_are_not_negative(name: str, wrong: float) -> None:
     values = a_map()
     values[3, 4, 5] = wrong
     with pytest.raises(SettingsError, match="least cost of the cost map"):
-        Objective(**{name: 1.0}).arrays(values)
-    SHORTEST.arrays(values)
+        Objective(**{name: 1.0}).arrays(values, 1.0)
+    SHORTEST.arrays(values, 1.0)
 
 
 def test_a_map_of_obstacles_alone_is_refused() -> None:
     with pytest.raises(SettingsError, match="some of them finite"):
-        Objective(cost_map=1.0).arrays(np.full((3, 3, 3), math.inf, dtype=np.float32))
+        Objective(cost_map=1.0).arrays(np.full((3, 3, 3), math.inf, dtype=np.float32), 1.0)
 
 
 def test_the_kernels_see_one_type_of_map() -> None:
     """Else they would be compiled twice."""
-    given_map = Objective(cost_map=1.0).arrays(a_map()).cost_map
-    none = SHORTEST.arrays(None).cost_map
-    not_looked_at = SHORTEST.arrays(a_map()).cost_map
+    given_map = Objective(cost_map=1.0).arrays(a_map(), 1.0).cost_map
+    none = SHORTEST.arrays(None, 1.0).cost_map
+    not_looked_at = SHORTEST.arrays(a_map(), 1.0).cost_map
     assert numba.typeof(given_map) == numba.typeof(none) == numba.typeof(not_looked_at)
     assert none is NO_MAP and not_looked_at is NO_MAP
-    converted = Objective(voxel_sum=1.0).arrays(a_map().astype(np.float64, order="C")).cost_map
+    converted = Objective(voxel_sum=1.0).arrays(a_map().astype(np.float64, order="C"), 1.0).cost_map
     assert numba.typeof(converted) == numba.typeof(NO_MAP) and np.array_equal(converted, a_map())
 
 
 def test_the_least_cost_of_a_mm() -> None:
     def least(objective: Objective) -> float:
-        return objective.arrays(a_map(0.25)).least_rate
+        return objective.arrays(a_map(0.25), 1.0).least_rate
 
     assert least(Objective(length=2.0)) == 2.0
     assert least(Objective(cost_map=3.0)) == pytest.approx(0.75)
@@ -169,7 +171,7 @@ def test_the_least_cost_of_a_mm() -> None:
     assert least(Objective(length=2.0, cost_map=3.0, voxel_sum=5.0)) == pytest.approx(2.75)
 
 
-WEIGHTS = st.tuples(*[st.sampled_from([0.0, 0.3, 1.0, 7.0])] * 4).filter(any)
+WEIGHTS = st.tuples(*[st.sampled_from([0.0, 0.3, 1.0, 7.0])] * len(NAMES)).filter(any)
 PLACES = st.tuples(*[st.floats(-9.0, 9.0)] * 3)
 
 

@@ -28,7 +28,7 @@ def ball_environment(**changes: float) -> NeedleEnvironment:
 
 
 GOAL = np.array([0.0, 0.0, 28.0])
-OBJECTIVE = SHORTEST.arrays(None)
+OBJECTIVE = SHORTEST.arrays(None, 1.0)
 START = np.array([0.0, 0.0, -28.0, 0.0, 0.0, 1.0])
 
 

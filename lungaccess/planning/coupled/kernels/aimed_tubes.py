@@ -9,22 +9,15 @@ import math
 
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 from lungaccess.planning.coupled.kernels.candidate import why_refused
-from stages.needle.kernels import cost_of_arc
-from stages.tube.kernels import (
-    ACCEPTED,
-    CLOSE_MM,
-    LEFT_AT,
-    N_TRACE,
-    WALL_RUN,
-    aim,
-    aim_shape,
-    bend_towards,
-    carried,
-    take_member,
-    tube_pieces,
+from lungaccess.planning.coupled.kernels.tubes_cost import (
+    bent_towards,
+    cost_beyond,
+    cost_in_tissue,
+    pieces_of,
 )
+from stages.tube.kernels import ACCEPTED, CLOSE_MM, LEFT_AT, N_TRACE, WALL_RUN, aim, aim_shape, take_member
 
 ROTATION, OUTER, INNER, COST, JOINTS = range(5)
 """Columns of what is found; tubes that are not planar have all their joints from JOINTS on."""
@@ -36,46 +29,6 @@ TIP_OFF_MM = 5e-7
 """So far from the target may a tip be after its whole way was followed: half of what a proof allows."""
 NOT_TRIED = -2
 """Stands for a reason where the scope cannot take the tip, or enough were found before."""
-COST_STEP_MM = 0.5
-"""Step of estimated integrals: about a voxel, since clearance changes by no more than one moves."""
-
-
-@inner_kernel
-def _cost_beyond(obstacles, objective, base, normal, pieces, begin):
-    """Return the weighted cost of the pieces of tubes from an arc length on."""
-    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
-    across = normal
-    total = 0.0
-    first = True
-    for start, stop, direction, kappa in pieces:
-        if stop <= start:
-            continue
-        skipped = min(max(begin - start, 0.0), stop - start)
-        for length, counts in ((skipped, False), (stop - start - skipped, True)):
-            if length <= 0.0:
-                continue
-            bend = bend_towards(pose, across, direction, kappa)
-            if counts:
-                total += cost_of_arc(obstacles, objective, COST_STEP_MM, pose, bend, length, first)
-                first = False
-            pose, across = carried(pose, across, bend, direction, length)
-    return total
-
-
-@merged_kernel
-def _pieces_of(constants, outer, inner, shape):
-    """Return begin, end, direction and curvature of each piece of tubes `(P, 4)`."""
-    if shape.number[0] > 0:
-        pieces, at = np.zeros((shape.number[0], 4)), 0.0
-        for m in range(shape.number[0]):
-            length, direction, kappa, _radius = shape.arcs[m]
-            pieces[m] = np.array([at, at + length, direction, kappa])
-            at += length
-        return pieces
-    pieces = np.zeros((4, 4))
-    for m, (start, stop, kappa, _radius) in enumerate(tube_pieces(constants, outer, inner)):
-        pieces[m] = np.array([start, stop, 0.0, kappa])
-    return pieces
 
 
 @inner_kernel
@@ -100,6 +53,7 @@ def aim_tubes(
     obstacles,
     weights,
     map_weights,
+    of_tubes,
     scope_poses,
     allowed,
     pose_of,
@@ -119,6 +73,8 @@ def aim_tubes(
     weights, map_weights : ObjectiveArrays
         The objective without its costs of the map, which count from the exit on, and with these alone, which
         count beyond the wall that the tubes pierce.
+    of_tubes : ObjectiveArrays
+        What counts for each mm of the tubes' width, beyond that wall, too.
     scope_poses : (K, 9) float64
     allowed : (K,) bool
         Which of these poses the scope can take.
@@ -150,12 +106,7 @@ def aim_tubes(
         )
         if why[n] != ACCEPTED:
             continue
-        c, s = math.cos(rotation), math.sin(rotation)
-        normal = (
-            c * base[6] + s * (base[4] * base[8] - base[5] * base[7]),
-            c * base[7] + s * (base[5] * base[6] - base[3] * base[8]),
-            c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
-        )
+        normal = bent_towards(base, rotation)
         found[n, ROTATION] = rotation
         found[n, OUTER] = outer
         found[n, INNER] = inner
@@ -167,10 +118,11 @@ def aim_tubes(
         if reason != ACCEPTED:
             continue
         left_at = trace[LEFT_AT]
-        pieces = _pieces_of(constants, outer, inner, shape)
-        cost = _cost_beyond(obstacles, weights, base, normal, pieces, left_at)
+        behind, arcs = left_at + trace[WALL_RUN], shape.arcs[: shape.number[0]]
+        pieces = pieces_of(constants, outer, inner, arcs)
+        cost = cost_beyond(obstacles, weights, base, normal, pieces, left_at, False)
         if map_weights.map_integral > 0.0 or map_weights.voxel_sum > 0.0:
-            behind = left_at + trace[WALL_RUN]
-            cost += _cost_beyond(obstacles, map_weights, base, normal, pieces, behind)
+            cost += cost_beyond(obstacles, map_weights, base, normal, pieces, behind, False)
+        cost += cost_in_tissue(obstacles, of_tubes, constants, base, normal, outer, inner, arcs, behind)
         found[n, COST] = cost
         enough -= 1

@@ -18,12 +18,15 @@ import numpy as np
 
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from lungaccess.planning.coupled.kernels.tubes_cost import bent_towards, cost_in_tissue
 from stages.needle.kernels import blocker_on_arc, cost_of_arc, least_cosine, map_costs_on_arc
 from stages.tube.kernels import (
     ACCEPTED,
     BRANCH,
+    LEFT_AT,
     MAX_EXTENSION,
     MAX_PROTRUSION,
+    WALL_RUN,
     near_shape,
     required_beside,
     take_over,
@@ -153,21 +156,16 @@ def why_refused(environment, constants, design, shape, base, towards, outer, inn
 def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, cost_limit, trace, tip):
     """Return the cost of a choice if it is below `cost_limit` and all of it is proved; else infinity.
 
-    The fast tests come first: limits and cost of the needle, the deployment, the needle's clearance.  Of
-    tubes that are not planar the tip is that of a shape reached from the one nearby; only where it passes
-    those of the needle, the whole way to it is followed.
+    The fast tests come first: limits and cost of the needle, the deployment and its cost, the needle's
+    clearance.  Of tubes that are not planar the tip is that of a shape reached from the one nearby; only
+    where it passes those of the needle, the whole way to it is followed.
     """
     environment, constants, design, near, shape = tube
     row = int(x[SCOPE_POSE])
     if row < 0 or row >= scope_poses.shape[0] or not allowed[row]:
         return math.inf
     base = scope_poses[row]
-    c, s = math.cos(x[ROTATION]), math.sin(x[ROTATION])
-    normal = (
-        c * base[6] + s * (base[4] * base[8] - base[5] * base[7]),
-        c * base[7] + s * (base[5] * base[6] - base[3] * base[8]),
-        c * base[8] + s * (base[3] * base[7] - base[4] * base[6]),
-    )
+    normal = bent_towards(base, x[ROTATION])
     found, followed, pose = _tip(constants, design, near, shape, base, normal, x)
     if not found:
         return math.inf
@@ -187,6 +185,19 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
         cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
         if cost == math.inf:
             return math.inf
+    cost += cost_in_tissue(
+        needle.obstacles,
+        needle.of_tubes,
+        constants,
+        base,
+        normal,
+        x[OUTER],
+        x[INNER],
+        shape.arcs[: shape.number[0]],
+        trace[LEFT_AT] + trace[WALL_RUN],
+    )
+    if not cost < cost_limit:
+        return math.inf
     branch = int(trace[BRANCH])
     if not _needle_clear(needle, pose, vias, count, target, branch):
         return math.inf

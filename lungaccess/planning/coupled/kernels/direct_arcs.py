@@ -63,13 +63,15 @@ def cost_bounds(needle, positions, lengths, target, bounds):
 
 
 @kernel(nogil=True)
-def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, blockers, costs):
+def evaluate_arcs(needle, positions, tangents, branches, before, target, slack, best, blockers, costs):
     """Evaluate the single arc from each pose to the target, and prove those whose cost is low enough.
 
     Parameters
     ----------
     positions, tangents : (N, 3) float64
     branches : (N,) int64
+    before : (N,) float64
+        What the tubes cost before the arc.
     target : tuple of 3 floats
     slack, best : float
         Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not tested.
@@ -77,7 +79,7 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
         Receives 0 for arcs that are proved clear, the label that blocks, -1 where no arc keeps the
         needle's limits, or PRUNED_BY_BOUND.
     costs : (N,) float64
-        Receives estimated costs, infinite where a lower bound was enough.
+        Receives estimated costs with those of the tubes, infinite where a lower bound was enough.
 
     Returns
     -------
@@ -95,10 +97,12 @@ def evaluate_arcs(needle, positions, tangents, branches, target, slack, best, bl
         if single_arc_exceeds(limits, bend, length, turn):
             blockers[n] = -1
             continue
-        if _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length) > slack * best:
+        bound = before[n] + _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length)
+        if bound > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue
-        costs[n] = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, _FIRST)
+        arc = cost_of_arc(obstacles, objective, limits.cost_step_mm, pose, bend, length, _FIRST)
+        costs[n] = before[n] + arc
         if costs[n] > slack * best:
             blockers[n] = PRUNED_BY_BOUND
             continue

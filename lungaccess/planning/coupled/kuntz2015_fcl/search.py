@@ -113,7 +113,7 @@ class ReferenceSearch:
         for iteration, placement in enumerate(random_placements(self.task, self._atlas), start=1):
             found = self._attempt(placement, began)
             proved = None if found is None else self._proved(found)
-            cost = math.inf if proved is None else self._evaluator.cost(proved.path)
+            cost = math.inf if proved is None else self._evaluator.cost(proved)
             if cost < best:
                 best = cost
                 yield Step(iteration=iteration, phase=PHASE, candidate=proved, cost=cost)

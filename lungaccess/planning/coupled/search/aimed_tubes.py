@@ -111,9 +111,11 @@ class TubeAiming:
         field, bits = lung.obstacle_field(with_fissures=with_fissures), obstacle_bits(with_fissures)
         self._obstacles = Obstacles(field.corners, lung.labels, field.geometry, bits)
         weighed = objective.without_map if lung.cost is None else objective
-        arrays = weighed.arrays(None if lung.cost is None else lung.cost.array)
+        cost_map = None if lung.cost is None else lung.cost.array
+        arrays = weighed.arrays(cost_map, width_mm=0.0)
         of_map = arrays._replace(inverse_clearance=0.0, length=0.0)
-        self._weights = arrays._replace(map_integral=0.0, voxel_sum=0.0), of_map
+        of_tubes = weighed.arrays_of_tubes(cost_map)
+        self._weights = arrays._replace(map_integral=0.0, voxel_sum=0.0), of_map, of_tubes
 
     def aim(
         self, target: Float, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts, enough: int = 0

@@ -11,12 +11,15 @@ import numpy as np
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, cost_bounds, evaluate_arcs
+from lungaccess.planning.coupled.kernels.tubes_cost import costs_in_tissue
 from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
 from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from stages.needle import NeedleEnvironment, direct_arcs, workspace_lengths
+from stages.tube import Deployments, shapes_of, tube_constants
+from stages.tube.kernels import ARC_COLUMNS
 
 CHUNK = 1000
 """Arcs that are evaluated in one call of a kernel: between two calls the caller can end the search."""
@@ -160,10 +163,15 @@ class DirectArcs:
             positions, lengths = entries.positions[self.in_workspace[rows]], self._lengths[rows]
             part, goal = np.zeros(len(lengths)), tuple(aim.tolist())
             cost_bounds(self.evaluator.needle_arrays, positions, np.array(lengths), goal, part)
-            bounds[rows] = part
+            bounds[rows] = part + self.before(self.in_workspace[rows])
         by_entry = np.zeros(entries.count)
         by_entry[self.in_workspace] = bounds
         return self.in_workspace[np.argsort(bounds, kind="stable")], by_entry
+
+    def before(self, chosen: Int) -> Float:
+        """Return what the tubes of deployments (N,) cost before their arcs."""
+        entries = self.atlas.deployments.only(chosen)
+        return costs_of_tubes(self.evaluator, self.atlas.motions.tips[entries.site], entries)
 
     def evaluate(self, chosen: Int, slack: float, best: float = math.inf) -> tuple[Int, Float, float]:
         """Evaluate the arcs from deployments, less and less of them as cheap ones are found.
@@ -193,6 +201,7 @@ class DirectArcs:
                 entries.positions[at],
                 entries.tangents[at],
                 entries.branch[at],
+                self.before(at),
                 tuple(aim.tolist()),
                 slack,
                 best,
@@ -201,6 +210,31 @@ class DirectArcs:
             )
             blockers[rows], costs[rows] = stopped, cost
         return blockers, costs, best
+
+
+def costs_of_tubes(evaluator: CandidateEvaluator, tips: Float, entries: Deployments) -> Float:
+    """Return what the tubes of N deployments cost `(N,)`: 0 under an objective of the needle alone.
+
+    Parameters
+    ----------
+    tips : (N, 9) float64
+        The scope tip of each; see `lungaccess.planning.coupled.kernels.candidate`.
+    """
+    costs = np.zeros(entries.count)
+    if evaluator.objective.tissue == 0.0:
+        return costs
+    system, arrays = evaluator.task.system, evaluator.needle_arrays
+    arcs, first_arc = np.zeros((0, ARC_COLUMNS)), np.zeros(1, dtype=np.int64)
+    if not system.tubes.planar:
+        shapes = shapes_of(system.tubes)
+        arcs, first_arc = np.array(shapes.arcs), np.array(shapes.first_arc)
+    behind_mm = entries.exit_mm + entries.wall_run_mm
+    deployed = np.stack([entries.rotation_rad, entries.outer_mm, entries.inner_mm, behind_mm], axis=1)
+    constants, shape = tube_constants(system.tubes, system.margins), np.array(entries.shape)
+    costs_in_tissue(
+        arrays.obstacles, arrays.of_tubes, constants, np.array(tips), deployed, shape, arcs, first_arc, costs
+    )
+    return costs
 
 
 class DirectArcSearch:

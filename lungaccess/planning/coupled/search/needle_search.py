@@ -58,7 +58,8 @@ def needle_searches(
         for entry in ordered.tolist():
             if bounds[entry] >= incumbent.cost:
                 break
-            found = _with_path(arcs, planner, entry, SLACK * incumbent.cost, iterations, rng)
+            limit = SLACK * incumbent.cost - float(arcs.before(np.array([entry]))[0])
+            found = _with_path(arcs, planner, entry, limit, iterations, rng)
             first = found is not None and incumbent.step is None
             yield evaluated_step(arcs.evaluator, PHASE, found) if first else nothing, found
         yield nothing, None
@@ -72,7 +73,7 @@ def _with_path(
     iterations: int,
     rng: np.random.Generator,
 ) -> Candidate | None:
-    """Return a deployment with a path that costs less than the limit, None if none is found."""
+    """Return a deployment with a path that itself costs less than the limit, None if none is found."""
     candidate = arcs.candidate(entry)
     seed = int(rng.integers(2**63))
     if candidate is None:

@@ -56,7 +56,7 @@ class TestDirectArcs:
         clear = ordered[search.arcs.blockers(ordered)[0] == 0]
         for entry in clear[:: max(len(clear) // 60, 1)].tolist():
             candidate = search.arcs.proved(entry)
-            assert candidate is not None and 0.0 < bounds[entry] <= search.evaluator.cost(candidate.path)
+            assert candidate is not None and 0.0 < bounds[entry] <= search.evaluator.cost(candidate)
 
     def test_different_deployments_are_the_first_of_their_kind(self, search: AtlasSearch) -> None:
         entries, near = search.atlas.deployments, search.arcs.in_workspace
@@ -95,7 +95,7 @@ class TestLocalSearch:
             assert found is not None
             assert search.evaluator.evaluate(found) == pytest.approx(run.cost, rel=0.05)
         assert costs == sorted(costs, reverse=True)
-        assert costs[-1] < 0.99 * search.evaluator.cost(begun.path)
+        assert costs[-1] < 0.99 * search.evaluator.cost(begun)
 
     def test_perturbed_runs_find_back_to_what_is_proved(self, search: AtlasSearch) -> None:
         local_search, begun, finite = local_search_of(search), first_clear(search), 0

@@ -87,7 +87,7 @@ class TestRefine:
     ) -> None:
         evaluator = CandidateEvaluator(case.task)
         found = [
-            (evaluator.cost(old.path), evaluator.cost(new.path))
+            (evaluator.cost(old), evaluator.cost(new))
             for old, new in zip(case.candidates, refined, strict=True)
             if new
         ]
@@ -165,7 +165,7 @@ class TestProgram:
         for which, candidate in enumerate(case.candidates):
             problem, solver = set_up(case, which)
             cost, values = solver.evaluate(problem.start, problem.numbers, problem.boxes)
-            shares.append(cost / CandidateEvaluator(case.task).cost(candidate.path))
+            shares.append(cost / CandidateEvaluator(case.task).cost(candidate))
             assert np.abs(values[problem.layout.constraints["end"]]).max() < 1e-6
             length_mm = values[problem.layout.constraints["length"]][0]
             assert length_mm == pytest.approx(candidate.path.length_mm)
@@ -366,7 +366,7 @@ def test_candidates_at_turned_tips_are_refined(small_lung: Lung) -> None:
         if refined is None:
             continue
         better += 1
-        assert search.evaluator.evaluate(refined) < search.evaluator.cost(candidate.path)
+        assert search.evaluator.evaluate(refined) < search.evaluator.cost(candidate)
         plan = assemble(search.task, refined, iteration=0, timing={})
         assert la.check(plan, small_lung).accepted
     assert better >= 2

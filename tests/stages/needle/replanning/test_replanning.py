@@ -149,7 +149,7 @@ class TestFound:
         target = TARGET + [12.0, 6.0, 0.0]
         found = replanner(with_ball(), query(BESIDE, target)).replan(BESIDE, target, 0.0)
         attempts = Attempts(
-            with_ball(), Objective(length=1.0).arrays(None), Root(query=query(BESIDE, target))
+            with_ball(), Objective(length=1.0).arrays(None, 1.0), Root(query=query(BESIDE, target))
         )
         attempts.by_legs()
         assert found.source is Source.DIRECT

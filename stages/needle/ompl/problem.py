@@ -21,6 +21,7 @@ from stages.needle.ompl.states import path_of, put_numbers
 from stages.needle.path import ArcPath, direct_path
 from stages.needle.planner_names import OMPL_PLANNERS
 from stages.needle.query import Query
+from stages.needle.search import planners
 from stages.needle.search.base import Search
 from stages.needle.violations import violation
 

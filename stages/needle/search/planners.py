@@ -47,7 +47,7 @@ _OWN: dict[str, MakeSearch] = {
     "resolution": _makes(ResolutionSearch),
     "decide": _makes(Decision),
 }
-"""See docs/explanation/needle.md; `stages.needle.planner_names` states the names where nothing is searched."""
+"""See docs/explanation/needle.md; `stages.needle.planner_names` states the names for a quick start."""
 
 
 def searches() -> dict[str, MakeSearch]:

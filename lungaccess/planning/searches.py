@@ -20,7 +20,7 @@ from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
 from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
 from lungaccess.planning.coupled.search.tube_search import TubeSearch
-from lungaccess.planning.coupled.search.window_search import WindowSearch
+from lungaccess.planning.coupled.search.window_search import WindowSearch, WindowTubeSearch, window_search
 from lungaccess.planning.coupled.window_explanation import explain_window
 from lungaccess.planning.driver import Turn
 from lungaccess.plans.assemble import assemble
@@ -86,7 +86,7 @@ def unknown_method(method: str) -> SettingsError:
 def search_of(request: Request, task: Task, atlas: Atlas) -> PlanSearch:
     """Return the search by cost, or for the widest window, of a request."""
     if request.is_for_window and request.method == ATLAS:
-        return WindowSearch(task, atlas, request.phases, widest=request.goal is WINDOW)
+        return window_search(task, atlas, request.phases, widest=request.goal is WINDOW)
     return planners()[request.method](task, atlas)
 
 
@@ -132,7 +132,7 @@ class CostFinder:
 
 def why_none(task: Task, atlas: Atlas, search: PlanSearch, iteration: int, counterfactuals: bool) -> NoPlan:
     """Return why a search has found nothing, after so many iterations."""
-    if isinstance(search, WindowSearch):
+    if isinstance(search, WindowSearch | WindowTubeSearch):
         stopped = explain_window(search, iteration)
         if stopped is not None:
             return stopped

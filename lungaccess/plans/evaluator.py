@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -66,6 +67,12 @@ TIP_OFF_MM = 1e-6
 class CandidateEvaluator:
     """Proves and costs the candidates of one task, from the numbers that a plan will state.
 
+    Parameters
+    ----------
+    task : Task
+    holds : callable, optional
+        Tells of a candidate whether what is asked for beside the proof holds, such as a stated exit.
+
     Attributes
     ----------
     tubes : DeploymentValidator
@@ -74,8 +81,8 @@ class CandidateEvaluator:
         How many direct arcs were stopped, by what stopped them.
     """
 
-    def __init__(self, task: Task) -> None:
-        self.task = task
+    def __init__(self, task: Task, holds: Callable[[Candidate], bool] | None = None) -> None:
+        self.task, self._holds = task, holds
         system, fissures = task.system, task.with_fissures
         self.tubes = DeploymentValidator(task.lung, system.tubes, system.margins, with_fissures=fissures)
         self.blocked: Counter[str] = Counter()
@@ -107,8 +114,8 @@ class CandidateEvaluator:
         """Return the cost of a candidate, infinite if its proof fails."""
         return self.cost(candidate) if self.accepts(candidate) else math.inf
 
-    def aim(self, tip: ScopeTip) -> Float:
-        """Return where the needle is to end, `(3,)` LPS mm, if it starts from a scope tip: at the target."""
+    def aim(self, tip_lps: Float) -> Float:
+        """Return where devices from a place of the scope's tip are to end, `(3,)` LPS mm: at the target."""
         return self.task.target.lps_mm
 
     def end_of(self, path: ArcPath) -> Float:
@@ -116,8 +123,9 @@ class CandidateEvaluator:
         return self.task.target.lps_mm
 
     def accepts(self, candidate: Candidate) -> bool:
-        """Tell whether a candidate is proved; its cost does not matter as long as it is finite."""
-        return self.allows(candidate.tip.lps_from_scope_tip, candidate.deployment, candidate.path)
+        """Tell whether a candidate is proved, and what is asked for holds; its cost only has to be finite."""
+        holds = self._holds is None or self._holds(candidate)
+        return holds and self.allows(candidate.tip.lps_from_scope_tip, candidate.deployment, candidate.path)
 
     def allows(self, lps_from_scope_tip: Float, deployment: Deployment, path: ArcPath) -> bool:
         """Tell whether a path is proved, and no tube enters an infinite cost that the objective weighs."""
@@ -165,6 +173,7 @@ class CandidateEvaluator:
         outer_mm: float,
         inner_mm: float,
         shape: int | TubeShape = -1,
+        end: Float | None = None,
     ) -> Candidate | None:
         """Return a deployment with a direct arc to the target, None if the deployment is refused.
 
@@ -172,11 +181,14 @@ class CandidateEvaluator:
         ----------
         rotation_rad, outer_mm, inner_mm, shape
             As those of `DeploymentValidator.choose`.
+        end : (3,) float64, optional
+            Where the arc ends, LPS mm; at the aim if None.
         """
         deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm, shape)
         if isinstance(deployment, str):
             return None
-        path = direct_path(deployment.lps_from_tip, self.aim(tip))
+        aim = self.aim(tip.lps_from_scope_tip[:3, 3]) if end is None else end
+        path = direct_path(deployment.lps_from_tip, aim)
         return Candidate(tip=tip, deployment=deployment, path=path)
 
     def reaches(self, lps_from_tip: Float) -> bool:
@@ -193,9 +205,7 @@ class CandidateEvaluator:
 
     def count_blockers(self, blockers: Int) -> None:
         """Add to `blocked` what stopped direct arcs, by their labels `(N,)`."""
-        labels, counts = np.unique(blockers, return_counts=True)
-        for label, count in zip(labels, counts, strict=True):
-            self.blocked[blocker_name(int(label))] += int(count)
+        self.blocked.update(blocker_counts(blockers))
 
     @cached_property
     def tip_rows(self) -> TipRows:
@@ -222,6 +232,15 @@ class CandidateEvaluator:
             forbidden,
             objective.arrays_of_tubes(None if costs is None else costs.array),
         )
+
+
+def blocker_counts(blockers: Int) -> Counter[str]:
+    """Return how many of direct arcs each name stops, from their labels `(N,)`."""
+    labels, counts = np.unique(blockers, return_counts=True)
+    named: Counter[str] = Counter()
+    for label, count in zip(labels.tolist(), counts.tolist(), strict=True):
+        named[blocker_name(label)] += count
+    return named
 
 
 def blocker_name(label: int) -> str:

@@ -29,13 +29,9 @@ if TYPE_CHECKING:
         evaluated_step,
     )
     from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
-    from lungaccess.planning.coupled.search.direct_candidates import (
-        DirectCandidates,
-        Scan,
-        direct_candidates,
-        reach_scan,
-    )
+    from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
     from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
+    from lungaccess.planning.coupled.search.reach_scans import Scan, reach_scan
     from lungaccess.planning.coupled.search.settings import SearchSettings
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -15,7 +15,6 @@ from anatomy.lung import Lung
 from lungaccess.planning.coupled.atlas import Atlas, require_same
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.costs import obstacle_clearance_mm
-from lungaccess.plans.evaluator import blocker_name
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
@@ -126,8 +125,7 @@ def feasible_exits(
     for begin in range(0, max(len(near), 1), CHUNK):
         chunk = near[begin : begin + CHUNK]
         blockers, lengths, _integrals = arcs.blockers(chunk)
-        for label, count in zip(*np.unique(blockers, return_counts=True), strict=True):
-            blocked[blocker_name(int(label))] += int(count)
+        blocked.update(arcs.reasons(blockers))
         clear = np.flatnonzero(blockers == 0)
         found = found.joined(_Found.of(arcs, chunk[clear], lengths[clear]))
         yield found.answer(arcs, len(near), begin + len(chunk), blocked)

@@ -6,12 +6,9 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 
-import numpy as np
-
 from anatomy.base.words import plural
-from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
-from lungaccess.planning.coupled.search.window_search import WindowSearch
-from lungaccess.plans.evaluator import blocker_name
+from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
+from lungaccess.planning.coupled.search.window_search import WindowSearch, WindowTubeSearch, window_search
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.window import WindowLimit
 from lungaccess.uncertainty.breathing.window import require_motion
@@ -22,17 +19,17 @@ WORTH_SAYING = 0.01
 """Phases of which a plan is not worth a sentence are fewer than this share of the breath."""
 
 
-def explain_window(search: WindowSearch, iterations: int) -> NoPlan | None:
+def explain_window(search: WindowSearch | WindowTubeSearch, iterations: int) -> NoPlan | None:
     """Return the `NoPlan` of a search for a window; None if the breath is not what stops every deployment.
 
-    Every deployment whose needle reaches its aim is counted once: it misses the target, is stopped in the
+    Every deployment that reaches its aim is counted once: it misses the target, is stopped in the
     masks' phase, or is refused at a phase of the breath.
     """
     evaluator, task = search.window_evaluator, search.task
-    reaching = DirectArcs(task, search.atlas, evaluator, search.aims).in_workspace
-    misses = search.misses_mm[search.atlas.deployments.site[reaching]]
+    reaching = direct_candidates(task, search.atlas, evaluator, search.aims.points).promising
+    misses = search.aims.misses_mm[search.atlas.deployments.site[reaching]]
     missing = misses[misses > 0.0]
-    refused = search.direct.refused
+    refused = search.windows.refused
     if not len(missing) and not refused:
         return None
     counts: dict[str, int] = {}
@@ -40,16 +37,20 @@ def explain_window(search: WindowSearch, iterations: int) -> NoPlan | None:
         begin, end = (100.0 * phase for phase in evaluator.phases or (0.0, 1.0))
         where = f"between {begin:g} % and {end:g} % of the breath by {missing.min():.2f} mm at least"
         counts[f"miss the moving target {where}, wherever they aim"] = len(missing)
-    for label, number in zip(*np.unique(search.direct.blockers, return_counts=True), strict=True):
-        if label:
-            counts[f"are stopped by {blocker_name(int(label))} in the masks' phase"] = int(number)
+    with_needle, blockers = task.system.needle is not None, search.windows.blockers
+    stopped = (
+        "are stopped by {} in the masks' phase" if with_needle else "are refused in the masks' phase: {}"
+    )
+    for why, number in search.arcs.reasons(blockers[blockers != 0]).items():
+        counts[stopped.format(why)] = number
     counts |= dict(_by_structure(refused.values()))
     left = len(reaching) - sum(counts.values())
     if left:
         counts["are refused by the whole proof in the masks' phase"] = left
     wanted = "a window" if evaluator.phases is None else "the phases {:g} to {:g}".format(*evaluator.phases)
     said = ", ".join(f"{number} {what}" for what, number in sorted(counts.items(), key=lambda each: -each[1]))
-    reason = f"of {plural(len(reaching), 'deployment')} whose needle reaches its aim {said}"
+    reaches = "whose needle reaches its aim" if with_needle else "that may reach their aim"
+    reason = f"of {plural(len(reaching), 'deployment')} {reaches} {said}"
     return NoPlan(
         f"No plan for {wanted} of the breath after {iterations} iterations: {reason}",
         reasons={f"breathing: deployments that {what}": number for what, number in counts.items()},
@@ -70,16 +71,17 @@ def _by_structure(limits: Iterable[WindowLimit]) -> Iterator[tuple[str, int]]:
         yield f"are refused {where} of the breath because {what}", len(found)
 
 
-def _advice(search: WindowSearch) -> str:
+def _advice(search: WindowSearch | WindowTubeSearch) -> str:
     """Say which of the phases that were asked for a plan was found for, the most that there are."""
     asked = search.window_evaluator.phases
+    simplest = "" if search.task.system.needle is None else " by a single arc"
     if asked is None:
-        return "No phase of the breath has a plan by a single arc; plan without --objective window"
+        return f"No phase of the breath has a plan{simplest}; plan without --objective window"
     motion = require_motion(search.task.lung)
     middle = min(max(motion.masks_phase, asked[0]), asked[1])
-    widest = WindowSearch(search.task, search.atlas, None, widest=True, middle=middle)
+    widest = window_search(search.task, search.atlas, None, widest=True, middle=middle)
     best = (0.0, 0.0)
-    for number, step in enumerate(widest.direct.steps()):
+    for number, step in enumerate(widest.windows.steps()):
         window = widest.window_evaluator.window
         for begin, end in () if step.candidate is None or window is None else window.phases.tolist():
             held = max(begin, asked[0]), min(end, asked[1])
@@ -88,5 +90,5 @@ def _advice(search: WindowSearch) -> str:
             break
     first, last = math.ceil(100.0 * best[0]) / 100.0, math.floor(100.0 * best[1]) / 100.0
     if last - first < WORTH_SAYING:
-        return "No part of these phases was found that has a plan by a single arc"
+        return f"No part of these phases was found that has a plan{simplest}"
     return f"The phases {first:g} to {last:g} have a plan (--phases {first:g}:{last:g})"

@@ -21,7 +21,7 @@ from lungaccess.planning.constraints import holds
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.search.base import AtlasBound, Step
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
-from lungaccess.planning.coupled.search.variation import SHIFT_MM, SMALLEST, TURN_RAD, varied
+from lungaccess.planning.coupled.search.variation import SMALLEST, random_change, varied
 from lungaccess.planning.driver import Turn
 from lungaccess.planning.success.judges import (
     ChanceJudge,
@@ -237,7 +237,7 @@ class ContestFinder:
 
     def _varied(self, best: Contender, rng: np.random.Generator, size: float) -> Contender | None:
         """Return the best with other rotation and insertions, if it is proved."""
-        turn, *shifts = (rng.standard_normal(3) * (TURN_RAD, SHIFT_MM, SHIFT_MM) * size).tolist()
+        turn, *shifts = random_change(rng, size, self._task.system.tubes)
         direct = self._direct
         evaluator = CandidateEvaluator(self._task) if direct is None else direct.evaluator
         made = varied(evaluator, best.candidate, turn, shifts)

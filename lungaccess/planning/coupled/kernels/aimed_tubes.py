@@ -60,12 +60,12 @@ def aim_tubes(
     outers,
     inners,
     shapes,
-    target,
+    targets,
     enough,
     found,
     why,
 ):
-    """Aim the tubes at a target from many scope tips, and validate and cost what hits it.
+    """Aim the tubes at targets from many scope tips, and validate and cost what hits them.
 
     Parameters
     ----------
@@ -84,7 +84,8 @@ def aim_tubes(
         Insertions from which each begins, mm.
     shapes : ManyShapes
         The shapes from which they begin instead where tubes are not planar.
-    target : tuple of 3 floats
+    targets : (K, 3) float64
+        Where they are to end from each pose.
     enough : int
         So many deployments end the attempts.
     found : (N, JOINTS + 2 n) float64
@@ -96,7 +97,8 @@ def aim_tubes(
     trace = np.zeros(N_TRACE)
     tip = np.zeros(9)
     for n in range(pose_of.shape[0]):
-        base = scope_poses[pose_of[n]]
+        base, goal = scope_poses[pose_of[n]], targets[pose_of[n]]
+        target = (goal[0], goal[1], goal[2])
         found[n, COST] = math.inf
         why[n] = NOT_TRIED
         if enough <= 0 or not allowed[pose_of[n]]:

@@ -83,16 +83,26 @@ class AimStarts(NamedTuple):
         return cls(made.outer_mm[entries], made.inner_mm[entries], shapes)
 
     @classmethod
-    def around(cls, tubes: ConcentricTubes, found: Float, count: int) -> AimStarts | None:
-        """Return `count` times what was found before; None if tubes that are not planar refuse it."""
-        shapes, ones, design = NO_SHAPES, np.ones(count), design_arrays(tubes)
+    def around(
+        cls, tubes: ConcentricTubes, insertions_mm: tuple[float, float], joints: Float, count: int
+    ) -> AimStarts | None:
+        """Return `count` times one deployment; None if tubes that are not planar refuse it.
+
+        Parameters
+        ----------
+        insertions_mm : tuple of 2 floats
+            Of outer and inner tube.
+        joints : (2 n,) float64
+            Insertions and rotations of tubes that are not planar, see `TubeShape`.
+        """
+        shapes, design = NO_SHAPES, design_arrays(tubes)
         if design is not None:
-            n = len(tubes.nested)
-            made = deployed(design, found[JOINTS : JOINTS + n], found[JOINTS + n :])
+            made = deployed(design, *np.split(joints, 2))
             if made is None:
                 return None
             shapes = copies(made, count)
-        return cls(found[OUTER] * ones, found[INNER] * ones, shapes)
+        outer, inner = insertions_mm
+        return cls(np.full(count, outer), np.full(count, inner), shapes)
 
 
 class TubeAiming:
@@ -118,13 +128,14 @@ class TubeAiming:
         self._weights = arrays._replace(map_integral=0.0, voxel_sum=0.0), of_map, of_tubes
 
     def aim(
-        self, target: Float, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts, enough: int = 0
+        self, ends: Float, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts, enough: int = 0
     ) -> tuple[Float, Int]:
-        """Aim the tubes at a point from scope tips.
+        """Aim the tubes at a point from scope tips, or from each at its own.
 
         Parameters
         ----------
-        target : (3,) float64, LPS mm
+        ends : (3,) or (K, 3) float64, LPS mm
+            Where they are to end.
         tips : (K, 9) float64
         allowed : (K,) bool
             Which of them the scope can take.
@@ -147,18 +158,21 @@ class TubeAiming:
         found = np.zeros((len(row_of), JOINTS + len(scratch[0].joints)))
         why = np.zeros(len(row_of), dtype=np.int64)
         tube = (self._environment, self._constants, self._design, *scratch)
-        x, y, z = target.tolist()
+        points = np.ascontiguousarray(np.broadcast_to(ends, (len(tips), 3)))
         aim_tubes(
             tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), *starts,
-            (x, y, z), enough or len(row_of), found, why,
+            points, enough or len(row_of), found, why,
         )  # fmt: skip
         return found, why
 
 
-def near_mm(atlas: Atlas, point: Float) -> Float:
-    """Return how near to a point (3,) deployments have to end to be aimed at it, by their scope tips (S,)."""
+def near_mm(atlas: Atlas, ends: Float) -> Float:
+    """Return how near to their ends deployments have to come to be aimed there, by their scope tips (S,).
+
+    The ends are one point (3,) for all, or one for each scope tip (S, 3).
+    """
     tips = atlas.motions.tips
-    aside = np.linalg.norm(np.cross(point - tips[:, :3], tips[:, 3:6]), axis=1)
+    aside = np.linalg.norm(np.cross(ends - tips[:, :3], tips[:, 3:6]), axis=1)
     return np.asarray(STOPS_MM + TURN_RAD * aside)
 
 
@@ -177,10 +191,10 @@ def nearest_of_each_tip(atlas: Atlas, entries: Int, away_mm: Float) -> Int:
     return ordered[np.sort(first)]
 
 
-def tips_of(atlas: Atlas, entries: Int) -> tuple[Float, Int]:
-    """Return the scope tips (K, 9) of entries (N,) of an atlas, and which of them each entry has."""
+def tips_of(atlas: Atlas, entries: Int) -> tuple[Int, Float, Int]:
+    """Return the scope tips of entries (N,) of an atlas, numbers (K,) and rows (K, 9), and that of each."""
     sites, row_of = np.unique(atlas.deployments.site[entries], return_inverse=True)
-    return np.ascontiguousarray(atlas.motions.tips[sites]), row_of.ravel()
+    return sites, np.ascontiguousarray(atlas.motions.tips[sites]), row_of.ravel()
 
 
 class AimedFromPose:
@@ -257,7 +271,16 @@ def reasons_of(why: Int) -> dict[str, int]:
 
 
 class AimedTubes:
-    """The deployments, from the scope tips of an atlas, that end at the target of a task.
+    """The deployments, from the scope tips of an atlas, that end at the target of a task or beside it.
+
+    Parameters
+    ----------
+    task : Task
+    atlas : Atlas
+    evaluator : CandidateEvaluator, optional
+        Made of the task if None.
+    aims : (S, 3) float64, optional
+        Where the tubes from each scope tip end, LPS mm, nan for none; at the target if None.
 
     Attributes
     ----------
@@ -268,63 +291,59 @@ class AimedTubes:
         Distance of the target from the nearest tip of the tubes in the atlas; infinite if there is none.
     """
 
-    def __init__(self, task: Task, atlas: Atlas) -> None:
+    def __init__(
+        self, task: Task, atlas: Atlas, evaluator: CandidateEvaluator | None = None, aims: Float | None = None
+    ) -> None:
         self.task, self.atlas = task, atlas
-        self.evaluator = CandidateEvaluator(task)
-        entries = atlas.deployments
-        away = np.linalg.norm(entries.positions - task.target.lps_mm, axis=1)
+        self.evaluator = evaluator or CandidateEvaluator(task)
+        entries, target = atlas.deployments, task.target.lps_mm
+        self._aims = np.broadcast_to(target, (atlas.motions.count, 3)) if aims is None else aims
+        away = np.linalg.norm(entries.positions - self._aims[entries.site], axis=1)
+        away[np.isnan(away)] = math.inf
         self.nearest_mm = float(away.min(initial=math.inf))
-        near = np.flatnonzero(away <= near_mm(atlas, task.target.lps_mm)[entries.site])
+        near = np.flatnonzero(away <= near_mm(atlas, self._aims)[entries.site])
         self.promising: Int = nearest_of_each_tip(atlas, near, away[near])
         self._aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
 
     def aim(self, entries: Int) -> tuple[Float, Int]:
-        """Aim from entries of the atlas; see `aim_from`."""
-        tips, row_of = tips_of(self.atlas, entries)
-        allowed = np.ones(len(tips), dtype=np.bool_)
-        return self.aim_from(tips, allowed, row_of, AimStarts.of(self.atlas, entries))
+        """Aim from entries (N,) of the atlas at the aims of their scope tips; see `TubeAiming.aim`."""
+        sites, tips, row_of = tips_of(self.atlas, entries)
+        ends, starts = self._aims[sites], AimStarts.of(self.atlas, entries)
+        return self._aiming.aim(ends, tips, np.isfinite(ends[:, 0]), row_of, starts)
 
-    def aim_from(self, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts) -> tuple[Float, Int]:
-        """Aim the tubes from scope tips, and count why they are refused; see `TubeAiming.aim`.
+    def aim_from(self, tips: Float, allowed: Bool, starts: AimStarts) -> tuple[Float, Int]:
+        """Aim once from each of other scope tips (N, 9); see `TubeAiming.aim`."""
+        ends = np.array([self.evaluator.aim(tip) for tip in tips[:, :3]]).reshape(-1, 3)
+        return self._aiming.aim(ends, tips, allowed, np.arange(len(tips)), starts)
 
-        Returns
-        -------
-        found : (N, JOINTS + 2 n) float64
-        clear : (C,) int64
-            The attempts with a deployment, the cheapest first.
-        """
-        target = self.task.target.lps_mm
-        found, why = self._aiming.aim(target, tips, allowed, row_of, starts)
-        self.evaluator.blocked.update(reasons_of(why))
-        clear = np.flatnonzero(np.isfinite(found[:, COST]))
-        return found, clear[np.argsort(found[clear, COST], kind="stable")]
+    def reasons(self, blockers: Int) -> dict[str, int]:
+        """Return how many attempts (N,) each reason refused, in words."""
+        return reasons_of(blockers)
 
     def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
-        """Return for entries (E,) whether they are refused, 1 if so, their estimated costs, and the least."""
-        found, clear = self.aim(chosen)
-        refused = np.ones(len(chosen), dtype=np.int64)
-        refused[clear] = 0
-        return refused, found[:, COST], float(found[:, COST].min(initial=math.inf))
+        """Return for entries (E,) why they are refused, 0 if not, their estimated costs, and the least."""
+        found, why = self.aim(chosen)
+        return why, found[:, COST], float(found[:, COST].min(initial=math.inf))
 
     def clear(self) -> Int:
-        """Return the entries (C,) with a deployment to the target, the cheapest first."""
-        return self.promising[self.aim(self.promising)[1]]
+        """Return the entries (C,) with a deployment that ends there, the cheapest first."""
+        return self.promising[cheapest_first(self.aim(self.promising)[0])]
+
+    def candidate(self, entry: int) -> Candidate | None:
+        """Return the deployment from the scope tip of an entry, None if the tubes are refused."""
+        found = self.aim(np.array([entry]))[0][0]
+        return self.made(self.tip(entry), found) if np.isfinite(found[COST]) else None
 
     def proved(self, entry: int) -> Candidate | None:
         """Return the deployment from the scope tip of an entry, None if its proof fails."""
-        found, clear = self.aim(np.array([entry]))
-        if not len(clear):
-            return None
-        candidate = self.candidate(self.tip(entry), found[0])
-        proved = candidate is not None and self.evaluator.proves(candidate.deployment, candidate.path)
-        return candidate if proved else None
+        candidate = self.candidate(entry)
+        return candidate if candidate is not None and self.evaluator.accepts(candidate) else None
 
     def lines(self, chosen: Int, samples: int) -> Float:
         """Return points (E, samples, 3) of the tubes in tissue from the scope tips of entries."""
-        rows, _clear = self.aim(chosen)
         lines = np.zeros((len(chosen), samples, 3))
-        for line, entry, row in zip(lines, chosen.tolist(), rows, strict=True):
-            candidate = self.candidate(self.tip(entry), row)
+        for line, entry, row in zip(lines, chosen.tolist(), self.aim(chosen)[0], strict=True):
+            candidate = self.made(self.tip(entry), row)
             if candidate is not None:
                 path = candidate.path
                 poses, _mm = poses_on_pieces(path.lps_from_start, path.arcs, path.length_mm / samples)
@@ -335,6 +354,12 @@ class AimedTubes:
         """Return the scope tip of an entry."""
         return self.atlas.motions.tip(int(self.atlas.deployments.site[entry]))
 
-    def candidate(self, tip: ScopeTip, found: Float) -> Candidate | None:
+    def made(self, tip: ScopeTip, found: Float) -> Candidate | None:
         """Return a row of what was found as a candidate, None if the tubes are refused."""
         return self.evaluator.aimed(tip, *chosen_of(self.task.system.tubes, found))
+
+
+def cheapest_first(found: Float) -> Int:
+    """Return the rows (C,) of what was found (N, ...) that have a deployment, the cheapest first."""
+    clear = np.flatnonzero(np.isfinite(found[:, COST]))
+    return clear[np.argsort(found[clear, COST], kind="stable")]

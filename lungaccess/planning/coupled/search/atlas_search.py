@@ -10,7 +10,7 @@ from itertools import count, islice
 import numpy as np
 
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled.search.base import DirectSearch, Incumbent, Step, evaluated_step
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
 from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.local_sampling import sampling_near_target
@@ -50,7 +50,7 @@ class AtlasSearch:
         self.blocked = self.evaluator.blocked
         self.incumbent = Incumbent()
         self._needle_planner = NamedNeedlePlanner(self.evaluator, PLANNER)
-        self.direct = DirectArcSearch(self.arcs, self.incumbent, self.settings)
+        self.direct: DirectSearch = DirectArcSearch(self.arcs, self.incumbent, self.settings)
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
         self._share = (0, 1)
         self._refined_cost = math.inf

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
 
 from anatomy.base.records import frozen_value
+from anatomy.base.typed import Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -94,6 +95,21 @@ class ParallelSearch(PlanSearch, Protocol):
 
     def is_futile(self, iteration: int) -> bool:
         """Tell whether nothing will be found after so many iterations without a candidate."""
+
+
+class DirectSearch(Protocol):
+    """What looks at the simplest ways from the entries of an atlas before a search goes on from the best.
+
+    Attributes
+    ----------
+    clear : (C,) int64
+        After its steps the entries with a clear way, the best first.
+    """
+
+    clear: Int
+
+    def steps(self) -> Iterator[Step]:
+        """Look at all entries, a few in each step; a step has a candidate if it is the best so far."""
 
 
 SearchFactory = Callable[[Task, Atlas], PlanSearch]

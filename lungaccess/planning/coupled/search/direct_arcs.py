@@ -15,7 +15,7 @@ from lungaccess.planning.coupled.kernels.tubes_cost import costs_in_tissue
 from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
 from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
 from lungaccess.plans.candidate import Candidate
-from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.plans.evaluator import CandidateEvaluator, blocker_counts
 from lungaccess.problem.task import Task
 from stages.needle import NeedleEnvironment, direct_arcs, workspace_lengths
 from stages.tube import Deployments, shapes_of, tube_constants
@@ -107,6 +107,10 @@ class DirectArcs:
             for whole, part in zip(found, parts, strict=True):
                 whole[rows] = part
         return found
+
+    def reasons(self, blockers: Int) -> dict[str, int]:
+        """Return how many arcs `(N,)` each blocker stops, by its name."""
+        return blocker_counts(blockers)
 
     def clear(self) -> Int:
         """Return the deployments (C,) with a clear arc, the shortest first."""

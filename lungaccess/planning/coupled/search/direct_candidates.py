@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from numpy.typing import ArrayLike
-
-from anatomy.base.typed import Float, Int, UInt64
-from anatomy.lung import Lung
+from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
-from lungaccess.planning.coupled.search.tube_reach import TubeReachScan
-from lungaccess.planning.coupled.search.window_reach import WindowReachScan
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
-from stages.needle import DEFAULT_ARCS, Reached, ReachScan, needle_environment
 
 
 class DirectCandidates(Protocol):
@@ -36,8 +30,14 @@ class DirectCandidates(Protocol):
     def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
         """Return for entries (E,) what blocks them, 0 for nothing, their estimated costs, and the least."""
 
+    def reasons(self, blockers: Int) -> dict[str, int]:
+        """Return what blocks entries (E,) in words, and how many of them."""
+
     def clear(self) -> Int:
         """Return the entries (C,) with a clear way, the best first."""
+
+    def candidate(self, entry: int) -> Candidate | None:
+        """Return the way from an entry as a candidate, None if the tubes are refused."""
 
     def proved(self, entry: int) -> Candidate | None:
         """Return the way from an entry as a candidate, None if its proof fails."""
@@ -46,41 +46,17 @@ class DirectCandidates(Protocol):
         """Return points (E, samples, 3) of what the costs are of, LPS mm."""
 
 
-class Scan(Protocol):
-    """Tells which of many points are reached, and how well."""
-
-    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
-        """Try points (N, 3), LPS mm; see `stages.needle.ReachScan.reach`."""
-
-
-def reach_scan(
-    atlas: Atlas,
-    *,
-    arcs: int = DEFAULT_ARCS,
-    trees: int = 0,
-    during: tuple[Lung, tuple[float, float]] | None = None,
-) -> Scan:
-    """Return what tells which points the system of an atlas reaches: by its needle, or by its tubes alone.
+def direct_candidates(
+    task: Task, atlas: Atlas, evaluator: CandidateEvaluator | None = None, aims: Float | None = None
+) -> DirectCandidates:
+    """Return the simplest ways to the target of a task, or to aims beside it.
 
     Parameters
     ----------
-    arcs, trees : int
-        See `stages.needle.ReachScan`; without a needle there are no trees, and `arcs` counts deployments.
-    during : tuple of Lung and phases, optional
-        The lung with its motion, and phases in all of which points are to be reached; then all arcs count,
-        and no trees.
+    evaluator : CandidateEvaluator, optional
+        What proves them, for instance also for phases of the breath; made of the task if None.
+    aims : (S, 3) float64, optional
+        Where the ways from each scope tip of the atlas end, LPS mm, nan for none; at the target if None.
     """
-    if during is not None:
-        return WindowReachScan(during[0], atlas, during[1])
-    system, entries = atlas.system, atlas.deployments
-    if system.needle is None:
-        return TubeReachScan(atlas, deployments=arcs)
-    environment = needle_environment(
-        atlas.lung, system.needle, system.margins, with_fissures=atlas.with_fissures
-    )
-    return ReachScan(environment, entries.positions, entries.tangents, entries.branch, arcs=arcs, trees=trees)
-
-
-def direct_candidates(task: Task, atlas: Atlas) -> DirectCandidates:
-    """Return the simplest ways to the target of a task."""
-    return AimedTubes(task, atlas) if task.system.needle is None else DirectArcs(task, atlas)
+    made = AimedTubes if task.system.needle is None else DirectArcs
+    return made(task, atlas, evaluator, aims)

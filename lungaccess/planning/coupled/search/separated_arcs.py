@@ -25,13 +25,13 @@ def separated_candidates(arcs: DirectCandidates, count: int, separation_mm: floa
     The nearest deployments are evaluated with an even sample of the others, then further samples, but only
     as long as there are not enough plans.
     """
-    near, evaluator = arcs.promising, arcs.evaluator
+    near = arcs.promising
     pool, pool_costs = np.zeros(0, dtype=np.int64), np.zeros(0)
     proved: dict[int, Candidate | None] = {}
     chosen: list[int] = []
     for sample in _samples(arcs.atlas.deployments.branch[near]):
         blockers, costs, _best = arcs.evaluate(near[sample], math.inf)
-        evaluator.count_blockers(blockers)
+        arcs.evaluator.blocked.update(arcs.reasons(blockers))
         clear = np.flatnonzero(blockers == 0)
         pool, pool_costs = np.append(pool, near[sample][clear]), np.append(pool_costs, costs[clear])
         chosen = _chosen(arcs, pool[np.argsort(pool_costs, kind="stable")], count, separation_mm, proved)

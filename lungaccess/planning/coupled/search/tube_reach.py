@@ -20,7 +20,7 @@ from lungaccess.planning.coupled.search.aimed_tubes import (
     tips_of,
 )
 from lungaccess.plans.candidate import tubes_in_tissue
-from stages.needle import DEFAULT_ARCS, DIRECT, UNREACHED, Objective, Reached
+from stages.needle import DEFAULT_ARCS, DIRECT, UNREACHED, ArcPath, Objective, Reached
 from stages.tube import DeploymentValidator
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class TubeReachScan:
         chosen = nearest_of_each_tip(atlas, close[near], away_mm[near])
         if not len(chosen):
             return None
-        tips, row_of = tips_of(atlas, chosen)
+        _sites, tips, row_of = tips_of(atlas, chosen)
         found, _why = self._aiming.aim(
             point, tips, np.ones(len(tips), dtype=np.bool_), row_of, AimStarts.of(atlas, chosen), self._enough
         )
@@ -106,7 +106,7 @@ class TubeReachScan:
         return int(chosen[best]), float(found[best, COST]), self._clearance_mm(int(chosen[best]), found[best])
 
     def _clearance_mm(self, entry: int, found: Float) -> float:
-        """Return a lower bound of the clearance of the tubes in tissue, the pierced branch passed over."""
+        """Return a lower bound of the clearance of what was found."""
         atlas = self._atlas
         frame = atlas.motions.tip(int(atlas.deployments.site[entry])).lps_from_scope_tip
         system, fissures = atlas.system, atlas.with_fissures
@@ -114,12 +114,17 @@ class TubeReachScan:
         made = tubes.choose(frame, *chosen_of(system.tubes, found))
         if isinstance(made, str):
             return 0.0
-        points, _mm = tubes_in_tissue(system, frame, made).sample(STEP_MM)
-        names = ("airway", "vessel", "pleura", *(("fissure",) if fissures else ()))
-        least = min(
-            atlas.lung.least_clearance_mm(
-                points, name, FIELD_BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=made.branch
-            )
-            for name in names
+        return tubes_clearance_mm(atlas, tubes_in_tissue(system, frame, made), made.branch)
+
+
+def tubes_clearance_mm(atlas: Atlas, path: ArcPath, branch: int) -> float:
+    """Return a lower bound of the clearance of tubes in tissue, the pierced branch passed over."""
+    points, _mm = path.sample(STEP_MM)
+    names = ("airway", "vessel", "pleura", *(("fissure",) if atlas.with_fissures else ()))
+    least = min(
+        atlas.lung.least_clearance_mm(
+            points, name, FIELD_BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=branch
         )
-        return max(least - 0.5 * STEP_MM, 0.0)
+        for name in names
+    )
+    return max(least - 0.5 * STEP_MM, 0.0)

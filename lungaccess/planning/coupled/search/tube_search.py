@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
 
 import numpy as np
 
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.kernels.aimed_tubes import COST
-from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes, AimStarts
+from lungaccess.planning.coupled.kernels.aimed_tubes import COST, INNER, JOINTS, OUTER
+from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes, AimStarts, cheapest_first
 from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
 from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK
-from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.task import Task
 from stages.scope import evenly
 
@@ -37,66 +35,84 @@ class TubeSearch:
     ----------
     blocked : Counter of str
         How many attempts were refused, by the reason.
+    incumbent : Incumbent
+        The best candidate so far.
+    clear : (C,) int64
+        After the direct steps the entries of the atlas with a deployment to the target, the cheapest first.
     """
 
-    def __init__(self, task: Task, atlas: Atlas) -> None:
-        self._aimed = self.arcs = AimedTubes(task, atlas)
-        self._atlas, self._evaluator = atlas, self._aimed.evaluator
-        self.blocked = self._evaluator.blocked
-        self._incumbent = Incumbent()
+    def __init__(self, task: Task, atlas: Atlas, aimed: AimedTubes | None = None) -> None:
+        self.task, self.atlas = task, atlas
+        self.arcs = aimed or AimedTubes(task, atlas)
+        self.evaluator = self.arcs.evaluator
+        self.blocked = self.evaluator.blocked
+        self.incumbent = Incumbent()
+        self.clear: Int = np.zeros(0, dtype=np.int64)
+        self._share = (0, 1)
 
     def steps(self) -> Iterator[Step]:
         """Search until the caller stops or all is tried; the same task gives the same steps."""
-        clear: list[Int] = []
-        rows: list[Float] = []
-        near = self._aimed.promising
+        yield from self.direct_steps()
+        yield from self.further_steps()
+
+    def take_part(self, number: int, parts: int) -> None:
+        """Look along the motions of every so many of the tips."""
+        self._share = (number, parts)
+
+    def is_futile(self, iteration: int) -> bool:
+        """Tell that it goes on: it ends by itself."""
+        return False
+
+    def direct_steps(self) -> Iterator[Step]:
+        """Aim from the tips of the atlas, those first from which a deployment ends nearest."""
+        clear, costs = [self.clear], [np.zeros(0)]
+        near, phase = self.arcs.promising, "aiming the tubes"
         for begin in range(0, len(near), CHUNK):
             chunk = near[begin : begin + CHUNK]
-            found, order = self._aimed.aim(chunk)
-            yield Step(iteration=0, phase="aiming the tubes")
-            yield from self._finalists(chunk, found, order)
+            found, why = self.arcs.aim(chunk)
+            self.blocked.update(self.arcs.reasons(why))
+            order = cheapest_first(found)
+            yield Step(iteration=0, phase=phase)
+            yield from self._finalists(phase, chunk[order], found[order])
             clear.append(chunk[order])
-            rows.append(found[order])
-        if clear:
-            yield from self._along(np.concatenate(clear), np.concatenate(rows))
+            costs.append(found[order, COST])
+        self.clear = np.concatenate(clear)[np.argsort(np.concatenate(costs), kind="stable")]
 
-    def _finalists(self, entries: Int, found: Float, order: Int) -> Iterator[Step]:
+    def _finalists(self, phase: str, entries: Int, found: Float) -> Iterator[Step]:
         """Evaluate the cheapest in full, as long as one may be better than all before."""
         left = FINALISTS
-        for n in order.tolist():
-            if not left or found[n, COST] > ESTIMATE_SLACK * self._incumbent.cost:
+        for entry, row in zip(entries.tolist(), found, strict=True):
+            if not left or row[COST] > ESTIMATE_SLACK * self.incumbent.cost:
                 return
-            tip = self._aimed.tip(int(entries[n]))
-            step = self._step("aiming the tubes", self._aimed.candidate(tip, found[n]))
+            made = self.arcs.made(self.arcs.tip(entry), row)
+            step = evaluated_step(self.evaluator, phase, made)
             left -= step.candidate is not None
-            yield self._incumbent.improved(step)
+            yield self.incumbent.improved(step)
 
-    def _along(self, entries: Int, found: Float) -> Iterator[Step]:
+    def further_steps(self) -> Iterator[Step]:
         """Look along the motions, the cheapest first; each motion is an iteration."""
-        order = np.argsort(found[:, COST], kind="stable")
-        entries, found = entries[order], found[order]
-        row_of = {int(entry): n for n, entry in enumerate(entries)}
-        ordered = different(self._atlas.deployments, entries)
-        for number, entry in zip(count(1), ordered.tolist(), strict=False):
-            step = self._shifted(int(entry), found[row_of[int(entry)]])
-            yield self._incumbent.improved(replace(step, iteration=number))
+        number, parts = self._share
+        ordered = different(self.atlas.deployments, self.clear)[number::parts]
+        for iteration, entry in enumerate(ordered.tolist(), start=1):
+            step = self._shifted(int(entry))
+            yield self.incumbent.improved(replace(step, iteration=iteration))
 
-    def _shifted(self, entry: int, found: Float) -> Step:
+    def _shifted(self, entry: int) -> Step:
         """Return the best deployment from tips along the motion to that of an entry."""
-        tip = self._aimed.tip(entry)
-        phase, best = "looking along the motion of the scope", found
+        phase, tubes = "looking along the motion of the scope", self.task.system.tubes
+        first = self.arcs.aim(np.array([entry]))[0][0]
+        tip, best = self.arcs.tip(entry), first
         for shifts_mm in ROWS_MM:
-            row = self._evaluator.tip_rows.along(tip, shifts_mm)
-            numbers = np.arange(len(shifts_mm))
-            starts = AimStarts.around(self._evaluator.task.system.tubes, best, len(shifts_mm))
+            row = self.evaluator.tip_rows.along(tip, shifts_mm)
+            inserted = float(best[OUTER]), float(best[INNER])
+            starts = AimStarts.around(tubes, inserted, best[JOINTS:], len(shifts_mm))
             if starts is None:
                 break
-            rows, order = self._aimed.aim_from(row.tips, row.proved, numbers, starts)
+            rows, why = self.arcs.aim_from(row.tips, row.proved, starts)
+            self.blocked.update(self.arcs.reasons(why))
+            order = cheapest_first(rows)
             if len(order) and rows[order[0], COST] < best[COST]:
-                best, tip = rows[order[0]], self._evaluator.tip_rows.tip(row, int(order[0]))
-        if best is found or best[COST] > ESTIMATE_SLACK * self._incumbent.cost:
+                best, tip = rows[order[0]], self.evaluator.tip_rows.tip(row, int(order[0]))
+        if best is first or best[COST] > ESTIMATE_SLACK * self.incumbent.cost:
             return Step(iteration=0, phase=phase)
-        return self._step(phase, self._aimed.candidate(tip, best))
-
-    def _step(self, phase: str, candidate: Candidate | None) -> Step:
-        return evaluated_step(self._evaluator, phase, candidate)
+        return evaluated_step(self.evaluator, phase, self.arcs.made(tip, best))

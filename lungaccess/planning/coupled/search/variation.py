@@ -1,12 +1,18 @@
-"""Variations of a candidate: other rotation and insertions from the same scope tip, and a direct arc."""
+"""Variations of a candidate: other rotation and insertions with a direct arc, or tubes aimed anew."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
+from anatomy.base.typed import Float
+from lungaccess.planning.coupled.kernels.aimed_tubes import COST
+from lungaccess.planning.coupled.search.aimed_tubes import AimStarts, TubeAiming, chosen_of
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
+from stages.tube import ConcentricTubes, Deployment, TubeShape, deployed, design_arrays, shape_of_arrays
 
 TURN_RAD, SHIFT_MM = math.radians(10.0), 2.0
 """Standard deviations of the first variations: less than the spacing of the atlas."""
@@ -14,16 +20,93 @@ SMALLEST = 0.02
 """Share of them below which a variation changes nothing that counts."""
 
 
+def random_change(rng: np.random.Generator, size: float, tubes: ConcentricTubes) -> list[float]:
+    """Return what `varied` changes, at random: a turn, two shifts, and turns of tubes against the others.
+
+    The spreads are TURN_RAD and SHIFT_MM times `size`.
+    """
+    relative = 0 if tubes.planar else len(tubes.nested)
+    spreads = np.array([TURN_RAD, SHIFT_MM, SHIFT_MM, *[TURN_RAD] * relative])
+    changes: list[float] = (rng.standard_normal(len(spreads)) * spreads * size).tolist()
+    return changes
+
+
 def varied(
-    evaluator: CandidateEvaluator, candidate: Candidate, turn_rad: float, shifts_mm: Sequence[float]
+    evaluator: CandidateEvaluator,
+    candidate: Candidate,
+    turn_rad: float,
+    shifts: Sequence[float],
+    end: Float | None = None,
 ) -> Candidate | None:
-    """Return a candidate turned and shifted; None if the tubes refuse it, or are not planar."""
-    old = candidate.deployment
-    if old.shape is not None:
-        return None
-    outer = max(old.outer_mm + shifts_mm[0], 0.0)
-    inner = max(old.inner_mm + shifts_mm[1], outer)
-    if evaluator.task.system.tubes.outer is None:
+    """Return a candidate that is turned and shifted; None if the tubes refuse it.
+
+    With a needle its arc follows from the tubes.  Without one the tubes have to end where they are to: then
+    the first shift is that of the scope along its motion, and the tubes are aimed from the changed ones.
+
+    Parameters
+    ----------
+    turn_rad : float
+        By which all tubes are turned.
+    shifts : sequence of float
+        Of outer and inner tube, mm.  Behind them, of tubes that are not planar, by how much each is turned
+        against the others, the innermost first, rad.
+    end : (3,) float64, optional
+        Where the devices end, LPS mm; what the evaluator aims at if None.
+    """
+    tubes, old, tip = evaluator.task.system.tubes, candidate.deployment, candidate.tip
+    joints = _changed_joints(tubes, old, shifts)
+    outer = max(old.outer_mm + shifts[0], 0.0)
+    inner = max(old.inner_mm + shifts[1], outer)
+    if tubes.outer is None:
         outer = inner
-    turned = (old.rotation_rad + turn_rad) % (2.0 * math.pi)
-    return evaluator.direct(candidate.tip, turned, outer, inner)
+    if evaluator.task.system.needle is None:
+        return _aimed_anew(evaluator, candidate, shifts[0], (outer, inner), joints, end)
+    turned, shape = (old.rotation_rad + turn_rad) % (2.0 * math.pi), _shape_of(tubes, joints)
+    if shape is None:
+        return None
+    if not isinstance(shape, int):
+        outer, inner = float(joints[len(joints) // 2 - 1]), float(joints[0])
+    return evaluator.direct(tip, turned, outer, inner, shape, end)
+
+
+def _changed_joints(tubes: ConcentricTubes, old: Deployment, shifts: Sequence[float]) -> Float:
+    """Return insertions and rotations `(2 n,)` of tubes that are not planar; of planar ones nothing."""
+    if old.shape is None:
+        return np.zeros(0)
+    n = len(tubes.nested)
+    inserted = np.maximum(old.shape.insertions_mm + np.linspace(shifts[1], shifts[0], n), 0.0)
+    turns = np.array(shifts[2:] or [0.0] * n)
+    # The first bent tube is what the others are turned against.
+    bent = np.array([bool(tube.bends) for tube in tubes.nested])
+    turned = old.shape.rotations_rad + np.where(bent & (np.cumsum(bent) > 1), turns, 0.0)
+    return np.concatenate([np.minimum.accumulate(inserted), turned])
+
+
+def _shape_of(tubes: ConcentricTubes, joints: Float) -> int | TubeShape | None:
+    """Return the shape of joints as `DeploymentValidator.choose` takes it, None if the tubes refuse it."""
+    design = design_arrays(tubes)
+    made = None if design is None else deployed(design, *np.split(joints, 2))
+    if made is None:
+        return -1 if design is None else None
+    return shape_of_arrays(made)
+
+
+def _aimed_anew(
+    evaluator: CandidateEvaluator,
+    candidate: Candidate,
+    shift_mm: float,
+    insertions_mm: tuple[float, float],
+    joints: Float,
+    end: Float | None,
+) -> Candidate | None:
+    """Return the tubes aimed from a scope tip farther along its motion, beginning with changed ones."""
+    task, row = evaluator.task, evaluator.tip_rows.along(candidate.tip, [shift_mm])
+    starts = AimStarts.around(task.system.tubes, insertions_mm, joints, 1)
+    if starts is None or not row.proved[0]:
+        return None
+    ends = evaluator.aim(row.tips[0, :3]) if end is None else end
+    aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
+    found, _why = aiming.aim(ends, row.tips, row.proved, np.zeros(1, dtype=np.int64), starts)
+    if not np.isfinite(found[0, COST]):
+        return None
+    return evaluator.aimed(evaluator.tip_rows.tip(row, 0), *chosen_of(task.system.tubes, found[0]))

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from anatomy.base.typed import Int, UInt64
 from anatomy.lung import Lung
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.search.window_search import WindowSearch
+from lungaccess.planning.coupled.search.tube_reach import tubes_clearance_mm
+from lungaccess.planning.coupled.search.window_search import window_search
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.target import Target
@@ -23,9 +24,10 @@ STEP_MM = 0.25
 
 
 class WindowReachScan:
-    """The direct arcs of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
+    """The direct ways of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
 
-    A point is reached if an arc to an aim beside it is proved clear and on target in all of the phases.
+    A point is reached if an arc of the needle, or the tubes alone, to an aim beside it is proved clear and on
+    target in all of the phases.
 
     Parameters
     ----------
@@ -35,8 +37,6 @@ class WindowReachScan:
 
     def __init__(self, lung: Lung, atlas: Atlas, phases: tuple[float, float]) -> None:
         self._lung, self._atlas, self._phases = lung, atlas, phases
-        needle = atlas.system.require_needle("A map for phases of the breath")
-        self._exempt_mm = needle.exit_exemption_mm
         self._field = lung.obstacle_field(with_fissures=atlas.with_fissures)
 
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
@@ -52,8 +52,8 @@ class WindowReachScan:
         for n, point in enumerate(places):
             target = Target(lps_mm=point, origin="point")
             task = Task(lung=self._lung, system=self._atlas.system, target=target)
-            search = WindowSearch(task, self._atlas, self._phases, widest=False)
-            found = [step for step in search.direct.steps() if step.candidate is not None]
+            search = window_search(task, self._atlas, self._phases, widest=False)
+            found = [step for step in search.direct_steps() if step.candidate is not None]
             if found and found[-1].candidate is not None:
                 kinds[n], cost[n] = DIRECT, found[-1].cost
                 clearance[n] = self._clearance_mm(found[-1].candidate)
@@ -62,9 +62,12 @@ class WindowReachScan:
         return Reached(kinds=kinds, cost=cost, clearance_mm=clearance, entries=entries, window_share=share)
 
     def _clearance_mm(self, candidate: Candidate) -> float:
-        """Return a lower bound of the clearance of a needle beyond the exempt length."""
+        """Return a lower bound of the clearance of a needle beyond the exempt length, or of the tubes."""
+        needle = self._atlas.system.needle
+        if needle is None:
+            return tubes_clearance_mm(self._atlas, candidate.path, candidate.deployment.branch)
         points, lengths = candidate.path.sample(STEP_MM)
-        beyond = self._field.lower_bound_mm(points[lengths >= self._exempt_mm])
+        beyond = self._field.lower_bound_mm(points[lengths >= needle.exit_exemption_mm])
         return max(float(beyond.min(initial=math.inf)) - 0.5 * STEP_MM, 0.0) if len(beyond) else 0.0
 
     def _share(self, task: Task, candidate: Candidate) -> float:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain, islice
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes, near_mm
 from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
-from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
+from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
-from lungaccess.planning.coupled.search.variation import SHIFT_MM, SMALLEST, TURN_RAD, varied
+from lungaccess.planning.coupled.search.tube_search import TubeSearch
+from lungaccess.planning.coupled.search.variation import SMALLEST, random_change, varied
 from lungaccess.plans.assemble import assemble, with_devices
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -28,8 +33,7 @@ from lungaccess.uncertainty.breathing.window import (
     first_limit,
     require_motion,
 )
-from stages.needle import ArcPath, direct_path
-from stages.scope import ScopeTip
+from stages.needle import ArcPath
 
 STEPS = 200
 """Windows that differ by less than half a percent of the breath count as equally wide: then cost decides."""
@@ -41,6 +45,8 @@ TOWARDS = 0.15
 """Standard deviation of the first variations of the phase about which an aim is made."""
 VARY_EVERY = 3
 """Steps of the other phases of the search for each variation of the window."""
+VARIATIONS = 200
+"""Variations with which the search of tubes alone ends, a few seconds: several times from wide to small."""
 SHRINK = 0.9
 """Variations become smaller with every one that fails, and are wide again when one succeeds."""
 _SETTINGS = SearchSettings(kept_slack=100.0)
@@ -60,6 +66,8 @@ class WindowEvaluator(CandidateEvaluator):
         Whether a wider window counts before cost.
     middle : float, optional
         See `MovingTarget`.
+    holds : callable, optional
+        See `CandidateEvaluator`.
 
     Attributes
     ----------
@@ -70,9 +78,15 @@ class WindowEvaluator(CandidateEvaluator):
     """
 
     def __init__(
-        self, task: Task, phases: tuple[float, float] | None, *, widest: bool, middle: float | None = None
+        self,
+        task: Task,
+        phases: tuple[float, float] | None,
+        *,
+        widest: bool,
+        middle: float | None = None,
+        holds: Callable[[Candidate], bool] | None = None,
     ) -> None:
-        super().__init__(task)
+        super().__init__(task, holds)
         self.moving = MovingTarget(
             require_motion(task.lung), task.target.lps_mm, phases, widened=widest, middle=middle
         )
@@ -89,9 +103,9 @@ class WindowEvaluator(CandidateEvaluator):
             self._aims[key] = self.moving.aim(tip_lps)
         return self._aims[key]
 
-    def aim(self, tip: ScopeTip) -> Float:
-        """Return the aim from a scope tip."""
-        return np.array(self.aim_from(tip.lps_from_scope_tip[:3, 3]).point_lps)
+    def aim(self, tip_lps: Float) -> Float:
+        """Return the aim from a place of the scope's tip, LPS mm."""
+        return np.array(self.aim_from(tip_lps).point_lps)
 
     def end_of(self, path: ArcPath) -> Float:
         """Return the end of a path: its window says whether that is near enough to the moving target."""
@@ -122,49 +136,86 @@ def cost_outside(share: float) -> float:
     return OUTSIDE_COST * (1.0 - math.floor(STEPS * share) / STEPS)
 
 
-def aims_by_site(evaluator: WindowEvaluator, atlas: Atlas) -> tuple[Float, Float, Float, Float]:
-    """Return aims `(S, 3)`, least misses, what is allowed, in mm, and most shares `(S,)` by scope tip.
+@frozen_record
+class WindowAims:
+    """Where devices from each of S scope tips have to end for a window.
 
-    They are nan for tips from which no needle gets near.
+    Parameters
+    ----------
+    points : (S, 3) float64
+        LPS mm; nan for tips from which no devices get near.
+    misses_mm : (S,) float64
+        Least miss of tips that are ruled out by it, else 0.
+    shares : (S,) float64
+        No end of the devices has the target within the tolerance in more of the breath.
     """
-    motion, phases = require_motion(evaluator.task.lung), evaluator.phases
-    held = phases is None or phases[0] <= motion.masks_phase <= phases[1]
-    environment = evaluator.environment
-    limits = environment.limits._replace(goal_tolerance_mm=2.0 * TOLERANCE_MM if held else FAR_MM)
-    near, _lengths = atlas.index.holding(replace(environment, limits=limits), evaluator.task.target.lps_mm)
-    found = np.full((atlas.motions.count, 6), np.nan)
-    for site in np.unique(atlas.deployments.site[near]).tolist():
-        aim = evaluator.aim_from(np.ascontiguousarray(atlas.motions.tips[site, :3]))
-        found[site] = *aim.point_lps, aim.least_miss_mm, aim.allowed_mm, aim.most_share
-    return found[:, :3], *found[:, 3:].T
+
+    points: Float
+    misses_mm: Float
+    shares: Float
+
+    @classmethod
+    def of(cls, evaluator: WindowEvaluator, atlas: Atlas) -> WindowAims:
+        """Return those of the scope tips of an atlas."""
+        motion, phases = require_motion(evaluator.task.lung), evaluator.phases
+        held = phases is None or phases[0] <= motion.masks_phase <= phases[1]
+        near = _ending_near(evaluator, atlas, 2.0 * TOLERANCE_MM if held else FAR_MM)
+        found = np.full((atlas.motions.count, 6), np.nan)
+        for site in np.unique(atlas.deployments.site[near]).tolist():
+            aim = evaluator.aim_from(np.ascontiguousarray(atlas.motions.tips[site, :3]))
+            found[site] = *aim.point_lps, aim.least_miss_mm, aim.allowed_mm, aim.most_share
+        misses, allowed = found[:, 3], found[:, 4]
+        ruled_out = np.where(misses > allowed, misses, 0.0)
+        return cls(points=found[:, :3], misses_mm=ruled_out, shares=found[:, 5])
+
+    @property
+    def reached(self) -> Float:
+        """The aims `(S, 3)` of tips that are not ruled out; nan for all others."""
+        return np.where((self.misses_mm > 0.0)[:, None], np.nan, self.points)
 
 
-class WindowArcSearch(DirectArcSearch):
-    """Evaluates the direct arcs of an atlas, those first that may be the best.
+def _ending_near(evaluator: WindowEvaluator, atlas: Atlas, within_mm: float) -> Int:
+    """Return the deployments from which devices may end within a distance of the target."""
+    target = evaluator.task.target.lps_mm
+    if evaluator.task.system.needle is None:
+        away = np.linalg.norm(atlas.deployments.positions - target, axis=1)
+        return np.flatnonzero(away <= near_mm(atlas, target)[atlas.deployments.site] + within_mm)
+    limits = evaluator.environment.limits._replace(goal_tolerance_mm=within_mm)
+    return atlas.index.holding(replace(evaluator.environment, limits=limits), target)[0]
+
+
+class WindowDirectSearch:
+    """Evaluates the direct candidates of an atlas, those first that may be the best.
 
     Attributes
     ----------
+    clear : (C,) int64
+        After the search the entries with a clear way, the best first.
     blockers : (N,) int64
-        What blocks the arcs from the deployments whose workspace holds their aim; see `DirectArcs.evaluate`.
+        What blocks the promising entries in the masks' phase; see `DirectCandidates.evaluate`.
     refused : dict of int to WindowLimit
-        What ends the window too early, by deployment.
+        What ends the window too early, by entry.
     """
 
-    def __init__(self, arcs: DirectArcs, evaluator: WindowEvaluator, shares: Float, incumbent: Incumbent):
-        super().__init__(arcs, incumbent, _SETTINGS)
-        self._evaluator, self._shares = evaluator, shares
+    phase = "direct candidates"
+
+    def __init__(
+        self, arcs: DirectCandidates, evaluator: WindowEvaluator, shares: Float, incumbent: Incumbent
+    ) -> None:
+        self._arcs, self._evaluator = arcs, evaluator
+        self._shares, self._incumbent = shares, incumbent
+        self.clear: Int = np.zeros(0, dtype=np.int64)
         self.blockers: Int = np.zeros(0, dtype=np.int64)
         self.refused: dict[int, WindowLimit] = {}
 
     def steps(self) -> Iterator[Step]:
-        """Yield a step for all arcs together, then one for each clear arc that may be the best."""
-        near, evaluator = self._arcs.in_workspace, self._evaluator
-        self.blockers = self._arcs.blockers(near)[0]
-        evaluator.count_blockers(self.blockers)
+        """Yield a step for all entries together, then one for each clear one that may be the best."""
+        near, evaluator = self._arcs.promising, self._evaluator
+        self.blockers, costs, _least = self._arcs.evaluate(near, math.inf)
+        evaluator.blocked.update(self._arcs.reasons(self.blockers))
         yield Step(iteration=0, phase=self.phase)
         clear = near[self.blockers == 0]
-        costs = self._arcs.evaluate(clear, math.inf)[1]
-        bounds = costs / ESTIMATE_SLACK
+        bounds = costs[self.blockers == 0] / ESTIMATE_SLACK
         if evaluator.widest:
             most = self._shares[self._arcs.atlas.deployments.site[clear]]
             bounds += [cost_outside(share) for share in most.tolist()]
@@ -188,67 +239,94 @@ class WindowSearch(AtlasSearch):
 
     Parameters
     ----------
-    task, atlas
-        As of `AtlasSearch`.
-    phases, widest, middle
-        As of `WindowEvaluator`.
+    evaluator : WindowEvaluator
+    atlas : Atlas
 
     Attributes
     ----------
-    aims : (S, 3) float64
-        By scope tip, LPS mm; nan for tips from which no needle gets near.
-    misses_mm : (S,) float64
-        Least miss of tips that are ruled out by it, else 0.
+    aims : WindowAims
+    windows : WindowDirectSearch
     """
 
-    def __init__(
-        self,
-        task: Task,
-        atlas: Atlas,
-        phases: tuple[float, float] | None,
-        *,
-        widest: bool,
-        middle: float | None = None,
-    ) -> None:
-        evaluator = WindowEvaluator(task, phases, widest=widest, middle=middle)
-        aims, misses, allowed, shares = aims_by_site(evaluator, atlas)
-        reached = np.where((misses <= allowed)[:, None], aims, np.nan)
-        super().__init__(task, atlas, _SETTINGS, DirectArcs(task, atlas, evaluator, reached))
-        self.window_evaluator, self.aims = evaluator, aims
-        self.misses_mm = np.where(misses > allowed, misses, 0.0)
-        self.direct: WindowArcSearch = WindowArcSearch(self.arcs, evaluator, shares, self.incumbent)
+    def __init__(self, evaluator: WindowEvaluator, atlas: Atlas) -> None:
+        self.window_evaluator, self.aims = evaluator, WindowAims.of(evaluator, atlas)
+        arcs = DirectArcs(evaluator.task, atlas, evaluator, self.aims.reached)
+        super().__init__(evaluator.task, atlas, _SETTINGS, arcs)
+        self.windows = self.direct = WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
 
     def _rounds(self) -> Iterator[Step]:
-        varied_too = self._varied()
+        varied_too = _variations(self.window_evaluator, self.incumbent, self._share[0])
         for number, step in enumerate(super()._rounds()):
             yield step
             if self.window_evaluator.widest and number % VARY_EVERY == 0:
                 yield next(varied_too)
 
-    def _varied(self) -> Iterator[Step]:
-        """Vary deployment and aim of the best candidate, as long as its window is not the whole breath."""
-        phase, evaluator, size = "variation", self.window_evaluator, 1.0
-        rng = np.random.Generator(np.random.PCG64([self.task.seed, VARY_EVERY]))
-        middle, nothing = self._middle, Step(iteration=0, phase=phase)
-        while True:
-            best = self.incumbent.candidate
-            if best is None or self.incumbent.cost < OUTSIDE_COST / STEPS:
-                yield nothing
-                continue
-            size = size if size >= SMALLEST else 1.0
-            turn, *shifts = (rng.standard_normal(3) * (TURN_RAD, SHIFT_MM, SHIFT_MM) * size).tolist()
-            towards = min(max(middle + TOWARDS * size * float(rng.standard_normal()), 0.0), 1.0)
-            made = varied(evaluator, best, turn, shifts)
-            if made is not None:
-                aim = evaluator.moving.aim(best.tip.lps_from_scope_tip[:3, 3], towards)
-                path = direct_path(made.deployment.lps_from_tip, np.array(aim.point_lps))
-                made = replace(made, path=path)
-            before = self.incumbent.cost
-            step = evaluated_step(evaluator, phase, made)
-            yield step
-            better = step.cost < before
-            size, middle = (1.0, towards) if better else (SHRINK * size, middle)
 
-    @property
-    def _middle(self) -> float:
-        return require_motion(self.task.lung).masks_phase
+class WindowTubeSearch(TubeSearch):
+    """The tubes aimed at the aims of all scope tips, then along each motion, and variations of the best.
+
+    Parameters and attributes are those of `WindowSearch`.
+    """
+
+    def __init__(self, evaluator: WindowEvaluator, atlas: Atlas) -> None:
+        self.window_evaluator, self.aims = evaluator, WindowAims.of(evaluator, atlas)
+        arcs = AimedTubes(evaluator.task, atlas, evaluator, self.aims.reached)
+        super().__init__(evaluator.task, atlas, arcs)
+        self.windows = WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
+
+    def direct_steps(self) -> Iterator[Step]:
+        """Aim from the tips of the atlas, those first that may be the best."""
+        yield from self.windows.steps()
+        self.clear = self.windows.clear
+
+    def further_steps(self) -> Iterator[Step]:
+        """Look along the motions, then vary the best; each motion and each variation is an iteration."""
+        varied_too = _variations(self.window_evaluator, self.incumbent, self._share[0])
+        steps = chain(super().further_steps(), islice(varied_too, VARIATIONS))
+        for iteration, step in enumerate(steps, start=1):
+            yield self.incumbent.improved(replace(step, iteration=iteration))
+
+
+def window_search(
+    task: Task,
+    atlas: Atlas,
+    phases: tuple[float, float] | None,
+    *,
+    widest: bool,
+    middle: float | None = None,
+    holds: Callable[[Candidate], bool] | None = None,
+) -> WindowSearch | WindowTubeSearch:
+    """Return the search for a window of the breath, with the needle of a system or with its tubes alone.
+
+    Parameters
+    ----------
+    phases, widest, middle, holds
+        As of `WindowEvaluator`.
+    """
+    evaluator = WindowEvaluator(task, phases, widest=widest, middle=middle, holds=holds)
+    return (WindowTubeSearch if task.system.needle is None else WindowSearch)(evaluator, atlas)
+
+
+def _variations(evaluator: WindowEvaluator, incumbent: Incumbent, number: int) -> Iterator[Step]:
+    """Vary deployment and aim of the best candidate, as long as its window is not the whole breath.
+
+    The variations of each process, by its number, are others.
+    """
+    phase, size, task = "variation", 1.0, evaluator.task
+    rng = np.random.Generator(np.random.PCG64([task.seed, VARY_EVERY, *([number] if number else [])]))
+    middle, nothing = require_motion(task.lung).masks_phase, Step(iteration=0, phase=phase)
+    while True:
+        best = incumbent.candidate
+        if best is None or (evaluator.widest and incumbent.cost < OUTSIDE_COST / STEPS):
+            yield nothing
+            continue
+        size = size if size >= SMALLEST else 1.0
+        turn, *shifts = random_change(rng, size, task.system.tubes)
+        towards = min(max(middle + TOWARDS * size * float(rng.standard_normal()), 0.0), 1.0)
+        aim = evaluator.moving.aim(best.tip.lps_from_scope_tip[:3, 3], towards)
+        before = incumbent.cost
+        made = varied(evaluator, best, turn, shifts, np.array(aim.point_lps))
+        step = evaluated_step(evaluator, phase, made)
+        yield step
+        better = step.cost < before
+        size, middle = (1.0, towards) if better else (SHRINK * size, middle)

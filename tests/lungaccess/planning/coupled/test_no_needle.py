@@ -12,7 +12,7 @@ import lungaccess as la
 from anatomy.base.errors import SettingsError
 from anatomy.base.settings import override, parse, to_mapping
 from anatomy.lung import Lung
-from lungaccess.planning.coupled.search.direct_candidates import reach_scan
+from lungaccess.planning.coupled.search.reach_scans import reach_scan
 from lungaccess.plans.parts import NeedleArc, NeedlePath
 from lungaccess.problem.preset_order import invasiveness
 from lungaccess.problem.system import System, load_system

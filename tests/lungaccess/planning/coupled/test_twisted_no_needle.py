@@ -9,7 +9,7 @@ import pytest
 
 import lungaccess as la
 from anatomy.lung import Lung
-from lungaccess.planning.coupled.search.direct_candidates import reach_scan
+from lungaccess.planning.coupled.search.reach_scans import reach_scan
 from lungaccess.planning.one_stage.replan import replan_from_scope
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target

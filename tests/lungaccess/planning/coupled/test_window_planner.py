@@ -11,7 +11,7 @@ import pytest
 import lungaccess as la
 from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
-from lungaccess.planning.coupled.search.window_search import WindowSearch
+from lungaccess.planning.coupled.search.window_search import WindowSearch, window_search
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from tests.lungaccess.motions import motion_by
@@ -102,8 +102,9 @@ def test_no_place_that_is_ruled_out_has_a_needle_on_target(
     breathing: Lung, target: Target, atlas: la.Atlas
 ) -> None:
     task = Task(lung=breathing, system=SYSTEM, target=target)
-    search = WindowSearch(task, atlas, (0.0, 1.0), widest=False)
-    out = np.flatnonzero(search.misses_mm > 0.0)
+    search = window_search(task, atlas, (0.0, 1.0), widest=False)
+    assert isinstance(search, WindowSearch)
+    out = np.flatnonzero(search.aims.misses_mm > 0.0)
     assert len(out)
     site = np.isin(atlas.deployments.site[search.arcs.in_workspace], out)
     assert not site.any()

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         BreathingError,
         CurvatureError,
         ErrorModel,
+        Place,
         PositionError,
     )
     from lungaccess.uncertainty.risk.rare import RareShare, rare_share

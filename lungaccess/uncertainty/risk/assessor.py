@@ -110,8 +110,9 @@ class RiskAssessor:
         """
         arcs = self.n_arcs if n_arcs is None else n_arcs
         return Draws(
-            count, arcs, seed, self._n_twisted, stretch=self.stretch, motion=self._motion, attempt=attempt
-        )
+            count, arcs, seed, self._n_twisted, stretch=self.stretch, motion=self._motion, attempt=attempt,
+            lps_from_scope_tip=self.plan.scope.lps_from_scope_tip,
+        )  # fmt: skip
 
     def no_deviations(self, count: int) -> dict[str, Float]:
         """Return the fields of `Deviations` for `count` sets without any error."""

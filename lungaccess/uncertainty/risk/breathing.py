@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.motion import LEFT, Motion
@@ -34,11 +35,17 @@ def phase(share_of_time: Float) -> Float:
 
 
 def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
-    """Return an error model with the patient's own breathing, where that is known; else the model itself.
+    """Return an error model at the place of a plan, with the patient's own breathing where that is known.
 
     A model of free breathing keeps any phase of the breath, one without breathing is taken to insert in the
     plan's window, each with the patient's motion and the spread of amplitudes over breaths.
+
+    Raises
+    ------
+    SettingsError
+        If the errors depend on the lobe and the patient came without lobes.
     """
+    model = _at_place(model, plan, lung)
     motion, window, stated = lung.motion, plan.window, model.breathing
     if motion is None or motion.warning_only:
         return model
@@ -52,6 +59,21 @@ def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
         source=f"the patient's own: {motion.source}; spread over breaths [Liang2018]",
     )
     return replace(model, breathing=term)
+
+
+def _at_place(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
+    """Return the errors where the scope's tip of a plan stands."""
+    if not model.place:
+        return model
+    if lung.lobes is None and any(each.lobe for each in model.place):
+        raise SettingsError(
+            f"The errors {model.label} depend on the lobe, and the patient has no masks of the lobes",
+            expected="a patient with lobes, or places by generation alone",
+            remedy="Segment the lobes with `lungaccess segment`, or leave out `lobe`",
+        )
+    tip, tree = np.asarray(plan.scope.lps_from_scope_tip)[:3, 3], lung.tree
+    branch = tree.branch_of_point[tree.nearest_point(tip)]
+    return model.at(lung.lobe_at(tip), int(tree.generation[branch]))
 
 
 def _size_mm(motion: Motion, plan: Plan) -> float:

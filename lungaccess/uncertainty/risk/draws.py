@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from anatomy.base.errors import SettingsError
@@ -40,6 +42,8 @@ class Draws:
         The patient's own.
     attempt : int
         Number of the attempt on the same N patients: what is drawn for each attempt has other numbers.
+    lps_from_scope_tip : (4, 4) float64, optional
+        The axes along which a bias of the scope's position is stated; by default those of LPS.
 
     Raises
     ------
@@ -57,6 +61,7 @@ class Draws:
         stretch: float = 0.0,
         motion: PatientMotion | None = None,
         attempt: int = 0,
+        lps_from_scope_tip: Float | None = None,
     ) -> None:
         if count < 1:
             raise SettingsError(
@@ -67,6 +72,7 @@ class Draws:
         self.count = count
         self._seed, self._n_arcs, self._n_twisted = seed, n_arcs, n_twisted
         self._stretch, self._motion, self._attempt = stretch, motion, attempt
+        self._axes = np.eye(3) if lps_from_scope_tip is None else np.asarray(lps_from_scope_tip)[:3, :3]
         self._made: dict[tuple[str, int], Float] = {}
 
     def deviations(self, model: ErrorModel) -> Deviations:
@@ -76,8 +82,11 @@ class Draws:
             # Each tube that is not planar is held by itself: none turns with another.
             own = "relative_rad" if kind == "tube_rotation" and self._n_twisted else field
             term = model.term(kind)
-            if term.size and values[own].size:
+            if (term.size or term.bias) and values[own].size:
                 error = self._error(kind, values[own].shape, term.distribution, term.patient, term.attempt)
+                if term.bias:
+                    bias = np.array(term.bias)
+                    error = error + (self._axes @ bias if kind == "scope_position" else bias)
                 values[own] = np.radians(error) if UNITS[kind] == "deg" else error
         values["factor"] = self._factors(model)
         if model.breathing.size and (self._motion or self._stretch):
@@ -97,9 +106,9 @@ class Draws:
         return own
 
     def _again(self) -> Draws:
-        return Draws(
-            self.count, self._n_arcs, self._seed, self._n_twisted, stretch=self._stretch, motion=self._motion
-        )
+        own = copy(self)
+        own._made = {}
+        return own
 
     def _error(
         self, kind: str, shape: tuple[int, ...], distribution: str, patient: float, attempt: float

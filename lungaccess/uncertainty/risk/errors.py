@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Annotated, Any, ClassVar, Self
 
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings, text
+from anatomy.lobes import LOBES, lobe_named
 
 CURVATURE, BREATHING = "needle_curvature", "breathing"
 UNITS: dict[str, str] = {
@@ -21,6 +23,17 @@ UNITS: dict[str, str] = {
     BREATHING: "mm",
 }
 """Kinds of error and the unit in which their size is stated; "ln" is the natural logarithm of a factor."""
+AXES: dict[str, int] = {
+    "scope_position": 3,
+    "scope_direction": 2,
+    "tube_rotation": 1,
+    "tube_insertion": 1,
+    "needle_roll": 1,
+    "needle_insertion": 1,
+    "target_position": 3,
+}
+"""How many numbers the bias of a kind has: along x, y, z of the scope's tip, about its x and y, LPS for the
+target, and one where the devices have one axis.  The curvature has its median instead."""
 OF_NEEDLE = (CURVATURE, "needle_roll", "needle_insertion")
 """The kinds that only a needle has."""
 ASSUMPTION = "assumption"
@@ -31,6 +44,19 @@ IN_WINDOW = "lognormal-in-window"
 
 _Source = Annotated[str, text(f"where the sizes come from, or a text that begins with {ASSUMPTION!r}")]
 _Distribution = Annotated[str, text(f"{NORMAL!r} or {BOUNDED!r}")]
+
+
+def _size(whose: str, at_most: float) -> Any:
+    return quantity(f"size of the part of each {whose}", at_least=0.0, at_most=at_most)
+
+
+def _bias(at_most: float) -> Any:
+    return quantity("mean of the error", at_least=-at_most, at_most=at_most)
+
+
+def _optional() -> Any:
+    """Return the field of a tuple that files lack where it is empty."""
+    return field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
 
 
 class _Term:
@@ -56,21 +82,40 @@ class _Term:
         return float(getattr(self, f"attempt_{self.unit}"))
 
     @property
+    def bias(self) -> tuple[float, ...]:
+        """The mean of the error in the unit of the term, as many numbers as `AXES` says; none for no bias."""
+        return tuple(getattr(self, f"bias_{self.unit}", ()))
+
+    @property
     def size(self) -> float:
         """Size of both parts together, which are independent: the root of the sum of their squares."""
         return math.hypot(self.patient, self.attempt)
 
     @property
+    def rms(self) -> float:
+        """Root of the mean square of the error along one axis, bias and spread together."""
+        bias = self.bias
+        return math.hypot(self.size, math.hypot(*bias) / math.sqrt(len(bias))) if bias else self.size
+
+    @property
     def is_assumed(self) -> bool:
         """Whether there is an error, and nobody has published its size."""
-        return self.size > 0.0 and self.source.startswith(ASSUMPTION)
+        return self.rms > 0.0 and self.source.startswith(ASSUMPTION)
 
     def sized(self, size: float) -> Self:
-        """Return the term with both parts scaled to a size together; a term of none gets one an attempt."""
+        """Return the term scaled to a size of both parts together; a term of none gets one an attempt."""
         if not self.size:
             return replace(self, **{f"attempt_{self.unit}": size})  # type: ignore[type-var]
-        scale = size / self.size
-        parts = {f"patient_{self.unit}": scale * self.patient, f"attempt_{self.unit}": scale * self.attempt}
+        return self.scaled(size / self.size)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the term with both parts and its bias multiplied by a factor."""
+        parts: dict[str, Any] = {
+            f"patient_{self.unit}": factor * self.patient,
+            f"attempt_{self.unit}": factor * self.attempt,
+        }
+        if self.bias:
+            parts[f"bias_{self.unit}"] = tuple(factor * each for each in self.bias)
         return replace(self, **parts)  # type: ignore[type-var]
 
 
@@ -84,6 +129,8 @@ class PositionError(_Term):
         "normal": the sizes are standard deviations.  "bounded": uniform, the sizes are the largest errors.
     patient_mm, attempt_mm : float
         Size of the part drawn once for each patient, and of that drawn once for each attempt; they add up.
+    bias_mm : tuple of float
+        Mean of the error, added to both parts: as many numbers as `AXES` says, none for no bias.
     source : str
         Where the sizes come from; what nobody has published begins with "assumption".
 
@@ -95,12 +142,9 @@ class PositionError(_Term):
 
     unit: ClassVar[str] = "mm"
     distribution: _Distribution = NORMAL
-    patient_mm: Annotated[float, quantity("size of the part of each patient", at_least=0.0, at_most=50.0)] = (
-        0.0
-    )
-    attempt_mm: Annotated[float, quantity("size of the part of each attempt", at_least=0.0, at_most=50.0)] = (
-        0.0
-    )
+    patient_mm: Annotated[float, _size("patient", 50.0)] = 0.0
+    attempt_mm: Annotated[float, _size("attempt", 50.0)] = 0.0
+    bias_mm: tuple[Annotated[float, _bias(50.0)], ...] = _optional()
     source: _Source = ASSUMPTION
 
 
@@ -110,12 +154,9 @@ class AngleError(_Term):
 
     unit: ClassVar[str] = "deg"
     distribution: _Distribution = NORMAL
-    patient_deg: Annotated[
-        float, quantity("size of the part of each patient", at_least=0.0, at_most=180.0)
-    ] = 0.0
-    attempt_deg: Annotated[
-        float, quantity("size of the part of each attempt", at_least=0.0, at_most=180.0)
-    ] = 0.0
+    patient_deg: Annotated[float, _size("patient", 180.0)] = 0.0
+    attempt_deg: Annotated[float, _size("attempt", 180.0)] = 0.0
+    bias_deg: tuple[Annotated[float, _bias(180.0)], ...] = _optional()
     source: _Source = ASSUMPTION
 
 
@@ -141,12 +182,8 @@ class CurvatureError(_Term):
     median: Annotated[float, quantity("median of the factor of the curvature", at_least=0.1, at_most=5.0)] = (
         1.0
     )
-    patient_ln: Annotated[
-        float, quantity("standard deviation of the logarithm, by patient", at_least=0.0, at_most=1.5)
-    ] = 0.0
-    attempt_ln: Annotated[
-        float, quantity("standard deviation of the logarithm, by attempt", at_least=0.0, at_most=1.5)
-    ] = 0.0
+    patient_ln: Annotated[float, _size("patient", 1.5)] = 0.0
+    attempt_ln: Annotated[float, _size("attempt", 1.5)] = 0.0
     straight_share: Annotated[
         float, quantity("share of the needles that go straight", at_least=0.0, at_most=1.0)
     ] = 0.0
@@ -175,9 +212,7 @@ class BreathingError(_Term):
     median_mm: Annotated[
         float, quantity("median of the patients' motion by breathing", at_least=0.0, at_most=60.0)
     ] = 0.0
-    patient_ln: Annotated[
-        float, quantity("standard deviation of its logarithm over patients", at_least=0.0, at_most=1.5)
-    ] = 0.0
+    patient_ln: Annotated[float, _size("patient", 1.5)] = 0.0
     source: _Source = ASSUMPTION
 
     @property
@@ -189,13 +224,72 @@ class BreathingError(_Term):
         """Return the term with another median."""
         return replace(self, median_mm=size)
 
+    def scaled(self, factor: float) -> BreathingError:
+        """Return the term with its median multiplied by a factor."""
+        return self.sized(factor * self.median_mm)
+
 
 Term = PositionError | AngleError | CurvatureError | BreathingError
 
 
+def _require_axes(kind: str, term: Term | None) -> None:
+    """Refuse a bias that has not as many numbers as its kind of error has axes."""
+    bias = term.bias if term else ()
+    if bias and len(bias) != AXES[kind]:
+        raise impossible(f"{kind}.bias_{UNITS[kind]}", list(bias), f"{AXES[kind]} numbers")
+
+
+@settings
+class Place:
+    """Errors of other sizes where the scope's tip stands in some of the airways.
+
+    Parameters
+    ----------
+    lobe : str
+        Lobe of the scope's tip, such as "right upper"; any where it is empty.
+    generation_from, generation_to : int
+        Generations of the tip's airway for which it holds, both included; the trachea is 0.
+    scope_position, ... : of the classes of `ErrorModel`, optional
+        What stands there in place of the model's own.
+    """
+
+    lobe: Annotated[str, text("lobe of the scope's tip, any if empty", may_be_empty=True)] = ""
+    generation_from: Annotated[int, quantity("least generation of its airway", at_least=0, at_most=99)] = 0
+    generation_to: Annotated[int, quantity("greatest generation of it", at_least=0, at_most=99)] = 99
+    scope_position: PositionError | None = None
+    scope_direction: AngleError | None = None
+    tube_rotation: AngleError | None = None
+    tube_insertion: PositionError | None = None
+    needle_curvature: CurvatureError | None = None
+    needle_roll: AngleError | None = None
+    needle_insertion: PositionError | None = None
+    target_position: PositionError | None = None
+    breathing: BreathingError | None = None
+
+    def __post_init__(self) -> None:
+        if self.lobe and not lobe_named(self.lobe):
+            raise impossible("lobe", self.lobe, f"one of {', '.join(LOBES.values())}")
+        if self.generation_to < self.generation_from:
+            raise impossible("generation_to", self.generation_to, f"at least {self.generation_from}")
+        if not self.terms:
+            raise impossible("place", "no errors", f"a table of errors, such as [place.{next(iter(UNITS))}]")
+        for kind, term in self.terms.items():
+            _require_axes(kind, term)
+
+    @property
+    def terms(self) -> dict[str, Any]:
+        """The errors that the place states, by kind."""
+        return {kind: getattr(self, kind) for kind in UNITS if getattr(self, kind) is not None}
+
+    def holds(self, lobe: str, generation: int) -> bool:
+        """Tell whether the place contains an airway of a lobe, by its whole name, and of a generation."""
+        here = not self.lobe or LOBES[lobe_named(self.lobe)] == lobe
+        return here and self.generation_from <= generation <= self.generation_to
+
+
 @settings
 class ErrorModel:
-    """How large the errors of devices, patient and images are; independent of each other, without bias.
+    """How large the errors of devices, patient and images are; independent of each other.
 
     Without arguments there is no error at all; `load_errors` reads the presets, which state their sources.
 
@@ -221,11 +315,13 @@ class ErrorModel:
     target_position : PositionError
         Position of the target, along each axis.
     breathing : BreathingError
+    place : tuple of Place
+        Other errors by the place of the scope's tip; of several that hold the last one counts.
 
     Raises
     ------
     SettingsError
-        If a value is not finite, negative or absurd.
+        If a value is not finite, negative or absurd, or a bias has not as many numbers as `AXES` says.
     """
 
     name: Annotated[str, text("what the model is called where its results are shown", may_be_empty=True)] = ""
@@ -239,6 +335,18 @@ class ErrorModel:
     needle_insertion: PositionError = PositionError()
     target_position: PositionError = PositionError()
     breathing: BreathingError = BreathingError()
+    place: tuple[Place, ...] = _optional()
+
+    def __post_init__(self) -> None:
+        for kind in UNITS:
+            _require_axes(kind, self.term(kind))
+
+    def at(self, lobe: str, generation: int) -> ErrorModel:
+        """Return the model of a place of the scope's tip: its lobe, "" if not known, and its generation."""
+        terms: dict[str, Any] = {}
+        for each in self.place:
+            terms |= each.terms if each.holds(lobe, generation) else {}
+        return replace(self, place=(), **terms)
 
     def term(self, kind: str) -> Term:
         """Return the error of a kind, by its name in `UNITS`."""
@@ -253,8 +361,12 @@ class ErrorModel:
 
     def scaled(self, factor: float) -> ErrorModel:
         """Return the model with all sizes multiplied by a factor."""
-        terms: dict[str, Any] = {kind: self.term(kind).sized(factor * self.term(kind).size) for kind in UNITS}
-        return replace(self, **terms)
+        terms: dict[str, Any] = {kind: self.term(kind).scaled(factor) for kind in UNITS}
+        places = (
+            replace(each, **{kind: term.scaled(factor) for kind, term in each.terms.items()})
+            for each in self.place
+        )
+        return replace(self, place=tuple(places), **terms)
 
     @property
     def assumed(self) -> tuple[str, ...]:
@@ -268,6 +380,8 @@ class ErrorModel:
 
     def words(self, *, with_needle: bool) -> str:
         """Return all sizes in one clause: those of normal errors are standard deviations."""
+        biased = [kind for kind in AXES if self.term(kind).bias and (with_needle or kind not in OF_NEEDLE)]
+        means = ", ".join(f"{kind.replace('_', ' ')} {_listed(self.term(kind))}" for kind in biased)
         size = {kind: self.term(kind).size for kind in UNITS}
         straight = self.needle_curvature.straight_share
         of_needle = (
@@ -279,4 +393,12 @@ class ErrorModel:
             f"scope tip {size['scope_position']:g} mm and {size['scope_direction']:g}°, "
             f"tubes {size['tube_insertion']:g} mm and {size['tube_rotation']:g}°, "
             f"{of_needle if with_needle else ''}target {size['target_position']:g} mm{breathing}"
+            f"{f', bias of {means}' if means else ''}"
+            f"{', others in some places' if self.place else ''}"
         )
+
+
+def _listed(term: Term) -> str:
+    """Return the bias of a term in words."""
+    unit = {"deg": "°"}.get(term.unit, f" {term.unit}")
+    return " / ".join(f"{each:g}" for each in term.bias) + unit

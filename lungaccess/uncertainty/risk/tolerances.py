@@ -14,6 +14,7 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
 from lungaccess.uncertainty.risk.draws import Draws
 from lungaccess.uncertainty.risk.error_files import load_errors
@@ -103,7 +104,7 @@ def find_tolerances(
             expected="above 0 and below 1",
             remedy="Choose a share such as 0.95",
         )
-    stated = model or load_errors()
+    stated = model_for(model or load_errors(), plan, lung)
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
     draws = assessor.draws(samples, seed)
     kinds = (kind for kind in assessor.kinds if kind != BREATHING)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, norm, uniform
 
 from anatomy.base.errors import FileError, SettingsError
+from anatomy.base.settings import parse, to_mapping
 from anatomy.lung import Lung
 from anatomy.motion.population import share_of_motion
 from lungaccess.uncertainty.risk import (
@@ -121,6 +123,11 @@ def test_a_file_states_what_differs_from_a_preset(tmp_path: Path) -> None:
         "[shaft]\nsize = 1.0",
         '[scope_direction]\ndistribution = "cauchy"', '[needle_curvature]\ndistribution = "normal"',
         "[needle_curvature]\nstraight_share = 1.5", '[target_position]\nsource = ""', "scope_position = 1.0",
+        "[scope_direction]\nbias_deg = [6.0]", "[scope_direction]\nbias_deg = 6.0",
+        "[tube_rotation]\nbias_deg = [inf]", "[breathing]\nbias_mm = [1.0]", "[[place]]\ngeneration_from = 4",
+        '[[place]]\nlobe = "upper"\n[place.tube_rotation]\nattempt_deg = 1.0',
+        "[[place]]\ngeneration_from = 4\ngeneration_to = 3\n[place.tube_rotation]\nattempt_deg = 1.0",
+        "[[place]]\n[place.target_position]\nbias_mm = [1.0, 2.0]",
         "[breathing]\nattempt_mm = 1.0", 'like = "gated"', "like = 3", "scope_position = = 1",
     ],
 )  # fmt: skip
@@ -146,6 +153,57 @@ def test_wrong_names_and_values_are_refused(tmp_path: Path) -> None:
         AngleError(attempt_deg=math.inf)
     with pytest.raises(SettingsError, match="samples"):
         Draws(0, 1, 0)
+
+
+BIASED = """
+[scope_direction]
+attempt_deg = 2.0
+bias_deg = [6.0, -1.0]
+source = "ours"
+
+[[place]]
+generation_from = 4
+[place.scope_direction]
+attempt_deg = 4.0
+source = "ours"
+
+[[place]]
+lobe = "RUL"
+generation_from = 4
+generation_to = 5
+[place.scope_position]
+attempt_mm = 3.0
+[place.scope_direction]
+bias_deg = [10.0, 0.0]
+"""
+
+
+def test_the_last_place_that_holds_counts(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(BIASED)
+    model = load_errors(file)
+    assert model.at("right upper lobe", 3) == replace(model, place=())
+    lower = model.at("right lower lobe", 4)
+    assert lower.scope_direction == AngleError(attempt_deg=4.0, source="ours")
+    assert lower.scope_position == model.scope_position
+    upper = model.at("right upper lobe", 5)
+    assert upper.scope_direction.bias == (10.0, 0.0) and upper.scope_position.size == 3.0
+    assert model.at("right upper lobe", 6) == model.at("", 6) == lower
+    assert "bias of scope direction 6 / -1°, others in some places" in model.words(with_needle=False)
+    assert "bias" not in load_errors().words(with_needle=True)
+
+
+def test_biases_and_places_are_restored_without_loss(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(BIASED)
+    model = load_errors(file)
+    plain = to_mapping(model)
+    assert parse(ErrorModel, json.loads(json.dumps(plain)), "again") == model
+    assert "place" not in to_mapping(load_errors()) and "bias_mm" not in to_mapping(PositionError())
+    doubled = model.scaled(2.0)
+    assert doubled.scope_direction.bias == (12.0, -2.0)
+    assert doubled.place[1].terms["scope_direction"].bias == (20.0, 0.0)
+    assert model.scope_direction.rms == pytest.approx(math.hypot(2.0, math.hypot(6.0, 1.0) / math.sqrt(2.0)))
 
 
 # Sizes -------------------------------------------------------------------------------------------
@@ -184,6 +242,42 @@ def test_each_distribution_is_the_stated_one() -> None:
         assert kstest(values.ravel(), norm(scale=scale).cdf).pvalue > 1e-3
     assert kstest(found.insertion_mm.ravel(), uniform(-0.5, 1.0).cdf).pvalue > 1e-3
     assert kstest(np.log(found.factor / 0.8), norm(scale=0.5).cdf).pvalue > 1e-3
+
+
+def test_a_bias_is_added_to_the_same_luck() -> None:
+    turned = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    frame = np.eye(4)
+    frame[:3, :3] = turned
+    biased = {
+        "scope_position": PositionError(attempt_mm=1.0, bias_mm=(1.0, 2.0, 3.0)),
+        "scope_direction": AngleError(attempt_deg=1.0, bias_deg=(6.0, 0.0)),
+        "tube_rotation": AngleError(bias_deg=(5.0,)),
+        "tube_insertion": PositionError(bias_mm=(0.5,)),
+        "needle_roll": AngleError(attempt_deg=1.0, bias_deg=(-3.0,)),
+        "needle_insertion": PositionError(bias_mm=(2.0,)),
+        "target_position": PositionError(patient_mm=1.0, bias_mm=(0.0, 0.0, -4.0)),
+    }
+    means = {
+        "scope_mm": turned @ [1.0, 2.0, 3.0],
+        "tilt_rad": np.radians([6.0, 0.0]),
+        "rotation_rad": np.radians(5.0),
+        "insertion_mm": 0.5,
+        "roll_rad": np.radians(-3.0),
+        "stop_mm": 2.0,
+        "target_mm": [0.0, 0.0, -4.0],
+    }
+    bias = {"bias_mm": (), "bias_deg": ()}
+    plain = {
+        kind: replace(term, **{name: none for name, none in bias.items() if hasattr(term, name)})
+        for kind, term in biased.items()
+    }
+    one, other = (
+        Draws(9, 2, 3, lps_from_scope_tip=frame).deviations(ErrorModel(**each)) for each in (biased, plain)
+    )
+    for field, mean in means.items():
+        assert np.allclose(getattr(one, field), getattr(other, field) + mean, atol=1e-12), field
+    twisted = Draws(9, 2, 3, 3).deviations(ErrorModel(**biased))
+    assert np.allclose(twisted.relative_rad, np.radians(5.0)) and not twisted.rotation_rad.any()
 
 
 def test_some_needles_go_straight() -> None:

@@ -35,6 +35,7 @@ from lungaccess.uncertainty.risk.errors import (
     AngleError,
     CurvatureError,
     ErrorModel,
+    Place,
     PositionError,
 )
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
@@ -293,6 +294,39 @@ def test_interval_of_wilson_1927() -> None:
 def found(plan: Plan, small_lung: Lung) -> dict[str, Tolerance]:
     kept = find_tolerances(plan, small_lung, samples=500, radius_mm=3.0)
     return {each.kind: each for each in kept}
+
+
+def test_a_bias_acts_along_the_axes_of_the_scopes_tip(
+    assessor: RiskAssessor, plan: Plan, small_lung: Lung
+) -> None:
+    """A known bias of the tip back along its axis and about its x moves and tilts every draw alike."""
+    model = ErrorModel(
+        scope_position=PositionError(bias_mm=(0.0, 0.0, -0.2)),
+        scope_direction=AngleError(bias_deg=(6.0, 0.0)),
+    )
+    planned = np.asarray(plan.scope.lps_from_scope_tip)
+    starts = deviated_starts(plan, small_lung, assessor.draws(3, 0).deviations(model))
+    assert np.allclose(starts[:, :3], planned[:3, 3] - 0.2 * planned[:3, 2])
+    turned = planned[:3, :3] @ Rotation.from_euler("x", 6.0, degrees=True).as_matrix()
+    assert np.allclose(starts[:, 3:6], turned[:, 2]) and np.allclose(starts[:, 6:], turned[:, 0])
+
+
+def test_a_model_has_the_errors_of_the_scopes_place(plan: Plan, small_lung: Lung) -> None:
+    tree, tip = small_lung.tree, np.asarray(plan.scope.lps_from_scope_tip)[:3, 3]
+    generation = int(tree.generation[tree.branch_of_point[tree.nearest_point(tip)]])
+    worse = AngleError(attempt_deg=30.0)
+    model = replace(load_errors("gated-ct"), name="")
+    here = replace(model, place=(Place(generation_from=generation, scope_direction=worse),))
+    elsewhere = replace(model, place=(Place(generation_from=generation + 1, scope_direction=worse),))
+    found = [
+        assess(plan, small_lung, model=each, samples=500, each_kind=False)
+        for each in (model, here, elsewhere)
+    ]
+    assert found[0].succeeds == found[2].succeeds and found[1].succeeds.count < found[0].succeeds.count
+    assert found[1].model.scope_direction == worse and not found[1].model.place
+    lobar = replace(model, place=(Place(lobe="right upper", scope_direction=worse),))
+    with pytest.raises(SettingsError, match="lobe"):
+        assess(plan, replace(small_lung, lobes=None), model=lobar, samples=10, each_kind=False)
 
 
 def test_tolerances_hold_and_more_does_not(found: dict[str, Tolerance], assessor: RiskAssessor) -> None:

@@ -164,7 +164,7 @@ class Policy:
         measured = as_measured(true, placing.position_mm, placing.direction_deg, noise)
         measured[:3, 3] = self._in_lumen(measured[:3, 3], true[:3, 3])
         expected, errors = np.asarray(plan.scope.lps_from_scope_tip), self.errors
-        sizes = errors.term("scope_position").size, math.radians(errors.term("scope_direction").size)
+        sizes = errors.term("scope_position").rms, math.radians(errors.term("scope_direction").rms)
         moves = scope_moves(expected, *sizes)
         likely = fused(expected, moves, measured, placing.position_mm, math.radians(placing.direction_deg))
         likely[:3, 3] = self._in_lumen(likely[:3, 3], measured[:3, 3])
@@ -290,7 +290,7 @@ class Policy:
         planned = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
         if not imaging.measured:
             return planned
-        errors, breath = self.errors.term("target_position").size, self.errors.term(BREATHING).size
+        errors, breath = self.errors.term("target_position").rms, self.errors.term(BREATHING).size
         expected = np.array([errors, errors, math.hypot(errors, self._assessor.stretch * breath)])
         shares = np.array([fused_share(each, imaging.position_mm) for each in expected.tolist()])
         measured = attempt.target_lps + imaging.position_mm * noise[:3]

@@ -11,7 +11,7 @@ from lungaccess.uncertainty.risk.errors import BREATHING, CURVATURE, ErrorModel
 
 @frozen_record
 class Residuals:
-    """Standard deviations of what is left of the errors after what a procedure measures, mm and rad.
+    """Sizes of what a procedure leaves of the errors by measuring, mm and rad; a bias counts as spread.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ class Residuals:
     @staticmethod
     def of(errors: ErrorModel, procedure: Procedure, stretch: float) -> Residuals:
         """Return what a procedure leaves of errors; `stretch` is that of `Draws`."""
-        placed, aimed = errors.term("scope_position").size, errors.term("target_position").size
+        placed, aimed = errors.term("scope_position").rms, errors.term("target_position").rms
         angles = ("scope_direction", "tube_rotation", "needle_roll")
-        turned, rotated, rolled = (math.radians(errors.term(kind).size) for kind in angles)
+        turned, rotated, rolled = (math.radians(errors.term(kind).rms) for kind in angles)
         scope, tubes, image, needle = (
             procedure.scope, procedure.tubes, procedure.imaging, procedure.needle,
         )  # fmt: skip
@@ -59,12 +59,12 @@ class Residuals:
             scope_mm=placed,
             scope_rad=turned,
             rotation_rad=rotated,
-            insertion_mm=errors.tube_insertion.size,
+            insertion_mm=errors.tube_insertion.rms,
             tip_mm=tubes.position_mm if tubes.measured else needle.position_mm if steered else None,
             tip_rad=math.radians(tubes.direction_deg if tubes.measured else needle.direction_deg),
             curvature=0.0 if steered else errors.term(CURVATURE).size,
             roll_rad=0.0 if steered else rolled,
-            stop_mm=errors.needle_insertion.size,
+            stop_mm=errors.needle_insertion.rms,
             target_mm=aimed,
             foot_mm=math.sqrt(max(foot**2 - aimed**2, 0.0)),
         )

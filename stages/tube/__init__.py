@@ -31,10 +31,9 @@ if TYPE_CHECKING:
     from stages.tube.errors import ConvergenceError
     from stages.tube.exits import exit_points
     from stages.tube.following import DeployedSequence, SnapError, deploy
-    from stages.tube.inverse import inverse_kinematics
     from stages.tube.kernels import DesignArrays, ManyShapes, ShapeArrays, TubeEnvironment
     from stages.tube.mechanics import Batch, TubeMechanics
-    from stages.tube.nearby import NearbyShape, NearbyShapes, Neighbourhood
+    from stages.tube.nearby import NearbyShape, Neighbourhood
     from stages.tube.nesting import check_nesting
     from stages.tube.one_shape import (
         NO_SHAPES,
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
         shape_of_arrays,
         with_any_sweep,
     )
-    from stages.tube.parts import SlottedSegment, opposite_slots
+    from stages.tube.parts import SlottedSegment
     from stages.tube.placing import PlacedShapes, place_shapes
     from stages.tube.proposals import (
         DesignProposal,
@@ -61,7 +60,7 @@ if TYPE_CHECKING:
     from stages.tube.shape_store import open_shapes, shapes_format
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
-    from stages.tube.strain import channel_curvature_limit, straightening, transit_strain
+    from stages.tube.strain import straightening
     from stages.tube.validation import REASONS, Deployment, DeploymentValidator
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

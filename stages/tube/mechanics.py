@@ -14,9 +14,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float
 from anatomy.grid import read_only
-from stages.tube.equilibrium import Equilibrium, matrices, torsion_scratch
+from stages.tube.equilibrium import Equilibrium, matrices
 from stages.tube.errors import ConvergenceError
-from stages.tube.kernels import all_equilibria, equilibrium
+from stages.tube.kernels import equilibrium
 from stages.tube.nesting import SAME_MM, NestedTubes
 
 
@@ -42,10 +42,6 @@ class Batch:
     stable: Bool
     least_determinant: Float
     residual_rad: Float
-
-
-LARGEST_COUNT = 64
-"""Of equilibria that are looked for: two tubes have a few, and one more for each turn of wind-up."""
 
 
 class TubeMechanics(NestedTubes):
@@ -134,38 +130,6 @@ class TubeMechanics(NestedTubes):
                 remedy="give tip angles of a configuration nearby as a guess",
             )
         return Equilibrium(self, tips[0], beta)
-
-    def equilibria(self, base_angles_rad: ArrayLike, beta_mm: ArrayLike) -> tuple[Equilibrium, ...]:
-        """Return all equilibria of one or two tubes with given rotations of the rear ends.
-
-        They are sorted by the angle between the tips.  Of several, stable and unstable ones take turns.
-
-        Raises
-        ------
-        SettingsError
-            If there are more than two tubes; see `given_tip_angles` too.
-        """
-        base, beta = self._joints(base_angles_rad, "base angles"), self._shifts(beta_mm)
-        if self.count == 1:
-            return (self.given_base_angles(base, beta),)
-        if self.count > 2:
-            raise SettingsError(
-                f"All equilibria of {self.count} tubes are asked for",
-                expected="two tubes at most",
-                remedy="use given_base_angles with several guesses",
-            )
-        cutting, n_steps = self.cut(beta)
-        nodes, steps = torsion_scratch(n_steps, 2, 1)
-        found = np.zeros(LARGEST_COUNT)
-        number = all_equilibria.all_of_two(
-            self.design, cutting, beta, float(base[0] - base[1]), nodes, steps, found
-        )
-        out = []
-        for between in found[: min(number, LARGEST_COUNT)]:
-            there = Equilibrium(self, np.array([between, 0.0]), beta)
-            turn = base[1] - there.base_angles_rad[1]
-            out.append(Equilibrium(self, np.array([between + turn, turn]), beta))
-        return tuple(out)
 
     def batch(
         self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, guess_rad: ArrayLike | None = None

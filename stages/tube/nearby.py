@@ -18,7 +18,6 @@ from stages.tube.following import deploy
 from stages.tube.kernels import shapes as kernel
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.sequences import BEND_RAD, together
-from stages.tube.shapes import TubeShapes
 
 ROOM = 4 * kernel.MOST_ARCS
 """For arcs: more than designs of three tubes have pieces; it grows where that is too little."""
@@ -120,35 +119,3 @@ class Neighbourhood:
             least_determinant=float(result[kernel.LEAST]),
             arc_error_mm=float(result[kernel.ERROR]),
         )
-
-
-class NearbyShapes:
-    """Finds shapes of joint values next to those of a grid.
-
-    Sideways sweep and strain of the whole way are not judged: what is chosen in the end has to be deployed by
-    itself, see `stages.tube.following.deploy`.
-    """
-
-    def __init__(self, shapes: TubeShapes) -> None:
-        self.shapes = shapes
-        self._mechanics = TubeMechanics(shapes.tubes)
-
-    def at(self, shape: int, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
-        """Return the shape of joint values, reached straight from a shape of the grid; None if tubes snap.
-
-        Parameters
-        ----------
-        shape : int
-            A deployment nearby.
-        insertions_mm, rotations_rad : (n,) float64
-
-        Raises
-        ------
-        SettingsError
-            If numbers are missing or not finite, or the tubes get out of order.
-        """
-        near = self.shapes
-        around = Neighbourhood(
-            self._mechanics, near.insertions_mm[shape], near.rotations_rad[shape], near.tip_angles_rad[shape]
-        )
-        return around.at(insertions_mm, rotations_rad)

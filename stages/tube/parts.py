@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 
@@ -89,21 +88,3 @@ def tube_parts(
         stiffness_n_mm2=stiffness_n_mm2 * stiffness,
         strained_radius_mm=radius_mm * strain,
     )
-
-
-def opposite_slots(bridge_deg: float, share: float) -> tuple[float, float]:
-    """Return stiffness and strain factor of a thin tube with pairs of opposite slots, by beam theory.
-
-    Each pair leaves two bridges of `bridge_deg` each, at the neutral axis of the bend or square to it: pairs
-    are turned by 90 degrees alternately.  Soft stretches bend more, and the strain is largest at the edge
-    of the bridges at the neutral axis.
-
-    Parameters
-    ----------
-    share : float
-        Part of the length that is slotted.
-    """
-    bridge = math.radians(bridge_deg)
-    soft, stiff = (bridge - math.sin(bridge)) / math.pi, (bridge + math.sin(bridge)) / math.pi
-    factor = 1.0 / (1.0 - share + 0.5 * share * (1.0 / soft + 1.0 / stiff))
-    return factor, math.sin(0.5 * bridge) * factor / soft

@@ -33,6 +33,5 @@ if TYPE_CHECKING:
     from stages.scope.advisor.orientability import Orientability, measure_orientability
     from stages.scope.advisor.path import ScopePath
     from stages.scope.advisor.path_search import PathSearch, PathSettings
-    from stages.scope.advisor.session import Session
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -77,22 +77,12 @@ class PathSearch:
 
     def run(self, start: ScopeState) -> ScopePath:
         """Return the path from a state that ends at the goal or comes nearest to it."""
-        return self.resume(start.array[None], np.zeros(1))
-
-    def resume(self, states: Float, steps_mm: Float) -> ScopePath:
-        """Return the path that goes on from the last of some states, or from where it must be pulled back to.
-
-        Parameters
-        ----------
-        states : (K, 14) float64
-            How the scope came; the path begins with the first of them.
-        steps_mm : (K,) float64
-            Advance of each state from the one before, 0 for the first.
-        """
         options = self._options
-        begin = np.zeros((len(states), 4))
-        begin[:, 2], begin[:, 3] = steps_mm, self._potentials(states)
-        states, info, end = self._compute_path(states, begin, options.weights, options.look_ahead_mm)
+        begin = np.zeros((1, 4))
+        begin[0, 3] = self._potential(start)
+        states, info, end = self._compute_path(
+            start.array[None], begin, options.weights, options.look_ahead_mm
+        )
         if self._environment.reproduction:
             return self._path(states, info, end == kernel.REACHED, 0)
         states, info = _cut(states, info)
@@ -110,11 +100,11 @@ class PathSearch:
                 states, info, end = more, more_info, new_end
         return self._path(states, info, end == kernel.REACHED, used)
 
-    def _potentials(self, states: Float) -> Float:
-        """Return the potential at the tip of states, infinity outside the lumen."""
-        tips = tool_frames(self._environment.model, states)[:, :3, 3]
-        voxels = [self._environment.lumen.voxel_at(tip) for tip in tips]
-        return np.array([self._environment.field.potential[v] if v >= 0 else np.inf for v in voxels])
+    def _potential(self, state: ScopeState) -> float:
+        """Return the potential at the tip of a state, infinity outside the lumen."""
+        tip = tool_frames(self._environment.model, state.array[None])[0, :3, 3]
+        voxel = self._environment.lumen.voxel_at(tip)
+        return float(self._environment.field.potential[voxel]) if voxel >= 0 else np.inf
 
     def _random_weights(self) -> Weights:
         low, high = (float(value) for value in np.sort(self._rng.uniform(size=2)))

@@ -115,24 +115,6 @@ def test_bifurcation_threshold(transmission: float) -> None:
     assert brentq(determinant, 0.9 * formula, 1.1 * formula, xtol=1e-13) == pytest.approx(formula, abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("lam", "first", "fold"),
-    [(1.8, 1.7082842834816, 3.2691025363662), (2.0, 1.2789589063533, 3.4520101817819),
-     (2.5, 0.70168568196856, 3.9963814374392)],
-)  # fmt: skip
-def test_all_equilibria_of_a_pair_that_snaps(lam: float, first: float, fold: float) -> None:
-    """K(m) = lam gives the bent ones; beyond the fold the middle and one other are gone."""
-    mechanics = pendulum(lam)
-    found = mechanics.equilibria([math.pi, 0.0], [0.0, 0.0])
-    between = [e.tip_angles_rad[0] - e.tip_angles_rad[1] for e in found]
-    assert between == pytest.approx([first, math.pi, 2.0 * math.pi - first], abs=1e-10)
-    assert [e.stable for e in found] == [True, False, True]
-    for e in found:
-        assert e.base_angles_rad == pytest.approx([math.pi, 0.0], abs=1e-12)
-    assert len(mechanics.equilibria([fold - 1e-6, 0.0], [0.0, 0.0])) == 3
-    assert len(mechanics.equilibria([fold + 1e-6, 0.0], [0.0, 0.0])) == 1
-
-
 def test_rigid_in_torsion_angles_are_those_of_the_base() -> None:
     """A Poisson's ratio near -1 would be rigid; shorter tubes come near that too."""
     short = TubeMechanics(
@@ -293,7 +275,7 @@ def test_along_the_tubes() -> None:
     ],
 )
 def test_joints_that_cannot_be(angles: list[float], beta: list[float], message: str) -> None:
-    for call in (PAIR.given_tip_angles, PAIR.given_base_angles, PAIR.equilibria):
+    for call in (PAIR.given_tip_angles, PAIR.given_base_angles):
         with pytest.raises(SettingsError, match=message):
             call(angles, beta)
 
@@ -309,8 +291,6 @@ def test_tubes_that_do_not_nest() -> None:
             TubeMechanics(tubes)
     with pytest.raises(LungaccessError, match="step"):
         TubeMechanics([tube(0.01)], step_rad=0.0)
-    with pytest.raises(SettingsError, match="two tubes at most"):
-        TRIPLE.equilibria([0.0, 0.0, 0.0], [-150.0, -120.0, -100.0])
 
 
 def test_same_input_same_bits() -> None:

@@ -15,7 +15,7 @@ from anatomy.margins import Margins
 from stages.tube import (
     BentPiece,
     ConcentricTubes,
-    NearbyShapes,
+    Neighbourhood,
     ShapeGrid,
     ShapeLimits,
     SlottedSegment,
@@ -152,16 +152,23 @@ def point_at(arcs: np.ndarray, at_mm: float) -> np.ndarray:
     return tip_of(cut)[:3, 3]
 
 
+def near(shapes: TubeShapes, shape: int) -> Neighbourhood:
+    return Neighbourhood(
+        TubeMechanics(shapes.tubes), shapes.insertions_mm[shape], shapes.rotations_rad[shape],
+        shapes.tip_angles_rad[shape],
+    )  # fmt: skip
+
+
 class TestBetween:
     def test_joint_values_between_stops(self, curved: TubeShapes) -> None:
-        mechanics, nearby = TubeMechanics(curved.tubes), NearbyShapes(curved)
+        mechanics = TubeMechanics(curved.tubes)
         rng = np.random.default_rng(2)
         long = np.flatnonzero(curved.insertions_mm.min(axis=1) > 5.0)
         for shape in rng.choice(long, 4, replace=False):
             step = np.sort(rng.uniform(-2.0, 2.0, len(curved.tubes)))[::-1]
             out = curved.insertions_mm[shape] + step
             turned = curved.rotations_rad[shape] + rng.uniform(-0.3, 0.3, len(curved.tubes))
-            found = nearby.at(shape, out, turned)
+            found = near(curved, shape).at(out, turned)
             done = deploy(mechanics, together(curved.tubes, turned + BEND_RAD, out)).final
             assert found is not None
             assert found.scope_from_tip[:3, 2:] == pytest.approx(done.base_from_tip[:3, 2:], abs=1e-8)
@@ -170,7 +177,7 @@ class TestBetween:
             assert off <= found.arc_error_mm < 0.05
 
     def test_the_same_joint_values_are_the_shape(self, curved: TubeShapes) -> None:
-        found = NearbyShapes(curved).at(40, curved.insertions_mm[40], curved.rotations_rad[40])
+        found = near(curved, 40).at(curved.insertions_mm[40], curved.rotations_rad[40])
         assert found is not None and found.arcs == pytest.approx(curved.arcs_of(40), abs=1e-9)
 
     @pytest.mark.slow
@@ -197,9 +204,9 @@ class TestBetween:
     def test_impossible_joint_values(self, curved: TubeShapes) -> None:
         n = len(curved.tubes)
         with pytest.raises(SettingsError, match="ahead of one in it"):
-            NearbyShapes(curved).at(0, np.arange(1.0, n + 1.0), np.zeros(n))
+            near(curved, 0).at(np.arange(1.0, n + 1.0), np.zeros(n))
         with pytest.raises(SettingsError, match="rotations"):
-            NearbyShapes(curved).at(0, np.ones(n), np.full(n, np.nan))
+            near(curved, 0).at(np.ones(n), np.full(n, np.nan))
 
 
 def test_single_tube_bends_towards_x() -> None:

@@ -133,21 +133,6 @@ def test_equilibrium_found_for_the_base_is_one(index: int) -> None:
         assert found.stable or guess is None or not known.stable
 
 
-@pytest.mark.parametrize("index", range(CASES_EACH))
-def test_all_equilibria_of_two_tubes(index: int) -> None:
-    known = random_cases()[index].found
-    every = known.mechanics.equilibria(known.base_angles_rad, known.beta_mm)
-    stable = []
-    for found in every:
-        case = case_of(found)
-        assert found.base_angles_rad == pytest.approx(known.base_angles_rad, abs=1e-9)
-        assert case.energy.newton_step_rad(case.angles) < 1e-4
-        stable.append(case.energy.negative_eigenvalues(case.angles) == 0)
-        assert found.stable == stable[-1]
-    assert min(np.abs(found.tip_angles_rad - known.tip_angles_rad).max() for found in every) < 1e-8
-    assert sum(stable) == (len(every) + 1) // 2  # minima of energy and saddles take turns
-
-
 @pytest.mark.parametrize("lam", [1.0, 1.5, 1.65, 4.6, 4.8, 5.0, 7.6, 8.2])
 @pytest.mark.parametrize("step_rad", [0.02, 0.1, 0.5])
 def test_opposed_pair_loses_stability_once_every_half_wave(lam: float, step_rad: float) -> None:

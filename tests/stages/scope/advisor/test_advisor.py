@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,12 +14,11 @@ from stages.scope.advisor.best_motion import Motion
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.fly_through import camera_flight
 from stages.scope.advisor.instructions import instructions_along
-from stages.scope.advisor.kinematics import ScopeModel, ScopeState, advanced, straight_state, tip_frames
+from stages.scope.advisor.kinematics import ScopeModel, advanced, straight_state
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import goal_at
 from stages.scope.advisor.path import ScopePath
 from stages.scope.advisor.path_search import PathSettings
-from stages.scope.advisor.session import SAME_STATE_MM, Session
 from tests.stages.scope.airways import CARINA, LEFT, LINES, RIGHT, tube, wall_mm
 
 MODEL = ScopeModel(radius_mm=1.5, twist_low_deg=-90.0, bend_low_deg=-120.0)
@@ -130,58 +128,6 @@ def test_a_scope_that_does_not_fit_is_refused(forked: tuple[Lung, Lumen]) -> Non
     lung, lumen = forked
     with pytest.raises(AnatomyError, match="fits nowhere in the trachea"):
         start_state(lumen, lung.tree, ScopeModel(radius_mm=8.0))
-
-
-def follow(session: Session, state: ScopeState, came: list[ScopeState]) -> tuple[str, list[ScopeState], int]:
-    """Do what a session says, with a hand that shakes; pulling back follows the path in reverse."""
-    rng, pulls = np.random.default_rng(0), 0
-    for _ in range(400):
-        advice = session.advise(state)
-        if advice.motion is None:
-            return advice.action, [*came, state], pulls
-        if advice.action == "advance":
-            came.append(state)
-            motion = advice.motion
-            shaky = motion.bend_rad + math.radians(rng.uniform(-0.5, 0.5))
-            state = advanced(MODEL, state, motion.advance_mm, motion.twist_rad, shaky)
-        else:
-            assert advice.motion.advance_mm < 0.0
-            state = came.pop()
-            pulls += 1
-    return "never ends", [*came, state], pulls
-
-
-@pytest.mark.parametrize("target", GOALS)
-def test_a_session_leads_to_the_goal(forked: tuple[Lung, Lumen], target: np.ndarray) -> None:
-    lung, lumen = forked
-    advisor, _path = path_to(forked, target)
-    start = start_state(lumen, lung.tree, MODEL)
-    session = Session(advisor, start, seed=3)
-    action, states, _pulls = follow(session, start, [])
-    assert action == "arrived"
-    assert session.plan.reached
-    tip = tip_frames(MODEL, states[-1].array)[0][:3, 3]
-    assert np.linalg.norm(tip - session.plan.lps_from_tip[:3, 3]) <= SAME_STATE_MM
-    thinner = replace(MODEL, radius_mm=MODEL.radius_mm - SAME_STATE_MM)
-    strayed = ScopeEnvironment(model=thinner, field=advisor.field)
-    assert strayed.fits(np.array([state.array for state in states])).all()
-
-
-@pytest.mark.slow
-def test_a_session_leads_back_out_of_the_wrong_airway(forked: tuple[Lung, Lumen]) -> None:
-    """Down the right bronchus against all advice, then as advised: back to the carina, into the left one."""
-    _right, wrong = path_to(forked, RIGHT)
-    advisor, _path = path_to(forked, GOALS[1])
-    session = Session(advisor, wrong.state(0), seed=3)
-    came = [wrong.state(number) for number in range(wrong.count)]
-    for state in came:
-        session.advise(state)
-    action, states, pulls = follow(session, came.pop(), came)
-    assert pulls > 10
-    assert action == "arrived"
-    assert session.plan.reached
-    tip = tip_frames(MODEL, states[-1].array)[0][:3, 3]
-    assert np.linalg.norm(tip - advisor.goal.centre_lps) <= SAME_STATE_MM + 1.0
 
 
 def test_best_motions_lead_on_or_end_with_a_word(forked: tuple[Lung, Lumen]) -> None:

@@ -72,7 +72,7 @@ def _distance_field(edge: int) -> Work:
 
 
 def _vesselness(edge: int) -> Work:
-    from anatomy.segmentation.vesselness import vesselness
+    from anatomy.segmentation.vessels import vesselness
 
     chest = scenes.chest(edge)
     return lambda: vesselness(chest.hu, chest.lung, chest.grid.spacing_mm)

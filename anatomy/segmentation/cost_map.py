@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from anatomy.base.errors import GridMismatchError, SettingsError
-from anatomy.base.typed import Mask
+from anatomy.base.typed import Int, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.inflation import grown_by_voxels, inflation_voxels
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
@@ -80,3 +80,30 @@ def cost_map(
 def obstacles_of(cost: Volume) -> Mask:
     """Return the voxels that a cost map calls obstacles: those of infinite cost."""
     return np.isposinf(cost.array)
+
+
+ROUNDING = 1e-6
+"""Relative: quotients and squared distances are whole numbers and fractions of small ones."""
+
+
+def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> Int:
+    """Return by how many voxels obstacles grow along i, j and k: `ceil(r_total / s_i)` [Fu2018, sec. IV-B].
+
+    It stands for growing by a radius and proves nothing: an ellipsoid of voxels is no ball, and the tip is
+    not at the centre of its voxel.  Paths in grown obstacles are for comparison alone.
+
+    The spacing `(3,)` is that along i, j, k; the total radius is that of the needle and the safety margin.
+    """
+    quotient = total_radius_mm / np.asarray(spacing_mm, dtype=np.float64)
+    return np.ceil(quotient * (1.0 - ROUNDING)).astype(np.int64)
+
+
+def grown_by_voxels(mask: Mask, axes: Int) -> Mask:
+    """Return the voxels within an ellipsoid of semi-axes `axes`, in voxels, about a voxel of `mask`."""
+    import edt
+
+    if not mask.any():
+        return mask
+    sides = tuple(float(1.0 / a) for a in axes)
+    distance = edt.edt(np.asfortranarray(~mask), anisotropy=sides, order="F", black_border=False, parallel=1)
+    return np.asarray(distance <= 1.0 + ROUNDING)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Int
 from anatomy.grid import Volume, read_only
-from anatomy.inflation import grown_by_voxels, inflation_voxels
+from anatomy.segmentation.cost_map import grown_by_voxels, inflation_voxels
 from anatomy.structures import OUTSIDE
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels.proof import Obstacles

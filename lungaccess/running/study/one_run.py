@@ -5,6 +5,7 @@ That command reads a run as JSON on standard input and writes its answer as JSON
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -28,6 +29,7 @@ from lungaccess.planning.coupled.atlas_store import open_atlas
 from lungaccess.planning.one_system import run as plan
 from lungaccess.planning.success.estimate import FRESH_SEED, chance_of, estimate_success
 from lungaccess.planning.success.judges import MEASURED, OPEN_LOOP
+from lungaccess.planning.one_stage import plan_needle
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
@@ -38,16 +40,17 @@ from lungaccess.running.study.answers import (
     EXACT,
     INVALID_GOAL,
     NO_PLAN,
+    PATH,
     PLAN,
     TIMEOUT,
     UNKNOWN,
     Answer,
     Improvement,
 )
-from lungaccess.running.study.needle_run import needle_answer
 from lungaccess.running.study.patients import Patient, open_patient
 from lungaccess.running.study.runs import Problem, Run
 from lungaccess.running.study.settings import StudyError
+from stages.needle import OMPL_TOLERANCE_MM, Query, violation
 
 KEPT_PATIENTS = 2
 """Runs come case by case, so that a worker needs the last patient and sometimes the next."""
@@ -241,6 +244,58 @@ def main(words: list[str]) -> int:
         return 2
     sys.stdout.write(json.dumps(asdict(made)))
     return 0
+
+
+def needle_answer(run: Run, lung: Lung) -> Answer:
+    """Search for a needle path and let `stages.needle.violations.violation` look at it.
+
+    Raises
+    ------
+    SettingsError
+        If the patient came with no such start pose.
+    TargetError
+        If the target is not in free lung tissue.
+    """
+    problem = run.problem
+    if not 1 <= problem.start <= len(lung.starts):
+        raise SettingsError(
+            f"There is no start pose {problem.start}",
+            expected=f"1 to {len(lung.starts)}",
+            remedy="Correct `starts` in the study's file",
+        )
+    pose = lung.starts[problem.start - 1]
+    target = point_target(lung, np.array(problem.target_lps), origin=problem.origin)
+    found = plan_needle(
+        lung,
+        problem.system,
+        pose,
+        target,
+        planner=run.planner.method,
+        objective=problem.objective,
+        seed=run.seed,
+        iterations=run.iterations,
+        time_s=problem.time_s,
+    )
+    if found.path is None:
+        return Answer(key=run.key, outcome=NO_PLAN, status=TIMEOUT, message=found.outcome)
+    record = found.record()
+    first_s = record["path"].pop("first_path_s")
+    costs = record["path"]["costs"]
+    text = json.dumps(record, sort_keys=True)
+    query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
+    tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.environment.goal_tolerance_mm
+    why = violation(found.environment, query, found.path, goal_tolerance_mm=tolerance_mm)
+    return Answer(
+        key=run.key,
+        outcome=PATH,
+        status=EXACT,
+        message=why,
+        accepted=not why,
+        costs=costs,
+        improvements=(Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
+        plan=text,
+        digest=hashlib.sha256(text.encode()).hexdigest(),
+    )
 
 
 if __name__ == "__main__":

@@ -12,11 +12,9 @@ from typing import Any, Self
 
 from anatomy.base.errors import FileError
 from anatomy.base.settings import to_mapping
-from lungaccess.running.study.answers import Answer
-from lungaccess.running.study.file_errors import BUSY_S, damaged, file_errors
+from lungaccess.running.study.answers import STATUS, Answer
 from lungaccess.running.study.rows import add_rest, experiment_row, problem_row, run_row
 from lungaccess.running.study.runs import Problem, Run
-from lungaccess.running.study.schema import APPLICATION_ID, FORMAT, KERNELS_TABLE, statements
 
 BATCH = 1000
 """Rows that are read at once: a few of them take no time, and all of them would fill the memory."""
@@ -199,3 +197,113 @@ class ResultsFile:
             "SELECT id FROM plannerConfigs WHERE name = ? AND settings = ?", row
         ).fetchone()
         return int(found[0])
+
+
+BUSY_S = 60.0
+"""Longer than any other process needs for the transaction of a run."""
+
+
+@contextlib.contextmanager
+def file_errors(path: Path) -> Iterator[None]:
+    """Turn what SQLite raises into a FileError that says what to do."""
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        raise damaged(path, str(error)) from error
+    except sqlite3.Error as error:
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        if code in (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR):
+            raise FileError(
+                f"{path} cannot be written: {error}",
+                expected="room on the disk",
+                remedy="What is stored is sound: make room and start the study again, it goes on from there",
+            ) from error
+        if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+            raise FileError(
+                f"{path} has been locked by another program for {BUSY_S:g} s",
+                remedy="Close that program and start the study again, it goes on from there",
+                expected="a file that no other program holds",
+            ) from error
+        if code in (sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_CORRUPT):
+            raise damaged(path, str(error)) from error
+        raise FileError(
+            f"{path} cannot be used: {error}",
+            expected="a folder that exists and may be written to",
+            remedy="Choose another file with --out",
+        ) from error
+
+
+def damaged(path: Path, why: str) -> FileError:
+    """Return the error for a file that is no sound database."""
+    return FileError(
+        f"{path} is damaged or is not a database: {why}",
+        expected="a results file of `lungaccess study run`",
+        remedy="Restore it from a copy, or choose another file with --out and run the study again",
+    )
+
+
+APPLICATION_ID = 0x6C756E67
+FORMAT = 1
+"""Raise it when the tables change: a file of another format is refused."""
+
+OMPL_TABLES = """
+CREATE TABLE experiments (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, name VARCHAR(512), totaltime REAL, timelimit REAL,
+    memorylimit REAL, runcount INTEGER, version VARCHAR(128), hostname VARCHAR(1024), cpuinfo TEXT,
+    date DATETIME, seed VARCHAR(24), setup TEXT, target INTEGER, start INTEGER);
+CREATE TABLE plannerConfigs (
+    id INTEGER PRIMARY KEY AUTOINCREMENT, name VARCHAR(512) NOT NULL, settings TEXT,
+    UNIQUE (name, settings));
+CREATE TABLE enums (
+    name VARCHAR(512), value INTEGER, description TEXT, PRIMARY KEY (name, value));
+CREATE TABLE runs (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    experimentid INTEGER NOT NULL REFERENCES experiments(id) ON DELETE CASCADE,
+    plannerid INTEGER NOT NULL REFERENCES plannerConfigs(id) ON DELETE CASCADE,
+    time REAL, memory REAL, iterations INTEGER, solved BOOLEAN, correct_solution BOOLEAN, status ENUM,
+    solution_length REAL, cpu_time REAL, first_solution_time REAL, solutions INTEGER, seed INTEGER,
+    cost REAL, inverse_clearance REAL, cost_map REAL, voxel_sum REAL, key TEXT NOT NULL UNIQUE);
+CREATE TABLE progress (
+    runid INTEGER REFERENCES runs(id) ON DELETE CASCADE, time REAL, best_cost REAL, iterations INTEGER,
+    PRIMARY KEY (runid, time));
+"""
+"""Their names and columns are those that `ompl.tools.readBenchmarkLog` makes of a log, so that Planner Arena
+and SQL written for those databases read them.  An experiment is one problem: a target of a case."""
+
+OUR_TABLES = """
+CREATE TABLE problems (
+    experimentid INTEGER PRIMARY KEY REFERENCES experiments(id) ON DELETE CASCADE,
+    key TEXT NOT NULL UNIQUE, case_name TEXT NOT NULL, patient TEXT, lung TEXT NOT NULL, system TEXT NOT NULL,
+    fissures_allowed BOOLEAN, objective TEXT NOT NULL, target INTEGER, origin TEXT,
+    x_lps_mm REAL, y_lps_mm REAL, z_lps_mm REAL, start INTEGER, iterations INTEGER, time_s REAL);
+CREATE TABLE outcomes (
+    runid INTEGER PRIMARY KEY REFERENCES runs(id) ON DELETE CASCADE,
+    outcome TEXT NOT NULL, failed BOOLEAN NOT NULL, message TEXT, advice TEXT);
+CREATE TABLE plans (
+    runid INTEGER PRIMARY KEY REFERENCES runs(id) ON DELETE CASCADE,
+    digest TEXT NOT NULL, plan TEXT NOT NULL);
+CREATE TABLE findings (
+    runid INTEGER REFERENCES runs(id) ON DELETE CASCADE, number INTEGER, name TEXT, ok BOOLEAN, value REAL,
+    bound REAL, side TEXT, tolerance REAL, unit TEXT, detail TEXT, PRIMARY KEY (runid, number)) WITHOUT ROWID;
+CREATE TABLE rejections (
+    runid INTEGER REFERENCES runs(id) ON DELETE CASCADE, reason TEXT, count INTEGER,
+    PRIMARY KEY (runid, reason)) WITHOUT ROWID;
+CREATE INDEX runs_of_experiment ON runs (experimentid);
+"""
+
+KERNELS_TABLE = """CREATE TABLE IF NOT EXISTS made_with (
+    runid INTEGER PRIMARY KEY REFERENCES runs(id) ON DELETE CASCADE, kernels TEXT NOT NULL)"""
+"""The kernels that made a run; a file may lack the table, or a run its row."""
+
+
+def statements() -> str:
+    """Return what makes an empty results file, as one transaction."""
+    words = ", ".join(f"('status', {number}, '{word}')" for number, word in enumerate(STATUS))
+    return f"""
+BEGIN IMMEDIATE;
+{OMPL_TABLES}{OUR_TABLES}{KERNELS_TABLE};
+INSERT INTO enums VALUES {words};
+PRAGMA application_id = {APPLICATION_ID};
+PRAGMA user_version = {FORMAT};
+COMMIT;
+"""

@@ -16,14 +16,13 @@ from anatomy.base.typed import Int16, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom, make_phantom
 from anatomy.segmentation import growing
-from anatomy.segmentation.airway import Airways, segment_airway
+from anatomy.segmentation.airway import Airways, local_minima_map, scale_of, segment_airway
 from anatomy.segmentation.airway_warnings import airway_warnings, tree_or_error
 from anatomy.segmentation.growing import LEVEL_RATIO, levels
 from anatomy.segmentation.kernels import local_minima as kernel
 from anatomy.segmentation.kernels.lumen_edge import grow_wall, join_corners
 from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.segmentation.kernels.states import LUMEN
-from anatomy.segmentation.local_minima import local_minima_map, scale_of
 from anatomy.segmentation.lungs import Lungs
 
 CROSS = ndimage.generate_binary_structure(2, 1)

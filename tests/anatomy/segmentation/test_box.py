@@ -8,9 +8,8 @@ from scipy import ndimage
 
 from anatomy.base.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
-from anatomy.segmentation.box import Box
+from anatomy.segmentation.box import Box, between
 from anatomy.segmentation.folder import onto_grid
-from anatomy.segmentation.interpolation import between
 from anatomy.segmentation.lungs import Lungs
 
 THICK = Grid.from_spacing((40, 36, 30), (0.8, 0.8, 3.0), (-10.0, 5.0, 100.0))

@@ -19,7 +19,7 @@ from lungaccess.judging.checking import Finding, check
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.html import tables
-from lungaccess.showing.slicer.readme import readme
+from lungaccess.showing.slicer.export import readme
 
 LIMITS = {
     "tube.sweep.limit": "at most",

@@ -16,9 +16,8 @@ from anatomy.base.errors import FileError
 from lungaccess.running.study import results as results_module
 from lungaccess.running.study.answers import CRASH
 from lungaccess.running.study.compare import differences
-from lungaccess.running.study.results import ResultsFile
+from lungaccess.running.study.results import APPLICATION_ID, ResultsFile
 from lungaccess.running.study.runs import Run
-from lungaccess.running.study.schema import APPLICATION_ID
 from tests.lungaccess.running.study.toys import toy_answer
 
 CHILDREN = ("outcomes", "plans", "progress", "findings")

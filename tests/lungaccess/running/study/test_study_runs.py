@@ -19,8 +19,7 @@ from lungaccess.problem import peripheral
 from lungaccess.problem.system import load_system
 from lungaccess.running.study import one_run, summarise
 from lungaccess.running.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
-from lungaccess.running.study.needle_run import needle_answer
-from lungaccess.running.study.one_run import answer
+from lungaccess.running.study.one_run import answer, needle_answer
 from lungaccess.running.study.patients import open_patient
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.runs import Run, runs_of

@@ -32,7 +32,7 @@ from lungaccess.showing.report.html import (
     tables,
     words,
 )
-from lungaccess.showing.report.html.glance import glance_section
+from lungaccess.showing.report.html.page_of_plan import glance_section
 from lungaccess.showing.report.html.page_of_reach import STEPS_PER_MM, packed_map
 from tests.lungaccess.showing.report.pages import SIZE_LIMIT, WINDOW, make_reach, reach_file, report_data
 

@@ -20,10 +20,19 @@ from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath
 from stages.needle.query import Query
 from stages.needle.search import guide_paths
-from stages.needle.search.guide_paths import ARCS_PER_ITERATION, CELLS, LAYERS, LEAST_GAIN, GuidePathFinder
+from stages.needle.search.guide_paths import (
+    ARCS_PER_ITERATION,
+    CELLS,
+    CURVATURE_SHARE,
+    LAYERS,
+    LEAST_GAIN,
+    SKEWS,
+    GuidePathFinder,
+    StateLatticeSearch,
+    via_points,
+)
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.portfolio import PortfolioSearch
-from stages.needle.search.state_lattice import CURVATURE_SHARE, SKEWS, StateLatticeSearch, via_points
 from tests.stages.needle.proved import assert_proved
 from tests.stages.scenes import Canvas
 

@@ -5,15 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from cyclopts import Argument, CycloptsError
-from cyclopts.exceptions import (
-    CoercionError,
-    MissingArgumentError,
-    UnknownCommandError,
-    UnknownOptionError,
-    UnusedCliTokensError,
-    ValidationError,
-)
+from cyclopts import Argument, CycloptsError, exceptions
 
 from anatomy.base.errors import LungaccessError
 from lungaccess.cli.examples import EXAMPLES
@@ -49,24 +41,24 @@ def usage_error(error: CycloptsError) -> UsageError:
 def _found_and_expected(error: CycloptsError) -> tuple[str, str]:
     """Return what the user wrote, and what could stand there."""
     argument, written = error.argument, str(error)
-    if isinstance(error, ValidationError) and argument is not None:
+    if isinstance(error, exceptions.ValidationError) and argument is not None:
         return f"{_name(argument)} is {_value(argument)}", error.exception_message
-    if isinstance(error, MissingArgumentError) and argument is not None:
+    if isinstance(error, exceptions.MissingArgumentError) and argument is not None:
         name, what = (error.keyword, "has no value") if error.keyword else (_name(argument), "is missing")
         return f"{name} {what}", argument.parameter.help or f"a value for {_name(argument)}"
-    if isinstance(error, CoercionError) and error.token is not None:
+    if isinstance(error, exceptions.CoercionError) and error.token is not None:
         name = error.token.keyword or ("A value" if argument is None else _name(argument))
         return f"{name} is {error.token.value!r}. {_guess(written)}", _kind(error)
-    if isinstance(error, UnknownCommandError):
+    if isinstance(error, exceptions.UnknownCommandError):
         return written, "a command of lungaccess"
-    if isinstance(error, UnknownOptionError):
+    if isinstance(error, exceptions.UnknownOptionError):
         return written, "an option of this command"
-    if isinstance(error, UnusedCliTokensError):
+    if isinstance(error, exceptions.UnusedCliTokensError):
         return f"Words too many: {' '.join(error.unused_tokens or ())}", "no more words than the example has"
     return written, "the words that this command takes"
 
 
-def _kind(error: CoercionError) -> str:
+def _kind(error: exceptions.CoercionError) -> str:
     """Return what a value has to be."""
     choices = re.search(r"Choose from:? (.*?)\.?( Did you mean|$)", str(error), re.DOTALL)
     if choices:

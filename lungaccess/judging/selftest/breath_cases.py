@@ -8,17 +8,7 @@ from anatomy.base.typed import Float, Labels
 from anatomy.grid import Grid
 from anatomy.motion.motion import LEFT, Motion
 from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, VESSEL
-from lungaccess.judging.selftest.scenes import (
-    Case,
-    Random,
-    draw_airway,
-    empty_labels,
-    line_tree,
-    lung_of,
-    near_segment,
-    true_distances,
-    unit,
-)
+from lungaccess.judging.selftest import scenes
 from lungaccess.uncertainty.breathing.kernels import rules
 from lungaccess.uncertainty.breathing.kernels.rigid import Rigid
 from lungaccess.uncertainty.breathing.kernels.window import MOST_LEAVES, divide
@@ -44,17 +34,20 @@ FAR_MM = 4.0
 """Voxels farther from the devices in the masks come near in no phase."""
 
 
-def windows(rng: Random) -> Case:
+def windows(rng: scenes.Random) -> scenes.Case:
     """Draw a breathing tissue; a clear stretch is so in sampled phases, and a blocked one is not."""
-    labels, grid = empty_labels((-7.0, -7.0, -18.0), (7.0, 7.0, 3.0), 1.0)
+    labels, grid = scenes.empty_labels((-7.0, -7.0, -18.0), (7.0, 7.0, 3.0), 1.0)
     ahead = np.array([*rng.uniform(-0.15, 0.15, 2), -1.0])
     points = np.array([0.0, 0.0, -1.0]) + ARC_MM[:, None] * ahead / np.linalg.norm(ahead)
     for _ in range(5):
         place = points[int(rng.integers(16, 31))] + np.array([*rng.uniform(1.4, 2.2) * unit2(rng), 0.0])
-        labels[near_segment(grid, place, place + unit(rng), 0.5)] = VESSEL
-    draw_airway(labels, grid, (0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 2.0)
-    lung, motion = lung_of(labels, grid, line_tree((0, 0, 0), (0, 0, -3.0), 2.0)), breathing(rng)
-    target = points[-1] + 0.5 * unit(rng)
+        labels[scenes.near_segment(grid, place, place + scenes.unit(rng), 0.5)] = VESSEL
+    scenes.draw_airway(labels, grid, (0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 2.0)
+    lung, motion = (
+        scenes.lung_of(labels, grid, scenes.line_tree((0, 0, 0), (0, 0, -3.0), 2.0)),
+        breathing(rng),
+    )
+    target = points[-1] + 0.5 * scenes.unit(rng)
     field, depth = lung.obstacle_field(with_fissures=False), lung.lumen_depth
     leaves, rigid = np.zeros((MOST_LEAVES, 5)), carrier(motion, points[0], LEFT)
     count = divide(
@@ -76,16 +69,16 @@ def windows(rng: Random) -> Case:
                     return f"{said}; {spare:.4f} mm spare at {phase:.4f}"
         return ""
 
-    return Case(answers=leaves.ravel(), contradiction=contradiction)
+    return scenes.Case(answers=leaves.ravel(), contradiction=contradiction)
 
 
-def unit2(rng: Random) -> Float:
+def unit2(rng: scenes.Random) -> Float:
     """Return a random direction `(2,)`."""
     around = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(around), np.sin(around)])
 
 
-def breathing(rng: Random) -> Motion:
+def breathing(rng: scenes.Random) -> Motion:
     """Return a motion of some millimetres that stretches and turns tissue, here more and there less."""
     grid = Grid.from_spacing((6, 6, 7), (NODE_MM,) * 3, (-12.5, -12.5, -22.5))
     places = grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1))
@@ -137,6 +130,6 @@ def spare_mm(
         inside = devices[:7] - share * displaced(motion, inside)
     return min(
         TOLERANCE_MM - miss_mm(points[-1], target), HOLE_MM - miss_mm(points[8], points[8]),
-        2.0 * rules.CORNER_MM - float(true_distances(labels, grid, inside, LUMEN).max()),
+        2.0 * rules.CORNER_MM - float(scenes.true_distances(labels, grid, inside, LUMEN).max()),
         least_mm(7, VESSEL, KEPT_MM), least_mm(20, AIRWAY, KEPT_MM), least_mm(15, LUMEN, 0.0, 20),
     )  # fmt: skip

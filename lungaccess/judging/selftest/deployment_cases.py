@@ -14,18 +14,7 @@ from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from lungaccess.judging.selftest.scenes import (
-    ROUNDING_MM,
-    Case,
-    Random,
-    draw_airway,
-    empty_labels,
-    line_tree,
-    lung_of,
-    near_segment,
-    true_distances,
-    unit,
-)
+from lungaccess.judging.selftest import scenes
 from lungaccess.planning.coupled.cost_to_go import cost_to_go
 from lungaccess.planning.coupled.kernels import box_queue, deployment_box
 from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment
@@ -80,18 +69,18 @@ class Reaching:
         return np.array(self.path.frames()[-1][:3, 3])
 
 
-def drawn_lung(rng: Random) -> Lung:
+def drawn_lung(rng: scenes.Random) -> Lung:
     """Return a box of 20 mm with an airway that ends in tissue, and vessels around its end."""
-    labels, grid = empty_labels((-9.0, -9.0, -20.0), (9.0, 9.0, 3.0), 1.0)
+    labels, grid = scenes.empty_labels((-9.0, -9.0, -20.0), (9.0, 9.0, 3.0), 1.0)
     for _ in range(8):
         place = np.array([*rng.uniform(-6.0, 6.0, 2), rng.uniform(-17.0, -6.0)])
-        labels[near_segment(grid, place, place + 2.0 * unit(rng), 0.6)] = VESSEL
+        labels[scenes.near_segment(grid, place, place + 2.0 * scenes.unit(rng), 0.6)] = VESSEL
     ends = (0.0, 0.0, 0.0), (0.0, 0.0, -4.0)
-    draw_airway(labels, grid, *ends, 2.2)
-    return lung_of(labels, grid, line_tree(*ends, 2.2))
+    scenes.draw_airway(labels, grid, *ends, 2.2)
+    return scenes.lung_of(labels, grid, scenes.line_tree(*ends, 2.2))
 
 
-def drawn_tubes(rng: Random, environment: TubeEnvironment) -> tuple[Float, Float, int, Float, Float]:
+def drawn_tubes(rng: scenes.Random, environment: TubeEnvironment) -> tuple[Float, Float, int, Float, Float]:
     """Return values and base of a deployment, why it is refused, trace and tip; see `Reaching`."""
     inner = rng.uniform(4.0, 9.9)
     place = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(1.0, 3.0)])
@@ -107,7 +96,7 @@ def drawn_tubes(rng: Random, environment: TubeEnvironment) -> tuple[Float, Float
     return values, base, int(reason), trace, np.concatenate([tip, normal])
 
 
-def tubes(rng: Random) -> Case:
+def tubes(rng: scenes.Random) -> scenes.Case:
     """Draw deployments; samples of an accepted one, beyond the wall, are clear of all but its branch."""
     lung = drawn_lung(rng)
     environment = tube_environment(lung, with_fissures=False)
@@ -122,15 +111,17 @@ def tubes(rng: Random) -> Case:
             points = centreline(base[:3], base[3:6], tip[9:], outer, inner, at)
             needed = np.where(at <= outer, TUBES[kernels.OUTER_RADIUS], TUBES[kernels.INNER_RADIUS])
             gap = (
-                true_distances(lung.labels, lung.grid, points, OBSTACLES, 0) - needed - TUBES[kernels.MARGIN]
+                scenes.true_distances(lung.labels, lung.grid, points, OBSTACLES, 0)
+                - needed
+                - TUBES[kernels.MARGIN]
             )
-            out = true_distances(lung.labels, lung.grid, points[at > left + 1.0], LUMEN)
-            if gap.min() < -ROUNDING_MM or out.min(initial=1.0) <= 0.0:
+            out = scenes.true_distances(lung.labels, lung.grid, points[at > left + 1.0], LUMEN)
+            if gap.min() < -scenes.ROUNDING_MM or out.min(initial=1.0) <= 0.0:
                 return f"accepted with a clearance of {gap.min():.4f} mm beyond what is required, in samples"
         return ""
 
     answers = [np.concatenate([[each[2]], each[3], each[4][:9]]) for each in drawn]
-    return Case(answers=np.concatenate(answers), contradiction=contradiction)
+    return scenes.Case(answers=np.concatenate(answers), contradiction=contradiction)
 
 
 def centreline(base: Float, forward: Float, normal: Float, outer: float, inner: float, at: Float) -> Float:
@@ -146,7 +137,7 @@ def centreline(base: Float, forward: Float, normal: Float, outer: float, inner: 
     return np.stack([np.interp(at, fine, points[:, n]) for n in range(3)], axis=1)
 
 
-def drawn_reaching(rng: Random) -> Reaching:
+def drawn_reaching(rng: scenes.Random) -> Reaching:
     """Draw tubes until some are accepted and have a clear arc of the needle ahead."""
     lung = drawn_lung(rng)
     environment = tube_environment(lung, with_fissures=False)
@@ -163,9 +154,11 @@ def drawn_reaching(rng: Random) -> Reaching:
         path = ArcPath(lps_from_start=pose(tip[:3], tip[3:6], tip[6:9]), arcs=np.array([arc]))
         points, lengths = path.sample(0.05)
         beyond = points[lengths >= NEEDLE.exit_exemption_mm]
-        free = true_distances(lung.labels, lung.grid, beyond, OBSTACLES).min(initial=1.0) >= REQUIRED_MM
-        at_exit = true_distances(lung.labels, lung.grid, points, OBSTACLES, 0).min() >= REQUIRED_MM
-        out = true_distances(lung.labels, lung.grid, points, LUMEN).min() >= NEEDLE.radius_mm
+        free = (
+            scenes.true_distances(lung.labels, lung.grid, beyond, OBSTACLES).min(initial=1.0) >= REQUIRED_MM
+        )
+        at_exit = scenes.true_distances(lung.labels, lung.grid, points, OBSTACLES, 0).min() >= REQUIRED_MM
+        out = scenes.true_distances(lung.labels, lung.grid, points, LUMEN).min() >= NEEDLE.radius_mm
         if free and at_exit and out:
             return Reaching(lung=lung, tubes=environment, needle=needle, values=values, base=base, path=path)
 
@@ -178,14 +171,14 @@ def greatest_insertions() -> Float:
     return found
 
 
-def not_reached(rng: Random) -> Case:
+def not_reached(rng: scenes.Random) -> scenes.Case:
     """Draw a deployment that reaches a target; no box that holds it is ruled out, and far ones are."""
     case = drawn_reaching(rng)
     environment, boxes = _proof_environment(case), []
     for scale in (0.01, 0.03, 0.1, 0.2, 0.3, 0.5):
         halves = scale * HALVES * rng.uniform(0.3, 1.0, 8)
         boxes.append(np.concatenate([case.values + rng.uniform(-1.0, 1.0, 8) * halves, halves]))
-    targets = [(case.target, True)] + [(case.target + away * unit(rng), False) for away in (3.0, 8.0)]
+    targets = [(case.target, True)] + [(case.target + away * scenes.unit(rng), False) for away in (3.0, 8.0)]
     pieces = unreachable.Pieces(
         frames=FRAME[None],
         first_cone=np.array([0, 1]),
@@ -211,7 +204,7 @@ def not_reached(rng: Random) -> Case:
             else ""
         )
 
-    return Case(
+    return scenes.Case(
         answers=np.concatenate([np.concatenate([o.outcome, o.share, o.looked]) for o in outcomes]),
         contradiction=contradiction,
     )
@@ -234,7 +227,7 @@ def _proof_environment(case: Reaching) -> ProofEnvironment:
     )  # fmt: skip
 
 
-def cost_bound(rng: Random) -> Case:
+def cost_bound(rng: scenes.Random) -> scenes.Case:
     """Draw a deployment and a path to a target; no bound of a box that holds it is above the path's cost."""
     case, bounds = drawn_reaching(rng), []
     cost = path_cost(case)
@@ -261,14 +254,14 @@ def cost_bound(rng: Random) -> Case:
     def contradiction() -> str:
         return f"bound {max(bounds):.4f}, cost {cost:.4f}" if max(bounds) > cost * (1.0 + 1e-3) else ""
 
-    return Case(answers=np.array(bounds), contradiction=contradiction)
+    return scenes.Case(answers=np.array(bounds), contradiction=contradiction)
 
 
 def path_cost(case: Reaching) -> float:
     """Return the cost of a path, summed up over true clearances."""
     points, lengths = case.path.sample(0.05)
     middle = 0.5 * (points[1:] + points[:-1])
-    clearance = true_distances(case.lung.labels, case.lung.grid, middle, OBSTACLES)
+    clearance = scenes.true_distances(case.lung.labels, case.lung.grid, middle, OBSTACLES)
     rates = WEIGHTS[0] / np.maximum(clearance, CLEARANCE_FLOOR_MM) + WEIGHTS[1]
     return float((rates * np.diff(lengths)).sum())
 

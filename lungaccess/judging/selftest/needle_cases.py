@@ -11,17 +11,7 @@ from anatomy.fields import corner_geometry, distance_field
 from anatomy.kernels.field import MIN_GAP_MM, UNITS_PER_MM, exact_at
 from anatomy.poses import pose
 from anatomy.structures import LUMEN, OBSTACLES, VESSEL
-from lungaccess.judging.selftest.scenes import (
-    ROUNDING_MM,
-    Case,
-    Random,
-    draw_airway,
-    empty_labels,
-    near_segment,
-    tilted,
-    true_distances,
-    unit,
-)
+from lungaccess.judging.selftest import scenes
 from stages.needle import (
     ArcPath,
     Needle,
@@ -41,10 +31,10 @@ SAMPLE_MM = 0.02
 """Paths are sampled so finely where an answer is compared with the truth."""
 
 
-def distances(rng: Random) -> Case:
+def distances(rng: scenes.Random) -> scenes.Case:
     """Draw voxels and points; a bound is below the distance by a voxel's diagonal at most."""
     spacing = rng.uniform(0.5, 1.5, 3)
-    labels, grid = empty_labels((0.0, 0.0, 0.0), 9.0 * spacing, spacing)
+    labels, grid = scenes.empty_labels((0.0, 0.0, 0.0), 9.0 * spacing, spacing)
     labels[tuple(rng.integers(0, 9, (12, 3)).T)] = VESSEL
     points = rng.uniform(0.0, 9.0, (60, 3)) * spacing
     field, exact = distance_field("obstacle", labels != 0, grid), np.zeros(len(points))
@@ -52,26 +42,28 @@ def distances(rng: Random) -> Case:
     exact_at(labels, corner_geometry(grid), points, VESSEL, -1, cap, exact)
 
     def contradiction() -> str:
-        truth = true_distances(labels, grid, points, VESSEL)
+        truth = scenes.true_distances(labels, grid, points, VESSEL)
         loss = float(np.linalg.norm(spacing)) + 2.0 / UNITS_PER_MM
-        wrong = (bounds > truth + ROUNDING_MM) | (bounds < truth - loss)
-        wrong |= np.abs(exact - np.minimum(truth, cap)) > ROUNDING_MM
+        wrong = (bounds > truth + scenes.ROUNDING_MM) | (bounds < truth - loss)
+        wrong |= np.abs(exact - np.minimum(truth, cap)) > scenes.ROUNDING_MM
         n = int(np.argmax(wrong))
         said = f"bound {bounds[n]:.6f} mm, exact search {exact[n]:.6f} mm, true distance {truth[n]:.6f} mm"
         return said if wrong.any() else ""
 
-    return Case(answers=np.concatenate([bounds, exact]), contradiction=contradiction)
+    return scenes.Case(answers=np.concatenate([bounds, exact]), contradiction=contradiction)
 
 
-def tissue(rng: Random, vessels: int, wall_mm: float = math.inf) -> NeedleEnvironment:
+def tissue(rng: scenes.Random, vessels: int, wall_mm: float = math.inf) -> NeedleEnvironment:
     """Return a box of 18 mm with an airway behind the start, and vessels beside the way and beyond x."""
-    labels, grid = empty_labels((-9.0, -9.0, -12.0), (9.0, 9.0, 12.0), (1.0, 1.1, 0.9))
+    labels, grid = scenes.empty_labels((-9.0, -9.0, -12.0), (9.0, 9.0, 12.0), (1.0, 1.1, 0.9))
     for _ in range(vessels):
         around, away = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(2.0, 6.0)
         place = np.array([away * math.cos(around), away * math.sin(around), rng.uniform(-5.0, 9.0)])
-        labels[near_segment(grid, place, place + 2.0 * unit(rng), rng.uniform(0.6, 1.0))] = VESSEL
+        labels[scenes.near_segment(grid, place, place + 2.0 * scenes.unit(rng), rng.uniform(0.6, 1.0))] = (
+            VESSEL
+        )
     labels[grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1))[..., 0] > wall_mm] = VESSEL
-    draw_airway(labels, grid, (-9.0, 0.0, -10.0), (9.0, 0.0, -10.0), 1.2)
+    scenes.draw_airway(labels, grid, (-9.0, 0.0, -10.0), (9.0, 0.0, -10.0), 1.2)
     needle = Needle(diameter_mm=0.8, max_curvature_per_mm=0.05, exit_exemption_mm=3.0)
     return environment_of_labels(labels, grid, needle, required_clearance_mm=REQUIRED_MM)
 
@@ -84,20 +76,20 @@ def spare_mm(environment: NeedleEnvironment, path: ArcPath, branch: int) -> floa
     labels, grid, limits = environment.obstacles.labels, environment.grid, environment.limits
     points, lengths = path.sample(SAMPLE_MM)
     in_exit = (lengths < limits.exempt_mm) & (branch >= 0)
-    spare = true_distances(labels, grid, points[~in_exit], OBSTACLES) - limits.required_mm
-    at_exit = true_distances(labels, grid, points[in_exit], OBSTACLES, branch) - limits.required_mm
-    lumen = true_distances(labels, grid, points[in_exit], LUMEN) - limits.radius_mm
+    spare = scenes.true_distances(labels, grid, points[~in_exit], OBSTACLES) - limits.required_mm
+    at_exit = scenes.true_distances(labels, grid, points[in_exit], OBSTACLES, branch) - limits.required_mm
+    lumen = scenes.true_distances(labels, grid, points[in_exit], LUMEN) - limits.radius_mm
     return float(np.concatenate([spare, at_exit, lumen]).min())
 
 
-def arcs(rng: Random) -> Case:
+def arcs(rng: scenes.Random) -> scenes.Case:
     """Draw paths of one and two arcs; a clear one is clear in all samples, another is not."""
     environment, paths = tissue(rng, 5), []
     for _ in range(6):
         pieces = np.column_stack(
             [rng.uniform(3.0, 8.0, 2), rng.uniform(-3.0, 3.0, 2), rng.uniform(0, 0.05, 2)]
         )
-        frame = tilted(START, 0.3 * unit(rng), rng.uniform(0.0, 0.3), rng.uniform(0.0, 6.0))
+        frame = scenes.tilted(START, 0.3 * scenes.unit(rng), rng.uniform(0.0, 0.3), rng.uniform(0.0, 6.0))
         paths.append(ArcPath(lps_from_start=frame, arcs=pieces[: int(rng.integers(1, 3))]))
     branches = rng.integers(-1, 1, len(paths)).tolist()
     labels = [
@@ -107,14 +99,14 @@ def arcs(rng: Random) -> Case:
     def contradiction() -> str:
         for path, branch, label in zip(paths, branches, labels, strict=True):
             spare = spare_mm(environment, path, branch)
-            if spare < -ROUNDING_MM if label == 0 else spare > MIN_GAP_MM + SAMPLE_MM:
+            if spare < -scenes.ROUNDING_MM if label == 0 else spare > MIN_GAP_MM + SAMPLE_MM:
                 return f"blocking label {label}, true clearance beyond what is required {spare:.4f} mm"
         return ""
 
-    return Case(answers=np.array(labels, dtype=np.float64), contradiction=contradiction)
+    return scenes.Case(answers=np.array(labels, dtype=np.float64), contradiction=contradiction)
 
 
-def start_region(rng: Random) -> Case:
+def start_region(rng: scenes.Random) -> scenes.Case:
     """Draw a wall beside a path; from starts of the proved part, aside to the wall, the path is clear."""
     environment = tissue(rng, 2, wall_mm=rng.uniform(1.8, 3.0))
     target = np.array([*rng.uniform(-0.5, 0.5, 2), 4.0])
@@ -125,19 +117,21 @@ def start_region(rng: Random) -> Case:
         max_curvature_per_mm=environment.limits.kappa,
     )  # fmt: skip
     aside, around = np.array([1.0, 0.0, 0.0]), math.atan2(START[0, 1], START[0, 0])
-    drawn = [(around, aside), (around + math.pi, aside), (rng.uniform(0.0, 6.3), unit(rng))]
+    drawn = [(around, aside), (around + math.pi, aside), (rng.uniform(0.0, 6.3), scenes.unit(rng))]
 
     def contradiction() -> str:
         for n in range(0, len(proved.offsets_mm), 3):
             for around, aside in drawn:
                 offset, tilt = float(proved.offsets_mm[n]), float(proved.tilts_rad[n])
-                moved = tilted(START, (1.0 - 1e-9) * offset * aside, max(tilt - 1e-9, 0.0), around)
+                moved = scenes.tilted(START, (1.0 - 1e-9) * offset * aside, max(tilt - 1e-9, 0.0), around)
                 path = region.path_from(moved)
                 if path is None or not _reaches(environment, path, target):
                     return f"{offset:.4f} mm and {tilt:.4f} rad proved, but a start there has no such path"
         return ""
 
-    return Case(answers=np.concatenate([proved.offsets_mm, proved.tilts_rad]), contradiction=contradiction)
+    return scenes.Case(
+        answers=np.concatenate([proved.offsets_mm, proved.tilts_rad]), contradiction=contradiction
+    )
 
 
 NOTHING_TRIED = TriedStarts(
@@ -153,17 +147,17 @@ def _reaches(environment: NeedleEnvironment, path: ArcPath, target: Float) -> bo
         np.linalg.norm(path.frames()[-1][:3, 3] - target) < 1e-6
         and path.arcs[:, 2].max() <= limits.kappa * (1.0 + 1e-6)
         and path.max_angle_from_start_rad() <= limits.max_angle_rad + 1e-6
-        and spare_mm(environment, path, 0) >= -ROUNDING_MM
+        and spare_mm(environment, path, 0) >= -scenes.ROUNDING_MM
     )
 
 
-def no_path(rng: Random) -> Case:
+def no_path(rng: scenes.Random) -> scenes.Case:
     """Draw a path in a corridor just wide enough, open or walled off, and a needle that just bends so."""
     kappa = 1.0 / float(rng.uniform(5.0, 12.0))
     pieces = np.column_stack([rng.uniform(3.0, 6.0, 3), rng.uniform(-3.0, 3.0, 3), kappa * np.ones(3)])
     pieces = pieces[: int(rng.integers(1, 4))]
     pieces[:, 0] *= min(3.0 / float(kappa * pieces[:, 0].sum()), 1.0)
-    path = ArcPath(lps_from_start=pose(np.zeros(3), unit(rng)), arcs=pieces)
+    path = ArcPath(lps_from_start=pose(np.zeros(3), scenes.unit(rng)), arcs=pieces)
     walled = bool(rng.random() < 0.3)
     environment = _corridor(path, kappa, walled)
     target = path.frames()[-1][:3, 3]
@@ -177,7 +171,7 @@ def no_path(rng: Random) -> Case:
         exists = not walled and spare_mm(environment, path, -1) >= 0.0
         return f"outcome: {proof.outcome}; a path exists: {exists}" if denied and exists else ""
 
-    return Case(answers=np.array([denied, proof.states, proof.cell_mm]), contradiction=contradiction)
+    return scenes.Case(answers=np.array([denied, proof.states, proof.cell_mm]), contradiction=contradiction)
 
 
 PROOF_STEPS = 25
@@ -190,7 +184,7 @@ SPACING_MM = 1.0
 def _corridor(path: ArcPath, kappa: float, walled: bool) -> NeedleEnvironment:
     """Return tissue that is all vessel but for the voxels that are too near to a path."""
     points, lengths = path.sample(0.2)
-    labels, grid = empty_labels(points.min(axis=0) - 3.0, points.max(axis=0) + 3.0, SPACING_MM)
+    labels, grid = scenes.empty_labels(points.min(axis=0) - 3.0, points.max(axis=0) + 3.0, SPACING_MM)
     places = grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1))
     nearest = np.full(grid.shape, np.inf)
     for point in points if not walled else points[np.abs(lengths - 0.5 * lengths[-1]) > 1.6]:

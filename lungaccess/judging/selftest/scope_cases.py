@@ -9,18 +9,7 @@ import numpy as np
 from anatomy.base.typed import Float
 from anatomy.poses import pose, poses_on_arc
 from anatomy.structures import AIRWAY, LUMEN
-from lungaccess.judging.selftest.scenes import (
-    ROUNDING_MM,
-    Case,
-    Random,
-    draw_airway,
-    empty_labels,
-    line_tree,
-    lung_of,
-    tilted,
-    true_distances,
-    unit,
-)
+from lungaccess.judging.selftest import scenes
 from stages.scope import Bronchoscope, MotionProver, ScopeMotion
 
 SCOPE = Bronchoscope(
@@ -36,15 +25,15 @@ LOST_MM = 0.15
 """The proof gives up this much near a wall at most: half of a step, and of a part of a change."""
 
 
-def motions(rng: Random) -> Case:
+def motions(rng: scenes.Random) -> scenes.Case:
     """Draw motions beside a septum; what is proved free is so in all samples, and nearly all else is not."""
-    labels, grid = empty_labels((-6.5, -6.5, -14.0), (6.5, 6.5, 6.0), 1.0)
-    draw_airway(labels, grid, (0.0, 0.0, 0.0), (0.0, 0.0, -8.0), 4.5)
+    labels, grid = scenes.empty_labels((-6.5, -6.5, -14.0), (6.5, 6.5, 6.0), 1.0)
+    scenes.draw_airway(labels, grid, (0.0, 0.0, 0.0), (0.0, 0.0, -8.0), 4.5)
     labels[:, 6, :7] &= ~np.uint16(LUMEN)
-    lung = lung_of(labels, grid, line_tree((0.0, 0.0, 0.0), (0.0, 0.0, -8.0), 4.5))
+    lung = scenes.lung_of(labels, grid, scenes.line_tree((0.0, 0.0, 0.0), (0.0, 0.0, -8.0), 4.5))
     prover, drawn, rooms = MotionProver(lung, SCOPE), [], []
     for _ in range(5):
-        entry = tilted(ENTRY, 0.2 * unit(rng), rng.uniform(0.0, 0.1), 0.0)
+        entry = scenes.tilted(ENTRY, 0.2 * scenes.unit(rng), rng.uniform(0.0, 0.1), 0.0)
         states = np.zeros((4, 3))
         states[2:, 0] = rng.uniform(0.0, 0.3)
         states[:, 1:] = rng.uniform((-0.4, 0.65), (0.4, 0.85), (4, 2))
@@ -59,13 +48,13 @@ def motions(rng: Random) -> Case:
     def contradiction() -> str:
         wall = np.where(labels & LUMEN, 0, AIRWAY).astype(np.uint16)
         for motion, (margin, room) in zip(drawn, rooms, strict=True):
-            least = float(true_distances(wall, grid, places(motion), AIRWAY).min()) - NEEDED_MM
+            least = float(scenes.true_distances(wall, grid, places(motion), AIRWAY).min()) - NEEDED_MM
             proved = max(margin, room)
-            if proved > max(least + ROUNDING_MM, -0.5) or (margin < 0.0 and least > LOST_MM):
+            if proved > max(least + scenes.ROUNDING_MM, -0.5) or (margin < 0.0 and least > LOST_MM):
                 return f"room {margin:.4f} mm, by long steps {room:.4f} mm; in samples {least:.4f} mm"
         return ""
 
-    return Case(answers=np.array(rooms).ravel(), contradiction=contradiction)
+    return scenes.Case(answers=np.array(rooms).ravel(), contradiction=contradiction)
 
 
 def places(motion: ScopeMotion) -> Float:

@@ -36,17 +36,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, point_target
-from lungaccess.running.study.answers import (
-    EXACT,
-    INVALID_GOAL,
-    NO_PLAN,
-    PATH,
-    PLAN,
-    TIMEOUT,
-    UNKNOWN,
-    Answer,
-    Improvement,
-)
+from lungaccess.running.study import answers
 from lungaccess.running.study.patients import Patient, open_patient
 from lungaccess.running.study.runs import Problem, Run
 from lungaccess.running.study.settings import StudyError
@@ -70,7 +60,7 @@ class Opened(NamedTuple):
     checker: Checker
 
 
-def answer(run: Run, cache: Path | None = None) -> Answer:
+def answer(run: Run, cache: Path | None = None) -> answers.Answer:
     """Make a run and return what it ended with.
 
     Parameters
@@ -101,13 +91,13 @@ def prepare(problem: Problem, cache: Path | None = None) -> None:
         _atlas_of(problem, cache)
 
 
-def _here(run: Run, cache: Path | None) -> Answer:
+def _here(run: Run, cache: Path | None) -> answers.Answer:
     with _one_at_a_time:
         numba.set_num_threads(1)
         return _measured(run, cache)
 
 
-def _measured(run: Run, cache: Path | None) -> Answer:
+def _measured(run: Run, cache: Path | None) -> answers.Answer:
     opened = _opened(run.problem.patient, cache)
     atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
     began, cpu_began = time.perf_counter(), time.process_time()
@@ -116,8 +106,8 @@ def _measured(run: Run, cache: Path | None) -> Answer:
     except NoPlan as failure:
         made = _no_plan(run, failure)
     except ANSWERS as error:
-        status = INVALID_GOAL if isinstance(error, TargetError) else UNKNOWN
-        made = Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
+        status = answers.INVALID_GOAL if isinstance(error, TargetError) else answers.UNKNOWN
+        made = answers.Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
     return replace(
         made,
         time_s=time.perf_counter() - began,
@@ -126,7 +116,7 @@ def _measured(run: Run, cache: Path | None) -> Answer:
     )
 
 
-def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
+def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:
     """Search for plans and let the best be checked."""
     problem, best = run.problem, None
     improvements = []
@@ -138,7 +128,7 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
         loss = request.goal.loss(best)
         if np.isfinite(loss):
             improvements.append(
-                Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
+                answers.Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
             )
         first_s = first_s or time.process_time() - began
         if problem.first_plan:
@@ -148,10 +138,10 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     spent = {FIRST_CPU: first_s, SEARCH_CPU: time.process_time() - began}
     best = replace(best, chance=_chance(run, best, opened.lung), timing={**best.timing, **spent})
     report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
-    return Answer(
+    return answers.Answer(
         key=run.key,
-        outcome=PLAN,
-        status=EXACT,
+        outcome=answers.PLAN,
+        status=answers.EXACT,
         iterations=best.iterations,
         accepted=report.accepted,
         costs=dict(best.costs),
@@ -186,11 +176,11 @@ def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:
     )
 
 
-def _no_plan(run: Run, failure: NoPlan) -> Answer:
-    return Answer(
+def _no_plan(run: Run, failure: NoPlan) -> answers.Answer:
+    return answers.Answer(
         key=run.key,
-        outcome=NO_PLAN,
-        status=TIMEOUT,
+        outcome=answers.NO_PLAN,
+        status=answers.TIMEOUT,
         message=failure.found,
         advice=failure.advice,
         rejections=dict(failure.reasons),
@@ -221,7 +211,7 @@ def _atlas(patient: Patient, system: System, spacing: tuple[int, float, float], 
     )
 
 
-def _in_own_process(run: Run, cache: Path | None) -> Answer:
+def _in_own_process(run: Run, cache: Path | None) -> answers.Answer:
     """Make a run in a fresh process, as a library with one seed a process needs."""
     words = [sys.executable, "-m", "lungaccess.running.study.one_run", *([str(cache)] if cache else [])]
     done = subprocess.run(words, input=run.to_json(), capture_output=True, encoding="utf-8", errors="replace")
@@ -231,7 +221,7 @@ def _in_own_process(run: Run, cache: Path | None) -> Answer:
             expected="a process that ends with 0",
             remedy="Start the study again; it goes on from what is stored",
         )
-    return Answer.from_mapping(json.loads(done.stdout))
+    return answers.Answer.from_mapping(json.loads(done.stdout))
 
 
 def main(words: list[str]) -> int:
@@ -246,7 +236,7 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def needle_answer(run: Run, lung: Lung) -> Answer:
+def needle_answer(run: Run, lung: Lung) -> answers.Answer:
     """Search for a needle path and let `stages.needle.violations.violation` look at it.
 
     Raises
@@ -277,7 +267,9 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
         time_s=problem.time_s,
     )
     if found.path is None:
-        return Answer(key=run.key, outcome=NO_PLAN, status=TIMEOUT, message=found.outcome)
+        return answers.Answer(
+            key=run.key, outcome=answers.NO_PLAN, status=answers.TIMEOUT, message=found.outcome
+        )
     record = found.record()
     first_s = record["path"].pop("first_path_s")
     costs = record["path"]["costs"]
@@ -285,14 +277,14 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
     query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
     tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.environment.goal_tolerance_mm
     why = violation(found.environment, query, found.path, goal_tolerance_mm=tolerance_mm)
-    return Answer(
+    return answers.Answer(
         key=run.key,
-        outcome=PATH,
-        status=EXACT,
+        outcome=answers.PATH,
+        status=answers.EXACT,
         message=why,
         accepted=not why,
         costs=costs,
-        improvements=(Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
+        improvements=(answers.Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
         plan=text,
         digest=hashlib.sha256(text.encode()).hexdigest(),
     )

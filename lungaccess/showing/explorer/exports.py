@@ -12,13 +12,7 @@ from anatomy.base.settings_file import settings_toml
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import appraise, plan_record
 from lungaccess.plans.plan import Plan
-from lungaccess.showing.report import (
-    CostPoint,
-    cost_over_time_csv,
-    cost_over_time_png,
-    overview_png,
-    tree_png,
-)
+from lungaccess.showing import report
 from lungaccess.showing.report.html import PageOptions, plan_page
 from lungaccess.showing.report.html.volumes import read_ct
 from lungaccess.showing.slicer import export_slicer
@@ -41,7 +35,7 @@ def export_file(
     made = Path(tempfile.mkdtemp(dir=folder))
     file = made / what
     points = [
-        CostPoint(elapsed_s=elapsed_s, iteration=int(iteration), best_cost=cost)
+        report.CostPoint(elapsed_s=elapsed_s, iteration=int(iteration), best_cost=cost)
         for elapsed_s, iteration, cost in curve
     ]
     if what == "plan.json":
@@ -52,18 +46,18 @@ def export_file(
         write_json(file, plan_record(plan, lung, appraise(plan, lung), made, (what,)))
     elif what == "report.html":
         history = made / "cost_over_time.csv"
-        cost_over_time_csv(points, history)
+        report.cost_over_time_csv(points, history)
         image = None if ct is None else read_ct(ct)
         name = "" if ct is None else ct.name
         plan_page(plan, lung, file, PageOptions(ct=image, ct_name=name, cost_over_time=history))
     elif what == "overview.png":
-        overview_png(plan, lung, file, appraise(plan, lung))
+        report.overview_png(plan, lung, file, appraise(plan, lung))
     elif what == "tree.png":
-        tree_png(lung, file)
+        report.tree_png(lung, file)
     elif what == "cost_over_time.csv":
-        cost_over_time_csv(points, file)
+        report.cost_over_time_csv(points, file)
     elif what == "cost_over_time.png":
-        cost_over_time_png(points, file, Objective.of(plan.objective).words)
+        report.cost_over_time_png(points, file, Objective.of(plan.objective).words)
     else:
         scene = made / "slicer"
         export_slicer(plan, lung, scene)

@@ -15,7 +15,7 @@ from stages.needle.query import Query
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch
-from stages.needle.start_region_proof import prove_starts
+from stages.needle.start_region import prove_starts
 from stages.needle.start_region_trial import try_starts
 
 RADIUS_MM = 60.0

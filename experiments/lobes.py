@@ -25,10 +25,10 @@ from anatomy.lobes import LOBES
 from anatomy.phantom import make_phantom
 from anatomy.phantom.patient import Size
 from anatomy.segmentation.airway import Airways, segment_airway
-from anatomy.segmentation.airway_warnings import tree_or_error
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.lobes import FISSURES, OF_LUNG, SEEN, Lobes, segment_lobes
 from anatomy.segmentation.lungs import segment_lungs
+from anatomy.segmentation.scan_warnings import tree_or_error
 from anatomy.segmentation.vessels import segment_vessels
 from experiments.support.anatomies import PATIENTS, data_folder, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import json
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -282,3 +283,35 @@ def _without_none(annotation: object) -> object:
 
 def _fields(cls: type | None) -> Mapping[str, FieldInfo]:
     return getattr(cls, "__pydantic_fields__", {})
+
+
+def settings_toml(values: object) -> str:
+    """Return settings as TOML, from which `anatomy.base.settings.parse` restores them without loss.
+
+    What is None is left out, as TOML has no such value; it must be the default of its field.
+    """
+    return "\n".join(_lines(to_mapping(values), ())).strip() + "\n"
+
+
+def _lines(mapping: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
+    """Return the plain values of a mapping, then its tables."""
+    lines, tables = [], []
+    for key, value in mapping.items():
+        if value is None:
+            continue
+        name = ".".join((*path, key))
+        if isinstance(value, Mapping):
+            tables += ["", f"[{name}]", *_lines(value, (*path, key))]
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            for each in value:
+                tables += ["", f"[[{name}]]", *_lines(each, (*path, key))]
+        else:
+            lines.append(f"{key} = {_text(value)}")
+    return lines + tables
+
+
+def _text(value: Any) -> str:
+    """Return a value as TOML writes it: JSON's strings and numbers are TOML's, too."""
+    if isinstance(value, list):
+        return f"[{', '.join(_text(each) for each in value)}]"
+    return json.dumps(value, ensure_ascii=True, allow_nan=False).replace("\x7f", "\\u007f")

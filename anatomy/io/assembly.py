@@ -10,10 +10,10 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
-from anatomy.io.cost_maps import from_stored
 from anatomy.io.lungs import with_lobes
 from anatomy.io.masks import MaskSet
 from anatomy.io.placement import place
+from anatomy.io.voxels import from_stored
 from anatomy.patient import PatientImages
 
 LUNG_ROLES: Mapping[str, str] = {"lumen": "the airway lumen", "vessels": "the vessels", "lung": "the lungs"}

@@ -12,7 +12,7 @@ from pydantic import Field
 from anatomy.base.errors import AnatomyError, FileError, SettingsError
 from anatomy.base.files import read_toml, sha256
 from anatomy.base.settings import parse, quantity, settings
-from anatomy.base.suggestion import did_you_mean
+from anatomy.base.words import did_you_mean
 from anatomy.io.assembly import assemble, require_cost
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume

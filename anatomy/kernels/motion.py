@@ -126,7 +126,7 @@ def _eigenvalue_ends(g):
 
 @kernel()
 def fill_cell_bounds(nodes, spacing, out):
-    """Fill `out` (ni - 1, nj - 1, nk - 1, 3), see `anatomy.motion.stretch.cell_bounds`."""
+    """Fill `out` (ni - 1, nj - 1, nk - 1, 3), see `anatomy.motion.motion.cell_bounds`."""
     edges, mean = np.zeros((4, 3)), np.zeros((3, 3))
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -165,7 +165,7 @@ def fill_cell_bounds(nodes, spacing, out):
 def stretch_near(cells, frame, begin, end, x, y, z, reach):
     """Return least stretch from share `begin` to `end`, and greatest norm of the gradient, near a point.
 
-    `cells` is `(ni, nj, nk, 3)`, see `anatomy.motion.stretch`; those are taken that meet a box of half side
+    `cells` is `(ni, nj, nk, 3)`, see `anatomy.motion.motion`; those are taken that meet a box of half side
     `reach` mm about the point.
     """
     ni, nj, nk, _ = cells.shape

@@ -16,7 +16,6 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import Grid, freeze_arrays, read_only
 from anatomy.kernels import motion as kernel
-from anatomy.motion.stretch import cell_bounds
 
 RIGHT, LEFT = 0, 1
 """Each lung slides along chest wall and mediastinum by itself, and has a displacement of its own."""
@@ -156,3 +155,31 @@ def require_phase(phase: float) -> float:
 def _plain(points_lps: ArrayLike) -> tuple[Float, Float]:
     points = np.array(points_lps, dtype=np.float64, order="C").reshape(-1, 3)
     return points, np.zeros_like(points)
+
+
+def cell_bounds(nodes: Float, spacing_mm: float) -> Float:
+    """Return bounds of the gradient of a trilinear displacement on its cells.
+
+    In a cell the derivative along an axis is a mean of those along its four edges of that axis; so the
+    gradient is nowhere farther from the mean one than the edges are.  With G the gradient and S its
+    symmetric part, `|v + share G v| >= v'(v + share G v) >= 1 + share v'S v` for unit vectors v: a segment
+    that stays in cells is stretched by no less than `1 + share low` (share >= 0) or `1 + share high` (share
+    < 0).
+
+    Parameters
+    ----------
+    nodes : (ni, nj, nk, 3) float64
+        Displacements at nodes, mm.
+    spacing_mm : float
+        Distance of nodes along all axes.
+
+    Returns
+    -------
+    (ni - 1, nj - 1, nk - 1, 3) float64
+        For each cell: low, a lower bound of the eigenvalues of S; high, an upper one; an upper bound of the
+        norm of G.
+    """
+    ni, nj, nk, _ = nodes.shape
+    out = np.zeros((ni - 1, nj - 1, nk - 1, 3))
+    kernel.fill_cell_bounds(np.ascontiguousarray(nodes), float(spacing_mm), out)
+    return out

@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Int16, Mask
-from anatomy.grid import Volume, freeze_arrays
+from anatomy.grid import Grid, Volume, freeze_arrays
 from anatomy.morphology import Window, bounds, window
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.growing import Ground, grow
@@ -259,3 +259,15 @@ def _some(slices: Int16, scale: int, out: Int16, first: int) -> None:
         smooth_slice(work[0], work[1])
         depth_slice(work[1], scale, work[2:], queue, waiting, work[0])
         out[n] = work[0]
+
+
+WALL_MM = 1.5
+"""Walls of lobar bronchi are 1 to 1.5 mm thick; those of thinner ones less."""
+
+
+def wall_around(lumen: Mask, grid: Grid) -> Mask:
+    """Return the wall of airways that came without one: all within `WALL_MM` of the lumen."""
+    box = window(*bounds(lumen, np.ceil(WALL_MM / grid.spacing_mm).astype(np.int64) + 1))
+    wall = np.zeros(lumen.shape, dtype=np.bool_, order="F")
+    wall[box] = (distance_mm(~lumen[box], grid.spacing_mm) <= WALL_MM) & ~lumen[box]
+    return wall

@@ -16,8 +16,8 @@ from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.base.files import atomic_write, read_json, require_writable_folder, sha256, write_text
 from anatomy.base.typed import Array
 from anatomy.grid import Grid, Volume
-from anatomy.io import cost_maps
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
+from anatomy.io.voxels import COST_MAP_NOTE
 from anatomy.lobes import LOBES
 from anatomy.segmentation.canonical import canonical
 
@@ -28,7 +28,7 @@ CORRECTIONS = "corrections"
 IMAGES = ("lungs", "airway", "airway_wall", "nodule", "vessels", "all_vessels", "lobes", "fissures")
 """What a person may correct."""
 NOTES = {
-    "cost": cost_maps.NOTE,
+    "cost": COST_MAP_NOTE,
     "lobes": ", ".join(f"{number} {name}" for number, name in LOBES.items()).replace(" lobe", ""),
     "fissures": "1 border of lobes without a fissure to be seen, 2 fissure seen",
 }

@@ -13,22 +13,22 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.files import sha256
 from anatomy.base.typed import Array, Float32, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.io.cost_maps import OBSTACLE_COST, as_stored, from_stored
 from anatomy.io.images import read_volume
+from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
+from anatomy.segmentation.airway import wall_around
 from anatomy.segmentation.box import Box
+from anatomy.segmentation.central_airway import without_larynx
 from anatomy.segmentation.description import Description
 from anatomy.segmentation.folder import IMAGES, SegmentationFolder, digest_of, grid_digest, key_of
 from anatomy.segmentation.gate import plausibility, require_plausible
 from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
-from anatomy.segmentation.larynx import without_larynx
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
 from anatomy.segmentation.misplaced import misplaced
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
 from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import Given, SegmentationRequest
 from anatomy.segmentation.scan_warnings import scan_warnings
-from anatomy.segmentation.wall import wall_around
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
@@ -167,7 +167,7 @@ class Steps:
 
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.airway import segment_airway
-            from anatomy.segmentation.airway_warnings import airway_warnings
+            from anatomy.segmentation.scan_warnings import airway_warnings
 
             grid = self._folder.grid
             lumen, wall = self._source_mask("airway"), self._source_mask("airway_wall")
@@ -192,7 +192,7 @@ class Steps:
 
     def _tree_of(self, lumen: Mask) -> AirwayTree | AnatomyError:
         """Return the tree of the lumen, which is made once, or why there is none."""
-        from anatomy.segmentation.airway_warnings import tree_or_error
+        from anatomy.segmentation.scan_warnings import tree_or_error
 
         if self._tree is None or self._tree[0] is not lumen:
             self._tell("airway tree")

@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.plugins import registered
-from anatomy.base.suggestion import did_you_mean
+from anatomy.base.words import did_you_mean
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.cost_bound import CostBound, GapGoal, guided
 from lungaccess.planning.coupled.explanation import explain

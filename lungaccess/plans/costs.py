@@ -68,7 +68,7 @@ def _costs(
     parts: Sequence[InTissue],
 ) -> dict[str, float]:
     obstacles, beyond = _obstacles(lung, with_fissures), path_beyond(path, wall_mm)
-    found = {}
+    found: dict[str, float] = {}
     for term in terms:
         found |= needle.path_costs(obstacles, lung.cost, beyond if term.of_map else path, parts, [term])
     return found

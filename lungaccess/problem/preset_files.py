@@ -10,7 +10,7 @@ from typing import Any
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import read_toml
 from anatomy.base.records import frozen_value
-from anatomy.base.suggestion import did_you_mean
+from anatomy.base.words import did_you_mean
 
 _ROOM = resources.files("lungaccess.problem")
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.base.records import frozen_record, frozen_value
-from anatomy.base.suggestion import did_you_mean
 from anatomy.base.typed import Float
+from anatomy.base.words import did_you_mean
 from anatomy.lung import Lung
 from anatomy.motion.motion import require_phase
 from anatomy.organ import Organ

@@ -51,8 +51,14 @@ if TYPE_CHECKING:
         blocker_on_path,
         direct_path,
     )
-    from stages.needle.planner_choice import has_ompl, require_planner
-    from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS, OMPL_TOLERANCE_MM, OUR_PLANNERS
+    from stages.needle.planner_names import (
+        NEEDLE_PLANNERS,
+        OMPL_PLANNERS,
+        OMPL_TOLERANCE_MM,
+        OUR_PLANNERS,
+        has_ompl,
+        require_planner,
+    )
     from stages.needle.query import Query
     from stages.needle.reach import (
         BLOCK_MM,
@@ -80,12 +86,18 @@ if TYPE_CHECKING:
     from stages.needle.search.decision import Decision
     from stages.needle.search.optimal import OptimalSearch
     from stages.needle.search.planners import MakeSearch, searches
-    from stages.needle.search.portfolio import PortfolioSearch
+    from stages.needle.search.portfolio import PortfolioSearch, successive_halving
     from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
-    from stages.needle.search.successive_halving import successive_halving
     from stages.needle.start_index import StartIndex
-    from stages.needle.start_region import KINDS, REACHING, ProvedStarts, StartRegion, TriedStarts
-    from stages.needle.start_region_proof import prove_starts, proved_factor
+    from stages.needle.start_region import (
+        KINDS,
+        REACHING,
+        ProvedStarts,
+        StartRegion,
+        TriedStarts,
+        prove_starts,
+        proved_factor,
+    )
     from stages.needle.start_region_trial import try_around, try_poses, try_starts
     from stages.needle.violations import violation
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_value
-from anatomy.base.suggestion import did_you_mean
 from anatomy.base.typed import Float32
+from anatomy.base.words import did_you_mean
 from anatomy.grid import read_only
 
 if TYPE_CHECKING:

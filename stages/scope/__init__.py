@@ -9,10 +9,16 @@ from anatomy.base.facade import lazy_exports
 if TYPE_CHECKING:
     from stages.scope.device import Bronchoscope
     from stages.scope.motion import ScopeMotion
-    from stages.scope.motion_proof import MotionProver, prove_motion, prover_of
+    from stages.scope.motion_proof import (
+        MAX_OFF_AXIS_MM,
+        MAX_TURN_AT_TIP_RAD,
+        MotionProver,
+        in_tip_region,
+        prove_motion,
+        prover_of,
+    )
     from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
     from stages.scope.passages import Passages, find_passages
     from stages.scope.shifting import TipRow, evenly, shifted
-    from stages.scope.tip_region import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD, in_tip_region
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -8,15 +8,18 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.base.typed import Float
+from anatomy.airway_tree import AirwayTree
+from anatomy.base.typed import Bool, Float, Int
+from anatomy.fields import corner_geometry
+from anatomy.grid import read_only
 from anatomy.lung import Lung
+from anatomy.structures import LUMEN, OUTSIDE
 from stages.scope.device import SHORTEST_MM, Bronchoscope
-from stages.scope.kernels.body import MOST_TWIST_RAD, motion_room
+from stages.scope.kernels.body import MOST_TWIST_RAD, Walls, motion_room
+from stages.scope.kernels.growth import Device
 from stages.scope.kernels.shifting import shifted_tips
-from stages.scope.lumen_walls import kernel_device, walls_of
 from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
 from stages.scope.shifting import TipRow, as_shifts
-from stages.scope.tip_region import in_tip_region
 
 PROOF_STEP_MM = 0.1
 """Longest step of the proof along the body; at most half of it is lost, far less than a voxel."""
@@ -137,3 +140,69 @@ def broken_limit(scope: Bronchoscope, motion: ScopeMotion) -> str:
     if laid.max(initial=0.0) > scope.laying_curvature_per_mm * slack:
         return f"the shaft lies in an arc of {1.0 / laid.max():.1f} mm radius, too tight for it"
     return ""
+
+
+MAX_OFF_AXIS_MM = 3.0
+"""A tip lies at most so far from the nearest point of the tree.
+
+That holds the whole cross-section which thin scopes leave free in bronchi of 10 mm, beyond which tubes leave.
+"""
+MAX_TURN_AT_TIP_RAD = math.radians(45.0)
+"""A tip looks along the airway, within this angle of its direction: more means sideways."""
+
+
+def in_tip_region(tree: AirwayTree, tips: Float) -> tuple[Int, Bool]:
+    """Return the nearest tree point of each tip `(S,)`, and whether the tip lies in the region `(S,)`.
+
+    Proofs that a target is unreachable rule out all of this region, so every tip of a motion lies in it.
+
+    Parameters
+    ----------
+    tips : (S, >= 6) float64
+        Point and unit direction of each tip, LPS mm.
+    """
+    distance_mm, nearest = tree.nearest_point_index.query(tips[:, :3])
+    cosine = np.einsum("sk,sk->s", tips[:, 3:6], tree.tangents[nearest])
+    inside = (distance_mm <= MAX_OFF_AXIS_MM) & (cosine >= math.cos(MAX_TURN_AT_TIP_RAD))
+    return np.asarray(nearest, dtype=np.int64), np.asarray(inside)
+
+
+_WALLS: WeakKeyDictionary[Lung, Walls] = WeakKeyDictionary()
+"""The walls of each lung: to make them takes as long as to prove a hundred motions."""
+
+
+def walls_of(lung: Lung) -> Walls:
+    """Return the walls around the lumen of a lung, made once."""
+    if lung not in _WALLS:
+        _WALLS[lung] = _walls(lung)
+    return _WALLS[lung]
+
+
+def _walls(lung: Lung) -> Walls:
+    inside = (lung.labels & LUMEN) != 0
+    low, high = np.zeros(3, dtype=np.int64), np.array(lung.grid.shape)
+    for axis in range(3):
+        others = tuple(k for k in range(3) if k != axis)
+        filled = np.flatnonzero(inside.any(axis=others))
+        if len(filled):
+            low[axis], high[axis] = max(filled[0] - 1, 0), min(filled[-1] + 2, high[axis])
+    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    solid = np.asfortranarray(np.where(inside[box], np.uint16(0), np.uint16(OUTSIDE)))
+    return Walls(
+        solid=read_only(solid),
+        geometry=corner_geometry(lung.grid.crop(low, high)),
+        depth=lung.lumen_depth.corners,
+        depth_geometry=lung.lumen_depth.geometry,
+    )
+
+
+def kernel_device(scope: Bronchoscope, max_curvature_per_mm: float) -> Device:
+    """Return a scope whose body may have a largest curvature that the tubes in its channel can stand."""
+    least, most = scope.bends_rad
+    return Device(
+        radius=scope.radius_mm + scope.lumen_margin_mm,
+        length=scope.bending_length_mm,
+        laying=min(scope.laying_curvature_per_mm, max_curvature_per_mm),
+        least_bend=least,
+        most_bend=most,
+    )

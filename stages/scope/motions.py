@@ -19,11 +19,10 @@ from stages.scope.kernels import turning
 from stages.scope.kernels.body import Walls
 from stages.scope.kernels.growth import Device
 from stages.scope.kernels.turning import Places
-from stages.scope.lumen_walls import kernel_device, walls_of
 from stages.scope.motion import ScopeMotion
-from stages.scope.motion_steps import State, slide, turn
+from stages.scope.motion_proof import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD, kernel_device, walls_of
 from stages.scope.passages import Passages, find_passages
-from stages.scope.tip_region import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD
+from stages.scope.shifting import State, slide, turn
 
 BESIDE_AXIS_MM = 0.5
 """The lumen may be wider by so much, half a voxel or more, beside the axis than on it."""

@@ -11,7 +11,6 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float
 from stages.scope.device import SHORTEST_MM
 from stages.scope.motion import ADVANCE, ScopeMotion
-from stages.scope.motion_steps import slide, turn
 
 
 @frozen_record
@@ -77,3 +76,29 @@ def evenly(step_mm: float, reach_mm: float) -> Float:
 def as_shifts(values: ArrayLike) -> Float:
     """Return shifts as a float64 array `(K,)`."""
     return np.ascontiguousarray(np.atleast_1d(np.asarray(values, dtype=np.float64)))
+
+
+State = tuple[float, ...]
+"""Advance in mm, twist and bend in rad."""
+
+
+def turn(rows: list[State], twist: float, bend: float, by_straight: bool) -> None:
+    """Add a change in place, which may go by the straight section: twisting that moves nothing."""
+    advance, twist_before, bend_before = rows[-1]
+    if (twist, bend) == (twist_before, bend_before):
+        return
+    if by_straight and bend_before != 0.0:
+        rows.append((advance, twist_before, 0.0))
+    if by_straight and twist != twist_before and bend != 0.0:
+        rows.append((advance, twist, 0.0))
+    rows.append((advance, twist, bend))
+
+
+def slide(rows: list[State], advance_mm: float) -> None:
+    """Add an advance with twist and bend held; one that goes on with the advance before replaces its end."""
+    if advance_mm <= rows[-1][0]:
+        return
+    _, twist, bend = rows[-1]
+    if len(rows) > 1 and rows[-2][1:] == (twist, bend):
+        rows.pop()
+    rows.append((advance_mm, twist, bend))

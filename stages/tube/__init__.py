@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         join_deployments,
         one_site_enumerator,
     )
-    from stages.tube.design_shapes import coarser_shapes, shapes_digest, shapes_of
+    from stages.tube.design_shapes import coarser_shapes, open_shapes, shapes_digest, shapes_format, shapes_of
     from stages.tube.device import BentPiece, ConcentricTubes, Tube
     from stages.tube.environment import (
         DEFAULT_ROTATIONS,
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
     )
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape import centreline
-    from stages.tube.shape_store import open_shapes, shapes_format
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
     from stages.tube.strain import straightening

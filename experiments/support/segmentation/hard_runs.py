@@ -14,14 +14,13 @@ from anatomy.base.typed import Mask
 from anatomy.grid import Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.segmentation.airway import segment_airway
-from anatomy.segmentation.airway_warnings import airway_warnings, tree_or_error
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.gate import plausibility, require_plausible
 from anatomy.segmentation.hounsfield import without_offset
 from anatomy.segmentation.input import require_chest_ct
 from anatomy.segmentation.lungs import Lungs, segment_lungs
-from anatomy.segmentation.scan_warnings import scan_warnings
+from anatomy.segmentation.scan_warnings import airway_warnings, scan_warnings, tree_or_error
 from experiments.support.segmentation.hard_images import HardImage, upright
 from experiments.support.segmentation.scores import dice
 

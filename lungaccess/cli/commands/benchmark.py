@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from anatomy.patient import PatientImages
     from lungaccess.problem.system import System
     from lungaccess.running.benchmark import BenchmarkRow
-    from lungaccess.running.benchmark.posing import Pose
+    from lungaccess.running.benchmark.runs import Pose
 
 Rules = Literal["ours", "unc"]
 UNC_RADII_MM = "50,100,121"

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
         Appraisal,
         Appraiser,
         appraise,
+        plan_record,
     )
     from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
     from lungaccess.judging.appraisal.headline import Geometry, Headline
     from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
-    from lungaccess.judging.appraisal.record import plan_record
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

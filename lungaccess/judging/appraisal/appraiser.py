@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from html import escape
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_value
@@ -12,6 +13,8 @@ from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limi
 from lungaccess.judging.checking import Checker, CheckReport
 from lungaccess.planning.procedure import Procedure, load_procedure
 from lungaccess.planning.success import Estimate, estimate_success
+from lungaccess.plans.costs import known_costs
+from lungaccess.plans.scope_steps import motion_record
 from lungaccess.uncertainty.risk import ErrorModel, load_errors
 
 if TYPE_CHECKING:
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import System
+
 
 DRAWS = 2000
 """A share of one half is then known to 2 % with 95 % confidence, within a tenth of a second."""
@@ -180,3 +184,29 @@ def appraise(
     """
     appraiser = Appraiser(lung, errors, procedure=procedure, draws=draws, seed=seed)
     return appraiser.appraise(plan, system, target_lps=target_lps, each_kind=each_kind)
+
+
+def plan_record(
+    plan: Plan, lung: Lung, appraisal: Appraisal, folder: Path, files: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return what a search for a plan found and wrote; lengths in mm, times in s."""
+    return {
+        "found": True,
+        **appraisal.to_mapping(),
+        "refusals": [each.to_mapping() for each in appraisal.check.refusals],
+        "not_checked": [each.name for each in appraisal.check.unchecked],
+        "folder": str(folder),
+        "files": list(files),
+        "digest": plan.digest,
+        "objective": plan.objective,
+        "cost": plan.cost,
+        "cost_bound": plan.cost_bound or None,
+        "gap": plan.gap,
+        "costs": known_costs(plan.costs, has_map=lung.cost is not None),
+        "system": plan.system.name,
+        "system_choice": list(plan.system_choice),
+        "clearance_mm": {device: dict(values) for device, values in plan.clearance_mm.items()},
+        "iterations": plan.iterations,
+        "timing": dict(plan.timing),
+        "scope_motion": motion_record(plan, lung),
+    }

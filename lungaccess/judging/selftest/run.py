@@ -11,22 +11,79 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_value
-from lungaccess.judging.selftest.kinds import KINDS
+from lungaccess.judging.selftest import breath_cases, deployment_cases, needle_cases, scope_cases
+from lungaccess.judging.selftest.scenes import Case
 
 TOLERANCE = 1e-9
 """Relative, or in mm and rad.  Arithmetic is done in the same order, but `hypot` and others may differ in
 their last digit, and a proof goes on from what it has computed."""
 PACKAGES = Path(__file__).resolve().parents[3]
+
+
+class Kind(NamedTuple):
+    """One kind of proof.
+
+    Parameters
+    ----------
+    proves : str
+        What a case looks at, in words.
+    draw : callable
+        Draws a case and has the kernels answer it.
+    seeds : tuple of int
+        Of the cases: those in which bounds are close to the truth, and that take little time in Python.
+    """
+
+    proves: str
+    draw: Callable[[np.random.Generator], Case]
+    seeds: tuple[int, ...]
+
+    def case(self, seed: int) -> Case:
+        """Return the case of a seed, answered."""
+        return self.draw(np.random.default_rng(seed))
+
+
+KINDS: Mapping[str, Kind] = {
+    "distances": Kind(
+        "a clearance bound is below the distance, by a diagonal of a voxel at most",
+        needle_cases.distances, (0, 1, 2, 3),
+    ),
+    "arcs": Kind(
+        "a path of the needle keeps its clearance, or does not", needle_cases.arcs, (0, 1, 2, 3, 4)
+    ),
+    "tubes": Kind(
+        "tubes keep clear of all but the wall that they pierce",
+        deployment_cases.tubes, (0, 1, 2, 3, 4, 5, 6, 7),
+    ),
+    "scope motions": Kind(
+        "a motion of the scope touches no wall, at and between its states", scope_cases.motions, (3, 4, 6)
+    ),
+    "start region": Kind(
+        "the needle reaches its target from every start of the region", needle_cases.start_region, (1, 2, 3)
+    ),
+    "no path": Kind("no path of the needle leads to a target", needle_cases.no_path, (1, 3, 5, 11, 14)),
+    "cost bound": Kind(
+        "no path from a range of deployments costs less", deployment_cases.cost_bound, (0, 1, 2, 3)
+    ),
+    "unreachable": Kind(
+        "no deployment of a range reaches a target", deployment_cases.not_reached, (2, 3, 4, 7)
+    ),
+    "window": Kind(
+        "devices are clear and on target in all phases of a stretch of the breath, or in none",
+        breath_cases.windows, (1, 4, 7),
+    ),
+}  # fmt: skip
+"""The kinds by name."""
 
 
 @frozen_value
@@ -89,29 +146,26 @@ def self_test(
     for name in names:
         if name not in KINDS:
             raise SettingsError(f"There is no kind of proof named {name!r}", expected=", ".join(KINDS))
-    if numba.config.DISABLE_JIT:
-        return tuple(_outcome(name, *_answered(name), None) for name in map(_reported(progress), names))
-    with _plain(names) as plain:
-        found = {name: _answered(name) for name in map(_reported(progress), names)}
+    found = []
+    with nullcontext() if numba.config.DISABLE_JIT else _plain(names) as plain:
+        for name in names:
+            progress(name)
+            found.append(_answered(name))
+        if plain is None:
+            return tuple(outcome for outcome, _answers in found)
         progress("the same in plain Python")
-        answers = plain()
-    return tuple(_outcome(name, *found[name], answers[name]) for name in names)
+        there = plain()
+    return tuple(
+        replace(outcome, differences=_differences(answers, there[outcome.kind])) for outcome, answers in found
+    )
 
 
 Answers = dict[int, Any]
 """The answers to cases by their seeds: numbers, or an error in words."""
 
 
-def _reported(progress: Callable[[str], None]) -> Callable[[str], str]:
-    def tell(name: str) -> str:
-        progress(name)
-        return name
-
-    return tell
-
-
-def _answered(name: str) -> tuple[Answers, tuple[Failure, ...], float]:
-    """Return the compiled answers, what contradicts the truth, and the time for both."""
+def _answered(name: str) -> tuple[Outcome, Answers]:
+    """Compare the compiled answers with the truth, and return them, too."""
     begun, contradictions = time.perf_counter(), []
     answers: Answers = {}
     for seed in KINDS[name].seeds:
@@ -122,7 +176,15 @@ def _answered(name: str) -> tuple[Answers, tuple[Failure, ...], float]:
             said = answers[seed] = f"{type(error).__name__}: {error}"
         if said:
             contradictions.append(Failure(seed=seed, said=said))
-    return answers, tuple(contradictions), time.perf_counter() - begun
+    outcome = Outcome(
+        kind=name,
+        proves=KINDS[name].proves,
+        cases=len(answers),
+        differences=None,
+        contradictions=tuple(contradictions),
+        seconds=time.perf_counter() - begun,
+    )
+    return outcome, answers
 
 
 @contextmanager
@@ -150,18 +212,9 @@ def _plain(names: list[str]) -> Iterator[Callable[[], dict[str, Answers]]]:
             process.kill()
 
 
-def _outcome(
-    name: str, compiled: Answers, contradictions: tuple[Failure, ...], seconds: float, plain: Answers | None
-) -> Outcome:
-    pairs = [] if plain is None else [(seed, _difference(compiled[seed], plain[seed])) for seed in compiled]
-    return Outcome(
-        kind=name,
-        proves=KINDS[name].proves,
-        cases=len(compiled),
-        differences=None if plain is None else tuple(Failure(seed=s, said=said) for s, said in pairs if said),
-        contradictions=contradictions,
-        seconds=seconds,
-    )
+def _differences(compiled: Answers, plain: Answers) -> tuple[Failure, ...]:
+    said = {seed: _difference(compiled[seed], plain[seed]) for seed in compiled}
+    return tuple(Failure(seed=seed, said=words) for seed, words in said.items() if words)
 
 
 def _difference(compiled: Any, plain: Any) -> str:

@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.running.benchmark.export import write_rows
+    from lungaccess.running.benchmark.export import summary_rows, write_rows
     from lungaccess.running.benchmark.peer import PeerResult, read_peer
-    from lungaccess.running.benchmark.posing import posed_by_unc, posed_in_lung
     from lungaccess.running.benchmark.published import PublishedQuery, patients_of, published_queries
-    from lungaccess.running.benchmark.runs import BenchmarkRow, run_query
-    from lungaccess.running.benchmark.summary import summary_rows
+    from lungaccess.running.benchmark.runs import BenchmarkRow, posed_by_unc, posed_in_lung, run_query
     from lungaccess.running.benchmark.unc_rules import (
         UNC_EXEMPT_MM,
         UNC_GOAL_TOLERANCE_MM,

@@ -26,10 +26,10 @@ from anatomy.lung import Lung
 from lungaccess.judging.checking import Checker
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.atlas_store import open_atlas
+from lungaccess.planning.one_stage import plan_needle
 from lungaccess.planning.one_system import run as plan
 from lungaccess.planning.success.estimate import FRESH_SEED, chance_of, estimate_success
 from lungaccess.planning.success.judges import MEASURED, OPEN_LOOP
-from lungaccess.planning.one_stage import plan_needle
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan

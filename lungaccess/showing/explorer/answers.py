@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.base.errors import LungaccessError, SettingsError
-from anatomy.base.settings_file import settings_toml
+from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from lungaccess.planning import ProgressEvent, run, tips_near
@@ -22,8 +22,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
 from lungaccess.problem.request import Request
 from lungaccess.showing.explorer import questions as ask
-from lungaccess.showing.explorer.changed_system import plan_command, system_of
-from lungaccess.showing.explorer.chosen_place import ChosenPlace
+from lungaccess.showing.explorer.changed_system import ChosenPlace, plan_command, system_of
 from lungaccess.showing.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
 from lungaccess.showing.explorer.questions import WhatIf
 from lungaccess.showing.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
@@ -102,7 +101,7 @@ class Answers:
         yield Part({"answer": "image", **image_parts(self.lung, self._source, asked.question.around)})
 
     def _slice(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
-        from lungaccess.showing.explorer.ct_slice import ct_slice
+        from lungaccess.showing.explorer.patient import ct_slice
 
         question, ct = asked.question, patient_ct(self._source.ct)
         if ct is None:

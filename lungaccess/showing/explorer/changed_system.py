@@ -1,4 +1,4 @@
-"""Systems with what is changed of them, and the command that plans with them."""
+"""Systems with what is changed of them, places to go through, and the command that plans with them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from anatomy.base.errors import SettingsError
+from anatomy.base.records import frozen_value
+from lungaccess.planning import TIP_WITHIN_MM
+from lungaccess.planning.coupled.exits import PLACE_MM
 from lungaccess.problem import System, load_system, shipped_names
-from lungaccess.showing.explorer.chosen_place import ChosenPlace
+from lungaccess.problem.request import StatedPlace
 from lungaccess.showing.explorer.questions import PlanQuestion, WhatIf
 
 SYSTEM_FILE = "system.toml"
@@ -124,3 +130,45 @@ def plan_command(
     if cache is not None:
         words += ["--cache", str(cache)]
     return shlex.join([*words, "--out", "plan"])
+
+
+DIGITS = 3
+"""Of the point in mm, as the command states it; the search takes the same number."""
+
+
+@frozen_value
+class ChosenPlace:
+    """A place, LPS mm, with the words of the command for it.
+
+    Parameters
+    ----------
+    kind : "exit" or "scope tip"
+    lps_mm : (3,) floats
+        As the command states them.
+    """
+
+    kind: Literal["exit", "scope tip"]
+    lps_mm: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, kind: Literal["exit", "scope tip"], point: ArrayLike) -> ChosenPlace:
+        """Return the place of a point `(3,)`."""
+        x, y, z = np.round(np.asarray(point, dtype=np.float64), DIGITS).tolist()
+        return cls(kind=kind, lps_mm=(x, y, z))
+
+    @property
+    def within_mm(self) -> float:
+        """How far from the place a plan may be."""
+        return PLACE_MM if self.kind == "exit" else TIP_WITHIN_MM
+
+    @property
+    def stated(self) -> StatedPlace:
+        """The place as a request states it."""
+        return StatedPlace(kind=self.kind, lps_mm=np.array(self.lps_mm), within_mm=self.within_mm)
+
+    @property
+    def words(self) -> list[str]:
+        """Options of the command that makes the same search."""
+        option = "--" + self.kind.replace(" ", "-")
+        point = "lps:" + ",".join(str(value) for value in self.lps_mm)
+        return [option, point, f"{option}-within", str(self.within_mm)]

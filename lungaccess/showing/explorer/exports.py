@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from anatomy.base.files import write_json, write_text
-from anatomy.base.settings_file import settings_toml
+from anatomy.base.settings import settings_toml
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import appraise, plan_record
 from lungaccess.plans.plan import Plan

@@ -94,7 +94,7 @@ class ImageQuestion(_Question):
 
 @settings
 class SliceQuestion(_Question):
-    """The CT at the pixels of a plane, as `lungaccess.showing.explorer.ct_slice.ct_slice` takes it."""
+    """The CT at the pixels of a plane, as `lungaccess.showing.explorer.patient.ct_slice` takes it."""
 
     origin: Point
     across: Point

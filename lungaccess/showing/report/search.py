@@ -1,15 +1,17 @@
-"""Best cost over time of a search, as a picture."""
+"""Best cost over time of a search, as a picture and as a table."""
 
 from __future__ import annotations
 
+import csv
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
 
+from anatomy.base.files import atomic_write
+from anatomy.base.records import frozen_value
 from lungaccess.showing.report import drawing, style
-from lungaccess.showing.report.cost_points import CostPoint
 
 
 def cost_over_time_png(
@@ -53,3 +55,37 @@ def _note(axes: Axes, x: float, y: float, text: str, shift: tuple[float, float],
         text, (x, y), xytext=shift, textcoords="offset points", ha=side, va="bottom",
         fontsize=9, color=style.INK, path_effects=drawing.halo(3),
     )  # fmt: skip
+
+
+@frozen_value
+class CostPoint:
+    """The state of a search at one moment.
+
+    Parameters
+    ----------
+    elapsed_s : float
+        Planning time since the search began.
+    best_cost : float or None
+        Cost of the best plan yet, in the unit of the objective; None before the first plan.
+    """
+
+    elapsed_s: float
+    iteration: int
+    best_cost: float | None
+
+
+def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str]) -> Path:
+    """Write one line a point: elapsed_s, iteration, best_cost (empty before the first plan).
+
+    Raises
+    ------
+    anatomy.base.errors.FileError
+        If the file cannot be written.
+    """
+    with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["elapsed_s", "iteration", "best_cost"])
+        for point in history:
+            cost = "" if point.best_cost is None else repr(float(point.best_cost))
+            writer.writerow([f"{point.elapsed_s:.6f}", point.iteration, cost])
+    return Path(path)

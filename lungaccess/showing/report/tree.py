@@ -1,4 +1,4 @@
-"""The airway tree over its mask, coloured by generation."""
+"""The airway tree over its mask, coloured by generation; and an organ without airways."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from lungaccess.showing.report.views import STANDARD, View
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
     from anatomy.lung import Lung
+    from anatomy.organ import Organ
 
 
 WIDTH_IN, HEIGHT_IN = 17.0, 6.6
@@ -89,3 +90,46 @@ def _branches(tree: AirwayTree, points: Float, colours: Colormap, norm: Boundary
     lines.set_array(np.asarray(tree.generation)[tree.branch_of_point[child]])
     lines.set_linewidth(np.clip(0.35 * np.asarray(tree.radius_mm)[child], 0.9, 3.2).tolist())
     return lines
+
+
+ARROW_MM = 25.0
+"""Length of the arrow at a start: long enough to show its direction in a whole organ."""
+
+
+def organ_png(organ: Organ, path: str | os.PathLike[str]) -> Path:
+    """Draw an organ seen through from three sides; an arrow is a start, a ring a target.
+
+    FileError is raised if the file cannot be written.
+    """
+    figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
+    layers = Layers(organ)
+    for box, view in zip(PANELS_IN, STANDARD, strict=True):
+        _panel(style.panel(figure, box), organ, layers, view)
+    style.heading(
+        figure,
+        f"{organ.name}: vessels red, nodules green, starts as arrows ({len(organ.starts)}), "
+        f"targets as rings ({len(organ.targets_lps)})",
+    )
+    return style.save_png(figure, path)
+
+
+def _panel(axes: Axes, organ: Organ, layers: Layers, view: View) -> None:
+    drawing.anatomy_seen_through(axes, layers, view)
+    drawing.see_through(axes, layers.footprint("nodule", view), style.NODULE, 10.0, 0.8)
+    corners = [organ.grid.lps(np.zeros(3)), organ.grid.lps(np.array(organ.grid.shape) - 1.0)]
+    shown = [view.project(corner) for corner in corners]
+    for pose in organ.starts:
+        tail, tip = view.project(pose[:3, 3] - ARROW_MM * pose[:3, 2]), view.project(pose[:3, 3])
+        axes.annotate(
+            "",
+            xy=(tip[0], tip[1]),
+            xytext=(tail[0], tail[1]),
+            arrowprops={"color": style.INK, "arrowstyle": "-|>"},
+            zorder=9,
+        )
+        shown += [tail, tip]
+    for point in organ.targets_lps:
+        drawing.target_mark(axes, view.project(point))
+    drawing.fit_around(axes, None, np.array(shown))
+    drawing.dress(axes, view, ticks=True)
+    drawing.title(axes, view.name)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from itertools import count
 from operator import attrgetter
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from stages.needle.path import ArcPath
 from stages.needle.query import Query
 from stages.needle.search.guide_paths import GuidePathFinder, Work
 from stages.needle.search.optimal import OptimalSearch
-from stages.needle.search.successive_halving import successive_halving
 
 FIRST_SIZE, LARGEST_SIZE = 4, 64
 """Searches in the first round of halving; each round has twice as many as the one before, up to the largest.
@@ -226,3 +226,40 @@ def _found_and_refined(search: OptimalSearch, iterations: int, patience: int) ->
         spent += SLICE
     if search.path is not None:
         yield search, iterations
+
+
+C = TypeVar("C")
+
+
+def successive_halving(
+    candidates: list[C],
+    cost: Callable[[C], float],
+    *,
+    work: int,
+    survivors: Callable[[int, int], int],
+    rungs: int | None = None,
+) -> Iterator[tuple[list[C], int]]:
+    """Yield the candidates of each rung, and how much work each of them is to get on it.
+
+    The caller does the work before it asks for the next rung.  The cheapest candidates go on to that, the
+    cheapest first, for twice the work each.
+
+    Parameters
+    ----------
+    candidates : list
+        Those of the first rung.
+    cost : callable
+        Returns what a candidate costs after the work so far; infinite ones go no further.
+    work : int
+        Work for each candidate on the first rung, in a unit of the caller's.
+    survivors : callable
+        Returns how many candidates go on, given how many a rung had and how many of them have a finite cost.
+    rungs : int, optional
+        Number of rungs; by default the last rung is the first that has no more than one candidate.
+    """
+    for rung in count() if rungs is None else range(rungs):
+        yield candidates, work << rung
+        if rungs is None and len(candidates) <= 1:
+            return
+        finite = sorted((each for each in candidates if math.isfinite(cost(each))), key=cost)
+        candidates = finite[: survivors(len(candidates), len(finite))]

@@ -12,8 +12,8 @@ import pytest
 
 from anatomy.grid import Grid, Volume
 from anatomy.io.assembly import require_cost
-from anatomy.io.cost_maps import NOTE, OBSTACLE_COST, as_stored
 from anatomy.io.images import read_volume, write_volume
+from anatomy.io.voxels import COST_MAP_NOTE, OBSTACLE_COST, as_stored
 
 GRID = Grid.from_spacing((5, 4, 3), (0.7, 0.8, 1.0), (3.0, -2.0, 7.0))
 
@@ -53,7 +53,7 @@ def test_every_reader_finds_the_obstacles(
     reader: Callable[[Path], np.ndarray], cost: np.ndarray, tmp_path: Path
 ) -> None:
     path = tmp_path / "cost.nii.gz"
-    write_volume(path, Volume(grid=GRID, array=as_stored(cost)), note=NOTE)
+    write_volume(path, Volume(grid=GRID, array=as_stored(cost)), note=COST_MAP_NOTE)
     found = reader(path)
     assert ((found == OBSTACLE_COST) == np.isinf(cost)).all()
     assert (found[np.isfinite(cost)] == cost[np.isfinite(cost)]).all()
@@ -61,9 +61,9 @@ def test_every_reader_finds_the_obstacles(
 
 def test_the_header_says_what_an_obstacle_is(cost: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "cost.nii.gz"
-    write_volume(path, Volume(grid=GRID, array=as_stored(cost)), note=NOTE)
+    write_volume(path, Volume(grid=GRID, array=as_stored(cost)), note=COST_MAP_NOTE)
     description = gzip.decompress(path.read_bytes())[148:228].rstrip(b"\0").decode()
-    assert description == NOTE and f"{OBSTACLE_COST:g} is an obstacle" in description
+    assert description == COST_MAP_NOTE and f"{OBSTACLE_COST:g} is an obstacle" in description
 
 
 @pytest.mark.parametrize("stored", [as_stored, np.asfortranarray], ids=["finite", "infinite"])

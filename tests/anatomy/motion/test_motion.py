@@ -12,11 +12,10 @@ from anatomy.base.errors import AnatomyError, FrameError, SettingsError
 from anatomy.build import build_lung
 from anatomy.grid import Grid
 from anatomy.lung import Lung
-from anatomy.motion.motion import LEFT, RIGHT, Motion
+from anatomy.motion.motion import LEFT, RIGHT, Motion, cell_bounds
 from anatomy.motion.population import share_of_motion
 from anatomy.motion.prepare import continued_unfolded, prepare_motion
 from anatomy.motion.source import MotionSource
-from anatomy.motion.stretch import cell_bounds
 from anatomy.phantom import Phantom
 from anatomy.phantom.breathing import PhantomBreathing
 from anatomy.store import folder_name, open_lung

@@ -17,13 +17,13 @@ from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom, make_phantom
 from anatomy.segmentation import growing
 from anatomy.segmentation.airway import Airways, local_minima_map, scale_of, segment_airway
-from anatomy.segmentation.airway_warnings import airway_warnings, tree_or_error
 from anatomy.segmentation.growing import LEVEL_RATIO, levels
 from anatomy.segmentation.kernels import local_minima as kernel
 from anatomy.segmentation.kernels.lumen_edge import grow_wall, join_corners
 from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.segmentation.kernels.states import LUMEN
 from anatomy.segmentation.lungs import Lungs
+from anatomy.segmentation.scan_warnings import airway_warnings, tree_or_error
 
 CROSS = ndimage.generate_binary_structure(2, 1)
 FACES = ndimage.generate_binary_structure(3, 1)

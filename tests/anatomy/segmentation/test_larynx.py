@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anatomy.grid import Grid
-from anatomy.segmentation.larynx import without_larynx
+from anatomy.segmentation.central_airway import without_larynx
 
 
 def _trachea(taper_voxels: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 import lungaccess as la
 from anatomy.base.errors import SettingsError
-from anatomy.base.suggestion import did_you_mean
+from anatomy.base.words import did_you_mean
 from lungaccess.cli import app as cli
 from lungaccess.cli import progress
 from lungaccess.cli.exit_code import ExitCode

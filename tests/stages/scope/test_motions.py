@@ -8,7 +8,7 @@ import pytest
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN, VESSEL
 from stages.scope import MotionProver, ScopeMotions, evenly, find_motions, prove_motion
-from stages.scope.tip_region import in_tip_region
+from stages.scope.motion_proof import in_tip_region
 from tests.stages.scenes import brute_clearance
 from tests.stages.scope.airways import forked_lung
 from tests.stages.scope.sampled_motion import SCOPE, axis_places

@@ -14,9 +14,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.words import plural
 from lungaccess.judging.appraisal import Appraiser
-from lungaccess.planning import with_front
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
 from lungaccess.judging.appraisal.headline import Geometry, of_hundred
+from lungaccess.planning import with_front
 from lungaccess.planning.procedure import load_procedure, procedure_names
 from lungaccess.plans.chance import Chance
 from lungaccess.showing.report.html import breathing, phase, tables, words

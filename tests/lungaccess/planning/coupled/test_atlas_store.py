@@ -15,8 +15,8 @@ from anatomy.lung import Lung
 from lungaccess.planning.coupled import atlas_store
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.atlas_store import atlas_format, atlas_is_kept, open_atlas
-from stages.tube import shape_store
-from stages.tube.shape_store import shapes_format
+from stages.tube import design_shapes
+from stages.tube.design_shapes import shapes_format
 
 SYSTEM = la.load_system("ultrathin")
 COARSE: dict[str, Any] = {"rotations": 4, "stop_spacing_mm": 10.0, "site_spacing_mm": 4.0}
@@ -106,6 +106,6 @@ def test_a_folder_that_cannot_be(small_lung: Lung, tmp_path: Path) -> None:
 
 def test_an_atlas_and_shapes_of_other_kernels_are_others(monkeypatch: pytest.MonkeyPatch) -> None:
     here = atlas_format(), shapes_format()
-    for module in (atlas_store, shape_store):
+    for module in (atlas_store, design_shapes):
         monkeypatch.setattr(module, "kernel_digest", lambda *_rooms: "0123456789abcdef")
     assert here[0] != atlas_format() and here[1] != shapes_format()

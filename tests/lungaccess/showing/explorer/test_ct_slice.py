@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.grid import Grid, Volume
-from lungaccess.showing.explorer.ct_slice import ct_slice
+from lungaccess.showing.explorer.patient import ct_slice
 
 SHAPE, SPACING_MM, FIRST = (9, 8, 7), (0.7, 0.8, 1.5), (-10.0, 5.0, 30.0)
 SLOPE = np.array([3.0, -2.0, 5.0])

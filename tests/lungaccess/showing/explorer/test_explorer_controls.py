@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lungaccess.showing.explorer.ct_slice import ct_slice
+from lungaccess.showing.explorer.patient import ct_slice
 from lungaccess.showing.report.html.volumes import find_ct, read_ct
 from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.showing.explorer.client import source_of

@@ -12,11 +12,9 @@ import pytest
 
 import lungaccess as la
 from anatomy.base.errors import SettingsError
-from anatomy.base.settings import parse
-from anatomy.base.settings_file import settings_toml
+from anatomy.base.settings import parse, settings_toml
 from lungaccess.problem.system import System, shipped_names
-from lungaccess.showing.explorer.changed_system import plan_command, system_of
-from lungaccess.showing.explorer.chosen_place import ChosenPlace
+from lungaccess.showing.explorer.changed_system import ChosenPlace, plan_command, system_of
 from lungaccess.showing.explorer.messages import frame, read_frame
 from lungaccess.showing.explorer.questions import (
     CANCEL,

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from stages.needle.search.successive_halving import successive_halving
+from stages.needle.search.portfolio import successive_halving
 
 
 def half(count: int, _finite: int) -> int:

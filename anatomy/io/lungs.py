@@ -29,7 +29,8 @@ def with_lobes(masks: MaskSet) -> MaskSet:
     known = dict((fill_lung(masks) if are_the_lungs else masks).masks)
     lobes = grown_into(main, known["lung"])
     if are_the_lungs:
-        statements += _absent(lobes)
+        absent = [name for number, name in LOBES.items() if not (lobes == number).any()]
+        statements += [f"There is no mask of the {name}: what lies there is not lung." for name in absent]
     if "fissures" not in known or not known["fissures"].any():
         fissures = fissures_between(lobes)
         if fissures.any():
@@ -54,11 +55,6 @@ def _main_lobes(lobes: UInt8, statements: list[str]) -> UInt8:
                 f"{stray} voxels of the mask of the {name} lie apart from it: they are lung, but of no lobe."
             )
     return kept
-
-
-def _absent(lobes: UInt8) -> list[str]:
-    absent = [name for number, name in LOBES.items() if not (lobes == number).any()]
-    return [f"There is no mask of the {name}: what lies there is not lung." for name in absent]
 
 
 def fill_lung(masks: MaskSet) -> MaskSet:

@@ -236,7 +236,7 @@ def placement(name: str, role: str, mask: Mask, grid: Grid, target: Grid, found:
         sentences.append(f"Its own grid is {grid.describe()}: borders moved by up to {half:.1f} mm.")
     if (low > 0).any() or (high < target.shape).any():
         sentences.append(f"Beyond it {_BEYOND.get(role, 'nothing is known')}.")
-    faces = _touched_faces(mask)
+    faces = sum(bool(np.moveaxis(mask, axis, 0)[end].any()) for axis in range(3) for end in (0, -1))
     if faces and role != "lung":
         sentences.append(f"It reaches {faces} of its 6 faces, so that it may go on beyond them.")
     if found.n_lost:
@@ -273,10 +273,6 @@ def moved(
     if found.n_lost:
         sentences.append(f"{found.n_lost} of its {found.n_voxels} voxels lie outside the images.")
     return " ".join(sentences)
-
-
-def _touched_faces(mask: Mask) -> int:
-    return sum(bool(np.moveaxis(mask, axis, 0)[end].any()) for axis in range(3) for end in (0, -1))
 
 
 def _times(numbers: object) -> str:

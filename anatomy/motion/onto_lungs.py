@@ -59,7 +59,14 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
             remedy="Check maps_from and masks_phase, and that other_lungs shows this patient at the other "
             f"end of the breath, phase {phase:g}",
         )
-    apart = _borders_mm(moved.reshape(lattice.shape), there.reshape(lattice.shape))
+    # The mean distance from the border of each mask to that of the other, mm.
+    borders = [
+        mask & ~ndimage.binary_erosion(mask)
+        for mask in (moved.reshape(lattice.shape), there.reshape(lattice.shape))
+    ]
+    away = [ndimage.distance_transform_edt(~border, sampling=SAMPLE_MM) for border in borders]
+    both = np.concatenate([away[1][borders[0]], away[0][borders[1]]])
+    apart = float(both.mean())
     return {"lungs_dice": dice, "lungs_dice_unmoved": unmoved, "lungs_borders_mm": apart}
 
 
@@ -74,11 +81,3 @@ def _at(mask: Mask, grid: Grid, points: Float) -> Mask:
 
 def _dice(a: Mask, b: Mask) -> float:
     return float(2.0 * (a & b).sum() / max(a.sum() + b.sum(), 1))
-
-
-def _borders_mm(a: Mask, b: Mask) -> float:
-    """Return the mean distance from the border of each mask to that of the other, mm."""
-    borders = [mask & ~ndimage.binary_erosion(mask) for mask in (a, b)]
-    away = [ndimage.distance_transform_edt(~border, sampling=SAMPLE_MM) for border in borders]
-    both = np.concatenate([away[1][borders[0]], away[0][borders[1]]])
-    return float(both.mean())

@@ -57,8 +57,13 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
     FrameError
         If a field does not cover the lungs.
     """
-    places = _places(labels, grid)
-    nodes_grid = _nodes_grid(places)
+    # Places `(N, 3)` LPS mm spread over the lungs.
+    steps = np.maximum(np.rint(SAMPLE_MM / grid.spacing_mm).astype(int), 1)
+    inside = np.argwhere((labels[tuple(slice(None, None, n) for n in steps)] & OUTSIDE) == 0)
+    places = grid.lps(inside * steps)
+    low, high = places.min(axis=0) - BORDER_MM, places.max(axis=0) + BORDER_MM
+    shape = np.ceil((high - low) / NODE_MM).astype(int) + 1
+    nodes_grid = Grid.from_spacing(shape, (NODE_MM,) * 3, low)
     at = nodes_grid.lps(np.moveaxis(np.indices(nodes_grid.shape), 0, -1)).reshape(-1, 3)
     is_left = places[:, 0] > middle_x_mm
     if not is_left.any() or is_left.all():
@@ -90,19 +95,6 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
         return motion
     onto = require_onto_lungs(motion, labels, grid, source.other_lungs)
     return replace(motion, figures={**motion.figures, **onto})
-
-
-def _places(labels: Labels, grid: Grid) -> Float:
-    """Return places `(N, 3)` LPS mm spread over the lungs."""
-    steps = np.maximum(np.rint(SAMPLE_MM / grid.spacing_mm).astype(int), 1)
-    inside = np.argwhere((labels[tuple(slice(None, None, n) for n in steps)] & OUTSIDE) == 0)
-    return grid.lps(inside * steps)
-
-
-def _nodes_grid(places: Float) -> Grid:
-    low, high = places.min(axis=0) - BORDER_MM, places.max(axis=0) + BORDER_MM
-    shape = np.ceil((high - low) / NODE_MM).astype(int) + 1
-    return Grid.from_spacing(shape, (NODE_MM,) * 3, low)
 
 
 def _of_landmarks(

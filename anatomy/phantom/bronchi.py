@@ -199,7 +199,11 @@ def grow_airways(
         if stump:
             end = start + STUMP_SHARE * (end - start)
         elif bronchus.segment:
-            end = _aim(start, end, clouds[bronchus.name])
+            # Turn a segmental bronchus towards the middle of the points it supplies.
+            chord = end - start
+            middle = unit(clouds[bronchus.name].mean(axis=0) - start)
+            heading = unit((1 - MIDDLE_WEIGHT) * unit(chord) + MIDDLE_WEIGHT * middle)
+            end = np.asarray(start + np.linalg.norm(chord) * limit_turn(heading, unit(chord), 0.0, np.pi / 6))
         line = bent_line(start, sprouts.direction(parent), end, STEP_MM, bend=0.25)
         diameter = scale * STUMP_DIAMETER_MM if stump else rule.diameter_mm(counts[bronchus.name])
         index[bronchus.name] = sprouts.add(parent, line, diameter, bronchus.lobe, bronchus.name)
@@ -210,11 +214,3 @@ def grow_airways(
 
 def _lobe_of(name: str) -> int:
     return next((bronchus.lobe for bronchus in TEMPLATE if bronchus.name == name), 0)
-
-
-def _aim(start: Float, end: Float, cloud: Float) -> Float:
-    """Turn a segmental bronchus towards the middle of the points it supplies."""
-    chord = end - start
-    middle = unit(cloud.mean(axis=0) - start)
-    heading = unit((1 - MIDDLE_WEIGHT) * unit(chord) + MIDDLE_WEIGHT * middle)
-    return np.asarray(start + np.linalg.norm(chord) * limit_turn(heading, unit(chord), 0.0, np.pi / 6))

@@ -89,10 +89,10 @@ def plan_patient(
         If three nodules do not fit.
     """
     bullae = place_bullae(territory, traits.emphysema, scale, rng)
+    # The diameter at which vessels end: in small patients later, in coarse voxels earlier.
+    limit_mm = traits.vessel_limit_mm * (1.0 + EMPHYSEMA_VESSEL_SHARE * traits.emphysema)
     vessels = VesselRule(
-        calibre=traits.vessel_calibre,
-        limit_mm=_vessel_limit_mm(scale, spacing_mm, traits),
-        spacing_mm=spacing_mm,
+        calibre=traits.vessel_calibre, limit_mm=limit_mm * max(scale, spacing_mm), spacing_mm=spacing_mm
     )
     sprouts, rule = grow_airways(territory, scale, rng, traits)
     airways = _plan_airways(sprouts, spacing_mm)
@@ -131,12 +131,6 @@ def _plan_airways(sprouts: Sprouts, spacing_mm: float) -> PlannedTree:
     diameter = np.repeat(drawn.diameter_mm, drawn.counts)
     outer = 0.5 * diameter + wall_thickness_mm(diameter)
     return PlannedTree(sprouts=drawn, inner_mm=0.5 * diameter, outer_mm=outer, freedom=_freedom(drawn))
-
-
-def _vessel_limit_mm(scale: float, spacing_mm: float, traits: Traits) -> float:
-    """Return the diameter at which vessels end: in small patients later, in coarse voxels earlier."""
-    limit_mm = traits.vessel_limit_mm * (1.0 + EMPHYSEMA_VESSEL_SHARE * traits.emphysema)
-    return limit_mm * max(scale, spacing_mm)
 
 
 def _vessel_part(sprouts: Sprouts, rule: VesselRule) -> tuple[Sprouts, Float]:

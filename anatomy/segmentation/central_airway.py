@@ -138,16 +138,12 @@ def grow_from(ct: CoarseCt, outside: Mask, seed_lps: Float) -> CentralAirway:
     grown = grow(ct, seed, outside)
     main, warnings = _main_part(ct, grown)
     if not main[tuple(seed)]:  # the column was a lobar bronchus
-        seed = _middle_of_upper_half(ct, main)
+        # The voxel in the upper half of the main airways that is farthest from their wall.
+        low, high = bounds(main)
+        depth = distance_mm(main, ct.spacing_mm)
+        depth[:, :, : (low[2] + high[2]) // 2] = 0.0
+        seed = np.array(np.unravel_index(int(np.argmax(depth)), depth.shape), dtype=np.int64)
     return CentralAirway(grown=grown, main=main, seed=seed, warnings=warnings)
-
-
-def _middle_of_upper_half(ct: CoarseCt, main: Mask) -> Int:
-    """Return the voxel in the upper half of the main airways that is farthest from their wall."""
-    low, high = bounds(main)
-    depth = distance_mm(main, ct.spacing_mm)
-    depth[:, :, : (low[2] + high[2]) // 2] = 0.0
-    return np.array(np.unravel_index(int(np.argmax(depth)), depth.shape), dtype=np.int64)
 
 
 def _given_seed(ct: CoarseCt, seed_lps: Float) -> Int:
@@ -195,7 +191,9 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
     dx, dy, _ = ct.spacing_mm
     least, most = (area / (dx * dy) for area in COLUMN_AREA_MM2)
     chosen = np.zeros(ct.hu.shape, dtype=np.bool_)
-    middle = _midline(ct, outside)
+    # The middle of the body along the axis from right to left, as an index.
+    body = np.count_nonzero(~outside, axis=(1, 2)).astype(np.float64)
+    middle = float((body * np.arange(len(body))).sum() / body.sum())
     for k in range(ct.hu.shape[2]):
         plane = ct.hu[:, :, k]
         pieces, count = ndimage.label((plane < COLUMN_HU) & ~outside[:, :, k])
@@ -210,12 +208,6 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
             if np.median(plane[box][inside]) <= COLUMN_MEDIAN_HU:
                 chosen[(*box, k)] |= inside
     return chosen
-
-
-def _midline(ct: CoarseCt, outside: Mask) -> float:
-    """Return the middle of the body along the axis from right to left, as an index."""
-    body = np.count_nonzero(~outside, axis=(1, 2)).astype(np.float64)
-    return float((body * np.arange(len(body))).sum() / body.sum())
 
 
 def grow(ct: CoarseCt, seed: Int, outside: Mask) -> Mask:

@@ -16,7 +16,7 @@ from anatomy.base.typed import Float
 from anatomy.structures import OUTSIDE
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
-from lungaccess.showing.report.views import STANDARD, View
+from lungaccess.showing.report.views import STANDARD
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -53,7 +53,11 @@ def motion_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
         footprint = layers.footprint("lung", view)
         drawing.see_through(axes, layers.footprint("airway", view), "#555555", 5.0, 0.35)
         drawing.outline(axes, footprint, "#B9AEA2", 0.8)
-        near = _in_slab(lung, places, view)
+        # Which places lie in the slab through the middle of their lung, as the view looks at it.
+        depth = places @ view.towards_viewer
+        left = places[:, 0] > lung.tree.carina_lps[0]
+        middle = np.where(left, np.median(depth[left]), np.median(depth[~left]))
+        near = np.asarray(np.abs(depth - middle) <= SLAB_MM)
         at, along = view.project(places[near]), view.project(vectors[near])
         axes.quiver(
             *at.T, *along.T, length[near], cmap=colours, norm=norm, angles="xy", scale_units="xy", scale=1.0,
@@ -82,11 +86,3 @@ def _arrows(lung: Lung) -> tuple[Float, Float]:
     sides = [motion.displacements_mm(places, side) for side in (0, 1)]
     left = places[:, :1] > motion.middle_x_mm
     return places, np.asarray(motion.amplitude * np.where(left, sides[1], sides[0]))
-
-
-def _in_slab(lung: Lung, places: Float, view: View) -> Float:
-    """Return which places lie in the slab through the middle of their lung, as the view looks at it."""
-    depth = places @ view.towards_viewer
-    left = places[:, 0] > lung.tree.carina_lps[0]
-    middle = np.where(left, np.median(depth[left]), np.median(depth[~left]))
-    return np.asarray(np.abs(depth - middle) <= SLAB_MM)

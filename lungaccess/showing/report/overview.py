@@ -70,7 +70,9 @@ def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
     scope = view.project(plan.curves().scope.points_lps)
     drawing.anatomy_seen_through(axes, layers, view)
     drawing.fit_around(axes, frame, scope)
-    _nodule(axes, layers, view)
+    footprint = layers.footprint("nodule", view)
+    drawing.see_through(axes, footprint, style.NODULE, 2.0, 0.8)
+    drawing.outline(axes, footprint, style.NODULE, 1.0)
     _stages(axes, plan, view, scope)
     zoom.goal_marks(axes, plan, view)
     drawing.dress(axes, view, ticks=True)
@@ -83,12 +85,6 @@ def _stages(axes: Axes, plan: Plan, view: View, scope: Float) -> None:
     looks = ((style.TUBE, 3.0), (style.NEEDLE, 2.2))
     for order, (curve, (colour, width)) in enumerate(zip(others, looks, strict=False), start=7):
         drawing.curve(axes, view.project(curve.points_lps), colour, width, order)
-
-
-def _nodule(axes: Axes, layers: Layers, view: View) -> None:
-    footprint = layers.footprint("nodule", view)
-    drawing.see_through(axes, footprint, style.NODULE, 2.0, 0.8)
-    drawing.outline(axes, footprint, style.NODULE, 1.0)
 
 
 def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
@@ -163,7 +159,10 @@ def clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:
         axes.plot(along, clearance, color=colour, ls=dashes, lw=1.8, label=label + note, zorder=4)
         highest = max(highest, 1.2 * float(clearance[along >= 0].min()) + 4.0)
     _required_line(axes, plan, tube_arc, along)
-    _exempt_span(axes, plan, tube_arc)
+    # Show where the wall of the pierced airway may be near: from the scope to the exempt needle.
+    stop = plan.exemption.needle_length_mm
+    axes.axvspan(-tube_arc[-1], stop, color=style.AIRWAY, alpha=0.16, lw=0, zorder=0)
+    axes.axvline(plan.tube.exit.arc_length_mm - tube_arc[-1], color=style.TUBE, lw=1.4, ls=":", zorder=3)
     axes.axvline(0.0, color=style.FAINT_INK, lw=0.8, zorder=2)
     axes.set_xlim(along[0], along[-1])
     axes.set_ylim(0.0, min(highest, MOST_TOP_MM))
@@ -181,13 +180,6 @@ def _required_line(axes: Axes, plan: Plan, tube_arc: Float, along: Float) -> Non
     for start, stop, level in zip(places[:-1], places[1:], levels, strict=True):
         axes.fill_between([start, stop], 0.0, level, color=style.FORBIDDEN, lw=0, zorder=1)
     axes.stairs(levels, places, baseline=None, color=style.INK, lw=1.4, label="required", zorder=5)
-
-
-def _exempt_span(axes: Axes, plan: Plan, tube_arc: Float) -> None:
-    """Show where the wall of the pierced airway may be near: from the scope to the exempt needle."""
-    stop = plan.exemption.needle_length_mm
-    axes.axvspan(-tube_arc[-1], stop, color=style.AIRWAY, alpha=0.16, lw=0, zorder=0)
-    axes.axvline(plan.tube.exit.arc_length_mm - tube_arc[-1], color=style.TUBE, lw=1.4, ls=":", zorder=3)
 
 
 def _label_clearance(axes: Axes) -> None:

@@ -40,7 +40,10 @@ def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)
-    colours, norm = _generation_colours(int(np.max(lung.tree.generation)))
+    # One colour a generation, distinct in lightness too.
+    deepest = int(np.max(lung.tree.generation))
+    shades = matplotlib.colormaps["plasma"](np.linspace(0.0, 0.88, deepest + 1))
+    colours, norm = ListedColormap(shades), BoundaryNorm(np.arange(deepest + 2) - 0.5, deepest + 1)
     for box, view in zip(PANELS_IN, STANDARD, strict=True):
         axes = style.panel(figure, box)
         _tree_panel(axes, lung.tree, layers, view, colours, norm)
@@ -54,12 +57,6 @@ def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
         f"Airway tree of {lung.name}: {lung.tree.n_branches} branches, up to generation {generations[-1]}",
     )
     return style.save_png(figure, path)
-
-
-def _generation_colours(deepest: int) -> tuple[Colormap, BoundaryNorm]:
-    """Return one colour a generation, distinct in lightness too."""
-    shades = matplotlib.colormaps["plasma"](np.linspace(0.0, 0.88, deepest + 1))
-    return ListedColormap(shades), BoundaryNorm(np.arange(deepest + 2) - 0.5, deepest + 1)
 
 
 def _tree_panel(

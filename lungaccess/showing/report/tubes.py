@@ -72,7 +72,10 @@ def tubes_png(
     widest = scope_diameter_mm or 1.15 * equilibrium.mechanics.tubes[-1].outer_diameter_mm
     lines = [_body(equilibrium)]
     if deployed is not None:
-        lines += _ghosts(deployed)
+        # The centrelines of some earlier steps, evenly spread over those with a tube out.
+        out = [step for step in deployed.steps[:-1] if step.length_mm > 0.0]
+        chosen = np.unique(np.linspace(0, max(len(out) - 1, 0), GHOSTS).round().astype(int))
+        lines += [_body(out[number]) for number in chosen[: len(out)]]
     _side_view(style.panel(figure, SIDE_IN), equilibrium, lines, widest)
     _front_view(style.panel(figure, FRONT_IN), equilibrium, lines, widest)
     _key(style.panel(figure, KEY_IN), equilibrium, notes, with_ghosts=len(lines) > 1)
@@ -87,13 +90,6 @@ def _body(equilibrium: Equilibrium) -> Float:
 
 def _along(start_mm: float, end_mm: float) -> Float:
     return np.linspace(start_mm, end_mm, max(2, round((end_mm - start_mm) / SPACING_MM) + 1))
-
-
-def _ghosts(deployed: DeployedSequence) -> list[Float]:
-    """Return the centrelines of some earlier steps, evenly spread over those with a tube out."""
-    out = [step for step in deployed.steps[:-1] if step.length_mm > 0.0]
-    chosen = np.unique(np.linspace(0, max(len(out) - 1, 0), GHOSTS).round().astype(int))
-    return [_body(out[number]) for number in chosen[: len(out)]]
 
 
 def _sideways(points: Float) -> Float:

@@ -212,7 +212,11 @@ def _too_tight(path: ArcPath, points: Float, plan: Plan) -> tuple[Finding, ...]:
         "needle.curve.arc", 1.0 / float(path.arcs[tight[0], CURVATURE]), least, "mm radius", detail
     )
     if len(points) > 2:
-        radii = _radii(points)
+        # The radii `(N - 2,)` of the circles through three successive points, infinite on a line.
+        a, b, c = points[:-2], points[1:-1], points[2:]
+        sides = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - b, axis=1) * np.linalg.norm(c - a, axis=1)
+        area = 2.0 * np.linalg.norm(np.cross(b - a, c - b), axis=1)
+        radii = np.asarray(np.where(area > 0.0, sides / np.maximum(area, np.finfo(float).tiny), np.inf))
         along, sharp = arc_lengths(points)[1:-1], np.flatnonzero(radii < least * (1.0 - SAME_MM))
         where = f"; {len(sharp)} of {len(radii)} are too small" + (
             f", {along[sharp[0]]:.1f} to {along[sharp[-1]]:.1f} mm from the start" if len(sharp) else ""
@@ -222,14 +226,6 @@ def _too_tight(path: ArcPath, points: Float, plan: Plan) -> tuple[Finding, ...]:
             f"smallest circle through three successive points{where}", least * SAME_MM,
         )  # fmt: skip
     return collected.report().findings
-
-
-def _radii(points: Float) -> Float:
-    """Return the radii `(N - 2,)` of the circles through three successive points, infinite on a line."""
-    a, b, c = points[:-2], points[1:-1], points[2:]
-    sides = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - b, axis=1) * np.linalg.norm(c - a, axis=1)
-    area = 2.0 * np.linalg.norm(np.cross(b - a, c - b), axis=1)
-    return np.asarray(np.where(area > 0.0, sides / np.maximum(area, np.finfo(float).tiny), np.inf))
 
 
 def _of_polyline(plan: Plan, lung: Lung, points: Float) -> tuple[Finding, ...]:

@@ -288,7 +288,9 @@ class ResolutionSearch:
             elif reason == kernel.FULL_OF_NODES:
                 self._more_nodes()
             elif reason == kernel.FULL_OF_ENTRIES:
-                self._more_entries()
+                f, entries, heap_f, heap, ranks = self._queue
+                if self._may_double((f, entries, heap_f, heap)):
+                    self._queue = _doubled(f), _doubled(entries), _doubled(heap_f), _doubled(heap), ranks
         return False
 
     def _end(self, outcome: Outcome) -> None:
@@ -308,11 +310,6 @@ class ResolutionSearch:
             larger = np.zeros(2 * len(seen), dtype=np.int32)
             node_kernel.rehash(nodes, self._merge, seen, larger)
             self._store = _doubled(nodes), _doubled(links), _doubled(proved), larger
-
-    def _more_entries(self) -> None:
-        f, entries, heap_f, heap, ranks = self._queue
-        if self._may_double((f, entries, heap_f, heap)):
-            self._queue = _doubled(f), _doubled(entries), _doubled(heap_f), _doubled(heap), ranks
 
     def _best_path(self) -> ArcPath:
         """Return the path to the best node and on to the goal."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_value
-from anatomy.base.typed import Float, Int
+from anatomy.base.typed import Float
 from stages.scope.advisor.path import ScopePath
 
 DIRECTIONS = (
@@ -94,7 +94,10 @@ def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, 
     The tip is taken to be in the branch of the tree point nearest to it on the route to where it ends.
     """
     tips = path.tips()[: path.nearest + 1, :3, 3]
-    place = _places_on_route(tree, tips)
+    # For each tip the nearest tree point on the route to the last one, never going back.
+    route = tree.route(tree.nearest_point(tips[-1]))
+    away = np.linalg.norm(tips[:, None] - tree.points_lps[route][None], axis=2)
+    place = np.asarray(route[np.maximum.accumulate(np.argmin(away, axis=1))])
     branch = tree.branch_of_point[place]
     starts = [0, *(np.flatnonzero(np.diff(branch)) + 1).tolist(), len(branch)]
     carina = float(tree.distance_from_root_mm[tree.carina_point])
@@ -120,13 +123,6 @@ def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, 
         )
         twist_before = twist
     return tuple(instructions)
-
-
-def _places_on_route(tree: AirwayTree, tips: Float) -> Int:
-    """Return for each tip the nearest tree point on the route to the last one, never going back."""
-    route = tree.route(tree.nearest_point(tips[-1]))
-    away = np.linalg.norm(tips[:, None] - tree.points_lps[route][None], axis=2)
-    return np.asarray(route[np.maximum.accumulate(np.argmin(away, axis=1))])
 
 
 def _first_point(tree: AirwayTree, branch: int) -> int:

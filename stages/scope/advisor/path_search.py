@@ -79,7 +79,10 @@ class PathSearch:
         """Return the path from a state that ends at the goal or comes nearest to it."""
         options = self._options
         begin = np.zeros((1, 4))
-        begin[0, 3] = self._potential(start)
+        # The potential at the tip of a state, infinity outside the lumen.
+        tip = tool_frames(self._environment.model, start.array[None])[0, :3, 3]
+        voxel = self._environment.lumen.voxel_at(tip)
+        begin[0, 3] = float(self._environment.field.potential[voxel]) if voxel >= 0 else np.inf
         states, info, end = self._compute_path(
             start.array[None], begin, options.weights, options.look_ahead_mm
         )
@@ -99,12 +102,6 @@ class PathSearch:
             if more_info[-1, 3] < info[-1, 3]:
                 states, info, end = more, more_info, new_end
         return self._path(states, info, end == kernel.REACHED, used)
-
-    def _potential(self, state: ScopeState) -> float:
-        """Return the potential at the tip of a state, infinity outside the lumen."""
-        tip = tool_frames(self._environment.model, state.array[None])[0, :3, 3]
-        voxel = self._environment.lumen.voxel_at(tip)
-        return float(self._environment.field.potential[voxel]) if voxel >= 0 else np.inf
 
     def _random_weights(self) -> Weights:
         low, high = (float(value) for value in np.sort(self._rng.uniform(size=2)))

@@ -139,13 +139,9 @@ def score_submission(
                 judge = judge or _Scorer(phantom_named(name), folder, cache, tips, samples, certify_boxes)
                 yield judge.score(query, answer, submission.planner)
             else:
-                yield _unplanned(query, answer, submission.planner)
-
-
-def _unplanned(query: BenchmarkQuery, answer: SubmittedAnswer | None, planner: str) -> Score:
-    status = MISSING if answer is None else CLAIMED if answer.unreachable else NONE
-    cpu_s = None if answer is None else answer.cpu_s
-    return _named(query, planner, status, cpu_s=cpu_s)
+                status = MISSING if answer is None else CLAIMED if answer.unreachable else NONE
+                cpu_s = None if answer is None else answer.cpu_s
+                yield _named(query, submission.planner, status, cpu_s=cpu_s)
 
 
 def _named(

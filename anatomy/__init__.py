@@ -1,7 +1,5 @@
 """The patient: images, masks, airway tree and clearances; read, segmented from a CT, or made from a seed."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -3,8 +3,6 @@
 An alias names what the numbers are; the shape, the unit and the frame of each array stand in the docstrings.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

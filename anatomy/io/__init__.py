@@ -1,7 +1,5 @@
 """Reading and writing of medical files; the only place where frames are flipped."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -4,8 +4,6 @@ A `pose` is a tuple of six floats: a point and the unit tangent there.  A `bend`
 the curvature in 1/mm and the unit normal towards the centre of curvature.  Lengths in mm.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.compiling import kernel

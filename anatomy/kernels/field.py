@@ -24,8 +24,6 @@ obstacle is the centre of its voxel.  Then the field is sampled at voxel centres
 word with a point for the box, and the distance to the grid's edge still counts as that to a solid.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A label is a `uint16`: a bit for each structure the voxel belongs to and, above 
 airway branch.
 """
 
-from __future__ import annotations
-
 AIRWAY = 1
 """Airway lumen or wall."""
 VESSEL = 2

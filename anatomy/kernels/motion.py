@@ -7,8 +7,6 @@ border. `share` is the amplitude times the phase less that of the masks: a place
 share d(X)`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small random generator whose state belongs to the caller: SplitMix64."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel

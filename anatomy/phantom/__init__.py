@@ -1,7 +1,5 @@
 """A synthetic patient with known truth: airways, vessels, lobes, nodules and CT from a seed."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Compiled drawing of tubes and balls into a voxel grid."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel

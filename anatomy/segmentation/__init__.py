@@ -1,7 +1,5 @@
 """From a CT of the chest to the masks and the cost map of a patient."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

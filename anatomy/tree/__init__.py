@@ -1,7 +1,5 @@
 """Airway trees made from lumen masks and from centreline graphs."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

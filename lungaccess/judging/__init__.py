@@ -1,7 +1,5 @@
 """Whether a plan is true, what it is worth, and why there is none."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -7,8 +7,6 @@ about many points at once, and `StartRegion` about many start poses.  The planne
 `stages.needle.ompl`.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

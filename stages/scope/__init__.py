@@ -1,7 +1,5 @@
 """The bronchoscope: the device and its motions; see also `advisor`, `route` and `tour`."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """The concentric tubes: their mechanics, deployments and designs."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Errors of the tube stage."""
 
-from __future__ import annotations
-
 from anatomy.base.errors import LungaccessError
 
 

@@ -1,7 +1,5 @@
 """Eigenvalues of symmetric 3x3 matrices in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel

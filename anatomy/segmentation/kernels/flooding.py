@@ -1,7 +1,5 @@
 """Shares a volume out among labelled seeds: by the cheapest way from a seed, and by diffusion."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel

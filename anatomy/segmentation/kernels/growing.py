@@ -5,8 +5,6 @@ lies a border, of two voxels or more, of depth 0: nothing grows there, and only 
 or might are looked at.  `state` is uint8: FREE, LUMEN, BANNED, or the mark of a level.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel, merged_kernel

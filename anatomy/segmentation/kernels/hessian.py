@@ -1,7 +1,5 @@
 """Responses of Hessian filters at the voxels of a smoothed image [Fu2018, sec. IV-A]."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel

@@ -4,8 +4,6 @@ A slice is `(rows, columns)` int16, C-contiguous; the structuring element is the
 neighbours.  What lies beyond the border takes no part in a minimum or maximum.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel

@@ -6,8 +6,6 @@ layer, and the closing there looks two farther.  Lists of voxels are filled up t
 is listed once, when its state changes, so a list as long as the image has room for all.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel, merged_kernel

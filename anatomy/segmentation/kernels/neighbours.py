@@ -1,7 +1,5 @@
 """Neighbours of a voxel: where they lie, and what they hold."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel

@@ -1,7 +1,5 @@
 """Plates in a smoothed image: how much each voxel is one, and the sheets that they make together."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel

@@ -1,7 +1,5 @@
 """Separable symmetric smoothing of an image in place, plane by plane."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel

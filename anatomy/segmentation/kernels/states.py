@@ -1,7 +1,5 @@
 """What a voxel of the image `state`, uint8, is while the airway grows."""
 
-from __future__ import annotations
-
 import numpy as np
 
 FREE = np.uint8(0)

@@ -5,8 +5,6 @@ Points are in mm from the first voxel along these axes, `per_mm` is the number o
 float64.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel

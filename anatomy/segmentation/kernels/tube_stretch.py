@@ -9,8 +9,6 @@ each averaged along the whole stretch.  Noise falls with the square root of its 
 vessels has a dark side.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel

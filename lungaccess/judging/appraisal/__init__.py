@@ -1,7 +1,5 @@
 """What is said first of a plan: verdict of the check, chance of success, and how near its limits are."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

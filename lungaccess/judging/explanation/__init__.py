@@ -1,7 +1,5 @@
 """What one learns from a `NoPlan`: the nearest misses, what blocks, which system would do, what is proved."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Compiled kernel of explanations: where single arcs come too near to something, and by how much."""
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc

@@ -1,7 +1,5 @@
 """Proofs of every kind on drawn cases: compiled, in plain Python, and against a truth."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Published needle queries run with our planners and OMPL's, by our rules or those of a peer."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Studies: patients, targets, devices, planners and seeds from one file, results in one SQLite file."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """The explorer: a local page on which a target is clicked and its plans are seen at once."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Pictures of plans, searches and anatomy; the only package that draws."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

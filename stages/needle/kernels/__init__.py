@@ -1,7 +1,5 @@
 """Compiled kernels of the needle stage that its rooms share, and those that the coupled planner calls."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

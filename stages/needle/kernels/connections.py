@@ -10,8 +10,6 @@ The *trumpet* of a pose is the set of points it reaches [Kuntz2015, fig. 4]; the
 is the set of points on the paths between them.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import any_normal, arc_to_point

@@ -5,8 +5,6 @@ piece of at least r, it is that path less its last r mm; else it is the arc C as
 (docs/explanation/proofs.md, "Workspace").  With r = 0 all of this is about the goal itself.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import arc_to_point

@@ -4,8 +4,6 @@
 its distance from the nearest voxel that counts, and the distance that it has to keep.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc

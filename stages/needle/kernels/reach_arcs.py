@@ -5,8 +5,6 @@
 holds the same poses in that order: reachable points then need few looks.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 docs/explanation/reachability.md derives how far apart such arcs may be.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 For `starts`, `branches` and `order` see `stages.needle.kernels.reach_arcs`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

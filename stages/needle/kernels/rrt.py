@@ -1,7 +1,5 @@
 """The RRT of [Patil2014] as used in [Kuntz2015] and [Fu2018]."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

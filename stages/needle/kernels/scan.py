@@ -1,7 +1,5 @@
 """Many start poses and one target: the workspace test, and the direct arcs."""
 
-from __future__ import annotations
-
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import kernel
 from stages.needle.kernels.connections import seen_from, single_arc_exceeds

@@ -10,8 +10,6 @@ behind, or farther away than the needle is long, by more than the displacement, 
 the bundle.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.compiling import inner_kernel, kernel

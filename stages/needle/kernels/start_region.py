@@ -5,8 +5,6 @@ far each place of it moves: docs/explanation/start_region.md has the derivation.
 cells, each with what is free around its middle.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

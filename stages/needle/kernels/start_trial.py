@@ -1,7 +1,5 @@
 """Many start poses and one target: each is tried by the cheapest means that finds a clear path."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ of seven floats: its position, the direction from which the limit of the angle c
 inserted before.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

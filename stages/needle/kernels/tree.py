@@ -6,8 +6,6 @@ with the length and turn behind it, and its bend's normal is then the direction 
 the angle counts.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import arc_to_point, point_on_arc, pose_on_arc

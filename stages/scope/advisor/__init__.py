@@ -1,7 +1,5 @@
 """The bronchoscope advisor [Rosell2012]: motions from wherever the scope is, and paths to a goal."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Motions that stop a little earlier or later than a proved one, with the same last twist and bend."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Routes for a curvature-limited device along any tree of tubes with radii [Li2021]."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

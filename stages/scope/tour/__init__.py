@@ -1,7 +1,5 @@
 """Tours of the airway to several nodules in one procedure [Pan2025]."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -4,8 +4,6 @@ The common rotation turns the plane of the tubes to the point; in that plane the
 to the point's distance beside and ahead of the scope tip.  `tubes` is the array of `planar`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ by arc length from the tube's rear end, precurvature in 1/mm, its direction in r
 where the tubes' rear ends are, 0 or less; the front plate is at 0.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

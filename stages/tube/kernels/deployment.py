@@ -3,8 +3,6 @@
 `environment` and `trace` are those of `wall_exit`, `tubes` is the array of `planar`.
 """
 
-from __future__ import annotations
-
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels import planar
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried

@@ -9,8 +9,6 @@ As turning all tubes together turns everything, only derivatives by the angles o
 carried; those of each row sum up to 1.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

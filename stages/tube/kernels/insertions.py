@@ -1,7 +1,5 @@
 """Which insertions of the tubes there are: how the sideways sweep bounds them, all over a range."""
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.compiling import inner_kernel, kernel

@@ -4,8 +4,6 @@ A motion is a spatial twist (rotation, translation) in the frame of the front pl
 tubes moves by `rotation x p + translation`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A node is a stretch of tube between two stops.  It lies where its first shape ha
 scope tip; the others that it stands for are within its `error`, which enters the clearance.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ centreline consists of arcs in one plane [Kuntz2015, sec. IV-B].  `tubes` is a `
 the numbers below: curvatures in 1/mm, lengths in mm, the angle in rad.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import normal_on_arc, pose_on_arc, sine_length, versine_length

@@ -8,8 +8,6 @@ where psi includes the direction of the precurvature.  A step is the Magnus expa
 motions [Iserles2000]; where one tube alone is bent, curvature is constant in its frame, and the step exact.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ each stops at its own insertion.  So the sequence to a deployment is the chain o
 equilibrium is followed from that of its parent.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 `bodies` (S, K, 3) are points of S deployments at K stops, mm; see `shapes.follow_all` for the others.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.compiling import inner_kernel, merged_kernel

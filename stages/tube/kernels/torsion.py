@@ -8,8 +8,6 @@ where psi includes the direction of the precurvature, and u_i = 0 at the end of 
 are given, so this is an initial value problem; its derivatives are carried along.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Report pages: one HTML file each, complete in itself, for a plan, no plan, or a reachability map."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

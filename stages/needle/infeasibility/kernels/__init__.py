@@ -1,7 +1,5 @@
 """Compiled kernels of the infeasibility proofs, and those that other proofs call."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

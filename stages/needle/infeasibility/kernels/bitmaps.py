@@ -1,7 +1,5 @@
 """Sets of cells of a plane as bitmaps: moved, widened, united, halved."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """States around which every path is blocked, and sets without them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is known of all paths: how fast direction and place can change from plane to plane."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cubes that paths may pass, filled from the start."""
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.compiling import kernel

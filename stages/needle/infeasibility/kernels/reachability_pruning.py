@@ -1,7 +1,5 @@
 """States from which the target, or to which the start, is out of reach, and sets without them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ in depth, so that half a slab with a slope (v, u) moves a position by (v, u) cel
 Every function over-estimates; docs/explanation/certificate.md has the inequalities.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

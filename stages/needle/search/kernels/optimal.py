@@ -1,7 +1,5 @@
 """Growth and refinement of an asymptotically optimal search."""
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import arc_to_point

@@ -9,8 +9,6 @@ f, (M,) float64, and its entries, (M,) int32; `ranks`, (K, 2) int32, with the fi
 (-1: none) and the number of its entries.  Ranks K - LOOK_AHEAD and above have none.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel

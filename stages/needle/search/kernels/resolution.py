@@ -7,8 +7,6 @@ by the single arc.  An entry of the queue is a node with a primitive to go on by
 primitives that are to be looked at next; so each is looked at once.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import pose_on_arc

@@ -4,8 +4,6 @@ A row of `nodes` is a pose, the first direction of bending, and the length, the 
 of the path that leads there.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -11,8 +11,6 @@ between the middles of their pieces.  The cheapest path to each state is known a
 docs/explanation/needle.md.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.arcs import arc_to_point

@@ -9,8 +9,6 @@ A `state` is (14,) float64: rotation matrix (9, by rows) and origin (3, LPS mm) 
 rad.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Algorithm 2 of [Rosell2012], and eqs. 3 to 9: the path of the scope and its best motion."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """In which directions a bent tip can point at a place, without touching the wall."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel

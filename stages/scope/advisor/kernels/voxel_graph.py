@@ -4,8 +4,6 @@ Legend: N interior voxels, numbered in raster order (k fastest).  `neighbours` i
 before and after along i, j and k, -1 for wall.  `steps` is `(3,)` float64: what a step along an axis counts.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel

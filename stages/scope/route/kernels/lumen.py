@@ -6,8 +6,6 @@ depth of a point in a cone, `radius - distance to the centre` of the best ball, 
 the depth in a union of cones, the largest of theirs.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -12,8 +12,6 @@ Rows of `samples` (S, 7): width of the sample in the parameter, reference point 
 first path cone and the one after the last that lead back to the lumen.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

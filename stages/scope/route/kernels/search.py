@@ -1,7 +1,5 @@
 """Breadth-first search over the nearest nodes of a centreline."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.kernels.compiling import kernel

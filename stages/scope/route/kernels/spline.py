@@ -1,7 +1,5 @@
 """Cubic B-splines: basis, Bezier pieces, and the proof of curvature and depth on all of a curve."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The resistance of every combination of exits: by reduction of the tree, and as [Pan2025] prints it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

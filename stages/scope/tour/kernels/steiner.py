@@ -7,8 +7,6 @@ end below the node or not, the least cost is stored of serving at least this set
 all lie below.  A lesion that both children know is served by either: all divisions of the set are tried.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,24 +4,8 @@
 """
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
-from stages.tube.kernels import planar
+from stages.tube.kernels import planar, wall_exit
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
-from stages.tube.kernels.wall_exit import (
-    ACCEPTED,
-    BRANCH,
-    IN_TISSUE,
-    LEFT_AT,
-    NO_EXIT,
-    PHASE,
-    PROTRUDES,
-    SWEEPS,
-    TOO_LONG,
-    WALL_ANGLE,
-    WALL_RUN,
-    advance,
-    march,
-    reset,
-)
 
 # Columns of an enumerated deployment: site, rotation (indices), outer and inner insertion (mm),
 # pierced branch, arc length at the exit (mm), wall angle (rad), run in the wall (mm), tip pose (6).
@@ -35,30 +19,30 @@ def validate_deployment(environment, tubes, base, normal, outer, inner, trace, t
 
     Fills `trace` and `tip` (9,): tip pose and the normal there.  Returns a reason.
     """
-    reset(trace)
+    wall_exit.reset(trace)
     if inner > tubes[planar.MAX_EXTENSION]:
-        return TOO_LONG
+        return wall_exit.TOO_LONG
     if inner - outer > tubes[planar.MAX_PROTRUSION]:
-        return PROTRUDES
+        return wall_exit.PROTRUDES
     sweep = planar.lateral_sweep(tubes, outer, inner)
     if sweep > tubes[planar.MAX_SWEEP]:
-        return SWEEPS
+        return wall_exit.SWEEPS
     clearance = tubes[planar.MARGIN] + sweep
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])
     towards = (normal[0], normal[1], normal[2])
     for start, stop, kappa, radius in planar.tube_pieces(tubes, outer, inner):
         if stop - start <= 0.0:
             continue
-        reason, pose, towards = advance(
+        reason, pose, towards = wall_exit.advance(
             environment, tubes, trace, pose, towards, kappa, start, stop, radius, clearance
         )
-        if reason != ACCEPTED:
+        if reason != wall_exit.ACCEPTED:
             return reason
     for m in range(6):
         tip[m] = pose[m]
     for m in range(3):
         tip[6 + m] = towards[m]
-    return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
+    return wall_exit.ACCEPTED if trace[wall_exit.PHASE] == wall_exit.IN_TISSUE else wall_exit.NO_EXIT
 
 
 @kernel(nogil=True)
@@ -69,15 +53,17 @@ def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
     be free.  Fills `trace` and `tip` as `validate_deployment` does, with the normal carried along without
     turning.  Returns a reason.
     """
-    reset(trace)
+    wall_exit.reset(trace)
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])
     across = (normal[0], normal[1], normal[2])
     clearance, at = tubes[planar.MARGIN] + beside, 0.0
     for a in range(arcs.shape[0]):
         length, direction = arcs[a, LENGTH], arcs[a, DIRECTION]
         bend = bend_towards(pose, across, direction, arcs[a, CURVATURE])
-        reason = march(environment, tubes, trace, pose, bend, at, length, arcs[a, RADIUS], clearance)
-        if reason != ACCEPTED:
+        reason = wall_exit.march(
+            environment, tubes, trace, pose, bend, at, length, arcs[a, RADIUS], clearance
+        )
+        if reason != wall_exit.ACCEPTED:
             return reason
         pose, across = carried(pose, across, bend, direction, length)
         at += length
@@ -85,7 +71,7 @@ def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
         tip[m] = pose[m]
     for m in range(3):
         tip[6 + m] = across[m]
-    return ACCEPTED if trace[PHASE] == IN_TISSUE else NO_EXIT
+    return wall_exit.ACCEPTED if trace[wall_exit.PHASE] == wall_exit.IN_TISSUE else wall_exit.NO_EXIT
 
 
 @inner_kernel
@@ -102,18 +88,18 @@ def tip_of_arcs(base, normal, arcs):
 @kernel()
 def _record(entries, row, site, rotation, outer, inner, trace, pose, reasons):
     """Write an accepted deployment; return the number of rows written, 0 if it does not leave the airway."""
-    if trace[PHASE] != IN_TISSUE:
-        reasons[NO_EXIT] += 1
+    if trace[wall_exit.PHASE] != wall_exit.IN_TISSUE:
+        reasons[wall_exit.NO_EXIT] += 1
         return 0
     entry = entries[row]
     entry[0] = site
     entry[1] = rotation
     entry[2] = outer
     entry[3] = inner
-    entry[4] = trace[BRANCH]
-    entry[5] = trace[LEFT_AT]
-    entry[6] = trace[WALL_ANGLE]
-    entry[7] = trace[WALL_RUN]
+    entry[4] = trace[wall_exit.BRANCH]
+    entry[5] = trace[wall_exit.LEFT_AT]
+    entry[6] = trace[wall_exit.WALL_ANGLE]
+    entry[7] = trace[wall_exit.WALL_RUN]
     for m in range(6):
         entry[ENTRY_TIP + m] = pose[m]
     return 1
@@ -168,16 +154,16 @@ def enumerate_site(environment, tubes, base, normals, site, stops, wanted, entri
     margin = tubes[planar.MARGIN]
     for t in range(normals.shape[0]):
         outermost = _last_row(wanted[t])
-        reset(outer_trace)
+        wall_exit.reset(outer_trace)
         pose = (base[0], base[1], base[2], base[3], base[4], base[5])
         towards = (normals[t, 0], normals[t, 1], normals[t, 2])
         for m in range(outermost + 1):
             if m > 0:
-                reason, pose, towards = advance(
+                reason, pose, towards = wall_exit.advance(
                     environment, tubes, outer_trace, pose, towards, tubes[planar.OVERLAP_CURVATURE],
                     stops[m - 1], stops[m], tubes[planar.OUTER_RADIUS], margin,
                 )  # fmt: skip
-                if reason != ACCEPTED:
+                if reason != wall_exit.ACCEPTED:
                     reasons[reason] += wanted[t, m:].sum()
                     break
                 if wanted[t, m, m]:
@@ -190,14 +176,14 @@ def enumerate_site(environment, tubes, base, normals, site, stops, wanted, entri
             inner_pose = pose
             inner_towards = towards
             for e in range(m + 1, innermost + 1):
-                reason = PROTRUDES
+                reason = wall_exit.PROTRUDES
                 if stops[e] - stops[m] <= tubes[planar.MAX_PROTRUSION]:
-                    reason, inner_pose, inner_towards = advance(
+                    reason, inner_pose, inner_towards = wall_exit.advance(
                         environment, tubes, inner_trace, inner_pose, inner_towards,
                         tubes[planar.INNER_CURVATURE], stops[e - 1], stops[e],
                         tubes[planar.INNER_RADIUS], margin,
                     )  # fmt: skip
-                if reason != ACCEPTED:
+                if reason != wall_exit.ACCEPTED:
                     reasons[reason] += wanted[t, m, e:].sum()
                     break
                 if wanted[t, m, e]:

@@ -10,19 +10,8 @@ import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from stages.tube.kernels import wall_exit
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
-from stages.tube.kernels.wall_exit import (
-    ACCEPTED,
-    BRANCH,
-    IN_TISSUE,
-    LEFT_AT,
-    NO_EXIT,
-    PHASE,
-    WALL_ANGLE,
-    WALL_RUN,
-    march,
-    reset,
-)
 
 SAME_MM = 1e-9
 # Columns of a stretch: point, tangent and normal where it begins, curvature, length, arc length there.
@@ -197,36 +186,40 @@ def place_tree(environment, tubes, frame, tree, reasons, traces, placed):
     depth, skip, beneath, first, stretches, radius, clearance, first_shape, shapes = tree
     across = (frame[0, 0], frame[1, 0], frame[2, 0], frame[0, 1], frame[1, 1], frame[2, 1])
     forward = (frame[0, 2], frame[1, 2], frame[2, 2])
-    reset(traces[0])
+    wall_exit.reset(traces[0])
     count, node = 0, 0
     while node < depth.shape[0]:
         trace = traces[depth[node]]
         for m in range(trace.shape[0]):
             trace[m] = traces[depth[node] - 1, m]
-        reason = ACCEPTED
+        reason = wall_exit.ACCEPTED
         for r in range(first[node], first[node + 1]):
             row = stretches[r]
             x, y, z = _seen(across, forward, row, POINT)
             tx, ty, tz = _seen(across, forward, row, TANGENT)
             nx, ny, nz = _seen(across, forward, row, NORMAL)
             pose = (frame[0, 3] + x, frame[1, 3] + y, frame[2, 3] + z, tx, ty, tz)
-            reason = march(
+            reason = wall_exit.march(
                 environment, tubes, trace, pose, (row[KAPPA], nx, ny, nz), row[BEGINS], row[STRETCH_LENGTH],
                 radius[node], clearance[node],
             )  # fmt: skip
-            if reason != ACCEPTED:
+            if reason != wall_exit.ACCEPTED:
                 break
-        if reason != ACCEPTED:
+        if reason != wall_exit.ACCEPTED:
             reasons[reason] += beneath[node]
             node = skip[node]
             continue
         for e in range(first_shape[node], first_shape[node + 1]):
-            if trace[PHASE] != IN_TISSUE:
-                reasons[NO_EXIT] += 1
+            if trace[wall_exit.PHASE] != wall_exit.IN_TISSUE:
+                reasons[wall_exit.NO_EXIT] += 1
                 continue
             row = placed[count]
-            row[PLACED_SHAPE], row[PLACED_BRANCH], row[PLACED_EXIT] = shapes[e], trace[BRANCH], trace[LEFT_AT]
-            row[PLACED_ANGLE], row[PLACED_RUN] = trace[WALL_ANGLE], trace[WALL_RUN]
+            row[PLACED_SHAPE], row[PLACED_BRANCH], row[PLACED_EXIT] = (
+                shapes[e],
+                trace[wall_exit.BRANCH],
+                trace[wall_exit.LEFT_AT],
+            )
+            row[PLACED_ANGLE], row[PLACED_RUN] = trace[wall_exit.WALL_ANGLE], trace[wall_exit.WALL_RUN]
             count += 1
         node += 1
     return count

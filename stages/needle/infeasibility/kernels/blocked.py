@@ -7,16 +7,8 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import exact_distance, interpolate_squared
 from anatomy.kernels.labels import LUMEN
+from stages.needle.infeasibility.kernels import bounds
 from stages.needle.infeasibility.kernels.bitmaps import ONE, and_shifted, find_box, or_shifted
-from stages.needle.infeasibility.kernels.bounds import (
-    CELL,
-    KAPPA,
-    SLOPE_CELL,
-    SPARE,
-    largest_second_derivative,
-    slope_of,
-    steepest_sine,
-)
 from stages.needle.kernels.proof import kept_from_lumen
 
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
@@ -30,12 +22,12 @@ FIELD_STEP_MM = 0.005
 @inner_kernel
 def _probed_at(v, u, window, scale, depth):
     """Return the whole cells (y, x) by which a tangent has moved at a depth, and what that leaves in mm."""
-    move = depth * scale[SLOPE_CELL] / scale[CELL]
+    move = depth * scale[bounds.SLOPE_CELL] / scale[bounds.CELL]
     move_y = (v + window[0]) * move
     move_x = (u + window[1]) * move
     y = int(round(move_y))
     x = int(round(move_x))
-    return y, x, abs(move_y - y) * scale[CELL], abs(move_x - x) * scale[CELL]
+    return y, x, abs(move_y - y) * scale[bounds.CELL], abs(move_x - x) * scale[bounds.CELL]
 
 
 @kernel(nogil=True)
@@ -119,7 +111,7 @@ def grade_clearance(obstacles, limits, exempt_branch, inserted, origin, across, 
                 origin[1] + y * across[0, 1] + x * across[1, 1],
                 origin[2] + y * across[0, 2] + x * across[1, 2],
             )  # fmt: skip
-            grades[y, x] = _grade_of(slacks, limits.required_mm - above - SPARE)
+            grades[y, x] = _grade_of(slacks, limits.required_mm - above - bounds.SPARE)
 
 
 @kernel(nogil=True)
@@ -141,16 +133,16 @@ def keep_clear(states, window, scale, depths, corners, grades, slacks):
     box = np.zeros(4, np.int64)
     for v in range(nv):
         for u in range(nu):
-            slope_v, slope_u = slope_of(v, u, window, scale)
-            sine = steepest_sine(slope_v, slope_u, scale)
+            slope_v, slope_u = bounds.slope_of(v, u, window, scale)
+            sine = bounds.steepest_sine(slope_v, slope_u, scale)
             for d in range(depths.shape[0]):
                 if not find_box(states[v, u], box):
                     break
                 depth = abs(depths[d])
                 y, x, left_y, left_x = _probed_at(v, u, window, scale, depths[d])
-                half = 0.5 * (scale[CELL] + scale[SLOPE_CELL] * depth)
-                bound = largest_second_derivative(sine + scale[KAPPA] * depth, scale)
-                slack = math.hypot(half + left_y, half + left_x) + 0.5 * bound * depth * depth + SPARE
+                half = 0.5 * (scale[bounds.CELL] + scale[bounds.SLOPE_CELL] * depth)
+                bound = bounds.largest_second_derivative(sine + scale[bounds.KAPPA] * depth, scale)
+                slack = math.hypot(half + left_y, half + left_x) + 0.5 * bound * depth * depth + bounds.SPARE
                 q = _grade_of(slacks, slack)
                 if q == slacks.shape[0]:
                     continue

@@ -5,24 +5,8 @@ import math
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel
+from stages.needle.infeasibility.kernels import bounds
 from stages.needle.infeasibility.kernels.bitmaps import ALL, find_box
-from stages.needle.infeasibility.kernels.bounds import (
-    CELL,
-    FIRST_U,
-    FIRST_V,
-    HALF_DIAGONAL,
-    KAPPA,
-    LONGEST,
-    SLOPE_CELL,
-    SPARE,
-    SPINDLE_MIDDLE,
-    SPINDLE_OFFSET,
-    SPINDLE_RADIUS,
-    TOLERANCE,
-    TOP_SINE,
-    TOTAL,
-    slope_of,
-)
 
 # With a type of its own a constant is no literal, for each of which what is called would be compiled anew.
 _FIRST_BIT = np.int64(0)
@@ -47,37 +31,39 @@ def place_margin(h, y, x, scale, ends):
 
     The margin is 1-Lipschitz.  The place lies `h` mm deep, and (y, x) mm aside of the line to the target.
     """
-    radius = 1.0 / scale[KAPPA]
-    norm2 = 1.0 + scale[FIRST_V] ** 2 + scale[FIRST_U] ** 2
-    ahead = (h + y * scale[FIRST_V] + x * scale[FIRST_U]) / math.sqrt(norm2)
+    radius = 1.0 / scale[bounds.KAPPA]
+    norm2 = 1.0 + scale[bounds.FIRST_V] ** 2 + scale[bounds.FIRST_U] ** 2
+    ahead = (h + y * scale[bounds.FIRST_V] + x * scale[bounds.FIRST_U]) / math.sqrt(norm2)
     aside2 = y * y + x * x
     rho = math.sqrt(max(h * h + aside2 - ahead * ahead, 0.0))
     margin = escape_depth(rho, ahead, radius)
-    detour = math.sqrt(h * h + aside2) + math.sqrt((ends[TOTAL] - h) ** 2 + aside2)
-    margin = min(margin, 0.5 * (ends[LONGEST] - detour))
-    if ends[SPINDLE_RADIUS] < math.inf:
-        from_centre = math.hypot(math.sqrt(aside2) + ends[SPINDLE_OFFSET], h - ends[SPINDLE_MIDDLE])
-        margin = min(margin, ends[SPINDLE_RADIUS] - from_centre)
-    return margin + SPARE
+    detour = math.sqrt(h * h + aside2) + math.sqrt((ends[bounds.TOTAL] - h) ** 2 + aside2)
+    margin = min(margin, 0.5 * (ends[bounds.LONGEST] - detour))
+    if ends[bounds.SPINDLE_RADIUS] < math.inf:
+        from_centre = math.hypot(
+            math.sqrt(aside2) + ends[bounds.SPINDLE_OFFSET], h - ends[bounds.SPINDLE_MIDDLE]
+        )
+        margin = min(margin, ends[bounds.SPINDLE_RADIUS] - from_centre)
+    return margin + bounds.SPARE
 
 
 @inner_kernel
 def _state_margin(h, y, x, slope_v, slope_u, blur, scale, ends):
     """Return the same for a state; `blur` is the angle between a cell's directions and its centre's."""
-    radius = 1.0 / scale[KAPPA]
+    radius = 1.0 / scale[bounds.KAPPA]
     norm = math.sqrt(1.0 + slope_v * slope_v + slope_u * slope_u)
     aside2 = y * y + x * x
-    left = ends[TOTAL] - h
+    left = ends[bounds.TOTAL] - h
     sideways = y * slope_v + x * slope_u
     ahead = (left - sideways) / norm
     away2 = left * left + aside2
     margin = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius)
-    margin += math.sqrt(away2) * blur + ends[TOLERANCE]
+    margin += math.sqrt(away2) * blur + ends[bounds.TOLERANCE]
     # The same path backward leads to the start.
     ahead = (h + sideways) / norm
     away2 = h * h + aside2
     back = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius) + math.sqrt(away2) * blur
-    return min(margin, back) + HALF_DIAGONAL * scale[CELL] + SPARE
+    return min(margin, back) + bounds.HALF_DIAGONAL * scale[bounds.CELL] + bounds.SPARE
 
 
 @kernel(nogil=True)
@@ -97,26 +83,26 @@ def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
         That limit, rad.
     """
     nv, nu, rows, words = states.shape
-    cell = scale[CELL]
-    top = scale[TOP_SINE] / math.sqrt(1.0 - scale[TOP_SINE] ** 2)
+    cell = scale[bounds.CELL]
+    top = scale[bounds.TOP_SINE] / math.sqrt(1.0 - scale[bounds.TOP_SINE] ** 2)
     possible = np.zeros((rows, words), np.uint64)
     for y in range(rows):
-        side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
+        side_y = (y + window[2]) * cell + depth * scale[bounds.FIRST_V]
         x = _FIRST_BIT
         while x < 64 * words:
-            side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
-            margin = place_margin(depth, side_y, side_x, scale, ends) + HALF_DIAGONAL * cell
+            side_x = (x + window[3]) * cell + depth * scale[bounds.FIRST_U]
+            margin = place_margin(depth, side_y, side_x, scale, ends) + bounds.HALF_DIAGONAL * cell
             x = _set_run(possible[y], x, margin, cell)
     box = np.zeros(4, np.int64)
     row = np.zeros(words, np.uint64)
     for v in range(nv):
         for u in range(nu):
-            slope_v, slope_u = slope_of(v, u, window, scale)
+            slope_v, slope_u = bounds.slope_of(v, u, window, scale)
             slope = math.hypot(slope_v, slope_u)
-            least = max(slope - HALF_DIAGONAL * scale[SLOPE_CELL], 0.0)
-            blur = HALF_DIAGONAL * scale[SLOPE_CELL] / math.sqrt(1.0 + least * least)
+            least = max(slope - bounds.HALF_DIAGONAL * scale[bounds.SLOPE_CELL], 0.0)
+            blur = bounds.HALF_DIAGONAL * scale[bounds.SLOPE_CELL] / math.sqrt(1.0 + least * least)
             cosine = (reference[0] + slope_v * reference[1] + slope_u * reference[2]) / math.hypot(1.0, slope)
-            if least > top or math.acos(max(min(cosine, 1.0), -1.0)) - blur > max_angle + SPARE:
+            if least > top or math.acos(max(min(cosine, 1.0), -1.0)) - blur > max_angle + bounds.SPARE:
                 states[v, u] = 0
                 continue
             for y in range(rows):
@@ -125,8 +111,8 @@ def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
             if not find_box(states[v, u], box):
                 continue
             # The margin at the middle of the box may decide all of it.
-            middle_y = (0.5 * (box[0] + box[1]) + window[2]) * cell + depth * scale[FIRST_V]
-            middle_x = (32.0 * (box[2] + box[3] + 1) - 0.5 + window[3]) * cell + depth * scale[FIRST_U]
+            middle_y = (0.5 * (box[0] + box[1]) + window[2]) * cell + depth * scale[bounds.FIRST_V]
+            middle_x = (32.0 * (box[2] + box[3] + 1) - 0.5 + window[3]) * cell + depth * scale[bounds.FIRST_U]
             away = 0.5 * cell * math.hypot(box[1] - box[0], 64.0 * (box[3] - box[2] + 1))
             margin = _state_margin(depth, middle_y, middle_x, slope_v, slope_u, blur, scale, ends)
             if margin >= (1.0 + blur) * away:
@@ -136,10 +122,10 @@ def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
                 continue
             for y in range(box[0], box[1] + 1):
                 row[box[2] : box[3] + 1] = 0
-                side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
+                side_y = (y + window[2]) * cell + depth * scale[bounds.FIRST_V]
                 x = 64 * box[2]
                 while x < 64 * (box[3] + 1):
-                    side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
+                    side_x = (x + window[3]) * cell + depth * scale[bounds.FIRST_U]
                     margin = _state_margin(depth, side_y, side_x, slope_v, slope_u, blur, scale, ends)
                     x = _set_run(row[: box[3] + 1], x, margin, (1.0 + blur) * cell)
                 for w in range(box[2], box[3] + 1):

@@ -5,20 +5,10 @@ import math
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.random import uniform
+from stages.needle.kernels import tree
 from stages.needle.kernels.connections import seen_from, shortest_path
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 from stages.needle.kernels.rrt import goal_from_root, random_arc, sample_between
-from stages.needle.kernels.tree import (
-    PATH_COST,
-    PATH_LENGTH,
-    PATH_TURN,
-    ROWS_PER_STEP,
-    add_arc,
-    add_goal,
-    add_legs,
-    pose_of,
-    within,
-)
 
 RANDOM_SHARE = 0.4
 """Share of the iterations that extend a random node by a random arc."""
@@ -49,15 +39,15 @@ def _choose(nodes, count, q, limits, rate, cost_bound):
     chosen = -1
     for m in range(count):
         node = nodes[m]
-        pose = pose_of(node)
+        pose = tree.pose_of(node)
         rho, h = seen_from(pose, q)
-        length = shortest_path(rho, h, limits.kappa, math.pi, limits.max_turn_rad - node[PATH_TURN])
-        if not node[PATH_LENGTH] + length <= limits.max_length_mm:
+        length = shortest_path(rho, h, limits.kappa, math.pi, limits.max_turn_rad - node[tree.PATH_TURN])
+        if not node[tree.PATH_LENGTH] + length <= limits.max_length_mm:
             continue
         if cost_bound < math.inf:
-            measure = rate * length + max(node[PATH_COST] - cost_bound, 0.0)
+            measure = rate * length + max(node[tree.PATH_COST] - cost_bound, 0.0)
         else:
-            measure = rate * length + node[PATH_COST]
+            measure = rate * length + node[tree.PATH_COST]
         if measure < best:
             best = measure
             chosen = m
@@ -73,7 +63,7 @@ def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, cou
     every sequence of arcs keeps a chance.  Nodes that cannot lead to a cheaper path are refused.
     Parameters and results as those of `stages.needle.kernels.rrt.grow_rrt`.
     """
-    start = pose_of(nodes[0])
+    start = tree.pose_of(nodes[0])
     count, ends, solved = goal_from_root(
         obstacles, limits, objective, branch, goal, nodes, parents, count, state, best
     )
@@ -81,18 +71,18 @@ def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, cou
         return count, 0, solved
     rate = objective.least_rate
     for used in range(iterations):
-        if count + ROWS_PER_STEP > nodes.shape[0]:
+        if count + tree.ROWS_PER_STEP > nodes.shape[0]:
             return count, used, False
         before = count
         if uniform(state) < RANDOM_SHARE:
             near = int(uniform(state) * count)
-            bend, length = random_arc(pose_of(nodes[near]), limits, state)
-            if add_arc(
+            bend, length = random_arc(tree.pose_of(nodes[near]), limits, state)
+            if tree.add_arc(
                 obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
             ):
                 count += 1
         else:
-            end = within(goal, limits.goal_tolerance_mm, state)
+            end = tree.within(goal, limits.goal_tolerance_mm, state)
             q, drawn = sample_between(start, end, limits, state)
             bound = math.inf
             if best < math.inf and uniform(state) >= CHEAPEST_SHARE:
@@ -105,7 +95,7 @@ def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, cou
             )
         if count == before:
             continue
-        rows = add_goal(
+        rows = tree.add_goal(
             obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
         )
         if rows > count:
@@ -117,12 +107,12 @@ def grow_optimal(obstacles, limits, objective, branch, goal, nodes, parents, cou
 def _extend(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best, state):
     """Go from a node to a point, by legs or by an arc of at most the longest step; return the new `count`."""
     if uniform(state) < 0.5:
-        return add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best)
-    length, bend, _turn = arc_to_point(pose_of(nodes[near]), q)
+        return tree.add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best)
+    length, bend, _turn = arc_to_point(tree.pose_of(nodes[near]), q)
     length = min(length, limits.max_step_mm)
     if bend[0] > limits.kappa or length < MIN_ARC_MM:
         return count
-    added = add_arc(
+    added = tree.add_arc(
         obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
     )
     return count + 1 if added else count
@@ -139,16 +129,16 @@ def build(obstacles, limits, objective, branch, goal, nodes, parents, vias, coun
     for m in range(count):
         q = (vias[m, 0], vias[m, 1], vias[m, 2])
         if vias[m, 3] == ARC:
-            length, bend, _turn = arc_to_point(pose_of(nodes[last]), q)
+            length, bend, _turn = arc_to_point(tree.pose_of(nodes[last]), q)
             if length < MIN_ARC_MM or bend[0] > limits.kappa * (1.0 + TINY):
                 return 0
-            if not add_arc(
+            if not tree.add_arc(
                 obstacles, limits, objective, branch, nodes, parents, last + 1, last, bend, length, goal, best
             ):
                 return 0
             last += 1
         else:
-            rows = add_legs(
+            rows = tree.add_legs(
                 obstacles, limits, objective, branch, nodes, parents, last + 1, last, q, goal, best
             )
             if rows == last + 1:
@@ -160,8 +150,8 @@ def build(obstacles, limits, objective, branch, goal, nodes, parents, vias, coun
 @merged_kernel
 def _is_promising(nodes, vias, count, limits, rate, best):
     """Tell whether the path through via points could cost less than `best`, by its length alone."""
-    total = nodes[0, PATH_COST]
-    pose = pose_of(nodes[0])
+    total = nodes[0, tree.PATH_COST]
+    pose = tree.pose_of(nodes[0])
     for m in range(count):
         dx = vias[m, 0] - pose[0]
         dy = vias[m, 1] - pose[1]
@@ -209,7 +199,7 @@ def _mutate(vias, trial, count, goal, limits, state):
     for k in range(count):
         if k != m and not every:
             continue
-        x, y, z = within((trial[k, 0], trial[k, 1], trial[k, 2]), spread, state)
+        x, y, z = tree.within((trial[k, 0], trial[k, 1], trial[k, 2]), spread, state)
         trial[k, 0], trial[k, 1], trial[k, 2] = x, y, z
     last = count - 1
     dx = trial[last, 0] - goal[0]
@@ -243,9 +233,9 @@ def refine(obstacles, limits, objective, branch, goal, nodes, parents, vias, cou
         if 2 * number + 1 > nodes.shape[0]:
             continue
         last = build(obstacles, limits, objective, branch, goal, nodes, parents, trial, number, best)
-        if last == 0 or not nodes[last, PATH_COST] < best:
+        if last == 0 or not nodes[last, tree.PATH_COST] < best:
             continue
-        best = nodes[last, PATH_COST]
+        best = nodes[last, tree.PATH_COST]
         count = number
         improved += 1
         for m in range(count):

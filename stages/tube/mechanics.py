@@ -84,18 +84,13 @@ class TubeMechanics(NestedTubes):
         return Equilibrium(self, self._joints(tip_angles_rad, "tip angles"), self._shifts(beta_mm))
 
     def given_base_angles(
-        self,
-        base_angles_rad: ArrayLike,
-        beta_mm: ArrayLike,
-        *,
-        guess_rad: ArrayLike | None = None,
-        prefer_stable: bool = True,
+        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, guess_rad: ArrayLike | None = None
     ) -> Equilibrium:
         """Return an equilibrium with given rotations of the rear ends.
 
         From the guess Newton's method is tried; if it fails or ends at an unstable equilibrium, the
         precurvature is raised from nothing, and then guesses all round are tried.  So what is returned is
-        unstable only if no stable equilibrium was found, or it was not preferred.
+        unstable only if no stable equilibrium was found.
 
         Parameters
         ----------
@@ -105,8 +100,6 @@ class TubeMechanics(NestedTubes):
             See `given_tip_angles`.
         guess_rad : (n,) float64, optional
             Tip angles to start from, such as those of a configuration nearby; by default the base angles.
-        prefer_stable : bool
-            If False, an unstable equilibrium next to the guess is as good.
 
         Raises
         ------
@@ -119,9 +112,7 @@ class TubeMechanics(NestedTubes):
         tip = base.copy() if guess_rad is None else self._joints(guess_rad, "guess")
         results = np.zeros((1, equilibrium.RESULT_COLUMNS))
         tips = tip[None].copy()
-        equilibrium.settle_many(
-            self.design, base[None], beta[None], self.step_rad, prefer_stable, tips, results
-        )
+        equilibrium.settle_many(self.design, base[None], beta[None], self.step_rad, True, tips, results)
         if not results[0, equilibrium.CONVERGED]:
             raise ConvergenceError(
                 f"No equilibrium was found for base angles {np.round(base, 4).tolist()} rad and rear ends at "
@@ -131,15 +122,12 @@ class TubeMechanics(NestedTubes):
             )
         return Equilibrium(self, tips[0], beta)
 
-    def batch(
-        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, guess_rad: ArrayLike | None = None
-    ) -> Batch:
+    def batch(self, base_angles_rad: ArrayLike, beta_mm: ArrayLike) -> Batch:
         """Return the equilibria of many configurations; see `given_base_angles`.
 
         Parameters
         ----------
         base_angles_rad, beta_mm : (M, n) float64
-        guess_rad : (M, n) float64, optional
 
         Raises
         ------
@@ -148,8 +136,8 @@ class TubeMechanics(NestedTubes):
         """
         base = np.array(base_angles_rad, dtype=np.float64, order="C", ndmin=2)
         beta = np.array(beta_mm, dtype=np.float64, order="C", ndmin=2)
-        tips = base.copy() if guess_rad is None else np.array(guess_rad, dtype=np.float64, ndmin=2)
-        for name, values in (("base angles", base), ("rear ends", beta), ("guess", tips)):
+        tips = base.copy()
+        for name, values in (("base angles", base), ("rear ends", beta)):
             if values.shape != (len(base), self.count) or not np.isfinite(values).all():
                 raise SettingsError(
                     f"The {name} have the shape {values.shape}",

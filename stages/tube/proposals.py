@@ -21,7 +21,7 @@ from anatomy.margins import Margins
 from stages.tube import kernels
 from stages.tube.device import ConcentricTubes, Tube
 from stages.tube.environment import tube_constants
-from stages.tube.following import DEFAULT_STEP_MM, DEFAULT_STEP_RAD, DeployedSequence, SnapError, deploy
+from stages.tube.following import DeployedSequence, SnapError, deploy
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.sequences import Sequence, alternating, inner_first, together
 
@@ -71,13 +71,7 @@ class SequenceComparison:
 
 
 def least_sweep_sequence(
-    tubes: SequenceOf[Tube],
-    base_angles_rad: ArrayLike,
-    insertions_mm: ArrayLike,
-    *,
-    step_mm: float = DEFAULT_STEP_MM,
-    step_rad: float = DEFAULT_STEP_RAD,
-    mechanics: TubeMechanics | None = None,
+    tubes: SequenceOf[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike
 ) -> SequenceComparison:
     """Compare the sequences that lead to one deployment, by their sweep.
 
@@ -90,10 +84,6 @@ def least_sweep_sequence(
         Innermost first.
     base_angles_rad : float or (n,) float64
     insertions_mm : (n,) float64
-    step_mm, step_rad : float
-        Largest motion of any joint between two steps.
-    mechanics : TubeMechanics, optional
-        That of these tubes, if it is there already.
 
     Raises
     ------
@@ -102,12 +92,12 @@ def least_sweep_sequence(
     """
     together(tubes, base_angles_rad, insertions_mm)
     angles = np.broadcast_to(np.asarray(base_angles_rad, dtype=np.float64), (len(tubes),))
-    model = TubeMechanics(tubes) if mechanics is None else mechanics
+    mechanics = TubeMechanics(tubes)
     deployed, refused = [], {}
     for name, make in _makers(tubes, angles, insertions_mm).items():
         try:
             sequence = replace(make(), name=name)
-            deployed.append(deploy(model, sequence, step_mm=step_mm, step_rad=step_rad))
+            deployed.append(deploy(mechanics, sequence))
         except (SettingsError, SnapError) as error:
             refused[name] = str(error)
     deployed.sort(key=lambda each: each.lateral_sweep_mm)

@@ -15,7 +15,7 @@ from anatomy.grid import read_only
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.exact import Problem, repair_exact
-from stages.scope.route.genetic import GeneticSettings, repair_genetic
+from stages.scope.route.genetic import repair_genetic
 from stages.scope.route.guide_path import WAYPOINT_SPACING_MM, GuidePath, guide_path_along
 from stages.scope.route.proof import Proof
 from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
@@ -78,9 +78,7 @@ def plan_route(
     *,
     repair: Repair = "exact",
     links: Links | None = None,
-    waypoint_spacing_mm: float = WAYPOINT_SPACING_MM,
     seed: int = 0,
-    genetic: GeneticSettings | None = None,
     executor: Executor | None = None,
     require_proof: bool = True,
 ) -> Route:
@@ -97,8 +95,6 @@ def plan_route(
         "exact": a nonlinear program; "ga": the genetic search of the paper; "none".
     links : Links, optional
         Made with `nearest_links` beforehand, where many routes are planned on one centreline.
-    waypoint_spacing_mm : float
-        Distance of the points that the spline runs through; 0 for every node.
     seed : int
         Of the genetic search.
     executor : concurrent.futures.Executor, optional
@@ -123,8 +119,8 @@ def plan_route(
     links = nearest_links(centreline) if links is None else links
     nodes = fewest_hops(links, centreline.nearest_node(start), centreline.nearest_node(goal))
     guide = guide_path_along(centreline, nodes, start, goal)
-    tentative = guide.curve(waypoint_spacing_mm)
-    route = _route(centreline, nodes, guide, tentative, limits, repair, seed, genetic, executor)
+    tentative = guide.curve(WAYPOINT_SPACING_MM)
+    route = _route(centreline, nodes, guide, tentative, limits, repair, seed, executor)
     if require_proof:
         require_proved(route)
     return route
@@ -160,7 +156,6 @@ def _route(
     limits: RouteLimits,
     repair: Repair,
     seed: int,
-    genetic: GeneticSettings | None,
     executor: Executor | None,
 ) -> Route:
     problem = Problem(guide=guide, centreline=centreline, limits=limits)
@@ -170,9 +165,7 @@ def _route(
         claimed = proof.holds
     else:
         if repair == "ga":
-            curve, claimed = repair_genetic(
-                tentative, centreline, limits, seed=seed, settings=genetic, executor=executor
-            )
+            curve, claimed = repair_genetic(tentative, centreline, limits, seed=seed, executor=executor)
         proof = problem.prove(curve)
     return Route(
         nodes=read_only(nodes),

@@ -1,13 +1,15 @@
-"""Records that are slow to make, kept in the cache: one file of arrays for all that a record depends on."""
+"""What is slow to make, kept: records in the cache, one file of arrays for all that a record depends on, and
+plain values that follow from a lung alone, beside its stored arrays."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -15,9 +17,13 @@ from anatomy.base.cache import cache_limit_bytes, default_cache
 from anatomy.base.cache_entries import make_room, note_use
 from anatomy.base.checksums import array_checksum, values_checksum, warn_of_damage
 from anatomy.base.errors import FileError, LungaccessError
-from anatomy.base.files import DAMAGE, atomic_write
+from anatomy.base.files import DAMAGE, atomic_write, write_text
 from anatomy.base.unfinished import clear_place
 from anatomy.grid import read_only
+
+if TYPE_CHECKING:
+    from anatomy.organ import Organ
+
 
 T = TypeVar("T")
 
@@ -117,3 +123,48 @@ def _save(kind: str, values: Mapping[str, Any], path: Path) -> None:
             remedy="Choose another folder with --cache or LUNGACCESS_CACHE",
             expected="a folder that may be written to, with room on the disk",
         ) from error
+
+
+def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
+    """Return plain JSON values that follow from a lung: those kept with it, else those that `make` returns.
+
+    A lung that is not stored keeps nothing.  What is kept is made anew if it is missing, damaged or of
+    another version, and goes when the lung goes.
+
+    Parameters
+    ----------
+    name : str
+        What they are; the file is named after it.
+    version : int
+        To be raised when `make` returns something else for the same lung.
+    make : callable
+        Returns the values; they should say the same after they were written as JSON and read again.
+    """
+    if lung.folder is None:
+        return make()
+    path = lung.folder / f"{name}.json"
+    try:
+        stored = json.loads(path.read_text(encoding="ascii"))
+        current = stored["version"] == version
+        if current and stored["checksum"] == _seal_of(lung, name, stored["values"]):
+            return stored["values"]
+        damaged = current
+    except FileNotFoundError:
+        damaged = False
+    except DAMAGE:
+        damaged = True
+    if damaged:
+        warn_of_damage(path)
+    plain = json.loads(json.dumps(values := make()))
+    # A cache may be read-only, and another process may just have removed the lung.
+    with contextlib.suppress(FileError):
+        if path.is_dir():
+            clear_place(path)
+        seal = {"version": version, "checksum": _seal_of(lung, name, plain)}
+        write_text(path, json.dumps({**seal, "values": plain}))
+    return values
+
+
+def _seal_of(lung: Organ, name: str, values: Any) -> str:
+    """Return what binds values to the lung and the name under which they are kept."""
+    return values_checksum({"lung": lung.key, "name": name, "values": values})

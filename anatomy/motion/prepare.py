@@ -13,8 +13,7 @@ from anatomy.base.typed import Float, Labels, Mask
 from anatomy.grid import Grid
 from anatomy.motion.landmarks import Fitted, fit_landmarks
 from anatomy.motion.motion import LEFT, RIGHT, Motion, cell_bounds
-from anatomy.motion.onto_lungs import require_onto_lungs
-from anatomy.motion.plausible import require_plausible
+from anatomy.motion.plausible import require_onto_lungs, require_plausible
 from anatomy.motion.population import POPULATION_ERROR_MM, shares_of_motion
 from anatomy.motion.source import MotionSource
 from anatomy.structures import OUTSIDE

@@ -49,14 +49,8 @@ if TYPE_CHECKING:
         blocker_on_path,
         direct_path,
     )
-    from stages.needle.planner_names import (
-        NEEDLE_PLANNERS,
-        OMPL_PLANNERS,
-        OMPL_TOLERANCE_MM,
-        OUR_PLANNERS,
-        has_ompl,
-        require_planner,
-    )
+    from stages.needle.planner_choice import has_ompl, require_planner
+    from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS, OMPL_TOLERANCE_MM, OUR_PLANNERS
     from stages.needle.query import Query
     from stages.needle.reach import (
         BLOCK_MM,

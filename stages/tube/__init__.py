@@ -54,10 +54,9 @@ if TYPE_CHECKING:
         propose_designs,
     )
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
-    from stages.tube.shape import centreline
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
     from stages.tube.strain import straightening
-    from stages.tube.validation import REASONS, Deployment, DeploymentValidator
+    from stages.tube.validation import REASONS, Deployment, DeploymentValidator, centreline
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

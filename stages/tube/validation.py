@@ -11,12 +11,12 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.poses import bending_directions
 from stages.tube import kernels
 from stages.tube.arcs import TubeShape, points_on_arcs
 from stages.tube.design_shapes import shapes_of
 from stages.tube.device import ConcentricTubes
 from stages.tube.environment import tube_constants, tube_environment
-from stages.tube.shape import centreline
 
 REASONS: dict[int, str] = {
     kernels.NO_EXIT: "the tube does not leave the airway",
@@ -185,3 +185,24 @@ def _start(lps_from_scope_tip: Float, rotation_rad: float) -> tuple[Float, Float
     """Return the pose `(6,)` of the scope tip, and the direction `(3,)` to which the tubes are turned."""
     base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
     return base, np.asarray(frames.bending_directions(lps_from_scope_tip, rotation_rad)[0])
+
+
+def centreline(
+    tubes: ConcentricTubes,
+    lps_from_scope_tip: Float,
+    rotation_rad: float,
+    outer_mm: float,
+    inner_mm: float,
+    arc_lengths_mm: ArrayLike,
+) -> Float:
+    """Return points `(N, 3)` LPS mm of planar tubes' centreline at arc lengths `(N,)` from the scope tip.
+
+    The deployment is given as to `DeploymentValidator.validate`.
+    """
+    constants = tube_constants(tubes, Margins())
+    at_mm = np.array(arc_lengths_mm, dtype=np.float64, ndmin=1)
+    planar = np.zeros((len(at_mm), 2))
+    kernels.planar_points(constants, float(outer_mm), float(inner_mm), at_mm, planar)
+    bend = bending_directions(lps_from_scope_tip, rotation_rad)[0]
+    forward = lps_from_scope_tip[:3, 2]
+    return np.asarray(lps_from_scope_tip[:3, 3] + planar[:, :1] * bend + planar[:, 1:] * forward)

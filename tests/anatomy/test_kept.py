@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from anatomy.kept import kept
+from anatomy.kept_records import kept
 from anatomy.lung import Lung
 from anatomy.store import open_lung
 from tests.anatomy.toys import toy

@@ -14,7 +14,7 @@ import pytest
 import lungaccess as la
 from anatomy.base.cache_entries import cache_entries
 from anatomy.base.checksums import DamagedCacheWarning
-from anatomy.kept import kept
+from anatomy.kept_records import kept
 from anatomy.lung import Lung
 from anatomy.motion.source import MotionSource
 from anatomy.patient import PatientImages

@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Bool, Float, Int
-from anatomy.kept import kept
+from anatomy.kept_records import kept
 from anatomy.structures import BITS, OUTSIDE
 from lungaccess.showing.report.pack import Packed, pack, unpack
 from lungaccess.showing.report.views import STANDARD, View

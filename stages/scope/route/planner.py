@@ -243,7 +243,7 @@ class Replanner:
         for point, name in zip(ends, ("start", "goal"), strict=True):
             here.require_inside(point, limits.needed_mm, name)
         guide = guide_path_along(here, self._nodes, *ends)
-        route = _route(here, self._nodes, guide, guide.curve(), limits, "exact", 0, None, None)
+        route = _route(here, self._nodes, guide, guide.curve(), limits, "exact", 0, None)
         require_proved(route)
         return route
 

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     )
     from stages.scope.tour.exits import Exit, ExitRule, ExitTest, exits_of, find_exits
     from stages.scope.tour.itinerary import Itinerary, one_by_one_mm, plan_itinerary
-    from stages.scope.tour.resistance import Resistances, branch_resistances
     from stages.scope.tour.shortest import shortest_tour
-    from stages.scope.tour.subtree import MOST_LESIONS, Subtree, subtree_to
+    from stages.scope.tour.subtree import MOST_LESIONS, Resistances, Subtree, branch_resistances, subtree_to
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

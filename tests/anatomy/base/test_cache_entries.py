@@ -15,7 +15,7 @@ import pytest
 from anatomy.base.cache import BUILDING, LUNG_FILE, REMOVED, cache_limit_bytes, parse_size
 from anatomy.base.cache_entries import cache_entries, make_room, overdue, remove_entry
 from anatomy.base.errors import FileError, SettingsError
-from anatomy.kept import kept
+from anatomy.kept_records import kept
 from anatomy.patient import PatientImages
 from anatomy.store import open_lung, stored_format
 from tests.anatomy.toys import toy

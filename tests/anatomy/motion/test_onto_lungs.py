@@ -11,7 +11,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.motion.motion import Motion
-from anatomy.motion.onto_lungs import require_onto_lungs
+from anatomy.motion.plausible import require_onto_lungs
 from anatomy.motion.prepare import prepare_motion
 from anatomy.phantom import Phantom
 from anatomy.phantom.breathing import PhantomBreathing

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages.tube.shape import centreline
+from stages.tube.validation import centreline
 from tests.stages.tube.pairs import thin_pair
 
 TUBES = thin_pair(40.0)

@@ -9,7 +9,7 @@ import numpy as np
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume
-from anatomy.kept import kept
+from anatomy.kept_records import kept
 from lungaccess.showing.report.pack import Packed, pack
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Array, Float, Int, UInt8
 from anatomy.grid import Grid, Volume
-from anatomy.kept import kept
+from anatomy.kept_records import kept
 from anatomy.morphology import window
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
 from lungaccess.showing.report.pack import Packed, pack

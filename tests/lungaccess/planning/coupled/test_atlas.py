@@ -13,7 +13,7 @@ from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.planning.coupled import tip_clearances_mm, tube_stability
 from stages.tube import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, insertion_stops, kernels
-from stages.tube.shape import centreline
+from stages.tube.validation import centreline
 from tests.lungaccess.planning.coupled.planning import SYSTEM
 from tests.stages.scenes import brute_clearance
 

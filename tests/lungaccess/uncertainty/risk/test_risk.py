@@ -43,7 +43,7 @@ from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
 from lungaccess.uncertainty.risk.statistics import Share
 from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances
 from stages.needle.path import arc_transform
-from stages.tube.shape import centreline
+from stages.tube.validation import centreline
 from tests.stages.scenes import brute_clearance
 
 SYSTEM = la.load_system("ultrathin")

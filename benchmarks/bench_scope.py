@@ -9,11 +9,9 @@ from anatomy.grid import Grid, Volume
 from benchmarks.fresh import FreshProcess
 from stages.scope.advisor.advisor import Advisor, start_state
 from stages.scope.advisor.best_motion import Weights, evaluate_motions
-from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
 from stages.scope.advisor.nf1 import goal_at, navigation_field
-from stages.scope.advisor.orientability import measure_orientability
 from stages.scope.advisor.path_search import PathSettings
 
 SPACING_MM = (0.7, 0.7, 0.6)
@@ -67,7 +65,7 @@ class Stage:
         self.advisor = Advisor(self.lumen, self.model, self.goal)
         self.once = Advisor(self.lumen, self.model, self.goal, PathSettings(retreats=0))
         self.printed = Advisor(self.lumen, self.model, self.goal, reproduction=True)
-        for work in (self.time_field, self.time_best_motion, self.time_path, self.time_orientability):
+        for work in (self.time_field, self.time_best_motion, self.time_path):
             work()
 
     def time_field(self) -> None:
@@ -93,11 +91,6 @@ class Stage:
     def track_voxels(self) -> float:
         """Interior voxels."""
         return float(self.lumen.count)
-
-    def time_orientability(self) -> None:
-        """Where the tip can point in the trachea."""
-        environment = ScopeEnvironment(model=self.model, field=self.advisor.field)
-        measure_orientability(environment, self.tree, 60)
 
 
 class Compile(FreshProcess):

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     )
     from stages.scope.advisor.lumen import Lumen, lumen_of_lung, lumen_of_mask
     from stages.scope.advisor.nf1 import Goal, NavigationField, goal_at, navigation_field
-    from stages.scope.advisor.orientability import Orientability, measure_orientability
     from stages.scope.advisor.path import ScopePath
     from stages.scope.advisor.path_search import PathSearch, PathSettings
 

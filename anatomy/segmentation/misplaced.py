@@ -92,7 +92,7 @@ def misplaced(
                 failed.append(_failure(name, f"moved by {STEP_MM:g} mm it fits the CT better or as well"))
             elif worst < fit.doubt_hu:
                 warnings.append(
-                    f"The mask of the {_plain(name)} fits the CT hardly better than when moved by "
+                    f"The mask of the {name.replace('_', ' ')} fits the CT hardly better than when moved by "
                     f"{STEP_MM:g} mm: look at its edges in segmentation.png."
                 )
         if name in ("lobes", "fissures"):
@@ -136,11 +136,7 @@ def _at_lumen(wall: Mask, lumen: Mask, ct: Volume) -> float:
 def _failure(name: str, why: str) -> Implausible:
     return Implausible(
         name="masks",
-        found=f"The mask of the {_plain(name)} is not of this CT: {why}",
+        found=f"The mask of the {name.replace('_', ' ')} is not of this CT: {why}",
         remedy="Check that mask and CT show the same patient, scan and side, and that the mask holds nothing "
         "else",
     )
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", " ")

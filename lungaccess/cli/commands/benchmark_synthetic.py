@@ -133,12 +133,6 @@ def run(
     from lungaccess.running.benchmark.synthetic.reference import benchmark_study
     from lungaccess.running.study.driver import run_study
 
-    if workers is not None and scheduler is not None:
-        raise SettingsError(
-            f"--workers is {workers} and --scheduler is {scheduler}",
-            expected="one of them: a scheduler has workers of its own",
-            remedy="Leave out --workers",
-        )
     devices_asked = {"systems": names_of(devices)} if devices is not None else {}
     study = benchmark_study(
         folder, names_of(methods), phantoms=names_of(phantoms), targets=targets, iterations=iterations,

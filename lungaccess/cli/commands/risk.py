@@ -91,19 +91,11 @@ def risk(
 
 def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]:
     """Return a report and tolerances as plain values."""
-    from anatomy.base.settings import to_mapping
+    from lungaccess.judging.appraisal.headline import plain_share
 
-    return {
-        "errors": {**to_mapping(report.model), "name": report.model.label},
-        "samples": report.samples,
-        "seed": report.seed,
-        "radius_mm": report.radius_mm,
-        "radius_origin": report.radius_origin,
-        "succeeds": plain_share(report.succeeds),
+    return _estimate_record(report) | {
         "reaches": plain_share(report.reaches),
-        "touches": {name: plain_share(share) for name, share in report.touches.items()},
         "forbidden": list(report.forbidden),
-        "miss_mm": {f"{share:g}": miss for share, miss in report.miss_mm.items()},
         "rare": {
             name: {
                 "probability": rare.value,
@@ -208,32 +200,37 @@ def _largest(tolerance: Tolerance) -> str:
     return f"{more}{size:.2f}"
 
 
-def plain_share(share: Share) -> dict[str, object]:
-    """Return a share as plain values."""
-    return {"probability": share.value, "interval_95": list(share.interval)}
-
-
 def share_row(name: str, share: Share) -> terminal.Row:
     """Return name, per cent and interval of a share."""
     low, high = share.interval
     return name, f"{100.0 * share.value:.2f}", f"{100.0 * low:.2f} to {100.0 * high:.2f}"
 
 
-def procedure_record(report: ProcedureReport) -> dict[str, object]:
-    """Return a report as plain values."""
+def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
+    """Return what estimates of single plans and of procedures have in common."""
     from anatomy.base.settings import to_mapping
+    from lungaccess.judging.appraisal.headline import plain_share
 
     return {
         "errors": {**to_mapping(report.model), "name": report.model.label},
-        "procedure": to_mapping(report.procedure),
         "samples": report.samples,
         "seed": report.seed,
         "radius_mm": report.radius_mm,
         "radius_origin": report.radius_origin,
         "succeeds": plain_share(report.succeeds),
-        "ends": {name: plain_share(share) for name, share in report.ends.items()},
         "touches": {name: plain_share(share) for name, share in report.touches.items()},
         "miss_mm": {f"{share:g}": miss for share, miss in report.miss_mm.items()},
+    }
+
+
+def procedure_record(report: ProcedureReport) -> dict[str, object]:
+    """Return a report as plain values."""
+    from anatomy.base.settings import to_mapping
+    from lungaccess.judging.appraisal.headline import plain_share
+
+    return _estimate_record(report) | {
+        "procedure": to_mapping(report.procedure),
+        "ends": {name: plain_share(share) for name, share in report.ends.items()},
         "placements": report.placements,
         "stages": [
             {

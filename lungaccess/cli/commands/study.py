@@ -58,12 +58,6 @@ def run(
     from lungaccess.running.study.settings import read_study
     from lungaccess.running.study.summary import summarise
 
-    if workers is not None and scheduler is not None:
-        raise SettingsError(
-            f"--workers is {workers} and --scheduler is {scheduler}",
-            expected="one of them: a scheduler has workers of its own",
-            remedy="Leave out --workers",
-        )
     asked = read_study(study)
     with progress(asked.name) as shown:
         done = run_study(

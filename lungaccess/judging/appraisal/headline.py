@@ -213,16 +213,16 @@ class Headline:
     def to_mapping(self) -> dict[str, object]:
         """Return the headline as plain JSON values; None where something was not computed."""
         chance, first = self.chance, self.failures[:1]
-        counted = {name: _share(share) for name, share in self.all_failures.items()}
+        counted = {name: plain_share(share) for name, share in self.all_failures.items()}
         return {
             "text": self.text,
             "grade": self.grade.key,
             "verdict": self.verdict,
             "geometry": str(self.geometry),
             "fissures_unknown": self.fissures_unknown,
-            "success": None if self.success is None else _share(self.success),
+            "success": None if self.success is None else plain_share(self.success),
             "stated_by_plan": self.is_stated,
-            "most_frequent_failure": {"what": first[0][0], **_share(first[0][1])} if first else None,
+            "most_frequent_failure": {"what": first[0][0], **plain_share(first[0][1])} if first else None,
             "failures": None if chance is None else counted,
             "draws": None if chance is None else chance.samples,
             "seed": None if chance is None else chance.seed,
@@ -243,7 +243,8 @@ def _errors(chance: Chance, estimate: Estimate | None) -> dict[str, object]:
     return {**to_mapping(estimate.model), "name": chance.errors}
 
 
-def _share(share: Share) -> dict[str, object]:
+def plain_share(share: Share) -> dict[str, object]:
+    """Return a share as plain values."""
     return {"probability": share.value, "interval_95": list(share.interval)}
 
 

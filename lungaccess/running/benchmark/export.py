@@ -74,15 +74,15 @@ def _summary(group: list[BenchmarkRow], peer: Mapping[Key, PeerResult] | None) -
     solved = [each for each in group if each.solved]
     cells = [
         row.patient,
-        _number(row.start, 0),
-        _number(row.target, 0),
-        _number(row.radius_mm, 0),
+        decimals(row.start, 0),
+        decimals(row.target, 0),
+        decimals(row.radius_mm, 0),
         row.planner or ("all" if row.start else ""),
         f"{len(solved)}/{len(group)}" if row.planner else ("no" if row.start else ""),
         _median([each.first_cpu_ms for each in solved], 2),
         _median([each.first_length_mm for each in solved], 2),
         _median([each.length_mm for each in solved], 2),
-        _number(min((c for c in (each.clearance_mm for each in solved) if c is not None), default=None), 2),
+        decimals(min((c for c in (each.clearance_mm for each in solved) if c is not None), default=None), 2),
     ]
     if peer is not None:
         cells += _peer_cells(row, peer)
@@ -100,15 +100,16 @@ def _peer_cells(row: BenchmarkRow, peer: Mapping[Key, PeerResult]) -> list[str]:
         return ["refused", "", ""]
     return [
         f"{found.solved}/{found.runs} {found.planner}",
-        _number(found.first_cpu_ms, 2),
-        _number(found.length_mm, 2),
+        decimals(found.first_cpu_ms, 2),
+        decimals(found.length_mm, 2),
     ]
 
 
 def _median(values: Iterable[float | None], digits: int) -> str:
     known = [value for value in values if value is not None]
-    return _number(median(known), digits) if known else ""
+    return decimals(median(known), digits) if known else ""
 
 
-def _number(value: float | None, digits: int) -> str:
+def decimals(value: float | None, digits: int) -> str:
+    """Return a number with some decimals, nothing where there is none."""
     return "" if value is None else f"{value:.{digits}f}"

@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_value
 from lungaccess.plans.version import software_kernels
 from lungaccess.running.study.answers import CRASH, UNKNOWN, Answer
@@ -69,6 +70,8 @@ def run_study(
 
     Raises
     ------
+    SettingsError
+        If both a scheduler and a number of workers are given.
     StudyError
         If dask is not installed, or the scheduler does not answer.
     FileError
@@ -76,6 +79,12 @@ def run_study(
     LungaccessError
         If a patient, a system or a target of the study cannot be read.
     """
+    if workers is not None and scheduler is not None:
+        raise SettingsError(
+            f"--workers is {workers} and --scheduler is {scheduler}",
+            expected="one of them: a scheduler has workers of its own",
+            remedy="Leave out --workers",
+        )
     began = time.perf_counter()
     say = progress or (lambda _words, _share: None)
     require_dask()

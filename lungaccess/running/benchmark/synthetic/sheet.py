@@ -13,7 +13,7 @@ from typing import Any
 from anatomy.base.errors import FileError
 from anatomy.base.files import atomic_write, read_json
 from anatomy.base.records import frozen_value
-from lungaccess.running.benchmark.export import require_table_file
+from lungaccess.running.benchmark.export import decimals, require_table_file
 from lungaccess.running.benchmark.synthetic.manifest import manifest_sha256
 from lungaccess.running.benchmark.synthetic.phantoms import VERSION
 from lungaccess.running.benchmark.synthetic.scoring import (
@@ -76,9 +76,9 @@ class SheetLine:
         percent = [None if each is None else 100.0 * each for each in (self.success, self.breath_share)]
         return (
             self.planner, self.family, self.system, f"{self.queries}", f"{self.solved}", f"{share:.1f}",
-            f"{self.refused}", f"{self.certified}", f"{self.refuted}", _text(self.first_cpu_s, 3),
-            _text(self.cpu_s, 3), _text(self.cost, 2), _text(self.shared_cost, 2), _text(percent[0], 1),
-            _text(percent[1], 1), f"{self.not_checked}",
+            f"{self.refused}", f"{self.certified}", f"{self.refuted}", decimals(self.first_cpu_s, 3),
+            decimals(self.cpu_s, 3), decimals(self.cost, 2), decimals(self.shared_cost, 2),
+            decimals(percent[0], 1), decimals(percent[1], 1), f"{self.not_checked}",
         )  # fmt: skip
 
 
@@ -142,10 +142,6 @@ def _median(values: Iterable[float | None]) -> float | None:
 def _mean(values: Iterable[float | None]) -> float | None:
     known = _known(values)
     return sum(known) / len(known) if known else None
-
-
-def _text(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"
 
 
 def write_sheet(lines: Iterable[SheetLine], path: Path) -> None:

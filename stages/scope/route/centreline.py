@@ -17,8 +17,8 @@ from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
 from stages.scope.route.kernels import lumen as kernel
 
-DEFAULT_SPACING_MM = 0.75
-"""Longest edge: about a voxel of a CT, so that radii follow the wall."""
+LONGEST_EDGE_MM = 0.75
+"""The longest edge is about a voxel of a CT, so that radii follow the wall."""
 MIN_CELL_MM = 1.0
 """Smallest cell of the grid of cones: smaller ones hold the same cones and only cost memory."""
 SAME_POINT_MM = 1e-3
@@ -172,24 +172,16 @@ def from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) ->
     return Centreline(nodes_mm=points[first], radius_mm=widest, edges=pairs[pairs[:, 0] != pairs[:, 1]])
 
 
-def from_lung(lung: Lung, *, spacing_mm: float = DEFAULT_SPACING_MM) -> Centreline:
-    """Return the centreline of the airway with radii proved against the lumen mask.
-
-    Parameters
-    ----------
-    spacing_mm : float
-        Longest edge.
-    """
+def from_lung(lung: Lung) -> Centreline:
+    """Return the centreline of the airway with radii proved against the lumen mask."""
     base = from_tree(lung.tree)
     return _proved(
-        *_refined(base.nodes_mm, base.edges, spacing_mm),
+        *_refined(base.nodes_mm, base.edges),
         _Walls(lung.mask("lumen").array, lung.grid, SOLID, lung.lumen_depth),
     )
 
 
-def from_mask(
-    mask: Volume, *, spacing_mm: float = DEFAULT_SPACING_MM, max_gap_mm: float = 0.0, rounded: bool = False
-) -> Centreline:
+def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
     """Return the centreline of any branching tube: vein, artery or airway, without a root.
 
     The skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels as
@@ -199,10 +191,6 @@ def from_mask(
     ----------
     mask : Volume
         Non-zero inside the tube.
-    spacing_mm : float
-        Longest edge.
-    max_gap_mm : float
-        Longest break of the tube that is bridged; the radius is 0 there.
 
     Raises
     ------
@@ -212,7 +200,7 @@ def from_mask(
     from anatomy.tree.lumen import prepare_lumen
     from anatomy.tree.skeleton import prune, spanning_tree, thin
 
-    prepared = prepare_lumen(mask, max_gap_mm)
+    prepared = prepare_lumen(mask, 0.0)
     grid = prepared.grid
     ijk = thin(prepared.solid)
     depth = prepared.solid_depth_mm[tuple(ijk.T)].astype(np.float64)
@@ -228,10 +216,10 @@ def from_mask(
     walls = _Walls(prepared.lumen, grid, CENTRES if rounded else SOLID)
     used, edges = np.unique(np.array(pairs), return_inverse=True)
     nodes = _smoothed(grid.lps(skeleton.ijk[used]), edges.reshape(-1, 2), walls)
-    return _proved(*_refined(nodes, edges.reshape(-1, 2), spacing_mm), walls)
+    return _proved(*_refined(nodes, edges.reshape(-1, 2)), walls)
 
 
-def from_image(drawing: Bool, *, pixel_mm: float, spacing_mm: float = DEFAULT_SPACING_MM) -> Centreline:
+def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
     """Return the centreline of a drawing of vessels, in the plane z = 0.
 
     Parameters
@@ -240,8 +228,6 @@ def from_image(drawing: Bool, *, pixel_mm: float, spacing_mm: float = DEFAULT_SP
         True inside a vessel.
     pixel_mm : float
         Size of a pixel; the pixel in row i and column j is centred at x = j, y = i times that.
-    spacing_mm : float
-        Longest edge.
 
     Raises
     ------
@@ -274,7 +260,7 @@ def from_image(drawing: Bool, *, pixel_mm: float, spacing_mm: float = DEFAULT_SP
         )
     middle = np.column_stack((ij, np.ones(len(ij))))
     nodes = _smoothed(grid.lps(middle), edges, walls)
-    return _proved(*_refined(nodes, edges, spacing_mm), walls)
+    return _proved(*_refined(nodes, edges), walls)
 
 
 def _largest(picture: Bool) -> Bool:
@@ -285,10 +271,12 @@ def _largest(picture: Bool) -> Bool:
     return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
 
 
-def _refined(nodes: Float, edges: Int, spacing_mm: float) -> tuple[Float, Int]:
-    """Divide edges evenly until none is longer than `spacing_mm`."""
+def _refined(nodes: Float, edges: Int) -> tuple[Float, Int]:
+    """Divide edges evenly until none is longer than `LONGEST_EDGE_MM`."""
     begin, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
-    parts = np.maximum(np.ceil(np.linalg.norm(end - begin, axis=1) / spacing_mm - 1e-9), 1).astype(np.int64)
+    parts = np.maximum(np.ceil(np.linalg.norm(end - begin, axis=1) / LONGEST_EDGE_MM - 1e-9), 1).astype(
+        np.int64
+    )
     which = np.repeat(np.arange(len(edges)), parts - 1)
     number = np.arange(len(which)) - np.repeat(np.cumsum(parts - 1) - (parts - 1), parts - 1) + 1
     share = (number / parts[which])[:, None]

@@ -1,4 +1,4 @@
-"""The feasible exits of a target: where the tubes can leave the airway so that one arc reaches it."""
+"""The feasible exits of a target: where tubes can leave the airway so that it is reached directly."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from lungaccess.planning.coupled.atlas import Atlas, require_same
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
+from lungaccess.planning.coupled.search.tube_reach import tubes_clearance_mm
 from lungaccess.plans.costs import obstacle_clearance_mm
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
@@ -34,7 +36,8 @@ class FeasibleExits:
     """The deployments of an atlas from which a direct arc to a target is clear, by their place of exit.
 
     C deployments are feasible, at P places.  An arc is proved clear of every obstacle; that the deployment
-    with its arc becomes a plan is proved when it is planned.
+    with its arc becomes a plan is proved when it is planned.  Without a needle the deployments are those from
+    which the tubes were aimed at the target, and what is said of arcs holds for the tubes in tissue.
 
     Parameters
     ----------
@@ -48,7 +51,8 @@ class FeasibleExits:
         Of the least costly deployment of each place: where its axis leaves the lumen, LPS mm, and a lower
         bound of the distance of its arc from every obstacle, beyond the exempt length in the pierced wall.
     in_workspace, tried : int
-        Deployments with the target in the needle's workspace, and how many of them this answer is of.
+        Deployments with the target in the needle's workspace, or from which tubes are aimed at it, and how
+        many of them this answer is of.
     blocked : mapping of str to int
         How many arcs were stopped, by what stopped them.
     """
@@ -70,7 +74,7 @@ class FeasibleExits:
 
     @property
     def is_complete(self) -> bool:
-        """Whether every deployment with the target in the needle's workspace was tried."""
+        """Whether every deployment from which the target may be reached was tried."""
         return self.tried == self.in_workspace
 
     @cached_property
@@ -110,24 +114,24 @@ def feasible_exits(
     Raises
     ------
     SettingsError
-        If the system has no needle, or the atlas belongs to another lung or system.
+        If the atlas belongs to another lung or system.
     TargetError
         If the target lies outside the lung or inside an obstacle.
     """
     require_same(atlas, lung, system)
     task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective))
-    arcs = DirectArcs(task, replace(atlas, system=system))
-    near = arcs.in_workspace
+    arcs = direct_candidates(task, replace(atlas, system=system))
+    near = arcs.promising
     if scope_tips is not None:
         near = near[np.isin(atlas.deployments.site[near], scope_tips)]
     near = _in_turns(near, atlas.deployments.site)
     found, blocked = _Found.nothing(), Counter[str]()
     for begin in range(0, max(len(near), 1), CHUNK):
         chunk = near[begin : begin + CHUNK]
-        blockers, lengths, _integrals = arcs.blockers(chunk)
+        blockers, cost, _least = arcs.evaluate(chunk, np.inf)
         blocked.update(arcs.reasons(blockers))
         clear = np.flatnonzero(blockers == 0)
-        found = found.joined(_Found.of(arcs, chunk[clear], lengths[clear]))
+        found = found.joined(_Found.of(arcs, chunk[clear], cost[clear]))
         yield found.answer(arcs, len(near), begin + len(chunk), blocked)
 
 
@@ -157,10 +161,14 @@ class _Found:
         )
 
     @classmethod
-    def of(cls, arcs: DirectArcs, entries: Int, lengths: Float) -> _Found:
-        _blockers, cost, _least = arcs.evaluate(entries, np.inf)
+    def of(cls, arcs: DirectCandidates, entries: Int, cost: Float) -> _Found:
         atlas = arcs.atlas
-        points = exit_points(atlas.system.tubes, atlas.motions.tips, atlas.deployments, entries)
+        if isinstance(arcs, DirectArcs):
+            lengths = arcs.blockers(entries)[1]
+            points = exit_points(atlas.system.tubes, atlas.motions.tips, atlas.deployments, entries)
+        else:
+            lines = arcs.lines(entries, SAMPLES)
+            lengths, points = np.linalg.norm(np.diff(lines, axis=1), axis=2).sum(axis=1), lines[:, 0]
         return cls(entries=entries, cost=cost, length_mm=lengths, points=points)
 
     def joined(self, other: _Found) -> _Found:
@@ -171,7 +179,9 @@ class _Found:
             points=np.concatenate([self.points, other.points]),
         )
 
-    def answer(self, arcs: DirectArcs, in_workspace: int, tried: int, blocked: Counter[str]) -> FeasibleExits:
+    def answer(
+        self, arcs: DirectCandidates, in_workspace: int, tried: int, blocked: Counter[str]
+    ) -> FeasibleExits:
         """Return what is found by place, the least costly place first."""
         branch = arcs.atlas.deployments.branch[self.entries]
         cells = np.column_stack([branch, np.floor(self.points / PLACE_MM).astype(np.int64)])
@@ -197,10 +207,15 @@ class _Found:
         )
 
 
-def _clearance_mm(arcs: DirectArcs, entries: Int, lengths: Float) -> Float:
+def _clearance_mm(arcs: DirectCandidates, entries: Int, lengths: Float) -> Float:
     """Return lower bounds `(N,)` of the distance of arcs to obstacles, beyond what is exempt in the wall."""
     task = arcs.task
-    needle = task.system.require_needle("A direct arc")
+    needle = task.system.needle
+    if needle is None:
+        made = [arcs.candidate(entry) for entry in entries.tolist()]
+        return np.array(
+            [tubes_clearance_mm(arcs.atlas, one.path, one.deployment.branch) if one else 0.0 for one in made]
+        )
     points = arcs.lines(entries, SAMPLES)
     clearance = obstacle_clearance_mm(task.lung, points.reshape(-1, 3), with_fissures=task.with_fissures)
     step = lengths[:, None] / (SAMPLES - 1)

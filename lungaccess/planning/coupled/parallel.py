@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
+from itertools import count, islice
 from multiprocessing.connection import Connection
 
 from anatomy.base.child_process import end_with_parent
@@ -17,12 +17,12 @@ ROUND_ITERATIONS = 100
 
 
 def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
-    """Search in several processes until the caller stops, or until nothing can be found.
+    """Search in several processes until the caller stops, nothing can be found, or no process has more.
 
-    Direct arcs come first.  Then rounds: each process continues a search of its own, which begins from every
-    so many of the direct arcs and has random numbers that depend on the seed and its number, and the best of
-    all goes into the next round.  So the same seed, number of processes and iterations give the same plans,
-    whatever the machine's load.
+    The direct steps come first.  Then rounds: each process continues a search of its own, which begins from
+    every so many of the direct ways and has random numbers that depend on the seed and its number, and the
+    best of all goes into the next round.  So the same seed, number of processes and iterations give the same
+    plans, whatever the machine's load.
 
     Raises
     ------
@@ -51,8 +51,8 @@ def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
                 end.send(search.incumbent.step)
             found = [_received(end) for end in ends]
             iteration = turn * processes * ROUND_ITERATIONS
-            yield _best_of(search, found, iteration)
-            if search.is_futile(iteration):
+            yield _best_of(search, [step for step, _more in found], iteration)
+            if search.is_futile(iteration) or not any(more for _step, more in found):
                 return
     finally:
         for worker in workers:
@@ -68,17 +68,17 @@ def _best_of(search: ParallelSearch, found: list[Step | None], iteration: int) -
     return search.incumbent.improved(replace(better, iteration=iteration))
 
 
-def _received(end: Connection) -> Step | None:
-    """Return what a process has found in its round."""
+def _received(end: Connection) -> tuple[Step | None, bool]:
+    """Return what a process has found in its round, and whether its search goes on."""
     try:
-        step: Step | None = end.recv()
+        found: tuple[Step | None, bool] = end.recv()
     except EOFError as reason:
         raise AnatomyError(
             "A process of the search has ended before its time",
             expected="processes that run until the search ends",
             remedy="Give it more memory, or fewer processes with --processes",
         ) from reason
-    return step
+    return found
 
 
 def _work(search: ParallelSearch, number: int, processes: int, end: Connection) -> None:
@@ -96,9 +96,6 @@ def _work(search: ParallelSearch, number: int, processes: int, end: Connection) 
             return
         if best is not None:
             search.incumbent.adopt(best)
-        found = None
-        for _ in range(ROUND_ITERATIONS):
-            step = next(steps, None)
-            if step is not None and step.candidate is not None:
-                found = step
-        end.send(found)
+        made = list(islice(steps, ROUND_ITERATIONS))
+        found = [step for step in made if step.candidate is not None]
+        end.send((found[-1] if found else None, len(made) == ROUND_ITERATIONS))

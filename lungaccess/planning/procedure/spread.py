@@ -30,6 +30,8 @@ there for the errors that come after."""
 class Spread:
     """Direct arcs of the needle from deployments to one target, with what the errors do to each.
 
+    Without a needle the tubes end at the target, where a needle of no length shows what the errors do.
+
     Parameters
     ----------
     tips : (N, 9) float64
@@ -56,12 +58,17 @@ class Spread:
         left = Residuals.of(errors, procedure, height - scope)
         aside = ASIDE * radius_mm if procedure.tubes.measured else 0.0
         self._radius_mm = radius_mm
-        self._replanned = procedure.tubes.measured or procedure.needle.closed_loop
+        self._replanned = system.needle is not None and (
+            procedure.tubes.measured or procedure.needle.closed_loop
+        )
         x, y, z = target_lps.tolist()
         self._found = np.zeros((deployments.count, kernel.N_FOUND))
+        ends = deployments.positions
+        if system.needle is None:
+            ends = np.ascontiguousarray(np.broadcast_to(target_lps, ends.shape))
         kernel.find_spread(
             _around(lung, system), _sizes(system, left, errors, aside), np.ascontiguousarray(tips),
-            deployments.positions, deployments.tangents, deployments.exit_mm, deployments.inner_mm,
+            ends, deployments.tangents, deployments.exit_mm, deployments.inner_mm,
             (x, y, z), self._found,
         )  # fmt: skip
 
@@ -115,15 +122,19 @@ def _around(lung: Lung, system: System) -> kernel.Around:
 
 
 def _sizes(system: System, left: Residuals, errors: ErrorModel, aside_mm: float) -> kernel.Sizes:
-    needle, tubes = system.require_needle("A chance of success"), system.tubes
+    """Return the errors and devices; without a needle nothing of the tip of the tubes is exempt."""
+    needle, tubes = system.needle, system.tubes
+    tip_mm = None if needle is None else left.tip_mm
     return kernel.Sizes(
         scope=left.scope_mm, scope_turn=left.scope_rad, rotation=left.rotation_rad,
-        insertion=left.insertion_mm, tip_known=left.tip_mm is not None, tip=left.tip_mm or 0.0,
-        tip_turn=left.tip_rad, curvature=left.curvature, roll=left.roll_rad, stop=left.stop_mm,
+        insertion=left.insertion_mm, tip_known=tip_mm is not None, tip=tip_mm or 0.0,
+        tip_turn=left.tip_rad, curvature=left.curvature, roll=left.roll_rad,
+        stop=0.0 if needle is None else left.stop_mm,
         target=left.target_mm, breathing=left.foot_mm, bend=bend_per_mm(system),
-        steepest=needle.max_curvature_per_mm * errors.needle_curvature.median,
+        steepest=1.0 if needle is None else needle.max_curvature_per_mm * errors.needle_curvature.median,
         slack=errors.term(CURVATURE).size, aside=aside_mm, tube_radius=tubes.inner.radius_mm,
-        needle_radius=needle.radius_mm, exempt=needle.exit_exemption_mm,
+        needle_radius=0.0 if needle is None else needle.radius_mm,
+        exempt=-1.0 if needle is None else needle.exit_exemption_mm,
     )  # fmt: skip
 
 

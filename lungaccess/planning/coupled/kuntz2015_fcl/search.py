@@ -16,7 +16,7 @@ from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator
-from lungaccess.planning.coupled.search.base import Step
+from lungaccess.planning.coupled.search.base import SearchInParts, Step
 from lungaccess.planning.coupled.search.random_placement import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -41,7 +41,7 @@ class Refusal:
     candidate: Candidate
 
 
-class ReferenceSearch:
+class ReferenceSearch(SearchInParts):
     """Random placements, FCL, a needle RRT each, keep the best: the yardstick of the planner.
 
     The algorithm is as printed, but for what the paper leaves open or safety asks for.  The scope takes poses
@@ -96,7 +96,7 @@ class ReferenceSearch:
         system = task.system
         self.task, self._atlas, self._rejects = task, atlas, rejects
         self._evaluator = CandidateEvaluator(task)
-        self.blocked = self._evaluator.blocked
+        super().__init__(self._evaluator.blocked)
         self.obstacles = obstacles or obstacles_for(task)
         self._budget = (rrt_iterations, None) if rrt_time_s is None else (None, rrt_time_s)
         self._tubes = TubeValidator(system, self.obstacles)
@@ -107,18 +107,15 @@ class ReferenceSearch:
         self.spent_s: defaultdict[str, float] = defaultdict(float)
         self.refused_by_proof: list[Refusal] = []
 
-    def steps(self) -> Iterator[Step]:
-        """Search until the caller stops, or not at all if the scope fits nowhere."""
-        best, began = math.inf, time.thread_time()
-        for iteration, placement in enumerate(random_placements(self.task, self._atlas), start=1):
+    def further_steps(self) -> Iterator[Step]:
+        """Draw placements without end; each is an iteration, and none depends on those before it."""
+        began = time.thread_time()
+        placements = random_placements(self.task, self._atlas, self.share[0])
+        for iteration, placement in enumerate(placements, start=1):
             found = self._attempt(placement, began)
             proved = None if found is None else self._proved(found)
             cost = math.inf if proved is None else self._evaluator.cost(proved)
-            if cost < best:
-                best = cost
-                yield Step(iteration=iteration, phase=PHASE, candidate=proved, cost=cost)
-            else:
-                yield Step(iteration=iteration, phase=PHASE)
+            yield self.incumbent.improved(Step(iteration=iteration, phase=PHASE, candidate=proved, cost=cost))
             began = time.thread_time()
 
     def _attempt(self, placement: Placement, began: float) -> Candidate | None:

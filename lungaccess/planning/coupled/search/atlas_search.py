@@ -10,7 +10,7 @@ from itertools import count, islice
 import numpy as np
 
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.search.base import DirectSearch, Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled.search.base import DirectSearch, SearchInParts, Step, evaluated_step
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
 from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.local_sampling import sampling_near_target
@@ -28,7 +28,7 @@ WORTH_REFINING = 0.99
 """The best candidate is refined again once it is cheaper by this factor, as a refinement takes long."""
 
 
-class AtlasSearch:
+class AtlasSearch(SearchInParts):
     """Direct arcs from the whole atlas, then rounds of local search, sampling, needle search and refinement.
 
     Attributes
@@ -47,21 +47,11 @@ class AtlasSearch:
         self.settings = settings or SearchSettings()
         self.arcs = arcs or DirectArcs(task, atlas)
         self.evaluator = self.arcs.evaluator
-        self.blocked = self.evaluator.blocked
-        self.incumbent = Incumbent()
+        super().__init__(self.evaluator.blocked)
         self._needle_planner = NamedNeedlePlanner(self.evaluator, PLANNER)
         self.direct: DirectSearch = DirectArcSearch(self.arcs, self.incumbent, self.settings)
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
-        self._share = (0, 1)
         self._refined_cost = math.inf
-
-    def steps(self) -> Iterator[Step]:
-        """Search until the caller stops, or the target has come into no needle's workspace."""
-        yield from self.direct_steps()
-        for step in self.further_steps():
-            yield step
-            if self.is_futile(step.iteration):
-                return
 
     def is_futile(self, iteration: int) -> bool:
         """Tell whether there is no candidate, and the target has come into no needle's workspace."""
@@ -71,7 +61,7 @@ class AtlasSearch:
 
     def take_part(self, number: int, parts: int) -> None:
         """Do one part of the work of several processes, with random numbers of its own."""
-        self._share = (number, parts)
+        super().take_part(number, parts)
         self._rng = np.random.Generator(np.random.PCG64([self.task.seed, number]))
 
     def direct_steps(self) -> Iterator[Step]:
@@ -87,13 +77,13 @@ class AtlasSearch:
         """Start from the best direct arcs, then intensify the best candidate and try new starts, in turns."""
         if not self.atlas.deployments.count:
             return
-        settings, number = self.settings, self._share[0]
+        settings, number = self.settings, self.share[0]
         local_search = LocalSearch(self.evaluator, self._rng)
         rounds = LocalSearchRounds(local_search, self.evaluator, self.incumbent, settings)
         starts = self._starts(local_search)
         sampled = self._sampled(local_search)
         searched = needle_searches(
-            self.arcs, self._needle_planner, self.incumbent, settings, self._rng, self._share
+            self.arcs, self._needle_planner, self.incumbent, settings, self._rng, self.share
         )
         yield from rounds.halve(list(islice(starts, settings.starts)))
         for turn in count(1):
@@ -110,7 +100,7 @@ class AtlasSearch:
 
     def _starts(self, local_search: LocalSearch) -> Iterator[LocalSearchRun]:
         """Yield local searches from clear direct arcs, different ones by their cost, then any of them."""
-        number, parts = self._share
+        number, parts = self.share
         clear = self.direct.clear
         for entry in different(self.atlas.deployments, clear)[number::parts].tolist():
             run = local_search.begin(self.arcs.candidate(entry))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, runtime_checkable
@@ -88,7 +89,7 @@ class ParallelSearch(PlanSearch, Protocol):
         """Do what one process does alone, before the others begin."""
 
     def further_steps(self) -> Iterator[Step]:
-        """Continue from there without end; each step is an iteration."""
+        """Continue from there, without end or until all is tried; each step is an iteration."""
 
     def take_part(self, number: int, parts: int) -> None:
         """Do part `number` of `parts` of the work from here on, with random numbers of its own."""
@@ -143,6 +144,44 @@ class Incumbent:
             self.step = step
             return step
         return Step(iteration=step.iteration, phase=step.phase)
+
+
+class SearchInParts(ABC):
+    """What all searches have in common that can be continued in several processes: a `ParallelSearch`.
+
+    Attributes
+    ----------
+    incumbent : Incumbent
+    share : tuple of 2 int
+        The part of the work that it does, and of how many.
+    """
+
+    def __init__(self, blocked: Counter[str]) -> None:
+        self.blocked, self.incumbent, self.share = blocked, Incumbent(), (0, 1)
+
+    def steps(self) -> Iterator[Step]:
+        """Search until the caller stops or all is tried."""
+        yield from self.direct_steps()
+        for step in self.further_steps():
+            yield step
+            if self.is_futile(step.iteration):
+                return
+
+    def direct_steps(self) -> Iterator[Step]:
+        """Do what one process does alone: nothing."""
+        return iter(())
+
+    @abstractmethod
+    def further_steps(self) -> Iterator[Step]:
+        """See `ParallelSearch`."""
+
+    def take_part(self, number: int, parts: int) -> None:
+        """Do part `number` of `parts` of the work from here on."""
+        self.share = (number, parts)
+
+    def is_futile(self, iteration: int) -> bool:
+        """Tell that the search goes on as long as it can."""
+        return False
 
 
 def evaluated_step(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled.search.base import SearchInParts, Step, evaluated_step
 from lungaccess.planning.coupled.search.needle_planner import NamedNeedlePlanner
 from lungaccess.planning.coupled.search.random_placement import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
@@ -18,7 +18,7 @@ PLANNER = "rrt"
 """The planner of line 9 where none is named: the paper's."""
 
 
-class KuntzSearch:
+class KuntzSearch(SearchInParts):
     """Algorithm 1 of [Kuntz2015]: random placement, workspace rejection, RRT, keep the best.
 
     Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not hold
@@ -39,14 +39,14 @@ class KuntzSearch:
         self._task, self._atlas, self._rejects = task, atlas, rejects
         self._evaluator = CandidateEvaluator(task)
         self._needle_planner = NamedNeedlePlanner(self._evaluator, PLANNER)
-        self.blocked = self._evaluator.blocked
+        super().__init__(self._evaluator.blocked)
 
-    def steps(self) -> Iterator[Step]:
-        """Search until the caller stops, or not at all if the scope fits nowhere."""
-        incumbent = Incumbent()
-        for iteration, placement in enumerate(random_placements(self._task, self._atlas), start=1):
+    def further_steps(self) -> Iterator[Step]:
+        """Draw placements without end; each is an iteration, and none depends on those before it."""
+        placements = random_placements(self._task, self._atlas, self.share[0])
+        for iteration, placement in enumerate(placements, start=1):
             candidate = self._attempt(placement)
-            yield incumbent.improved(evaluated_step(self._evaluator, self.phase, candidate, iteration))
+            yield self.incumbent.improved(evaluated_step(self._evaluator, self.phase, candidate, iteration))
 
     def _attempt(self, placement: Placement) -> Candidate | None:
         """Carry out lines 8 and 9 for a placement."""

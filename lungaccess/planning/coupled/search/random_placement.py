@@ -33,13 +33,13 @@ class Placement:
     needle_seed: int
 
 
-def random_placements(task: Task, atlas: Atlas) -> Iterator[Placement]:
-    """Draw placements without end; there is none if the scope can take no pose.
+def random_placements(task: Task, atlas: Atlas, number: int = 0) -> Iterator[Placement]:
+    """Draw placements without end, each `number` others; there is none if the scope can take no pose.
 
     The poses are drawn from the atlas's tips that look along the airway.  These lie evenly spaced by arc
     length, where a motion of the scope ends and an airway in lung tissue is ahead.
     """
-    rng = np.random.Generator(np.random.PCG64(task.seed))
+    rng = np.random.Generator(np.random.PCG64([task.seed, number] if number else task.seed))
     along = np.flatnonzero(~atlas.motions.turned)
     longest_mm = tracking_length_mm(task.system.tubes)
     while len(along):

@@ -11,7 +11,7 @@ from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.aimed_tubes import COST, INNER, JOINTS, OUTER
 from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes, AimStarts, cheapest_first
-from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled.search.base import SearchInParts, Step, evaluated_step
 from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK
 from lungaccess.problem.task import Task
@@ -26,7 +26,7 @@ ROWS_MM = (evenly(0.25, 4.0), evenly(0.02, 0.26))
 as far as the next, then between the best of these and its neighbours."""
 
 
-class TubeSearch:
+class TubeSearch(SearchInParts):
     """Aims the tubes at the target from the tips of the atlas, then from tips along the motions of the best.
 
     It ends when it has looked along the motions of all tips with a deployment to the target that differ.
@@ -35,8 +35,6 @@ class TubeSearch:
     ----------
     blocked : Counter of str
         How many attempts were refused, by the reason.
-    incumbent : Incumbent
-        The best candidate so far.
     clear : (C,) int64
         After the direct steps the entries of the atlas with a deployment to the target, the cheapest first.
     """
@@ -45,23 +43,8 @@ class TubeSearch:
         self.task, self.atlas = task, atlas
         self.arcs = aimed or AimedTubes(task, atlas)
         self.evaluator = self.arcs.evaluator
-        self.blocked = self.evaluator.blocked
-        self.incumbent = Incumbent()
+        super().__init__(self.evaluator.blocked)
         self.clear: Int = np.zeros(0, dtype=np.int64)
-        self._share = (0, 1)
-
-    def steps(self) -> Iterator[Step]:
-        """Search until the caller stops or all is tried; the same task gives the same steps."""
-        yield from self.direct_steps()
-        yield from self.further_steps()
-
-    def take_part(self, number: int, parts: int) -> None:
-        """Look along the motions of every so many of the tips."""
-        self._share = (number, parts)
-
-    def is_futile(self, iteration: int) -> bool:
-        """Tell that it goes on: it ends by itself."""
-        return False
 
     def direct_steps(self) -> Iterator[Step]:
         """Aim from the tips of the atlas, those first from which a deployment ends nearest."""
@@ -91,7 +74,7 @@ class TubeSearch:
 
     def further_steps(self) -> Iterator[Step]:
         """Look along the motions, the cheapest first; each motion is an iteration."""
-        number, parts = self._share
+        number, parts = self.share
         ordered = different(self.atlas.deployments, self.clear)[number::parts]
         for iteration, entry in enumerate(ordered.tolist(), start=1):
             step = self._shifted(int(entry))

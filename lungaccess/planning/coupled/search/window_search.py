@@ -203,7 +203,7 @@ class WindowDirectSearch:
         self, arcs: DirectCandidates, evaluator: WindowEvaluator, shares: Float, incumbent: Incumbent
     ) -> None:
         self._arcs, self._evaluator = arcs, evaluator
-        self._shares, self._incumbent = shares, incumbent
+        self.shares, self._incumbent = shares, incumbent
         self.clear: Int = np.zeros(0, dtype=np.int64)
         self.blockers: Int = np.zeros(0, dtype=np.int64)
         self.refused: dict[int, WindowLimit] = {}
@@ -217,7 +217,7 @@ class WindowDirectSearch:
         clear = near[self.blockers == 0]
         bounds = costs[self.blockers == 0] / ESTIMATE_SLACK
         if evaluator.widest:
-            most = self._shares[self._arcs.atlas.deployments.site[clear]]
+            most = self.shares[self._arcs.atlas.deployments.site[clear]]
             bounds += [cost_outside(share) for share in most.tolist()]
         order = np.argsort(bounds, kind="stable")
         entries, bounds = clear[order], bounds[order]
@@ -255,7 +255,7 @@ class WindowSearch(AtlasSearch):
         self.windows = self.direct = WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
 
     def _rounds(self) -> Iterator[Step]:
-        varied_too = _variations(self.window_evaluator, self.incumbent, self._share[0])
+        varied_too = _variations(self.window_evaluator, self.incumbent, self.share[0])
         for number, step in enumerate(super()._rounds()):
             yield step
             if self.window_evaluator.widest and number % VARY_EVERY == 0:
@@ -281,7 +281,7 @@ class WindowTubeSearch(TubeSearch):
 
     def further_steps(self) -> Iterator[Step]:
         """Look along the motions, then vary the best; each motion and each variation is an iteration."""
-        varied_too = _variations(self.window_evaluator, self.incumbent, self._share[0])
+        varied_too = _variations(self.window_evaluator, self.incumbent, self.share[0])
         steps = chain(super().further_steps(), islice(varied_too, VARIATIONS))
         for iteration, step in enumerate(steps, start=1):
             yield self.incumbent.improved(replace(step, iteration=iteration))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
 from lungaccess.planning.coupled import DirectArcs, atlas_part
@@ -94,11 +93,6 @@ def test_a_part_of_the_atlas_plans_from_it_alone(
     *_, plan = la.plan(small_lung, SYSTEM, target, atlas=part, iterations=0, goal="default")
     assert plan.tube.rotation_rad == pytest.approx(float(atlas.deployments.rotation_rad[entry]))
     assert la.check(plan, small_lung).accepted
-
-
-def test_a_system_without_a_needle_is_refused(small_lung: Lung, atlas: la.Atlas, target: Target) -> None:
-    with pytest.raises(SettingsError):
-        list(la.feasible_exits(small_lung, la.load_system("tubes-only"), target, atlas=atlas))
 
 
 def test_a_place_says_what_is_there(small_lung: Lung, target: Target) -> None:

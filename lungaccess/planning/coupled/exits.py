@@ -107,7 +107,7 @@ def feasible_exits(
     atlas : Atlas
         The deployments, made for this lung, scope and tubes.
     objective : str or Objective
-        By which the arcs are put in order, as for `lungaccess.planning.coupled.planner.plan`.
+        By which the arcs are put in order, as for `lungaccess.planning.searches.CostFinder`.
     scope_tips : (T,) int64, optional
         Only exits from these tips of the atlas.
 

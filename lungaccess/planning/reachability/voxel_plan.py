@@ -44,7 +44,7 @@ def plan_to_voxel(reach: ReachMap, atlas: Atlas, ijk: Int) -> Plan:
         raise SettingsError(
             "The map is one for phases of the breath",
             expected="one of the masks alone",
-            remedy="Plan to the voxel with plan_for_window",
+            remedy="Plan to the voxel with lungaccess.plan and its phases",
         )
     require_same(atlas, atlas.lung, reach.system)
     grid, voxel = reach.kinds.grid, (int(ijk[0]), int(ijk[1]), int(ijk[2]))

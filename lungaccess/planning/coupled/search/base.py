@@ -42,7 +42,7 @@ class PlanSearch(Protocol):
     """A search for whole plans: the planner drives it and makes plans of its candidates.
 
     A search is made from a `Task` and an `Atlas`.  Its name in
-    `lungaccess.planning.coupled.planner.METHODS` is the `method` of the planner and of the command line.
+    `lungaccess.planning.searches.planners` is the `method` of the planner and of the command line.
 
     Attributes
     ----------

@@ -63,7 +63,7 @@ def benchmark_study(
     Parameters
     ----------
     methods : sequence of str
-        METHOD or METHOD+NEEDLE_PLANNER; see `lungaccess.planning.coupled.planner.METHODS` and
+        METHOD or METHOD+NEEDLE_PLANNER; see `lungaccess.planning.searches.planners` and
         `stages.needle.NEEDLE_PLANNERS`.
     phantoms : iterable of str
         Those of the folder if empty.

@@ -72,7 +72,7 @@ def window_plan(lung: la.Lung, atlas: la.Atlas, place: Float, seed: int) -> tupl
     found: list[la.Plan] = []
     options = {"atlas": atlas, "iterations": ITERATIONS, "seed": seed, "counterfactuals": False}
     try:
-        for each in la.plan_for_window(lung, atlas.system, point_target(lung, place), **options):
+        for each in la.plan(lung, atlas.system, point_target(lung, place), **options, goal="window"):
             found.append(each)
             first = np.fmin(first, time.process_time() - began)
     except la.NoPlan:

@@ -3,8 +3,8 @@
     python -m experiments.success_planning [--quick] [--seed 1] [--results FOLDER] [--patient NAME]
         [--system NAME]
 
-Random peripheral targets are planned for with `lungaccess.plan` and with `lungaccess.plan_for_success`, for
-each error model that ships and the procedures `open-loop` and `measured-tip`.  Both plans are then counted on
+Random peripheral targets are planned for with the goals of the default cost and of success, for each error
+model that ships and the procedures `open-loop` and `measured-tip`.  Both plans are then counted on
 the same draws, which neither search has seen.
 """
 
@@ -69,8 +69,8 @@ def compare(
     """
     variations, draws = size
     target, began = la.point_target(lung, plan.target_lps), time.process_time()
-    *_, best = la.plan_for_success(
-        lung, plan.system, target, errors=errors, procedure=procedure, seed=plan.seed,
+    *_, best = la.plan(
+        lung, plan.system, target, goal="success", errors=errors, procedure=procedure, seed=plan.seed,
         iterations=variations, atlas=atlas,
     )  # fmt: skip
     cpu_s = time.process_time() - began
@@ -78,7 +78,7 @@ def compare(
         estimate_success(
             each, lung, errors=errors, procedure=procedure, samples=draws, seed=seed + COUNT_SEED
         ).succeeds.value
-        for each in (plan, best.plan)
+        for each in (plan, best)
     )
     return Pair(cost=cost, success=success, cpu_s=cpu_s)
 

@@ -89,10 +89,11 @@ def test_a_comparison_has_one_luck(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def search(_lung: Any, system: str, target: str, **options: Any) -> list[Any]:
         assert (system, target, options["iterations"], options["seed"]) == ("s", "t", 5, 4)
-        return [SimpleNamespace(plan="a"), SimpleNamespace(plan="c")]
+        assert options["goal"] == "success"
+        return ["a", "c"]
 
     monkeypatch.setattr(success_planning, "estimate_success", estimate)
-    monkeypatch.setattr("lungaccess.plan_for_success", search, raising=False)
+    monkeypatch.setattr("lungaccess.plan", search, raising=False)
     monkeypatch.setattr("lungaccess.point_target", lambda _lung, point: point, raising=False)
     stated = {"target_lps": "t", "system": "s", "seed": 4}
     plan: Any = type("Named", (str,), stated)("b")

@@ -24,15 +24,18 @@ FACADES = (
     "anatomy.segmentation",
     "anatomy.tree",
     "lungaccess",
+    "lungaccess.judging",
     "lungaccess.judging.appraisal",
     "lungaccess.running.benchmark",
     "lungaccess.judging.checking",
+    "lungaccess.planning",
     "lungaccess.planning.coupled",
     "lungaccess.planning.one_stage",
     "lungaccess.plans",
     "lungaccess.problem",
     "lungaccess.planning.procedure",
     "lungaccess.planning.reachability",
+    "lungaccess.planning.success",
     "lungaccess.uncertainty.risk",
     "lungaccess.running.study",
     "stages.needle",
@@ -74,7 +77,7 @@ def test_facades_hold_every_name_they_state(package: str) -> None:
 def test_modules_do_not_hide_functions() -> None:
     """`la.plan` and `la.check` stay functions whatever has been imported before."""
     code = (
-        "import lungaccess.planning.coupled.planner, lungaccess.plans.plan, lungaccess.judging.checking\n"
+        "import lungaccess.judging.answering, lungaccess.plans.plan, lungaccess.judging.checking\n"
         "import lungaccess.cli.app, lungaccess as la\n"
         "print(callable(la.plan) and callable(la.check))"
     )

@@ -16,7 +16,7 @@ from anatomy.base.settings import override
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from experiments.support.mutants.draws import Rng
-from lungaccess.planning.coupled import DirectArcs, alternatives
+from lungaccess.planning.coupled import DirectArcs
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -132,8 +132,8 @@ def plans_to(lung: Lung, system: System, target: Target, atlas: Atlas, rng: Rng)
         return
     try:
         if kind < 0.5:
-            found = alternatives(
-                lung, system, target, objective=objective, count=AT_A_TIME, separation_mm=3.0, atlas=atlas
+            found = la.alternatives(
+                lung, system, target, goal=objective, count=AT_A_TIME, separation_mm=3.0, atlas=atlas
             )
             yield from (each.plan for each in found)
             return

@@ -15,8 +15,9 @@ import lungaccess as la
 from anatomy.base import kernel_clock
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
-from lungaccess.judging import presets_in_turn as presets
+from lungaccess.judging import answer, answering
 from lungaccess.judging.checking import Checker
+from lungaccess.problem.request import Request
 from lungaccess.problem.system import System
 from lungaccess.showing.report.html.tables import provenance_section
 
@@ -31,8 +32,11 @@ def atlas_of(small_atlas: la.Atlas) -> Callable[[System], la.Atlas]:
     return lambda system: replace(small_atlas, system=system)
 
 
-def planned(lung: Lung, systems: list[System], **options: Any) -> list[la.Plan]:
-    return list(la.plan_with_presets(lung, la.resolve_target(lung), systems=systems, iterations=5, **options))
+def planned(
+    lung: Lung, systems: list[System], time_s: float | None = None, goal: str = "default", **options: Any
+) -> list[la.Plan]:
+    asked = Request.of(lung, systems, la.resolve_target(lung), goal=goal, iterations=5, time_s=time_s)
+    return list(answer(asked, **options))
 
 
 def test_the_first_that_does_is_chosen_and_the_plan_says_why(small_lung: Lung, atlas_of: Any) -> None:
@@ -75,7 +79,7 @@ def test_what_the_check_refuses_is_not_chosen(
             # A check against other devices than the plan's: it has to refuse.
             return super().check(plan, MORE if plan.system == SYSTEM else system, **options)
 
-    monkeypatch.setattr(presets, "Checker", Strict)
+    monkeypatch.setattr(answering, "Checker", Strict)
     found = planned(small_lung, [SYSTEM, MORE], atlas_of=atlas_of)[-1]
     assert found.system == MORE
     assert found.system_choice[0].startswith("does: the independent check refuses the plan")
@@ -102,15 +106,17 @@ def test_getting_kernels_takes_nothing_from_the_time_of_the_next_system(
     fake = SimpleNamespace(perf_counter=lambda: clock["s"], process_time=lambda: 0.0)
     monkeypatch.setattr(kernel_clock, "time", fake)
 
-    def plan(*_: Any, time_s: float, **__: Any) -> Iterator[la.Plan]:
-        given.append(time_s)
+    def run(request: Request, **_: Any) -> Iterator[la.Plan]:
+        given.append((request.limits.time_s, request.limits.first_plan_s))
         with global_compiler_lock:
             clock["s"] += 1000.0
         clock["s"] += 2.0
         raise la.NoPlan("No", reasons={})
         yield
 
-    monkeypatch.setattr(presets, "plan", plan)
+    monkeypatch.setattr(answering, "run", run)
     with pytest.raises(la.NoPlan):
         planned(small_lung, [SHORT, SYSTEM, MORE], atlas_of=atlas_of, time_s=10.0)
-    assert given == pytest.approx([10.0, 8.0, 6.0])
+    times, first = zip(*given, strict=True)
+    assert times == pytest.approx([10.0, 8.0, 6.0])
+    assert first == pytest.approx([10.0 / 3.0, 4.0, 6.0])

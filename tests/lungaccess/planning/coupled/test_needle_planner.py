@@ -72,7 +72,7 @@ class TestNeedlePlanner:
                 goal="default",
             )
         with pytest.raises(SettingsError, match=f"with {len(preset_names())} systems"):
-            next(la.plan_with_presets(small_lung, target, needle_planner="control.EST"))
+            la.plan(small_lung, "auto", target, needle_planner="control.EST")
 
     @pytest.mark.parametrize("method", ["atlas", "kuntz2015"])
     def test_without_ompl_the_plans_are_the_same_bit_for_bit(

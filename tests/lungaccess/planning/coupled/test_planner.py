@@ -12,12 +12,11 @@ import pytest
 import lungaccess as la
 from anatomy.base.errors import SettingsError, TargetError
 from anatomy.lung import Lung
+from lungaccess.planning import ProgressEvent, searches
 from lungaccess.planning.coupled import (
-    METHODS,
     AtlasSearch,
     DirectArcs,
     Incumbent,
-    ProgressEvent,
     SearchSettings,
     Step,
     evaluated_step,
@@ -167,13 +166,13 @@ class NearestArcs:
 
 
 class TestOwnSearch:
-    """A search that is added to `METHODS`."""
+    """A search that is added to those of the package."""
 
     @pytest.mark.slow
     def test_it_becomes_a_method_of_the_planner(
         self, small_lung: Lung, target: Target, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setitem(METHODS, "nearest", NearestArcs)
+        monkeypatch.setitem(searches._OWN, "nearest", NearestArcs)
         plans = plans_of(small_lung, target, atlas, method="nearest", iterations=200)
         assert plans and {plan.method for plan in plans} == {"nearest"}
         assert all(la.check(plan, small_lung).accepted for plan in plans[-2:])
@@ -191,7 +190,7 @@ class TestSearchSettings:
         self, small_lung: Lung, target: Target, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         few = SearchSettings(starts=1, rungs=2, samplings=1, needle_searches=0)
-        monkeypatch.setitem(METHODS, "few", partial(AtlasSearch, settings=few))
+        monkeypatch.setitem(searches._OWN, "few", partial(AtlasSearch, settings=few))
         plans = plans_of(small_lung, target, atlas, method="few")
         assert plans[-1].digest != plans_of(small_lung, target, atlas)[-1].digest
 

@@ -93,7 +93,9 @@ def test_given_phases_and_the_widest_window_go_together(
     breathing: Lung, target: Target, atlas: la.Atlas
 ) -> None:
     asked = 0.1, 0.3
-    plain, widest = (planned(breathing, target, atlas, asked, widest=each)[-1] for each in (False, True))
+    plain, widest = (
+        planned(breathing, target, atlas, asked, goal=each)[-1] for each in ("default", "window")
+    )
     assert window_of(widest).share >= window_of(plain).share
     assert window_of(widest).phases[0, 0] <= asked[0] and asked[1] <= window_of(widest).phases[-1, 1]
 
@@ -128,8 +130,8 @@ def test_what_cannot_be_asked_for(small_lung: Lung, breathing: Lung, target: Tar
     for phases in ((0.3, 0.3), (0.5, 0.2), (0.0, 1.5)):
         with pytest.raises(SettingsError, match="phase"):
             planned(breathing, target, atlas, phases)
-    with pytest.raises(SettingsError, match="without one"):
-        planned(breathing, target, atlas, widest=False)
+    with pytest.raises(SettingsError, match="aim of its own"):
+        planned(breathing, target, atlas, (0.0, 0.3), gap=0.1)
 
 
 @pytest.mark.parametrize("asked", [{}, {"phases": (0.0, 0.3)}, {"goal": "window"}])

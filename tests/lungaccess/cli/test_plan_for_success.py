@@ -1,4 +1,4 @@
-"""`plan --objective success` and for a window: a plan with its chance, and what cannot be asked together."""
+"""`plan` for success and for a window: a plan with its chance, and what cannot be asked together."""
 
 from __future__ import annotations
 
@@ -9,20 +9,26 @@ import pytest
 
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.planning.success.judges import OPEN_LOOP
 from lungaccess.plans.plan import Plan
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--objective", "success", "--method", "kuntz2015"], "neither --method"),
-        (["--objective", "success", "--processes", "2"], "neither --method"),
-        (["--objective", "success", "--system", "auto"], "one system"),
-        (["--objective", "success", "--procedure", "measured-top"], "measured-tip"),
-        pytest.param(["--objective", "success", "--system", "tubes-only"], "needle", marks=pytest.mark.slow),
-        (["--objective", "window", "--system", "auto"], "one system"),
-        (["--objective", "window"], "masks_phase"),
-        (["--objective", "success", "--phases", "0:0.3"], "--objective window"),
+        (["--goal", "sucess"], "Did you mean 'success'"),
+        (["--goal", "success", "--gap", "0.1"], "nothing bounds chance of success"),
+        (["--goal", "length", "--gap", "0.1", "--phases", "0:0.3"], "breathes is not known"),
+        (["--goal", "success", "--procedure", "measured-top"], "measured-tip"),
+        (["--goal", "window"], "breathes is not known"),
+        (["--goal", "window", "--system", "auto"], "breathes is not known"),
+        (["--objective", "success", "--phases", "0:0.3"], "breathes is not known"),
+        (["--method", "kuntz2015", "--system", "tubes-only"], "needle"),
+        (["--method", "kunz2015"], "Did you mean 'kuntz2015'"),
+        (["--needle-planner", "control.EST", "--system", "auto"], "seeded once"),
+        (["--exit", "lps:0,0,0", "--scope-tip", "lps:0,0,0"], "--exit and --scope-tip"),
+        (["--least-clearance", "-1"], "--least-clearance"),
+        (["--goal", "cost-map"], "no cost map"),
         (["--phases", "0.3"], "a colon between them"),
         (["--phases", "0.3:0.1"], "the first before the last"),
         (["--phases", "0.3:1.1"], "end-inhale"),
@@ -39,14 +45,14 @@ def test_what_cannot_be_asked_together_is_refused_in_words(
 
 @pytest.mark.slow
 def test_a_plan_and_its_chance(patient: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--target", "lps:-45.6,47.0,-65.1", "--system", "ultrathin", "--objective", "success"]
+    words = ["--target", "lps:-45.6,47.0,-65.1", "--system", "ultrathin", "--procedure", "open-loop"]
     budget = ["--iterations", "2", "--no-pictures", "--json"]
     where = ["--errors", "gated-ct", "--out", str(tmp_path), "--cache", str(patient.parent / "cache")]
     assert cli.main(["plan", str(patient), *words, *budget, *where]) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)
     headline = said["headline"]
     assert (headline["errors"]["name"], headline["procedure"]) == ("gated-ct", "open-loop")
-    assert headline["stated_by_plan"] and headline["draws"] == 16384
+    assert headline["stated_by_plan"] and headline["draws"] == OPEN_LOOP.fresh
     low, high = headline["success"]["interval_95"]
     assert 0.0 <= low <= headline["success"]["probability"] <= high <= 1.0
     plan = Plan.load(tmp_path / "plan.json")

@@ -16,18 +16,26 @@ from anatomy.base.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
-from lungaccess.planning.coupled import Alternative, DirectArcs, alternatives, diverse_plans, with_front
+from lungaccess.planning import Alternative, diverse_plans, with_front
+from lungaccess.planning.coupled import DirectArcs
 from lungaccess.planning.coupled.kernels.separation import choose_separated
 from lungaccess.planning.coupled.search.separated_arcs import SAMPLES, _branches_first, _samples
+from lungaccess.problem.request import Request
+from lungaccess.problem.target import Target
 from stages.needle.path import direct_path
 from tests.lungaccess.planning.coupled.planning import SYSTEM
 from tests.lungaccess.resample import needle_walk
 
 
+def alternatives(lung: Lung, target: Target, **options: Any) -> tuple[Alternative, ...]:
+    """Return a set of small cost, whose best plan is searched for briefly."""
+    return la.alternatives(lung, SYSTEM, target, **{"goal": "default", "iterations": 5, **options})
+
+
 @pytest.fixture(scope="module")
 def found(small_lung: Lung, atlas: la.Atlas) -> tuple[Alternative, ...]:
     target = la.resolve_target(small_lung)
-    return alternatives(small_lung, SYSTEM, target, atlas=atlas, count=8, separation_mm=3.0)
+    return alternatives(small_lung, target, atlas=atlas, count=8, separation_mm=3.0)
 
 
 @pytest.mark.slow
@@ -46,14 +54,30 @@ def test_where_no_arc_leads_the_planner_searches(
 ) -> None:
     target = la.resolve_target(small_lung)
     monkeypatch.setattr(diverse_plans, "separated_candidates", lambda *_: iter(()))
-    monkeypatch.setitem(diverse_plans.separated_plans.__kwdefaults__, "iterations", 3)
-    (only,) = alternatives(small_lung, SYSTEM, target, atlas=atlas)
+    (only,) = alternatives(small_lung, target, atlas=atlas, iterations=3)
     *_, best = la.plan(small_lung, SYSTEM, target, atlas=atlas, iterations=3, goal="default")
     assert only.plan.digest == best.digest and only.on_front
 
 
-def test_each_branch_comes_first_once(found: tuple[Alternative, ...]) -> None:
-    branches = [each.plan.tube.exit.branch for each in found]
+def others(lung: Lung, atlas: la.Atlas, objective: str = "default") -> list[la.Plan]:
+    """Return the direct ways that are separated, whatever is searched for beside them."""
+    asked = Request.of(lung, SYSTEM, la.resolve_target(lung), goal=objective)
+    return list(diverse_plans._others(asked, atlas, 8, 3.0))
+
+
+def test_the_best_comes_first_and_all_others_are_direct(
+    found: tuple[Alternative, ...], small_lung: Lung, atlas: la.Atlas
+) -> None:
+    target = la.resolve_target(small_lung)
+    *_, best = la.plan(small_lung, SYSTEM, target, atlas=atlas, iterations=5, goal="default")
+    assert found[0].plan.digest == best.digest
+    assert all(each.plan.method == diverse_plans.METHOD for each in found[1:])
+    direct = {each.digest for each in others(small_lung, atlas)}
+    assert {each.plan.digest for each in found[1:]} <= direct
+
+
+def test_each_branch_comes_first_once(small_lung: Lung, atlas: la.Atlas) -> None:
+    branches = [each.tube.exit.branch for each in others(small_lung, atlas)]
     first = list(dict.fromkeys(branches))
     assert branches[: len(first)] == first
     assert _branches_first(np.array([4, 4, 2, 4, 7, 2])).tolist() == [0, 2, 4, 1, 3, 5]
@@ -74,15 +98,13 @@ def test_the_cheapest_under_the_objective_come_first(
 ) -> None:
     """Of each branch first, then of all; the order is that of estimates, which are some per cent off."""
     lung = patchy(small_lung)
-    found = alternatives(
-        lung, SYSTEM, la.resolve_target(lung), goal=objective, atlas=atlas, count=8, separation_mm=3.0
-    )
+    found = others(lung, atlas, objective)
     by_branch: dict[int, list[float]] = {}
     for each in found:
-        by_branch.setdefault(each.plan.tube.exit.branch, []).append(each.plan.cost)
+        by_branch.setdefault(each.tube.exit.branch, []).append(each.cost)
     cheapest = [costs[0] for costs in by_branch.values()]
-    others = [each.plan.cost for each in found[len(cheapest) :]]
-    for costs in (cheapest, others, *by_branch.values()):
+    rest = [each.cost for each in found[len(cheapest) :]]
+    for costs in (cheapest, rest, *by_branch.values()):
         assert all(later > 0.97 * sooner for sooner, later in itertools.pairwise(costs)), costs
 
 
@@ -150,24 +172,26 @@ def test_lines_are_the_arcs() -> None:
 
 def test_bad_input(small_lung: Lung, atlas: la.Atlas) -> None:
     target = la.resolve_target(small_lung)
-    for wrong in ({"count": 0}, {"separation_mm": 0.0}, {"objective": "beauty"}):
+    for wrong in ({"count": 0}, {"separation_mm": 0.0}, {"goal": "beauty"}):
         with pytest.raises(SettingsError):
-            alternatives(small_lung, SYSTEM, target, atlas=atlas, **wrong)
+            alternatives(small_lung, target, atlas=atlas, **wrong)
     other = replace(SYSTEM, name="other", scope=replace(SYSTEM.scope, outer_diameter_mm=2.9))
     with pytest.raises(SettingsError, match="atlas"):
-        alternatives(small_lung, other, target, atlas=atlas)
+        la.alternatives(small_lung, other, target, atlas=atlas)
 
 
 def test_an_atlas_serves_another_needle(small_lung: Lung, atlas: la.Atlas) -> None:
     other = replace(SYSTEM, name="other", needle=replace(SYSTEM.needle, max_curvature_per_mm=1.0 / 40.0))
     target = la.resolve_target(small_lung)
-    assert alternatives(small_lung, other, target, atlas=atlas, count=1)[0].plan.system == other
+    (only,) = la.alternatives(small_lung, other, target, goal="default", iterations=0, atlas=atlas, count=1)
+    assert only.plan.system == other
 
 
 @pytest.mark.slow
 def test_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_lung)
     words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]
+    words += ["--procedure", "open-loop", "--iterations", "2"]
     assert cli.main([*words, "--out", str(tmp_path / "plans"), "--cache", str(tmp_path)]) == 0
     saved = sorted(path.name for path in (tmp_path / "plans").iterdir())
     assert saved == ["plan-01.json", "plan-02.json", "trade_off.svg"]

@@ -125,7 +125,7 @@ def test_a_reason_for_every_deployment_and_phases_that_have_a_plan(
 
 
 def test_what_cannot_be_asked_for(small_lung: Lung, breathing: Lung, target: Target, atlas: la.Atlas) -> None:
-    with pytest.raises(AnatomyError, match="masks_phase"):
+    with pytest.raises(AnatomyError, match="breathes is not known"):
         planned(small_lung, target, atlas)
     for phases in ((0.3, 0.3), (0.5, 0.2), (0.0, 1.5)):
         with pytest.raises(SettingsError, match="phase"):

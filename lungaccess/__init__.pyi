@@ -14,6 +14,7 @@ from lungaccess.judging.explanation import explain_no_plan as explain_no_plan
 from lungaccess.judging.explanation import save_explanation as save_explanation
 from lungaccess.planning import Alternative as Alternative
 from lungaccess.planning import plan_tour as plan_tour
+from lungaccess.planning import register_planner as register_planner
 from lungaccess.planning.coupled import Atlas as Atlas
 from lungaccess.planning.coupled import FeasibleExits as FeasibleExits
 from lungaccess.planning.coupled import build_atlas as build_atlas

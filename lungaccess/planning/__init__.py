@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from lungaccess.planning.diverse_plans import COUNT, SEPARATION_MM, Alternative, alternatives, with_front
     from lungaccess.planning.driver import ProgressEvent, atlas_event
     from lungaccess.planning.one_system import run
-    from lungaccess.planning.searches import NEED_A_NEEDLE, planners
+    from lungaccess.planning.searches import NEED_A_NEEDLE, planners, register_planner
     from lungaccess.planning.tour import (
         TourAnswer,
         coupled_plan_test,

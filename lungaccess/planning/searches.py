@@ -61,6 +61,19 @@ def planners() -> dict[str, SearchFactory]:
     return _OWN | registered(PLUGINS)
 
 
+def register_planner(name: str, search: SearchFactory) -> None:
+    """Make a search known by its name in this process; a package does so by an entry point.
+
+    Raises
+    ------
+    SettingsError
+        If the name is that of a search of this package.
+    """
+    if name in (ATLAS, *NEED_A_NEEDLE):
+        raise SettingsError(f"A planner cannot be called {name!r}", expected="a name of its own")
+    _OWN[name] = search
+
+
 def require_method(request: Request) -> None:
     """Raise SettingsError unless the request's method exists and can plan with its systems."""
     method = request.method

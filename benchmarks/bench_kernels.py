@@ -16,7 +16,7 @@ from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from lungaccess.problem.target import nodule_target
 lung = build_lung(make_phantom(seed=3, size="small").images)
-next(la.plan(lung, la.load_system("ultrathin"), nodule_target(lung, 1)))
+next(la.plan(lung, la.load_system("ultrathin"), nodule_target(lung, 1), goal="default"))
 """
 
 

@@ -1,4 +1,4 @@
-"""Chances of success: deviated plans and simulated procedures of one plan, and the first plan for success."""
+"""Chances of success: deviated plans and simulated procedures of one plan, and a plan for success."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Chances:
         procedure = la.load_procedure("measured-tip")
         self.simulator = Simulator(plan, self.lung, self.errors, procedure, radius_mm=RADIUS_MM)
         self.simulator.report(2, 1)
-        self.time_first_plan_for_success()
+        self.time_plan_for_success()
 
     def time_deviated_plans(self) -> None:
         """A million deviated plans, carried out blindly."""
@@ -46,12 +46,10 @@ class Chances:
         """Fifty procedures that measure scope and tubes and plan the rest again."""
         self.simulator.report(PROCEDURES, 0)
 
-    def time_first_plan_for_success(self) -> None:
-        """The first plan for success with such procedures, from the atlas."""
-        procedure = la.load_procedure("measured-tip")
-        next(
-            la.plan_for_success(
-                self.lung, self.system, self.target, errors=self.errors, procedure=procedure,
-                radius_mm=RADIUS_MM, atlas=self.atlas, counterfactuals=False,
-            )
+    def time_plan_for_success(self) -> None:
+        """The first plan that states its chance, in open loop, from the atlas."""
+        plans = la.plan(
+            self.lung, self.system, self.target, errors=self.errors, procedure=la.load_procedure("open-loop"),
+            radius_mm=RADIUS_MM, atlas=self.atlas, counterfactuals=False,
         )  # fmt: skip
+        next(each for each in plans if each.chance is not None)

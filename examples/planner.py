@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import lungaccess as la
-from lungaccess.planning.coupled import METHODS, DirectArcs, Incumbent, Step, evaluated_step
+from lungaccess.planning.coupled import DirectArcs, Incumbent, Step, evaluated_step
 
 
 class RandomArcs:
@@ -29,7 +29,7 @@ class RandomArcs:
             yield incumbent.improved(evaluated_step(self.arcs.evaluator, "random arcs", candidate, iteration))
 
 
-METHODS["random-arcs"] = RandomArcs
+la.register_planner("random-arcs", RandomArcs)
 lung, system = la.load_patient("phantom-3"), la.load_system("ultrathin")
 target, atlas = la.resolve_target(lung, nodule=1), la.open_atlas(lung, system)
 figure, ax = plt.subplots(figsize=(6, 4))

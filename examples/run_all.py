@@ -22,6 +22,7 @@ NAMES = (
     "objective",
     "diverse_plans",
     "planner",
+    "goal",
     "risk",
     "success",
     "device",

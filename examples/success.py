@@ -1,9 +1,9 @@
 """Plan for the chance of success, and what it trades.
 
-The plan of least cost is far from everything, but not the one that most often succeeds. `plan_for_success`
-makes the share of simulated procedures large that end in the nodule and touch nothing forbidden. Beside
-both, a diverse plan set shows what success costs in length and clearance; a ring marks the plans that no
-other beats in all three.
+The plan of least cost is far from everything, but not the one that most often succeeds. The goal of whoever
+states none is success: the share of simulated procedures is made large that end in the nodule and touch
+nothing forbidden. Beside it, a diverse plan set shows what success costs in length and clearance; a ring
+marks the plans that no other beats in all three.
 """
 
 import matplotlib.pyplot as plt
@@ -14,15 +14,13 @@ from lungaccess.planning.success import chance_of, estimate_success
 
 lung = la.load_patient("phantom-3")
 system = la.load_system("ultrathin", fissures_allowed=True)
-target = la.resolve_target(lung, nodule=1)
-errors, procedure = la.load_errors("gated-ct"), la.load_procedure("open-loop")
-atlas = la.open_atlas(lung, system)
-*_, cheapest = la.plan(lung, system, target, atlas=atlas, iterations=50, goal="default")
-*_, likeliest = la.plan_for_success(lung, system, target, errors=errors, atlas=atlas, iterations=10)
-several = la.alternatives_for_success(lung, system, target, errors=errors, atlas=atlas, count=8)
-plans = [cheapest, likeliest.plan, *(each.plan for each in several)]
-# One luck for all: the draws that neither search has seen.
-same = {"errors": errors, "procedure": procedure, "samples": 10_000, "seed": likeliest.plan.chance.seed}
+target, atlas = la.resolve_target(lung, nodule=1), la.open_atlas(lung, system)
+assumed = {"errors": la.load_errors("gated-ct"), "procedure": la.load_procedure("open-loop")}
+*_, cheapest = la.plan(lung, system, target, goal="default", atlas=atlas, iterations=50)
+several = la.alternatives(lung, system, target, **assumed, atlas=atlas, count=8, iterations=10)
+plans = [cheapest, *(each.plan for each in several)]
+# One luck for all: the draws that the search has not seen.
+same = {**assumed, "samples": 10_000, "seed": several[0].plan.chance.seed}
 rated = with_front(plans, [chance_of(estimate_success(plan, lung, **same)) for plan in plans])
 figure, ax = plt.subplots(figsize=(7.5, 4.5))
 lengths = [each.criteria["length_in_tissue_mm"] for each in rated]

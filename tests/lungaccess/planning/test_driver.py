@@ -68,6 +68,11 @@ class Numbered:
         return la.NoPlan(f"nothing in {iteration}", reasons={})
 
 
+@pytest.fixture(scope="module")
+def target(small_lung: Lung) -> Target:
+    return la.resolve_target(small_lung, TARGET)
+
+
 @pytest.fixture
 def asked(toy_lung: Lung) -> Callable[..., Request]:
     def of(**options: Any) -> Request:
@@ -97,8 +102,8 @@ class TestLimits:
         other = {"time_s": "cpu_step_s", "cpu_s": "step_s"}[name]
         Clock(monkeypatch, **{other: 0.0})
         finder = Numbered(toy_plan)
-        assert found(finder, asked(**{name: 9.0})) != list(FOUND_AT)
-        assert len(finder.asked) < 10
+        assert found(finder, asked(**{name: 4.0})) != list(FOUND_AT)
+        assert len(finder.asked) < 7
 
     def test_seconds_without_a_plan_let_the_first_iteration_be_tried(
         self, toy_plan: Plan, asked: Any, monkeypatch: pytest.MonkeyPatch
@@ -163,10 +168,6 @@ def test_progress_is_told_now_and_then_and_never_of_an_unknown_value(
 
 class TestWholeSearches:
     """The same with a real finder."""
-
-    @pytest.fixture(scope="class")
-    def target(self, small_lung: Lung) -> Target:
-        return la.resolve_target(small_lung, TARGET)
 
     def test_processor_time_that_is_over_leaves_the_first_arc(
         self, small_lung: Lung, small_atlas: la.Atlas, target: Target

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lungaccess.planning.coupled.planner import METHODS
+from lungaccess.planning.one_stage.near_place import NearExit, NearPlace, NearScopeTip, plan_near
 
 import lungaccess as la
 from anatomy.base.errors import SettingsError, TargetError
 from anatomy.lung import Lung
 from lungaccess.planning.coupled.parallel import parallel_steps
-from lungaccess.planning.coupled.planner import METHODS
 from lungaccess.planning.coupled.search.base import ParallelSearch, Step
 from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
 from lungaccess.planning.coupled.search.variation import random_change, varied
 from lungaccess.planning.coupled.search.window_search import window_search
-from lungaccess.planning.one_stage.near_place import NearExit, NearPlace, NearScopeTip, plan_near
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.system import System, load_system

@@ -176,7 +176,8 @@ def _called_by(kernel: Any) -> Iterator[Any]:
 def _compiled_in_order(waits_for: dict[int, set[int]], processes: int) -> Iterator[int]:
     """Compile calls after those that they wait for, the largest first; yield each that is done.
 
-    A process that dies ends all of it: what is not done is compiled when it is called.
+    A process that dies ends all of it: what is not done is compiled when it is called.  So is a call that
+    cannot be compiled, as one of a list that is older than its kernel.
     """
     import multiprocessing
     from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -193,9 +194,10 @@ def _compiled_in_order(waits_for: dict[int, set[int]], processes: int) -> Iterat
                 finished, _ = wait(under_way, return_when=FIRST_COMPLETED)
                 for each in finished:
                     n = under_way.pop(each)
-                    each.result()
                     for others in left.values():
                         others.discard(n)
+                    if isinstance(each.exception(), BrokenProcessPool):
+                        return
                     yield n
         except BrokenProcessPool:
             return

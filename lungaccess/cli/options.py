@@ -243,6 +243,14 @@ class ErrorOptions:
             "vision-only) or a TOML file; breath-hold if not given."
         ),
     ] = None
+    known: Annotated[
+        tuple[str, ...],
+        Parameter(
+            consume_multiple=True,
+            help="Kinds of error whose size is known better, such as scope_direction=0.5: mm or degrees, of "
+            "needle_curvature the logarithm of the factor.",
+        ),
+    ] = ()
     procedure: Annotated[
         str | None,
         Parameter(
@@ -254,19 +262,33 @@ class ErrorOptions:
 
     def load(self) -> ErrorModel:
         """Return the error model, the default one if none is given."""
-        from lungaccess.uncertainty.risk import load_errors
+        from lungaccess.uncertainty.risk import load_errors, with_known
 
-        return load_errors() if self.errors is None else load_errors(self.errors)
+        model = load_errors() if self.errors is None else load_errors(self.errors)
+        for stated in self.known:
+            model = with_known(model, *_kind_and_size(stated))
+        return model
 
     def given(self) -> ErrorModel | None:
         """Return the error model, None if none is given: then a plan's own chance of success is shown."""
-        return None if self.errors is None else self.load()
+        return None if self.errors is None and not self.known else self.load()
 
     def given_procedure(self) -> Procedure | None:
         """Return the procedure, None if none is given."""
         from lungaccess.planning.procedure import load_procedure
 
         return None if self.procedure is None else load_procedure(self.procedure)
+
+
+def _kind_and_size(stated: str) -> tuple[str, float]:
+    """Return a kind of error and its size of a text such as scope_direction=0.5."""
+    kind, _equals, size = stated.partition("=")
+    try:
+        return kind.replace("-", "_"), float(size)
+    except ValueError:
+        raise SettingsError(
+            f"--known is {stated!r}", expected="a kind of error and its size, such as scope_direction=0.5"
+        ) from None
 
 
 @Parameter(name="*")

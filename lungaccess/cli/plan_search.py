@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,6 +19,7 @@ from lungaccess.plans.no_plan import NoPlan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from lungaccess.judging.advice import Advice
     from lungaccess.judging.appraisal import Appraisal
     from lungaccess.planning import ProgressEvent
     from lungaccess.planning.coupled import Atlas
@@ -160,7 +162,9 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     display = SearchDisplay(limits.time_s, limits.iterations, goal.words)
     best, history = run_search(request, job, display)
     # After the search: the first plan does not wait for these.
+    from lungaccess.judging.advice import advise
     from lungaccess.judging.appraisal import appraise, plan_record
+    from lungaccess.problem.preset_order import presets_by_invasiveness
     from lungaccess.uncertainty.breathing.window import with_window
 
     found = best if best.window is not None else with_window(best, lung)
@@ -175,10 +179,15 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
             system=system_of(found, request.systems),
             target_lps=request.target.lps_mm,
         )
-    record = plan_record(found, lung, appraisal, job.out, job.files)
+    with progress("looking for what would help"):
+        advice = advise(
+            found, lung, appraisal, errors=request.errors, procedure=request.procedure,
+            atlas_of=partial(kept_atlas, lung, job.output.cache), systems=presets_by_invasiveness(),
+        )  # fmt: skip
+    record = plan_record(found, lung, appraisal, job.out, job.files, [each.to_mapping() for each in advice])
     write_text(job.out / SUMMARY_FILE, terminal.json_text(record))
     if not job.output.json:
-        show_plan(found, lung, appraisal)
+        show_plan(found, lung, appraisal, advice)
     write_history(found, history, lung, appraisal, job, goal)
     if job.output.json:
         terminal.show_json(record)
@@ -187,14 +196,23 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     return ExitCode.of(appraisal.accepted)
 
 
+def kept_atlas(lung: Lung, cache: Path | None, system: System) -> Atlas | None:
+    """Return the atlas of a system if the cache holds it."""
+    from lungaccess.planning.coupled import atlas_is_kept, open_atlas
+
+    return open_atlas(lung, system, cache=cache) if atlas_is_kept(lung, system, cache=cache) else None
+
+
 def system_of(plan: Plan, systems: Sequence[System]) -> System:
     """Return the one of several systems by whose name a plan goes; the first if there is none."""
     return {each.name: each for each in systems}.get(plan.system.name, systems[0])
 
 
-def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal) -> None:
-    """Print headline and limits of a plan, then the plan."""
-    plan_tables.show_appraisal(appraisal)
+def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal, advice: Sequence[Advice] = ()) -> None:
+    """Print headline of a plan, what would lift its chance, its limits, then the plan."""
+    plan_tables.show_headline(appraisal.headline)
+    plan_tables.show_advice(advice, appraisal)
+    plan_tables.show_findings(appraisal)
     if plan.window is not None:
         terminal.say(plan.window.words)
     if plan.gap is not None:

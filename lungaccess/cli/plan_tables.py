@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shlex
+import sys
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +14,12 @@ from rich.text import Text
 
 from lungaccess.cli import terminal
 from lungaccess.judging.appraisal.grade import Grade
+from lungaccess.judging.appraisal.headline import of_hundred
 from stages.needle import Objective
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+    from lungaccess.judging.advice import Advice
     from lungaccess.judging.appraisal import Appraisal, Headline
     from lungaccess.judging.checking import CheckReport, Finding
     from lungaccess.plans.no_plan import NoPlan
@@ -101,9 +105,8 @@ def arcs_table(arcs: Iterable[Sequence[float]]) -> Table:
     return terminal.table("arcs of the needle", headings, rows)
 
 
-def show_appraisal(appraisal: Appraisal) -> None:
-    """Print the headline, then the limits, and what the check refuses, if anything."""
-    show_headline(appraisal.headline)
+def show_findings(appraisal: Appraisal) -> None:
+    """Print what the check refuses, if anything, and the limits."""
     for finding in (*appraisal.check.refusals, *appraisal.check.unchecked):
         terminal.say(f"{finding}")
     if appraisal.limits:
@@ -119,6 +122,27 @@ def show_headline(headline: Headline) -> None:
     terminal.console.print(
         Panel(terminal.styled(*parts), title=title, title_align="left", border_style=style)
     )
+
+
+def show_advice(advice: Sequence[Advice], appraisal: Appraisal) -> None:
+    """Print what lifts the chance of success most, as it was tried, each with its command."""
+    success = appraisal.headline.success
+    if not advice or success is None:
+        return
+    now = of_hundred(success.value)
+    rows = [(each.words, of_hundred(each.success.value), command_with(each.options)) for each in advice]
+    title = f"What was found to lift the chance of success, now {now} of 100"
+    terminal.show([terminal.table(title, ("with", "of 100", "command"), rows)])
+
+
+def command_with(options: Sequence[str]) -> str:
+    """Return the command that runs now with other options in place of those of the same name."""
+    words, replaced = sys.argv[1:], {options[0], *(["--nodule"] if options[0] == "--target" else [])}
+    kept, skips = [], False
+    for word in words:
+        skips = word in replaced or (skips and not word.startswith("--"))
+        kept += [] if skips else [word]
+    return shlex.join(["lungaccess", *kept, *options])
 
 
 def limits_table(appraisal: Appraisal) -> Table:

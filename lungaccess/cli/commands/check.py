@@ -54,7 +54,7 @@ def check(
             expected="an edited curve",
             remedy="Add --curve scene.mrml#needle",
         )
-    from lungaccess.cli.plan_tables import check_tables, show_appraisal
+    from lungaccess.cli.plan_tables import check_tables, show_findings, show_headline
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
 
@@ -66,7 +66,8 @@ def check(
     if output.json:
         terminal.show_json({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
         return ExitCode.of(appraisal.accepted)
-    show_appraisal(appraisal)
+    show_headline(appraisal.headline)
+    show_findings(appraisal)
     if everything:
         terminal.show(check_tables(appraisal.check))
     return ExitCode.of(appraisal.accepted)

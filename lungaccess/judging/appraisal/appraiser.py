@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,11 +12,11 @@ from anatomy.base.records import frozen_value
 from lungaccess.judging.appraisal.headline import Headline
 from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 from lungaccess.judging.checking import Checker, CheckReport
-from lungaccess.planning.procedure import Procedure, load_procedure
-from lungaccess.planning.success import Estimate, estimate_success
+from lungaccess.planning.procedure import DEFAULT_PROCEDURE, Procedure, load_procedure
+from lungaccess.planning.success import Estimate, chance_of, estimate_success
 from lungaccess.plans.costs import known_costs
 from lungaccess.plans.scope_steps import motion_record
-from lungaccess.uncertainty.risk import ErrorModel, load_errors
+from lungaccess.uncertainty.risk import ErrorModel, Share, assess, load_errors
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -44,6 +45,8 @@ class Appraisal:
     risk : RiskReport, ProcedureReport, Chance or None
         The estimate of success, or what the plan states of one; None for a refused plan and where no draws
         were asked for.
+    without_measuring : Share or None
+        How often it succeeds in open loop, where the estimate is of a procedure that measures.
     limits : tuple of Limit
         The limits of devices and distances, broken ones first, then the nearest.
     """
@@ -51,11 +54,12 @@ class Appraisal:
     check: CheckReport
     risk: Estimate | None
     limits: tuple[Limit, ...]
+    without_measuring: Share | None = None
 
     @property
     def headline(self) -> Headline:
         """Chance of success and verdict of the check, together."""
-        return Headline.of(self.check, self.risk)
+        return Headline.of(self.check, self.risk, self.without_measuring)
 
     @property
     def accepted(self) -> bool:
@@ -135,7 +139,16 @@ class Appraiser:
         """Appraise one plan; see `appraise`."""
         report = self._checker.check(plan, system, target_lps=target_lps)
         risk = self._estimated(plan, each_kind) if report.accepted else None
-        return Appraisal(check=report, risk=risk, limits=limits_of(report.findings, plan))
+        return Appraisal(
+            check=report, risk=risk, limits=limits_of(report.findings, plan),
+            without_measuring=self._without_measuring(plan, risk),
+        )  # fmt: skip
+
+    def _without_measuring(self, plan: Plan, risk: Estimate | None) -> Share | None:
+        """Return how often a plan succeeds in open loop; None where its estimate says that already."""
+        if risk is None or chance_of(risk).procedure == DEFAULT_PROCEDURE:
+            return None
+        return assess(plan, self._lung, model=self._errors, samples=DRAWS, seed=self._seed).succeeds
 
     def _estimated(self, plan: Plan, each_kind: bool) -> Estimate | None:
         """Return the estimate of a plan, or what it states of one."""
@@ -187,7 +200,12 @@ def appraise(
 
 
 def plan_record(
-    plan: Plan, lung: Lung, appraisal: Appraisal, folder: Path, files: tuple[str, ...]
+    plan: Plan,
+    lung: Lung,
+    appraisal: Appraisal,
+    folder: Path,
+    files: tuple[str, ...],
+    advice: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """Return what a search for a plan found and wrote; lengths in mm, times in s."""
     return {
@@ -197,6 +215,7 @@ def plan_record(
         "not_checked": [each.name for each in appraisal.check.unchecked],
         "folder": str(folder),
         "files": list(files),
+        "advice": list(advice),
         "digest": plan.digest,
         "objective": plan.objective,
         "cost": plan.cost,

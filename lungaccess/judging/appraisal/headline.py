@@ -57,6 +57,8 @@ class Headline:
         The estimate of success, or what the plan states of one; None if there is none, as for a refused plan.
     fissures_unknown : bool
         Whether fissures must not be crossed, and the patient has no mask of them.
+    without_measuring : Share or None
+        How often the plan succeeds in open loop, where the estimate is of a procedure that measures.
     has_aim : bool
         Whether the plan was made for a window of the breath, and ends beside the target of the masks' phase.
     """
@@ -65,10 +67,13 @@ class Headline:
     refusals: int = 0
     estimate: Estimate | None = None
     fissures_unknown: bool = False
+    without_measuring: Share | None = None
     has_aim: bool = False
 
     @classmethod
-    def of(cls, report: CheckReport | None, estimate: Estimate | None) -> Headline:
+    def of(
+        cls, report: CheckReport | None, estimate: Estimate | None, without_measuring: Share | None = None
+    ) -> Headline:
         """Return the headline of a check, or of none, and of an estimate, or of none."""
         if report is None:
             return cls(geometry=Geometry.UNCHECKED, estimate=estimate)
@@ -80,6 +85,7 @@ class Headline:
             refusals=len(report.refusals),
             estimate=estimate,
             fissures_unknown=unknown,
+            without_measuring=without_measuring,
             has_aim=has_aim,
         )
 
@@ -170,10 +176,12 @@ class Headline:
             f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in self.failures
         )
         why = f"fails most because it {failures}" if failures else "none of them failed"
+        open_loop = self.without_measuring
+        left = "" if open_loop is None else f" Without measuring: {of_hundred(open_loop.value)} of 100."
         return (
             f"Estimated to succeed in {of_hundred(success.value)} of 100 procedures (95 % interval "
             f"{of_hundred(low)} to {of_hundred(high, up=True)}); {why}. "
-            f"Procedure '{chance.procedure}', errors of '{chance.errors}'."
+            f"Procedure '{chance.procedure}', errors of '{chance.errors}'.{left}"
         )
 
     @property
@@ -213,6 +221,7 @@ class Headline:
     def to_mapping(self) -> dict[str, object]:
         """Return the headline as plain JSON values; None where something was not computed."""
         chance, first = self.chance, self.failures[:1]
+        open_loop = self.without_measuring
         counted = {name: plain_share(share) for name, share in self.all_failures.items()}
         return {
             "text": self.text,
@@ -221,6 +230,7 @@ class Headline:
             "geometry": str(self.geometry),
             "fissures_unknown": self.fissures_unknown,
             "success": None if self.success is None else plain_share(self.success),
+            "without_measuring": None if open_loop is None else plain_share(open_loop),
             "stated_by_plan": self.is_stated,
             "most_frequent_failure": {"what": first[0][0], **plain_share(first[0][1])} if first else None,
             "failures": None if chance is None else counted,

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         ErrorModel,
         Place,
         PositionError,
+        with_known,
     )
     from lungaccess.uncertainty.risk.rare import RareShare, rare_share
     from lungaccess.uncertainty.risk.sensitivity import Sensitivity, sensitivities

@@ -6,8 +6,10 @@ import math
 from dataclasses import field, replace
 from typing import Annotated, Any, ClassVar, Self
 
+from anatomy.base.errors import SettingsError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings, text
+from anatomy.base.words import did_you_mean
 from anatomy.lobes import LOBES, lobe_named
 
 CURVATURE, BREATHING = "needle_curvature", "breathing"
@@ -402,3 +404,23 @@ def _listed(term: Term) -> str:
     """Return the bias of a term in words."""
     unit = {"deg": "°"}.get(term.unit, f" {term.unit}")
     return " / ".join(f"{each:g}" for each in term.bias) + unit
+
+
+def with_known(errors: ErrorModel, kind: str, size: float) -> ErrorModel:
+    """Return an error model in which one kind of error has another size, wherever the scope stands.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such kind, or the size is absurd.
+    """
+    if kind not in UNITS:
+        raise SettingsError(
+            f"There is no kind of error {kind!r}",
+            expected=f"one of {', '.join(UNITS)}",
+            remedy=did_you_mean(kind, UNITS),
+        )
+    left = [each for each in errors.place if each.terms.keys() != {kind}]
+    nothing: dict[str, Any] = {kind: None}
+    known: dict[str, Any] = {kind: errors.term(kind).sized(size)}
+    return replace(errors, place=tuple(replace(each, **nothing) for each in left), **known)

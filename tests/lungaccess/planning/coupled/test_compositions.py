@@ -9,19 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lungaccess.planning.coupled.planner import METHODS
-from lungaccess.planning.one_stage.near_place import NearExit, NearPlace, NearScopeTip, plan_near
 
 import lungaccess as la
 from anatomy.base.errors import SettingsError, TargetError
 from anatomy.lung import Lung
+from lungaccess.planning.constraints import holds, place_part
 from lungaccess.planning.coupled.parallel import parallel_steps
 from lungaccess.planning.coupled.search.base import ParallelSearch, Step
 from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
 from lungaccess.planning.coupled.search.variation import random_change, varied
 from lungaccess.planning.coupled.search.window_search import window_search
-from lungaccess.plans.assemble import assemble
-from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.planning.searches import planners
+from lungaccess.problem.request import Request, StatedPlace
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, point_target
 from lungaccess.problem.task import Task
@@ -88,7 +87,9 @@ def test_any_system_has_plans_for_a_window(
 
     def planned() -> list[la.Plan]:
         options = {"atlas": atlas, "iterations": 6, "counterfactuals": False}
-        return list(la.plan_for_window(lung, system, goal, phases, **options))
+        return list(
+            la.plan(lung, system, goal, goal="default" if phases else "window", phases=phases, **options)
+        )
 
     plans = planned()
     last = plans[-1]
@@ -107,7 +108,17 @@ def test_without_a_needle_too_no_plan_says_what_the_breath_does(
 ) -> None:
     system, atlas, goal = case_of("tubes")
     with pytest.raises(la.NoPlan, match="miss the moving target between 0 % and 100 %") as caught:
-        list(la.plan_for_window(moving(small_lung, 0.6), system, goal, (0.0, 1.0), atlas=atlas, iterations=3))
+        list(
+            la.plan(
+                moving(small_lung, 0.6),
+                system,
+                goal,
+                goal="default",
+                phases=(0.0, 1.0),
+                atlas=atlas,
+                iterations=3,
+            )
+        )
     assert "--phases" in caught.value.advice or "No part" in caught.value.advice
 
 
@@ -115,7 +126,15 @@ def test_alternatives_of_tubes_have_windows(small_lung: Lung, case_of: Callable[
     system, atlas, goal = case_of("tubes")
     lung = moving(small_lung, 0.05)
     found = la.alternatives(
-        lung, system, goal, atlas=atlas, count=3, separation_mm=1.0, phases=(0.2, 0.6), counterfactuals=False
+        lung,
+        system,
+        goal,
+        atlas=atlas,
+        count=3,
+        separation_mm=1.0,
+        phases=(0.2, 0.6),
+        goal="default",
+        counterfactuals=False,
     )
     assert found
     for each in found:
@@ -134,8 +153,8 @@ def test_several_processes_give_the_same_again_and_nothing_worse(
     def search() -> ParallelSearch:
         if "window" in kind:
             return window_search(Task(lung=lung, system=system, target=goal), atlas, None, widest=True)
-        where = la.resolve_target(small_lung, KUNTZ_TARGET) if kind in METHODS else goal
-        made = METHODS[kind if kind in METHODS else "atlas"](
+        where = la.resolve_target(small_lung, KUNTZ_TARGET) if kind in planners() else goal
+        made = planners()[kind if kind in planners() else "atlas"](
             Task(lung=lung, system=system, target=where), atlas
         )
         assert isinstance(made, ParallelSearch)
@@ -182,31 +201,27 @@ def test_a_stated_place_holds_of_atlas_candidate_and_plan(
     small_lung: Lung, case_of: Callable[[str], Case], kind: str
 ) -> None:
     system, atlas, goal = case_of(kind)
-    *_, any_plan = la.plan(small_lung, system, goal, atlas=atlas, iterations=0)
-    x, y, z = np.asarray(any_plan.tube.exit.point_lps).tolist()
-    a, b, c = any_plan.scope.lps_from_scope_tip[:3, 3].tolist()
-    places: list[NearPlace] = [NearExit(lps_mm=(x, y, z)), NearScopeTip(lps_mm=(a, b, c))]
-    for near in places:
-        part = near.part_of(atlas)
+    *_, any_plan = la.plan(small_lung, system, goal, goal="default", atlas=atlas, iterations=0)
+    exit_lps = np.asarray(any_plan.tube.exit.point_lps)
+    tip_lps = any_plan.scope.lps_from_scope_tip[:3, 3]
+    for place in (
+        StatedPlace(kind="exit", lps_mm=exit_lps, within_mm=5.0),
+        StatedPlace(kind="scope tip", lps_mm=tip_lps, within_mm=1.5),
+    ):
+        request = Request.of(small_lung, system, goal, goal="default", place=place, iterations=2)
+        part = place_part(request, atlas)
         assert 0 < part.deployments.count <= atlas.deployments.count
-        task = Task(lung=small_lung, system=system, target=goal)
-
-        def holds(made: Any, near: NearPlace = near) -> bool:
-            return near.holds_of(made, system)
-
-        direct = direct_candidates(task, part, CandidateEvaluator(task, holds))
-        proved = [made for made in map(direct.proved, direct.clear()[:10].tolist()) if made is not None]
-        assert proved
-        for made in proved:
-            assert near.holds(assemble(task, made, iteration=0, timing={}))
-        *_, last = plan_near(small_lung, system, goal, near, atlas=atlas, iterations=2, counterfactuals=False)
-        assert near.holds(last)
-        far = replace(near, lps_mm=(x + 500.0, y, z))
-        assert not far.holds(last) and not far.holds_of(proved[0], system)
+        *_, last = la.plan(
+            small_lung, system, goal, goal="default", place=place, atlas=atlas, iterations=2,
+            counterfactuals=False,
+        )  # fmt: skip
+        assert holds(request, last)
+        far = replace(request, place=replace(place, lps_mm=place.lps_mm + np.array([500.0, 0.0, 0.0])))
+        assert not holds(far, last)
         with pytest.raises(TargetError, match="No "):
-            far.part_of(atlas)
+            place_part(far, atlas)
         with pytest.raises(SettingsError, match="above 0"):
-            replace(near, within_mm=0.0)
+            replace(place, within_mm=0.0)
 
 
 def test_tubes_without_a_needle_have_feasible_exits(small_lung: Lung, case_of: Callable[[str], Case]) -> None:

@@ -1,0 +1,227 @@
+"""What would lift the chance of success of a plan: tried, each by itself, and never guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from anatomy.base.kernel_clock import working_s
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from lungaccess.judging.appraisal import Appraisal
+from lungaccess.judging.checking import Checker
+from lungaccess.planning import run
+from lungaccess.planning.coupled import Atlas
+from lungaccess.planning.procedure import Procedure, load_procedure, procedure_names
+from lungaccess.planning.success import chance_of, estimate_success
+from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.request import Limits, Request
+from lungaccess.problem.system import System
+from lungaccess.problem.target import Target
+from lungaccess.uncertainty.risk import UNITS, ErrorModel, Share, load_errors, with_known
+
+GOOD = 0.9
+"""A plan that succeeds so often is left without advice."""
+WORTH_SAYING = 0.03
+"""A chance that is higher by less than this may be so by the luck of the draws."""
+DRAWS, SIMULATED = 2000, 250
+"""Draws of each trial in open loop, and procedures of one that measures: a half is known to 1 and 3 %."""
+MOST = 5
+"""So many pieces of advice are given, the best first."""
+TIME_S = 5.0
+"""Seconds that all trials may take."""
+KNOWN = {
+    "scope_position": 0.5,
+    "scope_direction": 0.5,
+    "tube_rotation": 1.0,
+    "tube_insertion": 0.2,
+    "needle_curvature": 0.05,
+    "needle_roll": 2.0,
+    "needle_insertion": 0.3,
+    "target_position": 0.5,
+    "breathing": 1.0,
+}
+"""Sizes of errors that careful calibration or tracking is taken to reach, an assumption of each kind, in mm,
+degrees or, of the curvature, its logarithm."""
+PLANNED_S = 0.6
+"""Seconds of the search with another device or to another point."""
+OF_A_NODULE = 0.5
+"""Other points of a nodule lie so far from its centre, as a share of its radius."""
+
+
+@frozen_value
+class Advice:
+    """One thing that lifts the chance of success.
+
+    Parameters
+    ----------
+    words : str
+        What it is.
+    success : Share
+        How many procedures succeed with it, on the draws of the trial.
+    options : tuple of str
+        Words that the command `lungaccess plan` needs more for it.
+    """
+
+    words: str
+    success: Share
+    options: tuple[str, ...]
+
+    def to_mapping(self) -> dict[str, object]:
+        """Return plain JSON values."""
+        chance = {"probability": self.success.value, "interval_95": list(self.success.interval)}
+        return {"words": self.words, **chance, "options": list(self.options)}
+
+
+class Adviser:
+    """Tries what could lift the chance of a plan; see `advise`."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        lung: Lung,
+        errors: ErrorModel | None,
+        procedure: Procedure | None,
+        atlas_of: Callable[[System], Atlas | None],
+        systems: tuple[System, ...],
+    ) -> None:
+        self._plan, self._lung, self._atlas_of, self._systems = plan, lung, atlas_of, systems
+        self._errors = errors or load_errors()
+        self._procedure = procedure or load_procedure()
+        self._checker = Checker(lung)
+
+    def trials(self) -> Iterator[Advice | None]:
+        """Yield what each trial shows, the quickest trials first; None where there is nothing to show."""
+        yield from self._errors_known()
+        yield from self._procedures()
+        yield from self._points()
+        yield from self._presets()
+
+    def _estimated(self, plan: Plan, errors: ErrorModel, procedure: Procedure) -> Share:
+        samples = DRAWS if procedure.is_open_loop else SIMULATED
+        return estimate_success(
+            plan, self._lung, errors=errors, procedure=procedure, samples=samples, seed=plan.seed
+        ).succeeds
+
+    def _errors_known(self) -> Iterator[Advice]:
+        for kind, size in KNOWN.items():
+            if self._errors.term(kind).size <= size:
+                continue
+            unit = UNITS[kind] if UNITS[kind] != "ln" else "as a logarithm"
+            yield Advice(
+                words=f"{kind.replace('_', ' ')} known to {size:g} {unit}",
+                success=self._estimated(self._plan, with_known(self._errors, kind, size), self._procedure),
+                options=("--known", f"{kind}={size:g}"),
+            )
+
+    def _procedures(self) -> Iterator[Advice]:
+        for name in procedure_names():
+            other = load_procedure(name)
+            if name == self._procedure.name or other.is_open_loop:
+                continue
+            yield Advice(
+                words=f"procedure {name}: {other.description}",
+                success=self._estimated(self._plan, self._errors, other),
+                options=("--procedure", name),
+            )
+
+    def _points(self) -> Iterator[Advice | None]:
+        """Try other points of the nodule."""
+        nodules, plan = self._lung.nodules, self._plan
+        if nodules is None or not plan.target_origin.startswith("nodule"):
+            return
+        chance = plan.chance
+        radius_mm = 5.0 if chance is None else chance.radius_mm
+        for offset in np.concatenate([np.eye(3), -np.eye(3)]):
+            point = plan.target_lps + OF_A_NODULE * radius_mm * offset
+            if not _inside(nodules, point):
+                continue
+            found = self._planned(plan.system, Target(lps_mm=point, origin=plan.target_origin))
+            text = ",".join(f"{value:.1f}" for value in point)
+            yield self._of_plan(
+                found, f"another point of the nodule, lps:{text}", ("--target", f"lps:{text}")
+            )
+
+    def _presets(self) -> Iterator[Advice | None]:
+        plan = self._plan
+        target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
+        for system in self._systems:
+            if system.name != plan.system.name:
+                words = f"device {system.name}"
+                yield self._of_plan(self._planned(system, target), words, ("--system", system.name))
+
+    def _of_plan(self, found: Plan | None, words: str, options: tuple[str, ...]) -> Advice | None:
+        if found is None or not self._checker.check(found).accepted:
+            return None
+        success = self._estimated(found, self._errors, self._procedure)
+        return Advice(words=words, success=success, options=options)
+
+    def _planned(self, system: System, target: Target) -> Plan | None:
+        """Return the plan of a short search for success, None without one or where no atlas is at hand."""
+        atlas = self._atlas_of(system)
+        if atlas is None:
+            return None
+        request = Request(
+            lung=self._lung, target=target, systems=(system,), errors=self._errors,
+            procedure=load_procedure(), seed=self._plan.seed, limits=Limits(time_s=PLANNED_S),
+        )  # fmt: skip
+        try:
+            *_, best = run(request, atlas=atlas, counterfactuals=False)
+        except NoPlan:
+            return None
+        return best
+
+
+def advise(
+    plan: Plan,
+    lung: Lung,
+    appraisal: Appraisal,
+    *,
+    errors: ErrorModel | None = None,
+    procedure: Procedure | None = None,
+    atlas_of: Callable[[System], Atlas | None] = lambda _system: None,
+    systems: tuple[System, ...] = (),
+    time_s: float = TIME_S,
+) -> tuple[Advice, ...]:
+    """Return what lifts the chance of success of a plan most, the best first; nothing for a good plan.
+
+    Errors that are known better, procedures, other points of the nodule and presets are tried one by one,
+    under the same errors and procedure otherwise, until the time is up.
+
+    Parameters
+    ----------
+    appraisal : Appraisal
+        Of the plan: an accepted one whose chance of success is known.
+    errors, procedure
+        Under which it was estimated; as of `lungaccess.judging.appraisal.Appraiser`.
+    atlas_of : callable, optional
+        Returns the atlas of a system if it is at hand, else None: making one takes too long.
+    systems : tuple of System, optional
+        Other devices to try.
+    time_s : float
+    """
+    success = appraisal.headline.success
+    if success is None or success.value >= GOOD:
+        return ()
+    chance = None if appraisal.risk is None else chance_of(appraisal.risk)
+    stated = procedure or (load_procedure(chance.procedure) if chance and _ships(chance.procedure) else None)
+    began, found = working_s(), []
+    for each in Adviser(plan, lung, errors, stated, atlas_of, systems).trials():
+        if each is not None and each.success.value > success.value + WORTH_SAYING:
+            found.append(each)
+        if working_s() - began > time_s:
+            break
+    return tuple(sorted(found, key=lambda each: -each.success.value)[:MOST])
+
+
+def _ships(procedure: str) -> bool:
+    return procedure in procedure_names()
+
+
+def _inside(nodules: object, point: Float) -> bool:
+    grid, array = nodules.grid, nodules.array  # type: ignore[attr-defined]
+    ijk = np.rint(grid.ijk(point)).astype(int)
+    return bool(grid.contains(point)) and bool(array[tuple(ijk)])

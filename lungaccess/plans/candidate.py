@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from anatomy.base.records import frozen_record
@@ -51,9 +53,9 @@ def parts_in_tissue(
         tubes = _tubes_beyond(system, lps_from_scope_tip, deployment, begin_mm)
         ends_mm = begin_mm + np.cumsum(tubes.arcs[:, LENGTH])
         middles_mm = ends_mm - 0.5 * tubes.arcs[:, LENGTH]
-        shape = deployment.shape
-        both_mm = deployment.outer_mm, deployment.inner_mm
-        inserted = both_mm[-len(system.tubes.named) :] if shape is None else tuple(shape.insertions_mm[::-1])
+        inserted: Sequence[float] = (deployment.outer_mm, deployment.inner_mm)[-len(system.tubes.named) :]
+        if deployment.shape is not None:
+            inserted = deployment.shape.insertions_mm[::-1].tolist()
         radii = radii_at(system.tubes, inserted, middles_mm)
         for frame, arc, radius in zip(tubes.frames(), tubes.arcs, radii.tolist(), strict=False):
             parts.append(InTissue(ArcPath(lps_from_start=frame, arcs=arc), 2.0 * radius))

@@ -23,7 +23,7 @@ def path_cost(
     *,
     with_fissures: bool,
     wall_mm: float = 0.0,
-    parts: Sequence[InTissue] = (),
+    parts: Sequence[InTissue] | None = None,
 ) -> float:
     """Return the cost of a path under an objective.
 
@@ -39,7 +39,8 @@ def path_cost(
         Length at the beginning of the path that lies in the wall which the tubes pierce.  The costs of the
         map, which forbids walls, count beyond it.
     parts : sequence of InTissue
-        All that lies in tissue, the path too; see `lungaccess.plans.candidate.parts_in_tissue`.
+        All that lies in tissue, the path too; see `lungaccess.plans.candidate.parts_in_tissue`.  None where
+        that is not known, and the objective does not weigh it.
     """
     weighed = Objective.of(objective)
     terms = [term for term, _weight in weighed.weighed]
@@ -55,7 +56,7 @@ def path_costs(
     cross voxels that the map forbids to the needle.
     """
     found = _costs(lung, path, TERMS, with_fissures, wall_mm, parts)
-    unknown = {term.key for term in TERMS if term.of_all and not (parts and math.isfinite(found[term.key]))}
+    unknown = {term.key for term in TERMS if term.of_all and (parts is None or found[term.key] == math.inf)}
     return {key: cost for key, cost in found.items() if key not in unknown}
 
 
@@ -65,12 +66,13 @@ def _costs(
     terms: Sequence[Term],
     with_fissures: bool,
     wall_mm: float,
-    parts: Sequence[InTissue],
+    parts: Sequence[InTissue] | None,
 ) -> dict[str, float]:
     obstacles, beyond = _obstacles(lung, with_fissures), path_beyond(path, wall_mm)
     found: dict[str, float] = {}
     for term in terms:
-        found |= needle.path_costs(obstacles, lung.cost, beyond if term.of_map else path, parts, [term])
+        along = beyond if term.of_map else path
+        found |= needle.path_costs(obstacles, lung.cost, along, parts or [], [term])
     return found
 
 

@@ -64,9 +64,9 @@ class Plan(Record):
         ("airway", "vessel", "outside", "fissure"; voxels as solid boxes) where it must be kept.  A structure
         may be left out.
     costs : mapping of str to float
-        "inverse_clearance", "cost_map", "voxel_sum" and "length_mm" of the needle, or without one of the
-        tubes beyond the lumen (costs of the map: beyond the wall), and the cost under the objective where
-        that is a weighted sum; a plan of an earlier version may lack "voxel_sum".
+        By the keys of `stages.needle.TERMS`: of the needle, or without one of the tubes beyond the lumen
+        (costs of the map: beyond the wall); "tissue" of both; and the cost under the objective where that is
+        a weighted sum.  A plan of an earlier version may lack "voxel_sum" and "tissue".
     kernels : str
         What the planner's machine code was compiled from: `lungaccess.plans.version.software_kernels`; "" in
         a plan that was not planned, or of an earlier version.

@@ -66,7 +66,7 @@ class Answer:
     accepted : bool
         Whether the independent check accepts the plan; for a needle path, whether nothing objects to it.
     costs : mapping of str to float
-        "inverse_clearance", "cost_map", "voxel_sum", "length_mm".
+        By the keys of `stages.needle.TERMS`.
     findings : tuple of mapping
         What the check looked at; see `lungaccess.judging.checking.findings.Finding.to_mapping`.
     rejections : mapping of str to int

@@ -14,8 +14,8 @@ from lungaccess.running.study.answers import Answer
 from lungaccess.running.study.runs import Problem, Run
 from stages.needle import TERMS
 
-COST_COLUMNS = {term.key: term.key for term in TERMS} | {"length_mm": "solution_length"}
-"""The column of each cost; OMPL's benchmarks have one for the length."""
+COST_COLUMNS = {term.key: term.key for term in TERMS if not term.of_all} | {"length_mm": "solution_length"}
+"""The column of each cost of the needle; OMPL's benchmarks have one for the length."""
 
 Statement = tuple[str, tuple[Any, ...]]
 """SQL and its values."""

@@ -6,16 +6,27 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from lungaccess.running.study.results import ResultsFile
+from lungaccess.running.study.rows import COST_COLUMNS
+from stages.needle import TERMS
 
 TIMES = frozenset({"time", "cpu_time", "first_solution_time", "memory"})
 """Columns that two equal runs may differ in."""
 
-_RUNS = """
+
+def _column(cost: str) -> str:
+    """Return what reads a cost: its column, or where it has none, from the plan or the needle path stored."""
+    if cost in COST_COLUMNS:
+        return f"r.{COST_COLUMNS[cost]}"
+    stated = (f"json_extract(l.plan, '$.{place}.{cost}')" for place in ("costs", "path.costs"))
+    return f"coalesce({', '.join(stated)}) AS {cost}"
+
+
+_RUNS = f"""
 SELECT r.key, p.case_name AS "case", p.patient, p.lung, p.system, p.fissures_allowed, p.objective, p.target,
        p.origin, p.x_lps_mm, p.y_lps_mm, p.z_lps_mm, p.start, p.iterations AS iterations_allowed,
        p.time_s AS time_allowed_s, e.version, c.name AS planner, c.settings AS planner_settings, r.seed,
        o.outcome, o.failed, o.message, o.advice, r.solved, r.correct_solution, r.status, r.iterations,
-       r.solutions, r.cost, r.inverse_clearance, r.cost_map, r.voxel_sum, r.solution_length,
+       r.solutions, r.cost, {", ".join(_column(term.key) for term in TERMS)},
        json_extract(l.plan, '$.chance.errors') AS errors,
        json_extract(l.plan, '$.chance.procedure') AS procedure,
        json_extract(l.plan, '$.chance.samples') AS success_samples,

@@ -202,6 +202,6 @@ def test_weights_add_up(environment: NeedleEnvironment) -> None:
         arrays = environment.objective_arrays(Objective(**weights))
         return float(kernel.cost_of_arc(environment.obstacles, arrays, 0.5, pose, bend, 17.0, True))
 
-    weights = dict(zip(NAMES, (2.0, 3.0, 5.0, 7.0), strict=True))
+    weights = dict(zip(NAMES, (2.0, 3.0, 5.0, 7.0, 11.0), strict=True))
     assert cost(**weights) == pytest.approx(sum(w * cost(**{name: 1.0}) for name, w in weights.items()))
     assert cost(length=1.0) == 17.0

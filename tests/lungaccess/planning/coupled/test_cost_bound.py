@@ -40,7 +40,7 @@ from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.target import Target, point_target
 from lungaccess.problem.task import Task
-from stages.needle import direct_path
+from stages.needle import Objective, direct_path
 from stages.needle.kernels import Limits
 from stages.tube import tube_constants
 from stages.tube.kernels import CURVED_LENGTH, MAX_EXTENSION, NEAR_PLEURA, NEAR_VESSEL, lateral_sweep
@@ -299,10 +299,13 @@ def _direction(rng: np.random.Generator) -> Points:
     return np.asarray(away / np.linalg.norm(away))
 
 
-def test_no_deployment_costs_less_than_the_bound(small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
+@pytest.mark.parametrize("objective", ["inverse_clearance", "tissue"])
+def test_no_deployment_costs_less_than_the_bound(
+    small_lung: Lung, target: Target, atlas: la.Atlas, objective: str
+) -> None:
     """Rotations and insertions beside those of the atlas, each with a single arc."""
-    task = Task(lung=small_lung, system=SYSTEM, target=target)
-    *_, best = plans_of(small_lung, target, atlas, iterations=20)
+    task = Task(lung=small_lung, system=SYSTEM, target=target, objective=Objective.of(objective))
+    *_, best = plans_of(small_lung, target, atlas, iterations=20, objective=objective)
     bound = CostBound(task, atlas)
     values = [bound.improve(2.0 * best.cost, 5000) for _ in range(4)]
     assert values == sorted(values)

@@ -19,7 +19,7 @@ from lungaccess.planning.refinement import boxes, refine
 from lungaccess.planning.refinement.axis import LocalAxis
 from lungaccess.planning.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.planning.refinement.geometry import Geometry
-from lungaccess.planning.refinement.problem import Problem
+from lungaccess.planning.refinement.problem import Problem, program_weights
 from lungaccess.planning.refinement.program import Program, program
 from lungaccess.planning.refinement.reconstruction import Reconstruction
 from lungaccess.plans.assemble import assemble
@@ -136,7 +136,7 @@ class TestRefine:
         new = refine(task, old, iterations=ITERATIONS)
         assert new is not None
         cost = CandidateEvaluator(task).cost
-        assert cost(new.path) < 0.99 * cost(old.path)
+        assert cost(new) < 0.99 * cost(old)
 
     def test_without_a_map_nothing_is_cheaper_than_free(self, case: Case) -> None:
         task = replace(case.task, objective=Objective(cost_map=1.0))
@@ -152,8 +152,11 @@ def tip_moved_mm(old: Candidate, new: Candidate) -> float:
     return float(np.linalg.norm((new.tip.lps_from_scope_tip - old.tip.lps_from_scope_tip)[:3, 3]))
 
 
-def set_up(case: Case, which: int = 1) -> tuple[Problem, Program]:
-    problem = Problem(CandidateEvaluator(case.task), case.candidates[which], (1.0, 0.0, 0.0))
+def set_up(case: Case, which: int = 1, task: Task | None = None) -> tuple[Problem, Program]:
+    task = task or case.task
+    weights = program_weights(task)
+    assert weights is not None
+    problem = Problem(CandidateEvaluator(task), case.candidates[which], weights)
     return problem, program(problem.layout, ITERATIONS)
 
 
@@ -172,6 +175,30 @@ class TestProgram:
         # The first grazes an obstacle, where the smooth clearance of the program has no peak.
         np.testing.assert_allclose(shares[1:], 1.0, rtol=0.1)
         assert shares[0] < 1.0
+
+    def test_the_tubes_cost_what_they_cost_the_candidate(self, case: Case) -> None:
+        """The part of the tubes is what the cost has over that of the needle."""
+        width = SYSTEM.require_needle("The test").diameter_mm
+        task = replace(case.task, objective=Objective(tissue=1.0))
+        needle = replace(case.task, objective=Objective(inverse_clearance=width))
+        parts = []
+        for which, candidate in enumerate(case.candidates):
+            found = []
+            for each in (task, needle):
+                problem, solver = set_up(case, which, each)
+                found.append(solver.evaluate(problem.start, problem.numbers, problem.boxes)[0])
+            both, alone = (CandidateEvaluator(each).cost(candidate) for each in (task, needle))
+            parts.append(both - alone)
+            assert found[0] - found[1] == pytest.approx(parts[-1], rel=0.3, abs=0.5)
+        assert max(parts) > 1.0
+
+    def test_tissue_is_reduced_under_its_own_objective(self, case: Case) -> None:
+        task = replace(case.task, objective=Objective(tissue=1.0))
+        cost, saved = CandidateEvaluator(task).cost, []
+        for old in case.candidates[:3]:
+            new = refine(task, old, iterations=ITERATIONS)
+            saved.append(0.0 if new is None else 1.0 - cost(new) / cost(old))
+        assert max(saved) > 0.05
 
     @pytest.mark.slow
     def test_its_gradients_are_those_of_differences(self, case: Case) -> None:

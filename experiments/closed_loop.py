@@ -2,10 +2,9 @@
 
     python -m experiments.closed_loop [--quick] [--seed 1] [--results FOLDER] [--patient NAME] [--system NAME]
 
-Random peripheral targets are planned for with `lungaccess.plan`.  From each start the needle is inserted
-many times with errors drawn at random, in open and in closed loop: by size of the errors, and by curvature
-held in reserve for a needle that bends too little.  What the errors are, and what counts as reached:
-docs/explanation/replanning.md.
+Random peripheral targets are planned for with `lungaccess.plan`.  Each needle is inserted many times with
+errors drawn at random, in open and in closed loop: by size of the errors, and with a curvature that nobody
+knows, which is learned on the way or not.  docs/explanation/replanning.md says what counts as reached.
 """
 
 from __future__ import annotations
@@ -18,138 +17,116 @@ import numpy as np
 
 import lungaccess as la
 from anatomy.base.errors import TargetError
-from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from experiments.support.anatomies import PHANTOM, anatomy, default_anatomies
 from experiments.support.insertion.figure import draw_insertions
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.planning.procedure.insertion import (
+    ITERATIONS,
     TOLERANCE_MM,
-    Errors,
+    Insertion,
+    InsertionStudy,
     Outcome,
-    Study,
     Summary,
-    assumed_errors,
-    study,
-    summary,
+    insert_plan,
 )
+from lungaccess.plans.curves import needle_pieces
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
-from stages.needle.environment import NeedleEnvironment, needle_environment
+from lungaccess.uncertainty.risk import AngleError, CurvatureError, ErrorModel, load_errors
+from stages.needle.environment import needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform
 from stages.needle.query import Query
-from stages.needle.replanning.insertion import tilt
-from stages.needle.replanning.replanner import ITERATIONS, Replanner, ReplanSettings, with_reserve
-from stages.needle.search.base import RestartingRRT
+from stages.needle.replanning.belief import tilt
+from stages.needle.replanning.replanner import Replanner
 
-OBJECTIVE = Objective(inverse_clearance=1.0)
-PLANNING_ITERATIONS = 3000
-RESERVE = 0.1
-RESERVES = (0.0, 0.1, 0.2)
 REPLAN_LIMIT_MS = 20.0
-SIZES = {"quick": (2, 8, 60), "full": (12, 30, 1000)}
-"""Targets, insertions for each target and mode and level, and replans to time."""
+SIZES = {"quick": (2, 8, 60), "full": (20, 20, 1000)}
+"""Targets, insertions for each target and level, and replans to time."""
 SYSTEMS = {PHANTOM: "flexure-needle"}
-DRAWN_RUNS = 12
+LEVELS = {"no": 0.0, "half": 0.5, "whole": 1.0, "double": 2.0}
+ROLL = AngleError(attempt_deg=5.0)
+UNKNOWN = ErrorModel(needle_curvature=CurvatureError(attempt_ln=0.4), needle_roll=ROLL)
+FACTORS = (0.5, 2.0)
+SHARES = (1.0, 0.5)
+"""Plans use so much of the needle's curvature."""
 
 
-LEVELS = {"no": 0.0, "half": 0.5, "full": 1.0, "double": 2.0}
-WEAK = Errors(curvature_bias=-0.15, curvature_sd=0.05, position_noise_mm=0.2, direction_noise_deg=0.3)
-
-
-@frozen_record
-class Case:
-    """A start, a target, and the plan for each curvature reserve."""
-
-    query: Query
-    plans: dict[float, ArcPath]
-
-
-def cases_of(
-    lung: Lung, system: la.System, environment: NeedleEnvironment, count: int, seed: int
-) -> list[Case]:
-    """Plan to random targets until `count` have a needle plan with every reserve."""
-    curvature = (1.0 - max(RESERVES)) * system.needle.max_curvature_per_mm
-    needle = replace(system.needle, max_curvature_per_mm=curvature)
-    system = replace(system, name=f"{system.name} with a reserve", needle=needle)
-    atlas = la.build_atlas(lung, system)
-    cases: list[Case] = []
+def plans_of(lung: Lung, system: la.System, share: float, count: int, seed: int) -> list[la.Plan]:
+    """Plan to random targets with a share of the needle's curvature, until `count` have a plan."""
+    needle = replace(system.needle, max_curvature_per_mm=share * system.needle.max_curvature_per_mm)
+    held_back = replace(system, name=f"{system.name} with a reserve", needle=needle)
+    atlas = la.build_atlas(lung, held_back)
+    found: list[la.Plan] = []
     for point in np.random.default_rng(seed).permutation(peripheral_targets(lung, 10 * count, seed)):
         try:
-            found = next(
-                la.plan(
-                    lung,
-                    system,
-                    point_target(lung, point),
-                    atlas=atlas,
-                    iterations=100,
-                    time_s=60.0,
-                    goal="default",
-                )
-            )
+            *_, best = la.plan(lung, held_back, point_target(lung, point), atlas=atlas, goal="default", iterations=100)
         except la.NoPlan:
             continue
-        start = found.needle.lps_from_start
-        query = Query(lps_from_start=start, target=point, branch=found.exemption.branch)
-        plans = {reserve: needle_plan(with_reserve(environment, reserve), query) for reserve in RESERVES}
-        if all(plan is not None for plan in plans.values()):
-            cases.append(Case(query=query, plans={r: p for r, p in plans.items() if p is not None}))
-        if len(cases) == count:
+        found.append(replace(best, system=replace(held_back, needle=system.needle)))
+        if len(found) == count:
             break
-    return cases
-
-
-def needle_plan(environment: NeedleEnvironment, query: Query) -> ArcPath | None:
-    """Return the best path of a fixed number of iterations."""
-    search = RestartingRRT(environment, query, objective=OBJECTIVE)
-    for _ in range(100):
-        if search.iterations >= PLANNING_ITERATIONS:
-            break
-        search.advance(PLANNING_ITERATIONS - search.iterations)
-    return search.path
+    return found
 
 
 def inserted(
-    environment: NeedleEnvironment, cases: Sequence[Case], errors: Errors, reserve: float, runs: int
-) -> Study:
+    lung: Lung, plans: Sequence[la.Plan], errors: ErrorModel, runs: int, believed: ErrorModel | None = None
+) -> list[InsertionStudy]:
     """Insert needles to all targets."""
-    studies = [
-        study(
-            environment, case.query, case.plans[reserve], errors, seeds=range(runs * n, runs * (n + 1)),
-            objective=OBJECTIVE, replanning=ReplanSettings(curvature_reserve=reserve),
-        )
-        for n, case in enumerate(cases)
-    ]  # fmt: skip
-    return Study(
-        open_loop=summary(run for made in studies for run in made.open_loop.insertions),
-        closed_loop=summary(run for made in studies for run in made.closed_loop.insertions),
-    )
+    return [
+        insert_plan(plan, lung, errors=errors, believed=believed, samples=runs, seed=runs * n)
+        for n, plan in enumerate(plans)
+    ]
 
 
-def add_study(result: Result, label: str, made: Study) -> None:
+def add_study(result: Result, label: str, made: Sequence[InsertionStudy]) -> None:
     """Add the rows of open and closed loop."""
-    for mode, found in (("open loop", made.open_loop), ("closed loop", made.closed_loop)):
-        result.add(f"{label}, {mode}: reached", _percent(found, Outcome.REACHED), unit="%", note=_note(found))
+    for mode, each in (("open loop", "open_loop"), ("closed loop", "closed_loop")):
+        runs = [run for study in made for run in getattr(study, each).insertions]
+        _add(result, f"{label}, {mode}: reached", runs)
 
 
-def _percent(found: Summary, outcome: Outcome) -> float:
-    return 100.0 * found.outcomes.get(outcome, 0) / len(found.insertions)
-
-
-def _note(found: Summary) -> str:
-    no_path = _percent(found, Outcome.NO_PATH) + _percent(found, Outcome.OUT_OF_LENGTH)
-    return (
-        f"{len(found.insertions)} insertions, 95 % interval {100.0 * found.reached_low:.1f} to "
-        f"{100.0 * found.reached_high:.1f}; hit an obstacle {_percent(found, Outcome.HIT):.1f} %; no path "
-        f"{no_path:.1f} %; tip error median "
-        f"{found.median_error_mm:.2f} mm, 95 % within {found.error_95_mm:.2f} mm; least clearance "
-        f"{found.clearance_mm:.2f} mm"
+def _add(result: Result, label: str, runs: Sequence[Insertion]) -> None:
+    found = Summary.of(runs).to_mapping()
+    low, high = (100.0 * end for end in found["reached"]["interval_95"])
+    hit, no_path = (100.0 * found["outcomes"][each] / len(runs) for each in (Outcome.HIT, Outcome.NO_PATH))
+    note = (
+        f"{len(runs)} insertions, 95 % interval {low:.1f} to {high:.1f}; touched something {hit:.1f} %; "
+        f"no path {no_path:.1f} %; tip error median {found['tip_error_median_mm']:.2f} mm, 95 % within "
+        f"{found['tip_error_95_mm']:.2f} mm"
     )
+    result.add(label, 100.0 * found["reached"]["probability"], unit="%", note=note)
 
 
-def replan_times_ms(environment: NeedleEnvironment, cases: Sequence[Case], poses: int, seed: int) -> Float:
+def within_reach(study: InsertionStudy, run: Insertion, most_per_mm: float) -> bool:
+    """Tell whether the true needle could come near enough to its target in free space."""
+    start, away = study.query.lps_from_start, study.query.target - study.query.lps_from_start[:3, 3]
+    ahead, radius = float(away @ start[:3, 2]), 1.0 / (min(run.factor, 1.0) * most_per_mm)
+    aside = float(np.linalg.norm(away - ahead * start[:3, 2]))
+    return float(np.hypot(radius - aside, ahead)) >= radius - study.tolerance_mm
+
+
+def add_unknown(
+    result: Result, lung: Lung, system: la.System, share: float, size: tuple[int, int, int]
+) -> None:
+    """Add the rows of needles whose curvature nobody knows, learned on the way or not."""
+    count, runs, _poses = size
+    plans = plans_of(lung, system, share, count, 1)
+    for label, believed in (("learned", UNKNOWN), ("not learned", ErrorModel(needle_roll=ROLL))):
+        reachable = [
+            run
+            for study in inserted(lung, plans, UNKNOWN, runs, believed)
+            for run in study.closed_loop.insertions
+            if FACTORS[0] <= run.factor <= FACTORS[1]
+            and within_reach(study, run, system.needle.max_curvature_per_mm)
+        ]
+        if reachable:
+            _add(result, f"unknown curvature, {label}, plans of {share:g} of it: reached", reachable)
+
+
+def replan_times_ms(lung: Lung, plans: Sequence[la.Plan], poses: int, seed: int) -> Float:
     """Return the CPU time of replans from poses beside the plans, the first of each kind left out.
 
     Each pose is off the plan by 0.5 mm in each coordinate and by 1 degree about two axes, the target by
@@ -158,18 +135,21 @@ def replan_times_ms(environment: NeedleEnvironment, cases: Sequence[Case], poses
     rng = np.random.default_rng(seed)
     times = []
     for number in range(-20, poses):
-        case = cases[number % len(cases)]
-        plan = case.plans[RESERVE]
-        at = rng.uniform(0.0, 0.9) * plan.length_mm
-        tip = frame_at(plan, at) @ tilt(np.radians(rng.rayleigh()), rng.uniform(0.0, 2.0 * np.pi))
+        plan = plans[number % len(plans)]
+        path = ArcPath(lps_from_start=plan.tube.lps_from_tip, arcs=needle_pieces(plan.needle))
+        environment = needle_environment(
+            lung, plan.system.needle, plan.system.margins, with_fissures=plan.fissures_are_obstacles
+        )
+        at = rng.uniform(0.0, 0.9) * path.length_mm
+        tip = frame_at(path, at) @ tilt(np.radians(rng.rayleigh()), rng.uniform(0.0, 2.0 * np.pi))
         tip[:3, 3] += rng.normal(0.0, 0.5, 3)
-        target = case.query.target + rng.normal(0.0, 0.5, 3)
+        query = Query(lps_from_start=path.lps_from_start, target=np.array(plan.end_lps))
         replanner = Replanner(
-            environment, case.query, plan, objective=OBJECTIVE, seed=number + 20,
-            settings=ReplanSettings(curvature_reserve=RESERVE),
+            environment, query, path, objective=Objective.of(plan.objective), seed=number + 20,
+            iterations=ITERATIONS,
         )  # fmt: skip
         began = time.process_time()
-        replanner.replan(tip, target, at)
+        replanner.replan(tip, query.target + rng.normal(0.0, 0.5, 3), at)
         if number >= 0:
             times.append(1e3 * (time.process_time() - began))
     return np.array(times)
@@ -196,54 +176,42 @@ def add_replans(result: Result, times_ms: Float) -> None:
     )  # fmt: skip
 
 
-def insert_all(
-    result: Result, environment: NeedleEnvironment, cases: list[Case], runs: int
-) -> dict[str, Study]:
-    """Add the rows by size of the errors and by reserve; return the studies of all sizes above 0."""
-    by_level = {}
-    for name, size in LEVELS.items():
-        by_level[name] = inserted(environment, cases, assumed_errors(size), RESERVE, runs)
-        add_study(result, f"{name} errors", by_level[name])
-    for reserve in RESERVES:
-        made = inserted(environment, cases, WEAK, reserve, runs)
-        add_study(result, f"needle that bends 15 % too little, reserve {reserve:g}", made)
-    return {name: made for name, made in by_level.items() if LEVELS[name] > 0.0}
-
-
 def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
     parser.add_argument("--patient", default=default_anatomies()[-1], metavar="NAME")
     parser.add_argument("--system", metavar="NAME", help="default: lung-default; phantom: flexure-needle")
     options = parser.parse_args()
-    n_targets, runs, poses = SIZES[setting_of(options)]
+    size = SIZES[setting_of(options)]
     result = Result(
         name="closed_loop", title="Insertion with errors, in open and closed loop",
         setting=setting_of(options), seeds=[options.seed],
     )  # fmt: skip
     lung = anatomy(options.patient)
     system = la.load_system(options.system or SYSTEMS.get(options.patient, "lung-default"))
-    fissures = lung.has_fissures and not system.fissures_allowed
-    environment = needle_environment(lung, system.needle, system.margins, with_fissures=fissures)
-    cases = cases_of(lung, system, environment, n_targets, options.seed)
-    if not cases:
+    plans = plans_of(lung, system, 1.0, size[0], options.seed)
+    if not plans:
         raise TargetError(
-            f"{lung.name}: no target was found that the needle can be planned to with every reserve",
+            f"{lung.name}: no target was found that the needle can be planned to",
             remedy="Choose another system or patient",
         )
-    lengths = [case.plans[RESERVE].length_mm for case in cases]
     result.conditions = {
         "anatomy": f"{lung.name}, system {system.name}",
-        "targets": f"{len(cases)} peripheral ones, plans of {min(lengths):.0f} to {max(lengths):.0f} mm",
-        "insertions": f"{runs} for each target, mode and level; reached: within {TOLERANCE_MM:g} mm",
-        "errors": "full: curvature 8 % constant and 5 % along the way, roll 5 degrees and 10 degrees of "
-        "walk, tracker 0.4 mm and 0.6 degrees, target drift 2 mm and walk 1 mm; an assumption, not measured",
+        "targets": f"{len(plans)} peripheral ones",
+        "insertions": f"{size[1]} for each target and level; reached: within {TOLERANCE_MM:g} mm",
+        "errors": "whole: those of the preset breath-hold for needle and target, and its multiples",
     }
-    by_level = insert_all(result, environment, cases, runs)
-    add_replans(result, replan_times_ms(environment, cases, poses, options.seed))
-    longest = cases[int(np.argmax(lengths))]
-    at_target = inserted(environment, [longest], assumed_errors(1.0), RESERVE, min(runs, DRAWN_RUNS))
-    result.figure = draw_insertions(lung, longest.query, longest.plans[RESERVE], at_target, by_level)
+    by_level = {
+        name: inserted(lung, plans, load_errors().scaled(factor), size[1]) for name, factor in LEVELS.items()
+    }
+    for name, made in by_level.items():
+        add_study(result, f"{name} errors", made)
+    for share in SHARES:
+        add_unknown(result, lung, system, share, size)
+    add_replans(result, replan_times_ms(lung, plans, size[2], options.seed))
+    result.figure = draw_insertions(
+        lung, by_level["whole"][0], {k: v for k, v in by_level.items() if LEVELS[k]}
+    )
     write_result(result, options.results)
 
 

@@ -231,18 +231,21 @@ class SystemOptions:
         return (self.load(),)
 
 
+ErrorsText = Annotated[
+    str | None,
+    Parameter(
+        help="Error model: a preset (breath-hold, expiratory-free, gated-ct, inspiratory-ct, "
+        "vision-only) or a TOML file; breath-hold if not given."
+    ),
+]
+
+
 @Parameter(name="*")
 @frozen_value
 class ErrorOptions:
     """How large the errors of devices and target are assumed to be, and what a procedure measures of them."""
 
-    errors: Annotated[
-        str | None,
-        Parameter(
-            help="Error model: a preset (breath-hold, expiratory-free, gated-ct, inspiratory-ct, "
-            "vision-only) or a TOML file; breath-hold if not given."
-        ),
-    ] = None
+    errors: ErrorsText = None
     known: Annotated[
         tuple[str, ...],
         Parameter(

@@ -62,8 +62,9 @@ if TYPE_CHECKING:
         Reached,
         ReachScan,
     )
+    from stages.needle.replanning.belief import Belief, Unknown, tilt
     from stages.needle.replanning.escaping import structure_name, with_limits
-    from stages.needle.replanning.insertion import GAIN, Belief, TrueNeedle, steer, tilt
+    from stages.needle.replanning.insertion import Commands, TrueNeedle, steer
     from stages.needle.replanning.reaiming import pose_at
     from stages.needle.replanning.replanner import (
         DEFAULT_SETTINGS,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
@@ -13,7 +14,7 @@ from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Hertz, NotNegative, Positive, Samples, Seed
-from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile, require_picture
+from lungaccess.cli.options import ErrorsText, PatientOfPlan, PatientOptions, PlanFile, require_picture
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def insert(
     plan: PlanFile,
     patient: PatientOfPlan,
     *,
-    noise: Annotated[NotNegative, Parameter(help="Noise of the tracked tip along each axis, mm.")] = 0.4,
+    noise: Annotated[NotNegative, Parameter(help="Noise of the tracked tip along each axis, mm.")] = 0.5,
     tilt: Annotated[
         NotNegative, Parameter(help="Noise of its direction about each of two axes, degrees.")
     ] = 0.6,
@@ -33,10 +34,7 @@ def insert(
     lost: Annotated[NotNegative, Parameter(help="Share of the measurements that are lost, 0 to 1.")] = 0.0,
     speed: Annotated[Positive, Parameter(help="Speed of the insertion, mm/s.")] = 2.0,
     replan_every: Annotated[NotNegative, Parameter(help="Least insertion between two replans, mm.")] = 2.0,
-    size: Annotated[
-        NotNegative,
-        Parameter(help="Size of the errors of needle and target: 1 is what is assumed of a real needle."),
-    ] = 1.0,
+    errors: ErrorsText = None,
     tolerance: Annotated[
         NotNegative, Parameter(help="A tip that ends no farther from the target has reached it, mm.")
     ] = 2.0,
@@ -52,14 +50,15 @@ def insert(
 ) -> ExitCode:
     """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees."""
     from lungaccess.judging.checking import check
-    from lungaccess.planning.procedure.insertion import TrackerModel, insert_plan
+    from lungaccess.planning.procedure import NeedleSteering, insert_plan
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.report.insertion import insertion_webp, insertions_png
+    from lungaccess.uncertainty.risk import load_errors
 
     stored = Plan.load(plan)
-    tracker = TrackerModel(
-        position_mm=noise, direction_deg=tilt, target_mm=noise, rate_hz=rate, latency_s=latency,
-        lost_share=lost, insertion_mm_per_s=speed, replan_every_mm=replan_every,
+    steering = NeedleSteering(
+        closed_loop=True, measure_every_mm=speed / rate, replan_every_mm=replan_every, position_mm=noise,
+        direction_deg=tilt, target_mm=noise, latency_mm=latency * speed, lost_share=lost,
     )  # fmt: skip
     if film is not None and film.suffix.lower() != ".webp":
         raise SettingsError(
@@ -70,9 +69,10 @@ def insert(
     if picture is not None:
         require_picture(picture)
     lung = output.load(patient)
+    model = None if errors is None else load_errors(errors)
     with progress("inserting needles"):
         found = insert_plan(
-            stored, lung, tracker, size=size, samples=samples, seed=seed, tolerance_mm=tolerance
+            stored, lung, steering, errors=model, samples=samples, seed=seed, tolerance_mm=tolerance
         )
     accepted = check(stored, lung).accepted
     files = []
@@ -106,17 +106,23 @@ def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
         ("no path left", *(f"{each['outcomes']['no path left']}" for each in columns)),
         ("tip error, median, mm", *(f"{each['tip_error_median_mm']:.2f}" for each in columns)),
         ("95 % within, mm", *(f"{each['tip_error_95_mm']:.2f}" for each in columns)),
-        ("least clearance, mm", *(f"{each['least_clearance_mm']:.2f}" for each in columns)),
+        ("curvature known to, median, %", "not", _known(found)),
         ("replans", *(f"{each['replans']}" for each in columns)),
         ("of them without a path", *(f"{each['replans_without_path']}" for each in columns)),
     ]
     title = f"{record['samples']} needles, each inserted in both ways"
     made = terminal.table(title, ("", "blind", "tracked"), rows)
-    tracker = found.tracker
+    tracker = found.steering
     made.caption = (
-        f"Tracker: {tracker.position_mm:g} mm and {tracker.direction_deg:g}°, {tracker.rate_hz:g} Hz, "
-        f"{tracker.latency_s:g} s late, {100.0 * tracker.lost_share:g} % lost; "
-        f"{tracker.insertion_mm_per_s:g} mm/s. "
-        "The errors of needle and target are assumed."
+        f"Tracker: {tracker.position_mm:g} mm and {tracker.direction_deg:g}°, "
+        f"every {tracker.measure_every_mm:g} mm, {tracker.latency_mm:g} mm late, "
+        f"{100.0 * tracker.lost_share:g} % lost. Errors of needle and target: {found.errors.label}."
     )
     return made
+
+
+def _known(found: InsertionStudy) -> str:
+    """Return by how much the believed factor of the curvature differs from the true one, in words."""
+    bent = [run for run in found.closed_loop.insertions if run.factor > 0.0]
+    off = [abs(run.believed_factor / run.factor - 1.0) for run in bent]
+    return f"{100.0 * median(off):.1f}" if off else "none bends"

@@ -7,21 +7,15 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.procedure.insertion import (
-        Errors,
-        InsertionStudy,
-        SimulatedTracker,
-        TrackerModel,
-        insert_plan,
-    )
+    from lungaccess.planning.procedure.insertion import WATCHED, InsertionStudy, insert_plan
     from lungaccess.planning.procedure.report import ProcedureReport, StageReport
     from lungaccess.planning.procedure.settings import (
         DEFAULT_PROCEDURE,
+        NeedleSteering,
         Procedure,
         load_procedure,
         procedure_names,
     )
     from lungaccess.planning.procedure.simulation import Simulator, simulate_procedure
-    from lungaccess.planning.procedure.tracker import Measured, Tracker
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

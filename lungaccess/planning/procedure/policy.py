@@ -22,13 +22,12 @@ from lungaccess.planning.procedure.settings import Procedure
 from lungaccess.planning.procedure.spread import ASIDE, bend_per_mm
 from lungaccess.planning.procedure.truth import (
     Attempt,
-    SteeredTruth,
     as_measured,
     carried_out,
-    end_of,
+    insert_needle,
     needle_pieces,
     path_of,
-    with_stop,
+    unknown_of,
 )
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
@@ -40,7 +39,6 @@ from lungaccess.uncertainty.risk.deviations import deviated_starts
 from lungaccess.uncertainty.risk.errors import BREATHING
 from stages.needle import (
     ArcPath,
-    Belief,
     Failure,
     NeedleEnvironment,
     Objective,
@@ -48,10 +46,7 @@ from stages.needle import (
     Replan,
     Replanner,
     ReplanSettings,
-    TrueNeedle,
-    arc_transform,
     needle_environment,
-    steer,
 )
 
 SIDES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -256,18 +251,18 @@ class Policy:
         stage, needle = self.procedure.tubes, plan.needle
         if needle is None:
             return None
-        n_tube = len(pieces) - len(needle.arcs)
-        # The needle is turned from outside: tubes that are turned too far do not take it along.
-        rolled = float(pieces[n_tube, 1]) - needle.arcs[0].roll_rad - attempt.roll_rad(0)
-        true_tip = end_of(attempt.frame(), pieces[:n_tube]) @ arc_transform(0.0, rolled, 0.0)
+        true_tip, rolled = attempt.needle_tip(plan, pieces)
         path, tip = path_of(needle), np.asarray(needle.lps_from_start)
         target = self._target(attempt, noise[1])
+        moves = tip_moves(
+            np.asarray(plan.scope.lps_from_scope_tip), tip, self._left, bend_per_mm(plan.system)
+        )
+        doubt = moves @ moves.T
         if stage.measured:
+            sizes = stage.position_mm, math.radians(stage.direction_deg)
             measured = as_measured(true_tip, stage.position_mm, stage.direction_deg, noise[0])
-            moves = tip_moves(
-                np.asarray(plan.scope.lps_from_scope_tip), tip, self._left, bend_per_mm(plan.system)
-            )
-            tip = fused(tip, moves, measured, stage.position_mm, math.radians(stage.direction_deg))
+            tip = fused(tip, moves, measured, *sizes)
+            doubt = np.diag(np.repeat(sizes, 3) ** 2)
             history.corrected_mm[TUBE].append(
                 _miss(ArcPath(lps_from_start=tip, arcs=path.arcs), target.lps_mm)
             )
@@ -276,7 +271,7 @@ class Policy:
                 return None
             path = path_of(rest.needle)
         if self.procedure.needle.closed_loop:
-            arcs = self._steered(history, attempt, plan, path, true_tip, target, rng)
+            arcs = self._steered(history, attempt, plan, path, true_tip, doubt, target, rng)
         else:
             arcs = carried_out(path, attempt)
         if not len(arcs):
@@ -309,33 +304,27 @@ class Policy:
         plan: Plan,
         path: ArcPath,
         true_tip: Float,
+        doubt: Float,
         target: Target,
         rng: np.random.Generator,
     ) -> Float:
-        """Return the arcs `(A, 3)` of a needle that is measured and planned again on its way."""
+        """Return the arcs `(A, 3)` of a needle that is measured and planned again on its way.
+
+        `doubt` is the covariance `(6, 6)` of where it is taken to begin.
+        """
         steering = self.procedure.needle
         start = np.asarray(path.lps_from_start)
         query = Query(lps_from_start=start, target=target.lps_mm, branch=plan.exemption.branch)
-        truth = SteeredTruth(attempt, target.lps_mm, steering.position_mm, steering.direction_deg, rng)
         preferred, environment = self._environments[0], self._environments[-1]
-        needle, belief = TrueNeedle(truth, true_tip, 0.0), Belief(query, steering.gain)
         allowed = ReplanSettings(largest_miss_mm=min(self._aside_mm, 10.0))
         replanner = _FrugalReplanner(preferred, environment, query, path, allowed)
-        replans, stopped = steer(
-            environment,
-            truth,
-            needle,
-            belief,
-            path,
-            replanner,
-            branch=query.branch,
-            step_mm=steering.measure_every_mm,
-            measure_every_mm=steering.measure_every_mm,
-        )
-        history.replans[NEEDLE] += [each.path is not None for each in replans]
-        history.stopped = stopped is not None
-        arcs = np.array(needle.arcs).reshape(-1, 3)
-        return with_stop(arcs, float(attempt.errors.stop_mm[0, 0])) if len(arcs) else arcs
+        found = insert_needle(
+            environment, query, path, replanner, attempt, true_tip, steering,
+            unknown_of(self.errors, steering, doubt), rng,
+        )  # fmt: skip
+        history.replans[NEEDLE] += [each.path is not None for each in found.replans]
+        history.stopped = found.stopped is not None
+        return found.arcs
 
 
 class _FrugalReplanner(Replanner):

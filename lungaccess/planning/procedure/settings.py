@@ -75,17 +75,23 @@ class Imaging:
 
 @settings
 class NeedleSteering:
-    """Whether the needle is measured and planned again while it is inserted.
+    """Whether the needle is measured and planned again while it is inserted, and by what tracker.
 
     Parameters
     ----------
     closed_loop : bool
     measure_every_mm : float
-        Insertion between two measurements.
+        Insertion between two measurements: the speed over the tracker's rate.
+    replan_every_mm : float
+        Least insertion between two replans; measurements between them only correct what is believed.
     position_mm, direction_deg : float
         Errors of measuring, as of `ScopePlacing`.
-    gain : float
-        Share of a measurement by which dead reckoning is corrected; 1 trusts the sensor alone.
+    target_mm : float, optional
+        Error of the target as tracked, along each axis; None where it is not seen during the insertion.
+    latency_mm : float
+        Insertion between a measurement and its use: the speed times the tracker's delay.
+    lost_share : float
+        Share of the measurements that are lost.
     source : str
     """
 
@@ -93,11 +99,20 @@ class NeedleSteering:
         False
     )
     measure_every_mm: Annotated[
-        float, quantity("insertion between two measurements", at_least=1.0, at_most=500.0)
+        float, quantity("insertion between two measurements", above=0.0, at_most=500.0)
     ] = 5.0
+    replan_every_mm: Annotated[
+        float, quantity("least insertion between two replans", at_least=0.0, at_most=500.0)
+    ] = 0.0
     position_mm: _Position = 0.0
     direction_deg: _Direction = 0.0
-    gain: Annotated[float, quantity("share of a measurement that is believed", above=0.0, at_most=1.0)] = 0.5
+    target_mm: Annotated[float, quantity("error of the tracked target", at_least=0, at_most=20)] | None = None
+    latency_mm: Annotated[
+        float, quantity("insertion between a measurement and its use", at_least=0.0, at_most=100.0)
+    ] = 0.0
+    lost_share: Annotated[
+        float, quantity("share of the measurements that are lost", at_least=0.0, at_most=1.0)
+    ] = 0.0
     source: _Source = "assumption"
 
 

@@ -10,11 +10,26 @@ import numpy as np
 from anatomy import poses
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from lungaccess.planning.procedure.settings import NeedleSteering
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk import ErrorModel
 from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
-from stages.needle import ArcPath, arc_transform, tilt
+from stages.needle import (
+    ArcPath,
+    Belief,
+    Failure,
+    NeedleEnvironment,
+    Query,
+    Replan,
+    Replanner,
+    TrueNeedle,
+    Unknown,
+    arc_transform,
+    steer,
+    tilt,
+)
 
 ARCS = 12
 """Arcs of a needle that have errors of their own; those of further ones are the same again."""
@@ -39,6 +54,17 @@ class Attempt:
             self.errors, roll_rad=self.errors.roll_rad[:, columns], stop_mm=self.errors.stop_mm[:, columns]
         )
         return np.asarray(deviated_pieces(plan, fitted)[0])
+
+    def needle_tip(self, plan: Plan, pieces: Float) -> tuple[Float, float]:
+        """Return the true frame in which the needle of a plan begins behind its true arcs, see `pieces`.
+
+        The needle is turned from outside: tubes that are turned too far do not take it along, and by that
+        angle, the second result, its first arc in `pieces` is rolled farther than from this frame.
+        """
+        arcs = () if plan.needle is None else plan.needle.arcs
+        n_tube = len(pieces) - len(arcs)
+        rolled = float(pieces[n_tube, 1]) - arcs[0].roll_rad - self.roll_rad(0)
+        return end_of(self.frame(), pieces[:n_tube]) @ arc_transform(0.0, rolled, 0.0), rolled
 
     def roll_rad(self, number: int) -> float:
         """Return the error of the angle of the needle's arc with a number."""
@@ -67,31 +93,19 @@ def path_of(needle: NeedlePath) -> ArcPath:
 
 
 class SteeredTruth:
-    """What really happens to a needle that is steered, under the errors of one attempt.
+    """What really happens to a needle that is steered, under the errors of one attempt, and what is measured.
 
     Parameters
     ----------
     attempt : Attempt
-    target : (3,) float64, LPS mm
-        Where the target was found; it is not seen during the insertion.
-    position_mm, direction_deg : float
-        Errors of the sensor.
+    steering : NeedleSteering
     rng : numpy.random.Generator
-        Of the sensor's noise.
+        Of the tracker's noise.
     """
 
-    def __init__(
-        self,
-        attempt: Attempt,
-        target: Float,
-        position_mm: float,
-        direction_deg: float,
-        rng: np.random.Generator,
-    ) -> None:
-        self._attempt, self._target, self._rng = attempt, target, rng
-        self._noise = position_mm, direction_deg
-        self._rolls = 0
-        self._lag = 0.0
+    def __init__(self, attempt: Attempt, steering: NeedleSteering, rng: np.random.Generator) -> None:
+        self._attempt, self._steering, self._rng = attempt, steering, rng
+        self._rolls, self._lag = 0, 0.0
         self._factor = float(attempt.errors.factor[0])
 
     def roll(self) -> None:
@@ -103,9 +117,89 @@ class SteeredTruth:
         """Return direction and amount of the true curvature."""
         return self._lag, self._factor * curvature
 
-    def measure(self, frame: Float, inserted_mm: float) -> tuple[Float, Float]:
-        """Return the tip as the sensor has it, and the target as it was found."""
-        return as_measured(frame, *self._noise, self._rng.standard_normal(5)), self._target
+    def measure(self, needle: TrueNeedle) -> tuple[Float, Float | None] | None:
+        """Return the tip as the tracker had it a while ago, and the target if it sees that; None if lost."""
+        tracker = self._steering
+        if self._rng.random() < tracker.lost_share:
+            return None
+        noise = self._rng.standard_normal(8)
+        true = needle.frame_at(needle.inserted_mm - tracker.latency_mm)
+        seen = as_measured(true, tracker.position_mm, tracker.direction_deg, noise[:5])
+        if tracker.target_mm is None:
+            return seen, None
+        return seen, self._attempt.target_lps + tracker.target_mm * noise[5:]
+
+
+def unknown_of(errors: ErrorModel, steering: NeedleSteering, start: Float) -> Unknown:
+    """Return what is not known of a needle under an error model, watched by a tracker.
+
+    Parameters
+    ----------
+    start : (6, 6) float64
+        Covariance of the pose in which it begins, see `Unknown`.
+    """
+    factor = errors.needle_curvature
+    return Unknown(
+        start=start, factor=factor.median, factor_ln=factor.size,
+        roll_rad=math.radians(errors.needle_roll.rms), target_mm=errors.target_position.rms,
+        tip_mm=steering.position_mm, tip_rad=math.radians(steering.direction_deg),
+        seen_target_mm=steering.target_mm or 0.0,
+    )  # fmt: skip
+
+
+@frozen_record
+class Steered:
+    """What came of one needle that was measured and planned again on its way.
+
+    Parameters
+    ----------
+    arcs : (A, 3) float64
+        True arcs from the true tip of the tubes.
+    replans : tuple of Replan
+    stopped : Failure or None
+        Why it stopped before its end.
+    factor : float
+        What is believed in the end of the true curvature over the commanded one.
+    """
+
+    arcs: Float
+    replans: tuple[Replan, ...]
+    stopped: Failure | None
+    factor: float
+
+
+def insert_needle(
+    environment: NeedleEnvironment,
+    query: Query,
+    path: ArcPath,
+    replanner: Replanner,
+    attempt: Attempt,
+    true_tip: Float,
+    steering: NeedleSteering,
+    unknown: Unknown,
+    rng: np.random.Generator,
+) -> Steered:
+    """Insert a needle from a true tip of the tubes, watched by a tracker and planned again on its way.
+
+    Parameters
+    ----------
+    environment : NeedleEnvironment
+        In which the needle goes on without a new path as long as the old one is clear.
+    query, path
+        What is planned for, from where the tip is taken to be, and the path to follow first.
+    replanner : Replanner
+    attempt, true_tip, steering, unknown, rng
+        See `SteeredTruth` and `Belief`.
+    """
+    needle = TrueNeedle(SteeredTruth(attempt, steering, rng), true_tip, 0.0)
+    belief = Belief(query, unknown, steering.latency_mm)
+    replans, stopped = steer(
+        environment, needle, belief, path, replanner, branch=query.branch, step_mm=steering.measure_every_mm,
+        measure_every_mm=steering.measure_every_mm, replan_every_mm=steering.replan_every_mm,
+    )  # fmt: skip
+    arcs = np.array(needle.arcs).reshape(-1, 3)
+    ends = with_stop(arcs, float(attempt.errors.stop_mm[0, 0])) if len(arcs) else arcs
+    return Steered(arcs=ends, replans=replans, stopped=stopped, factor=belief.factor)
 
 
 def with_stop(arcs: Float, error_mm: float) -> Float:

@@ -14,8 +14,8 @@ from lungaccess.showing.report import style
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.planning.procedure.insertion import Insertion, InsertionStudy, Study
-    from stages.needle import ArcPath, Query
+    from lungaccess.planning.procedure.insertion import Insertion, InsertionStudy
+    from stages.needle import Query
 
 OPEN, CLOSED = style.TUBE, style.SCOPE
 FRAMES, FRAME_MS, LAST_MS = 40, 90, 2000
@@ -52,15 +52,15 @@ class Plane:
         axes.set(xlabel="towards the target, mm", ylabel="aside, mm", ylim=(-ASIDE_MM, ASIDE_MM))
 
 
-def draw_paths(axes: Any, lung: Lung, query: Query, plan: ArcPath, made: Study) -> None:
+def draw_paths(axes: Any, lung: Lung, found: InsertionStudy) -> None:
     """Draw true paths in the plane of the plan, with what the plane cuts in grey."""
     from lungaccess.planning.procedure.insertion import Outcome
 
-    plane = Plane(query)
+    plane = Plane(found.query)
     plane.show_obstacles(axes, lung)
     for colour, mode, name in (
-        (OPEN, made.open_loop, "open loop"),
-        (CLOSED, made.closed_loop, "closed loop"),
+        (OPEN, found.open_loop, "open loop"),
+        (CLOSED, found.closed_loop, "closed loop"),
     ):
         for n, run in enumerate(mode.insertions):
             points, goal = plane.flat(run.lps_from_tip[:, :3, 3]), plane.flat(run.target_lps)
@@ -69,7 +69,7 @@ def draw_paths(axes: Any, lung: Lung, query: Query, plan: ArcPath, made: Study) 
             axes.plot(*np.stack([points[-1], goal]).T, color=colour, lw=0.6, ls=":")
             axes.plot(*goal, "+", color=style.INK, ms=4)
     axes.plot([], [], "+", color=style.INK, ms=4, label="where the target is in the end")
-    axes.plot(*plane.flat(plan.sample(0.5)[0]).T, "--", color=style.INK, lw=1.0, label="plan")
+    axes.plot(*plane.flat(found.path.sample(0.5)[0]).T, "--", color=style.INK, lw=1.0, label="plan")
     axes.legend(fontsize=8, loc="lower left", frameon=False)
 
 
@@ -83,13 +83,13 @@ def insertions_png(found: InsertionStudy, lung: Lung, path: str | os.PathLike[st
     """
     figure = style.new_figure(13.0, 5.2)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.5, 1.0]})
-    draw_paths(left, lung, found.query, found.path, found.made)
+    draw_paths(left, lung, found)
     left.set_title("True paths; grey: what the plane of the plan cuts", fontsize=10)
     for colour, mode, name in (
-        (OPEN, found.made.open_loop, "open loop"),
-        (CLOSED, found.made.closed_loop, "closed loop"),
+        (OPEN, found.open_loop, "open loop"),
+        (CLOSED, found.closed_loop, "closed loop"),
     ):
-        errors = np.sort([run.tip_error_mm for run in mode.insertions])
+        errors = np.sort(mode.tip_errors_mm)
         share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
         right.step(errors, share, where="post", color=colour, label=name)
     right.axvline(found.tolerance_mm, color=style.FAINT_INK, lw=0.8)
@@ -122,7 +122,7 @@ def insertion_webp(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
-    blind, watched = found.made.open_loop.insertions[0], found.made.closed_loop.insertions[0]
+    blind, watched = found.open_loop.insertions[0], found.closed_loop.insertions[0]
     figure = style.new_figure(8.0, 4.4)
     canvas, axes = FigureCanvasAgg(figure), figure.subplots()
     plane = Plane(found.query)

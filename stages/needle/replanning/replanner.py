@@ -182,6 +182,8 @@ class Replanner:
             raise SettingsError(f"A replan has {iterations} iterations", expected="0 or more")
         self.plan = plan
         """The plan that is being followed; the last replan, if there is one."""
+        self.curvature_share = 1.0
+        """Share of the needle's largest curvature that it reaches in this tissue: replans keep to it."""
         self._environment = environment
         self._query = query
         self._objective = objective
@@ -241,22 +243,23 @@ class Replanner:
         away = float(np.linalg.norm(query.target - query.lps_from_start[:3, 3]))
         if away <= max(self._environment.goal_tolerance_mm, index.MIN_ARC_MM):
             return _arrived(query, away)
-        roots, relaxed = roots_of_tip(
-            self._environment, self._objective_arrays, query, self._settings.relaxed_mm
-        )
+        unreached = 1.0 - self.curvature_share
+        bending = with_reserve(self._environment, unreached) if unreached else self._environment
+        roots, relaxed = roots_of_tip(bending, self._objective_arrays, query, self._settings.relaxed_mm)
         if not roots:
             return self._stuck(query)
-        failure, why = self._out_of_reach(query)
+        failure, why = self._out_of_reach(bending, query)
         if failure is None:
             left = self._iterations
-            for n, variant in enumerate(self._variants):
+            for n, each in enumerate(self._variants):
+                variant = with_reserve(each, unreached) if unreached else each
                 best, spent = self._try(variant, roots, candidates, left // (len(self._variants) - n))
                 if best is not None:
                     return self._found(best, query, relaxed)
                 left -= spent
             failure = Failure.NOT_FOUND
             why = f"No clear path to the target was found in {self._iterations} iterations"
-        missed = self._near_miss(query, roots, relaxed, away)
+        missed = self._near_miss(bending, query, roots, relaxed, away)
         return missed or Replan(path=None, failure=failure, why=why)
 
     def _try(
@@ -295,13 +298,15 @@ class Replanner:
             relaxed_clearance_mm=relaxed if len(root.arcs) else 0.0,
         )
 
-    def _near_miss(self, query: Query, roots: list[Root], relaxed: float, away: float) -> Replan | None:
+    def _near_miss(
+        self, environment: NeedleEnvironment, query: Query, roots: list[Root], relaxed: float, away: float
+    ) -> Replan | None:
         """Return the tightest arc towards the target if it passes near enough, or stay if the tip is."""
         best: Attempts | None = None
         least = min(away, self._settings.largest_miss_mm)
-        kappa = self._environment.limits.kappa
+        kappa = environment.limits.kappa
         for root in roots:
-            attempts = Attempts(self._environment, self._objective_arrays, root)
+            attempts = Attempts(environment, self._objective_arrays, root)
             pose, target = pose_at(root.query.lps_from_start), query.goal
             turn, miss = nearest_turn(*seen_from(pose, target), kappa)
             if turn > index.MIN_ARC_MM * kappa and miss < least:
@@ -313,9 +318,9 @@ class Replanner:
             return self._found(best, query, relaxed)
         return _arrived(query, away) if away <= self._settings.largest_miss_mm else None
 
-    def _out_of_reach(self, query: Query) -> tuple[Failure | None, str]:
+    def _out_of_reach(self, environment: NeedleEnvironment, query: Query) -> tuple[Failure | None, str]:
         """Tell why no path leads to the target even in free space."""
-        limits = self._environment.limits
+        limits = environment.limits
         left = limits.max_length_mm - query.inserted_mm
         if left <= index.MIN_ARC_MM:
             return Failure.OUT_OF_LENGTH, f"All of the needle ({limits.max_length_mm:g} mm) is inserted"

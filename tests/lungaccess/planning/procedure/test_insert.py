@@ -1,8 +1,9 @@
-"""Insertions watched by a tracker: what its noise, rate, latency and losses do, and the command."""
+"""Insertions watched by a tracker: the errors of `risk`, what a tracker is worth, and the command."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,40 +14,54 @@ from PIL import Image
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.cli import app as cli
-from lungaccess.planning.procedure.insertion import InsertionStudy, TrackerModel, gain_for, insert_plan
+from lungaccess.planning.procedure.insertion import WATCHED, InsertionStudy, Outcome, insert_plan
 from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk import (
+    AngleError,
+    CurvatureError,
+    ErrorModel,
+    PositionError,
+    RiskAssessor,
+    load_errors,
+)
 
 EXACT = {"position_mm": 0.0, "direction_deg": 0.0, "target_mm": 0.0}
+SLOW = replace(WATCHED, measure_every_mm=1.0)
 
 
 def inserted(
-    plan: Plan, lung: Lung, *, size: float = 1.0, samples: int = 6, **changes: float
+    plan: Plan,
+    lung: Lung,
+    errors: ErrorModel | None = None,
+    *,
+    samples: int = 6,
+    seed: int = 0,
+    **changes: Any,
 ) -> InsertionStudy:
-    return insert_plan(plan, lung, TrackerModel(rate_hz=2.0, **changes), size=size, samples=samples)
+    return insert_plan(plan, lung, replace(SLOW, **changes), errors=errors, samples=samples, seed=seed)
 
 
-def test_a_usual_tracker_is_believed_as_usual() -> None:
-    assert gain_for(0.4, 5.0) == pytest.approx(0.3)
-
-
-def test_exact_measurements_are_believed_and_frequent_ones_less_each() -> None:
-    assert gain_for(0.0, 0.1) == 1.0
-    gains = [gain_for(0.4, every) for every in (0.1, 1.0, 5.0, 50.0)]
-    assert gains == sorted(gains) and 0.0 < gains[0] < 0.1 and gains[-1] < 1.0
-    assert gain_for(2.0, 5.0) < gain_for(0.4, 5.0) < gain_for(0.01, 5.0)
-
-
-@pytest.mark.parametrize("latency_s", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("latency_mm", [0.0, 1.0, 6.0])
 def test_without_errors_an_exact_tracker_leads_to_the_target_however_late(
-    latency_s: float, small_plan: Plan, breathing_lung: Lung
+    latency_mm: float, small_plan: Plan, breathing_lung: Lung
 ) -> None:
     """What was commanded since a measurement is added to it, rolls included, so that nothing is off."""
-    found = inserted(small_plan, breathing_lung, size=0.0, samples=1, latency_s=latency_s, **EXACT).errors
-    assert found.latency_mm == pytest.approx(2.0 * latency_s)
-    tracker = TrackerModel(rate_hz=2.0, latency_s=latency_s, **EXACT)
-    made = insert_plan(small_plan, breathing_lung, tracker, size=0.0, samples=1).made.closed_loop
-    # The target's own drift is of size 0, too.
-    assert made.median_error_mm < 1e-6 and made.insertions[0].replans
+    found = inserted(
+        small_plan, breathing_lung, ErrorModel(), samples=1, latency_mm=latency_mm, **EXACT
+    ).closed_loop
+    assert found.tip_errors_mm.max() < 1e-6 and found.insertions[0].replans
+
+
+def test_blind_insertions_are_those_of_the_risk(small_plan: Plan, breathing_lung: Lung) -> None:
+    """One model of errors and one simulator: the same draws end at the same places and touch the same."""
+    found = inserted(small_plan, breathing_lung, load_errors("gated-ct"), samples=50, seed=4)
+    assessor = RiskAssessor(small_plan, breathing_lung, radius_mm=2.0)
+    drawn = assessor.draws(50, 4).deviations(found.errors)
+    outcomes = assessor.outcomes(drawn)
+    assert np.allclose(found.open_loop.tip_errors_mm, outcomes.miss_mm, atol=1e-9)
+    assert found.open_loop.reached.count == assessor.succeeded(outcomes).sum()
+    assert not found.errors.scope_position.size and not found.errors.tube_rotation.size
+    assert [run.factor for run in found.open_loop.insertions] == drawn.factor.tolist()
 
 
 def test_the_same_seed_gives_the_same_result(small_plan: Plan, breathing_lung: Lung) -> None:
@@ -56,13 +71,34 @@ def test_the_same_seed_gives_the_same_result(small_plan: Plan, breathing_lung: L
 
 
 def test_a_tracker_helps(small_plan: Plan, breathing_lung: Lung) -> None:
-    found = inserted(small_plan, breathing_lung, size=2.0, samples=12).made
-    assert found.closed_loop.median_error_mm < found.open_loop.median_error_mm
-    assert found.closed_loop.reached_share >= found.open_loop.reached_share
+    found = inserted(small_plan, breathing_lung, samples=12)
+    assert np.median(found.closed_loop.tip_errors_mm) < np.median(found.open_loop.tip_errors_mm)
+    assert found.closed_loop.reached.count >= found.open_loop.reached.count
+
+
+def test_the_curvature_is_learned_on_the_way(small_plan: Plan, breathing_lung: Lung) -> None:
+    errors = ErrorModel(
+        needle_curvature=CurvatureError(attempt_ln=0.4), needle_roll=AngleError(attempt_deg=5.0)
+    )
+    found = inserted(small_plan, breathing_lung, errors, samples=8, measure_every_mm=0.1)
+    runs = found.closed_loop.insertions
+    known = [abs(np.log(run.believed_factor / run.factor)) for run in runs]
+    assert np.median(known) < 0.1 < np.median([abs(np.log(run.factor)) for run in runs])
+    weak = [run for run in runs if run.factor > 1.0]
+    assert all(run.outcome is Outcome.REACHED for run in weak)
+
+
+def test_a_bias_moves_all_targets_alike(small_plan: Plan, breathing_lung: Lung) -> None:
+    errors = ErrorModel(target_position=PositionError(bias_mm=(0.0, 0.0, 1.5)))
+    found = inserted(small_plan, breathing_lung, errors, samples=2)
+    for blind, watched in zip(found.open_loop.insertions, found.closed_loop.insertions, strict=True):
+        assert np.allclose(blind.target_lps, small_plan.end_lps + [0.0, 0.0, 1.5])
+        assert blind.tip_error_mm == pytest.approx(1.5) and watched.tip_error_mm < 1.0
 
 
 def test_a_tracker_that_loses_everything_is_none(small_plan: Plan, breathing_lung: Lung) -> None:
-    found = inserted(small_plan, breathing_lung, samples=3, lost_share=1.0).made
+    errors = ErrorModel(needle_curvature=CurvatureError(attempt_ln=0.2))
+    found = inserted(small_plan, breathing_lung, errors, samples=3, lost_share=1.0)
     for blind, watched in zip(found.open_loop.insertions, found.closed_loop.insertions, strict=True):
         assert not watched.replans
         assert np.allclose(blind.lps_from_tip[-1], watched.lps_from_tip[-1], atol=1e-9)
@@ -71,16 +107,14 @@ def test_a_tracker_that_loses_everything_is_none(small_plan: Plan, breathing_lun
 def test_replans_are_not_more_than_asked_for(small_plan: Plan, breathing_lung: Lung) -> None:
     length = small_plan.needle.length_mm
     for every in (2.0, 8.0):
-        (run,) = inserted(
-            small_plan, breathing_lung, samples=1, replan_every_mm=every
-        ).made.closed_loop.insertions
+        (run,) = inserted(small_plan, breathing_lung, samples=1, replan_every_mm=every).closed_loop.insertions
         assert 0 < len(run.replans) <= length / every + 2
 
 
-@pytest.mark.parametrize(("size", "samples"), [(-1.0, 5), (6.0, 5), (1.0, 0), (float("nan"), 1)])
-def test_numbers_have_a_range(size: float, samples: int, small_plan: Plan, breathing_lung: Lung) -> None:
+@pytest.mark.parametrize("wrong", [{"samples": 0}, {"tolerance_mm": -1.0}])
+def test_numbers_have_a_range(wrong: dict[str, Any], small_plan: Plan, breathing_lung: Lung) -> None:
     with pytest.raises(SettingsError):
-        insert_plan(small_plan, breathing_lung, size=size, samples=samples)
+        insert_plan(small_plan, breathing_lung, **wrong)
 
 
 @pytest.mark.slow
@@ -96,14 +130,16 @@ def test_the_command_writes_a_film_and_a_picture(
     small_plan.save(tmp_path / "plan.json")
     film, picture = tmp_path / "a.webp", tmp_path / "a.png"
     words: list[Any] = ["insert", tmp_path / "plan.json", "toy", "--samples", 2, "--rate", 1]
+    words += ["--errors", "gated-ct"]
     code = cli.main([str(each) for each in (*words, "--film", film, "--picture", picture, "--json")])
     answer = json.loads(capsys.readouterr().out)
     assert code == 0 and answer["plan_accepted"] and answer["samples"] == 2
-    assert len(answer["closed_loop"]["tip_errors_mm"]) == 2
+    assert len(answer["closed_loop"]["tip_errors_mm"]) == 2 and answer["errors"]["name"] == "gated-ct"
     with Image.open(film) as opened:
         assert opened.n_frames > 2  # type: ignore[attr-defined]
     with Image.open(picture) as opened:
         assert opened.width > 500
     assert cli.main([str(each) for each in (*words, "--film", tmp_path / "a.gif")]) == 2
     assert cli.main([str(each) for each in words]) == 0
-    assert "tracked" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "tracked" in said and "curvature known to" in said

@@ -69,9 +69,7 @@ def test_a_needle_carried_out_arc_by_arc_is_that_of_open_loop(plan: Plan, small_
 
 
 def test_without_errors_every_procedure_succeeds(plan: Plan, small_lung: Lung) -> None:
-    every = replace(
-        SEEN_EXACTLY, imaging=Imaging(measured=True), needle=NeedleSteering(closed_loop=True, gain=1.0)
-    )
+    every = replace(SEEN_EXACTLY, imaging=Imaging(measured=True), needle=NeedleSteering(closed_loop=True))
     found = simulate_procedure(plan, small_lung, errors=ErrorModel(), procedure=every, samples=3)
     assert found.succeeds.value == 1.0 and found.miss_mm[0.95] < 0.01
     assert [stage.stage for stage in found.stages] == ["scope", "tube", "needle"]
@@ -114,7 +112,7 @@ def test_steering_corrects_what_nobody_measured_before(plan: Plan, small_lung: L
         tube_rotation=AngleError(attempt_deg=1.5),
         needle_curvature=CurvatureError(median=0.9),
     )
-    steering = Procedure(needle=NeedleSteering(closed_loop=True, measure_every_mm=3.0, gain=1.0))
+    steering = Procedure(needle=NeedleSteering(closed_loop=True, measure_every_mm=3.0))
     steered, blind = (
         simulate_procedure(plan, small_lung, errors=model, procedure=each, samples=30, radius_mm=3.0)
         for each in (steering, Procedure())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -14,7 +13,7 @@ from anatomy.base.errors import SettingsError
 pyigtl = pytest.importorskip("pyigtl", reason="pyigtl (extra `live`) is not installed")
 
 from anatomy.io.openigtlink import pose_message  # noqa: E402
-from lungaccess.showing.live import Link, LinkTracker  # noqa: E402
+from lungaccess.showing.live import Link  # noqa: E402
 from lungaccess.showing.live import link as link_module  # noqa: E402
 from lungaccess.showing.live.link import LATE, LOST, REFUSED, UNREADABLE  # noqa: E402
 
@@ -174,24 +173,3 @@ def test_a_port_in_use_is_an_error_in_words(link: Link) -> None:
         Link(port=link.port)
     with pytest.raises(SettingsError, match="cannot be listened at"):
         Link(host="192.0.2.1", port=0)
-
-
-def test_the_tracker_gives_the_newest_pose_and_the_target(link: Link) -> None:
-    tracker = LinkTracker(link)
-    assert tracker.read() is None
-    (other,) = joined(link)
-    other.sendall(
-        pose_message("TargetTracked", pose_at(9.0), 1.0)
-        + pose_message("NeedleTipTracked", pose_at(1.0), 1.0)
-        + pose_message("Other", pose_at(5.0), 1.5)
-        + pose_message("NeedleTipTracked", pose_at(2.0), 2.0)
-    )
-    measured = None
-    for _ in range(PATIENCE):
-        measured = tracker.read() or measured
-        if measured is not None and measured.time_s == pytest.approx(2.0):
-            break
-        time.sleep(0.002)
-    assert measured is not None and measured.lps_from_tip[0, 3] == pytest.approx(2.0)
-    assert measured.target_lps is not None and measured.target_lps[0] == pytest.approx(9.0)
-    assert tracker.read() is None

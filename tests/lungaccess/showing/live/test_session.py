@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
+from anatomy.poses import roll_towards
 from lungaccess.plans.plan import Plan
 
 pytest.importorskip("pyigtl", reason="pyigtl (extra `live`) is not installed")
@@ -20,6 +21,7 @@ from anatomy.io.openigtlink import HEADER_BYTES, pose_message, require_pyigtl
 from lungaccess.cli import app as cli
 from lungaccess.showing.live import Answer, Link, LiveSession, TrackedReplanner
 from lungaccess.showing.live.replanning import NEEDLE_TIP, SCOPE_TIP, TARGET, TUBE_TIP
+from stages.needle import TrueNeedle, bend_direction
 
 ROUNDS = 400
 
@@ -193,6 +195,42 @@ def test_a_tracked_target_is_aimed_at(small_plan: Plan, breathing_lung: Lung) ->
         answer = replanner.answer(name, np.asarray(pose))
         if answer.needle_lps is not None:
             assert np.linalg.norm(answer.needle_lps[-1] - moved[:3, 3]) < 1.1
+
+
+class Bends(NamedTuple):
+    """A needle that goes where it is told to but bends more or less."""
+
+    factor: float
+
+    def roll(self) -> None:
+        pass
+
+    def bend(self, frame: np.ndarray, curvature: float, inserted_mm: float) -> tuple[float, float]:
+        return 0.0, self.factor * curvature
+
+    def measure(self, needle: TrueNeedle) -> None:
+        return None
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.6])
+def test_a_tracked_needle_tells_how_much_it_bends(
+    factor: float, small_plan: Plan, breathing_lung: Lung
+) -> None:
+    """A robot that does what the paths sent to it say, with another curvature; the target is tracked, too."""
+    replanner, moved = TrackedReplanner(small_plan, breathing_lung), np.eye(4)
+    moved[:3, 3] = small_plan.end_lps
+    needle = TrueNeedle(Bends(factor), np.asarray(small_plan.tube.lps_from_tip), 0.0)
+    words = replanner.answer(NEEDLE_TIP, needle.frame).words
+    most = small_plan.system.needle.max_curvature_per_mm
+    while needle.inserted_mm < 0.6 * small_plan.needle.length_mm:
+        path = replanner._needle_replanner.plan
+        length, roll, curvature = path.arcs[0]
+        needle.roll(roll_towards(needle.frame, bend_direction(path.lps_from_start, roll)))
+        needle.insert(min(0.5, length), min(curvature / replanner._belief.factor, most))
+        words = replanner.answer(NEEDLE_TIP, needle.frame).words
+        assert replanner.answer(TARGET, moved).words == "target moved"
+    assert replanner._belief.factor == pytest.approx(factor, rel=0.25), words
+    assert f"bends {replanner._belief.factor:.2f} times as told" in words
 
 
 def test_the_same_poses_give_the_same_answers(small_plan: Plan, breathing_lung: Lung) -> None:

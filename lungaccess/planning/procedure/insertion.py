@@ -1,0 +1,308 @@
+"""Insert the needle of a plan many times: blindly, and planned again by what a tracker sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from anatomy import poses
+from anatomy.base.records import frozen_record
+from anatomy.base.settings import to_mapping
+from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from lungaccess.planning.procedure.settings import NeedleSteering
+from lungaccess.planning.procedure.truth import (
+    ARCS,
+    Attempt,
+    Steered,
+    insert_needle,
+    needle_pieces,
+    unknown_of,
+)
+from lungaccess.plans import curves
+from lungaccess.plans.plan import Plan
+from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, Share, load_errors
+from lungaccess.uncertainty.risk.breathing import model_for
+from lungaccess.uncertainty.risk.deviations import Deviations
+from stages.needle import (
+    ArcPath,
+    Failure,
+    NeedleEnvironment,
+    Objective,
+    Query,
+    Replan,
+    Replanner,
+    ReplanSettings,
+    needle_environment,
+)
+
+RATE_HZ, SPEED_MM_PER_S, LATENCY_S = 20.0, 2.0, 0.1
+WATCHED = NeedleSteering(
+    closed_loop=True, measure_every_mm=SPEED_MM_PER_S / RATE_HZ, replan_every_mm=2.0, position_mm=0.5,
+    direction_deg=0.6, target_mm=0.5, latency_mm=LATENCY_S * SPEED_MM_PER_S,
+)  # fmt: skip
+"""An electromagnetic tracker and a slow insertion [assumption]."""
+SAMPLES = 50
+"""A share of one half is then known to 14 %."""
+ITERATIONS = 300
+"""Of a replan: more made no difference in simulated insertions."""
+TOLERANCE_MM = 2.0
+SHOWN_STEP_MM = 0.5
+_MEASURING = 1000
+"""Stream of the tracker's noise, beyond those of the kinds of error."""
+
+
+class Outcome(StrEnum):
+    """How an insertion ended."""
+
+    REACHED = "reached"
+    MISSED = "missed"
+    HIT = "hit an obstacle"
+    NO_PATH = "no path left"
+    OUT_OF_LENGTH = "out of length"
+
+
+@frozen_record
+class Insertion:
+    """What happened to one needle.
+
+    Parameters
+    ----------
+    lps_from_tip : (N, 4, 4) float64
+        Where the tip really was, the start first.
+    inserted_mm : (N,) float64
+        Length of needle at each of these poses.
+    outcome : Outcome
+    touched : tuple of str
+        Names of the forbidden structures that tubes or needle touch.
+    target_lps : (3,) float64, LPS mm
+        Where the target really is.
+    tip_error_mm : float
+        Distance from the tip to it, wherever the insertion ended.
+    factor : float
+        True curvature over the commanded one.
+    believed_factor : float
+        What is believed of it in the end; nan of a needle that nobody watched.
+    replans : tuple of Replan
+    """
+
+    lps_from_tip: Float
+    inserted_mm: Float
+    outcome: Outcome
+    touched: tuple[str, ...]
+    target_lps: Float
+    tip_error_mm: float
+    factor: float
+    believed_factor: float = math.nan
+    replans: tuple[Replan, ...] = ()
+
+
+@frozen_record
+class Summary:
+    """What became of many insertions, with the share that reached the target."""
+
+    insertions: tuple[Insertion, ...]
+    reached: Share
+
+    @staticmethod
+    def of(insertions: Iterable[Insertion]) -> Summary:
+        """Count what became of at least one insertion."""
+        runs = tuple(insertions)
+        reached = sum(run.outcome is Outcome.REACHED for run in runs)
+        return Summary(insertions=runs, reached=Share(count=reached, samples=len(runs)))
+
+    @property
+    def tip_errors_mm(self) -> Float:
+        """Of each insertion, wherever it ended."""
+        return np.array([run.tip_error_mm for run in self.insertions])
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        runs, errors = self.insertions, self.tip_errors_mm
+        hits = [name for run in runs for name in run.touched]
+        replans = [each for run in runs for each in run.replans]
+        return {
+            "reached": {"probability": self.reached.value, "interval_95": list(self.reached.interval)},
+            "outcomes": {str(each): sum(run.outcome is each for run in runs) for each in Outcome},
+            "hits": {name: hits.count(name) for name in sorted(set(hits))},
+            "tip_error_median_mm": float(np.median(errors)),
+            "tip_error_95_mm": float(np.quantile(errors, 0.95)),
+            "replans": len(replans),
+            "replans_without_path": sum(each.path is None for each in replans),
+            "tip_errors_mm": errors.tolist(),
+        }
+
+
+@frozen_record
+class InsertionStudy:
+    """What came of the same needles, inserted blindly and with the tracker.
+
+    Parameters
+    ----------
+    steering : NeedleSteering
+    errors : ErrorModel
+        Of needle and target alone.
+    seed : int
+    tolerance_mm : float
+        A tip that ends no farther from the target has reached it.
+    query, path
+        What was inserted.
+    open_loop, closed_loop : Summary
+    """
+
+    steering: NeedleSteering
+    errors: ErrorModel
+    seed: int
+    tolerance_mm: float
+    query: Query
+    path: ArcPath
+    open_loop: Summary
+    closed_loop: Summary
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        watched = self.closed_loop.insertions
+        return {
+            "tracker": to_mapping(self.steering),
+            "errors": to_mapping(self.errors),
+            "samples": len(watched),
+            "seed": self.seed,
+            "tolerance_mm": self.tolerance_mm,
+            "open_loop": self.open_loop.to_mapping(),
+            "closed_loop": self.closed_loop.to_mapping(),
+            "curvature_factors": [run.factor for run in watched],
+            "believed_factors": [run.believed_factor for run in watched],
+        }
+
+
+def insert_plan(
+    plan: Plan,
+    lung: Lung,
+    steering: NeedleSteering = WATCHED,
+    *,
+    errors: ErrorModel | None = None,
+    believed: ErrorModel | None = None,
+    samples: int = SAMPLES,
+    seed: int = 0,
+    tolerance_mm: float = TOLERANCE_MM,
+) -> InsertionStudy:
+    """Insert the needle of a plan many times, blindly and planned again by what a tracker sees.
+
+    The same needles go to the same targets in both ways, drawn as `lungaccess.uncertainty.risk.assess` draws
+    them, and judged by its kernel.  Scope and tubes stand as planned: their errors belong to
+    `lungaccess.simulate_procedure`.
+
+    Parameters
+    ----------
+    errors : ErrorModel, optional
+        The preset `breath-hold` if None; only what concerns needle and target counts.
+    believed : ErrorModel, optional
+        What the errors are taken to be when measurements are weighed, if that is something else.
+    samples, seed : int
+
+    Raises
+    ------
+    PlanFileError
+        If the plan was made for another patient.
+    SettingsError
+        If the plan has no needle, or a number is out of its range.
+    """
+    plan.system.require_needle("A simulated insertion")
+    model = model_for(errors or load_errors(), plan, lung)
+    inserter = _Inserter(plan, lung, steering, model, believed or model, tolerance_mm)
+    drawn = inserter.draw(samples, seed)
+    return InsertionStudy(
+        steering=steering, errors=inserter.errors, seed=seed, tolerance_mm=tolerance_mm, query=inserter.query,
+        path=inserter.path, open_loop=Summary.of(map(inserter.blind, drawn)),
+        closed_loop=Summary.of(inserter.watched(each, (seed, n)) for n, each in enumerate(drawn)),
+    )  # fmt: skip
+
+
+class _Inserter:
+    """Inserts the needle of one plan, and looks at what came of it."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        lung: Lung,
+        steering: NeedleSteering,
+        errors: ErrorModel,
+        believed: ErrorModel,
+        tolerance_mm: float,
+    ) -> None:
+        self.plan, self.steering = plan, steering
+        self.errors = ErrorModel(
+            name=errors.name, description=errors.description, needle_curvature=errors.needle_curvature,
+            needle_roll=errors.needle_roll, needle_insertion=errors.needle_insertion,
+            target_position=errors.target_position, breathing=errors.breathing,
+        )  # fmt: skip
+        # The needle begins where the plan has it, which is known.
+        self._unknown = unknown_of(believed, steering, np.zeros((6, 6)))
+        self._assessor = RiskAssessor(plan, lung, radius_mm=tolerance_mm)
+        needle = plan.system.require_needle("A simulated insertion")
+        self._environment: NeedleEnvironment = needle_environment(
+            lung, needle, plan.system.margins, with_fissures=plan.fissures_are_obstacles
+        )
+        start = np.asarray(plan.tube.lps_from_tip)
+        self.path = ArcPath(lps_from_start=start, arcs=curves.needle_pieces(plan.needle))
+        self.query = Query(
+            lps_from_start=start, target=np.asarray(plan.end_lps), branch=plan.exemption.branch
+        )
+
+    def draw(self, samples: int, seed: int) -> list[Attempt]:
+        """Return the errors of so many needles."""
+        errors = self._assessor.draws(samples, seed, n_arcs=ARCS).deviations(self.errors)
+        frame = np.asarray(self.plan.scope.lps_from_scope_tip)
+        start = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
+        rows = [slice(n, n + 1) for n in range(samples)]
+        each = [Deviations(**{name: values[row] for name, values in vars(errors).items()}) for row in rows]
+        aim = self.query.target
+        return [Attempt(errors=one, start=start, target_lps=aim + one.target_mm[0]) for one in each]
+
+    def blind(self, attempt: Attempt) -> Insertion:
+        """Carry out the plan as it stands."""
+        return self._judged(attempt, attempt.pieces(self.plan), None)
+
+    def watched(self, attempt: Attempt, luck: tuple[int, int]) -> Insertion:
+        """Insert the needle with the tracker; `luck` is the seed and the number of the needle."""
+        pieces = attempt.pieces(self.plan)
+        tip, rolled = attempt.needle_tip(self.plan, pieces)
+        replanner = Replanner(
+            self._environment, self.query, self.path, objective=Objective.of(self.plan.objective),
+            settings=ReplanSettings(largest_miss_mm=min(self._assessor.radius_mm, 10.0)),
+            iterations=ITERATIONS, seed=luck[1],
+        )  # fmt: skip
+        rng = np.random.default_rng(np.random.SeedSequence(luck[0], spawn_key=(_MEASURING, luck[1])))
+        found = insert_needle(
+            self._environment, self.query, self.path, replanner, attempt, tip, self.steering, self._unknown,
+            rng,
+        )  # fmt: skip
+        arcs = np.array(found.arcs)
+        arcs[:1, 1] += rolled
+        needle = needle_pieces(arcs, self.plan.system.track_radius_mm)
+        return self._judged(attempt, np.concatenate([pieces[: -len(self.path.arcs)], needle]), found)
+
+    def _judged(self, attempt: Attempt, pieces: Float, steered: Steered | None) -> Insertion:
+        """Return what a chain of true arcs has come to."""
+        n_tube = len(attempt.pieces(self.plan)) - len(self.path.arcs)
+        flags = int(self._assessor.follow(attempt.start[None], pieces[None], n_tube)[0][0])
+        structures = self._assessor.structures
+        touched = tuple(name for name in self._assessor.forbidden if flags & structures[name])
+        tip = poses.poses_on_pieces(attempt.frame(), pieces[:n_tube, :3], math.inf)[0][-1]
+        frames, lengths = poses.poses_on_pieces(tip, pieces[n_tube:, :3], SHOWN_STEP_MM)
+        error = float(np.linalg.norm(frames[-1][:3, 3] - attempt.target_lps))
+        stopped = None if steered is None else steered.stopped
+        outcome = Outcome.MISSED if stopped is None else Outcome.NO_PATH
+        outcome = Outcome.OUT_OF_LENGTH if stopped is Failure.OUT_OF_LENGTH else outcome
+        if touched or error <= self._assessor.radius_mm:
+            outcome = Outcome.HIT if touched else Outcome.REACHED
+        return Insertion(
+            lps_from_tip=frames, inserted_mm=lengths, outcome=outcome, touched=touched,
+            target_lps=attempt.target_lps, tip_error_mm=error, factor=float(attempt.errors.factor[0]),
+            believed_factor=math.nan if steered is None else steered.factor,
+            replans=() if steered is None else steered.replans,
+        )  # fmt: skip

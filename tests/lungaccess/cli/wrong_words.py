@@ -133,7 +133,7 @@ def bad_values(name: str, argument: Any, world: World) -> tuple[str, ...]:
         return LISTS
     if option == "--start":
         return ("0", "77", *world.bad_inputs)
-    if option == "--objective":
+    if option in ("--goal", "--objective"):
         return (*ODD_WORDS, "length=", "length=-1", "length=nan", "length=0", "=1", "length=1,,", "beauty=1")
     return ODD_WORDS
 

@@ -114,7 +114,7 @@ class TestChances:
         monkeypatch.setattr(finder, "_factor", noted)
         list(la.plan(**asked | {"iterations": 0}))
         assert not factors, "ordinary errors stay as they are"
-        rare = asked | {"errors": ERRORS.scaled(12.0), "iterations": 0}
+        rare = asked | {"errors": ERRORS.scaled(8.0), "radius_mm": 1.0, "iterations": 0}
         plans = list(la.plan(**rare))
         assert factors and all(0.0 < factor < 1.0 for factor in factors)
         assert share(plans[-1]) < 0.2

@@ -21,6 +21,8 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import DEFAULT_BUDGET_S, DEFAULT_SYSTEM
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.goals import SUCCESS
+from lungaccess.problem.request import Limits, Request
 from tests.lungaccess.appraisals import appraise_as_told, make_risk
 from tests.lungaccess.loading import load_with
 
@@ -57,8 +59,8 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
     }
     seen.update(accepted=True, risk=make_risk(60))
 
-    def search(lung: Any, system: Any, target: Any, **options: Any) -> Iterator[Plan]:
-        seen.update(options, system=system, target=target)
+    def search(request: Request, **options: Any) -> Iterator[Plan]:
+        seen.update(system=request.system, target=request.target, goal=request.goal, limits=request.limits)
         for number, found in enumerate(seen["plans"]):
             event = SimpleNamespace(
                 iteration=10 * number, elapsed_s=0.1, best_cost=None, phase="search", message=""
@@ -72,7 +74,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
 
     load_with(monkeypatch, lambda *_, **__: toy_lung)
     monkeypatch.setattr("lungaccess.planning.coupled.open_atlas", lambda *_, **__: None)
-    monkeypatch.setattr("lungaccess.planning.coupled.plan", search)
+    monkeypatch.setattr("lungaccess.judging.answering.run", search)
     monkeypatch.setattr(
         "lungaccess.problem.target.StatedTarget.resolve",
         lambda stated, lung: SimpleNamespace(named=stated.origin, lps_mm=toy_plan.target_lps),
@@ -107,7 +109,7 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 def test_plan_help_explains_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["plan", "--help"])
     text = capsys.readouterr().out
-    options = "target nodule system budget iterations seed objective method allow-fissures out cache"
+    options = "target nodule system budget iterations seed goal objective method allow-fissures out cache"
     for option in options.split():
         assert f"--{option}" in text
     assert "inverse-clearance" in text and "kuntz2015" in text
@@ -141,7 +143,8 @@ def test_an_accepted_plan_writes_everything_and_exits_0(
     toy_commands: dict[str, Any], toy_plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert cli.main(["plan", "toy", "--target", "lps:1,2,3", "--out", str(out)]) == ExitCode.OK
+    words = ["plan", "toy", "--target", "lps:1,2,3", "--goal", "inverse-clearance"]
+    assert cli.main([*words, "--out", str(out)]) == ExitCode.OK
     assert {file.name for file in out.iterdir()} == WRITTEN
     assert Plan.load(out / "plan.json").digest == toy_plan.digest
     with (out / "cost_over_time.csv").open(newline="", encoding="utf-8") as file:
@@ -190,7 +193,7 @@ def test_an_interruption_keeps_the_best_plan(
         yield toy_plan
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lungaccess.planning.coupled.plan", search)
+    monkeypatch.setattr("lungaccess.judging.answering.run", search)
     assert cli.main(["plan", "toy", "--nodule", "--out", str(tmp_path)]) == ExitCode.OK
     assert (tmp_path / "plan.json").exists()
 
@@ -222,14 +225,21 @@ def test_an_iteration_budget_leaves_the_time_open(
     words: list[str], time_s: Any, iterations: Any, toy_commands: dict[str, Any], tmp_path: Path
 ) -> None:
     cli.main(["plan", "toy", "--nodule", *words, "--out", str(tmp_path)])
-    assert (toy_commands["time_s"], toy_commands["iterations"]) == (time_s, iterations)
+    assert toy_commands["limits"] == Limits(time_s=time_s, iterations=iterations)
 
 
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize("words", ["length=1,inverse-clearance=2", "inverse_clearance=2, length_mm"])
 def test_an_objective_may_be_a_weighted_sum(words: str, toy_commands: dict[str, Any], tmp_path: Path) -> None:
     cli.main(["plan", "toy", "--nodule", "--objective", words, "--out", str(tmp_path)])
-    assert la.Objective.of(toy_commands["objective"]) == la.Objective(inverse_clearance=2.0, length=1.0)
+    assert toy_commands["goal"].objective == la.Objective(inverse_clearance=2.0, length=1.0)
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_success_is_the_goal_of_whoever_states_none(toy_commands: dict[str, Any], tmp_path: Path) -> None:
+    cli.main(["plan", "toy", "--nodule", "--cpu-budget", "3", "--out", str(tmp_path)])
+    assert toy_commands["goal"] is SUCCESS
+    assert toy_commands["limits"] == Limits(time_s=DEFAULT_BUDGET_S, cpu_s=3.0)
 
 
 @pytest.mark.usefixtures("no_pictures")

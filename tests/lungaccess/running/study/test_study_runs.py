@@ -104,7 +104,7 @@ def test_a_plan_is_checked_and_a_bad_target_is_an_answer(runs: list[Run], cache:
 @pytest.mark.slow
 def test_success_against_least_cost_with_the_same_luck(cache: Path, tmp_path: Path) -> None:
     """Each plan states its chance on the same draws; it is that of the results file, too."""
-    planners = [{"name": "cost"}, {"name": "safe", "method": "success", "iterations": 1}]
+    planners = [{"name": "cost"}, {"name": "safe", "goal": "success", "iterations": 1}]
     asked = content(planner=planners, seeds=[0], case={"errors": "gated-ct", "targets": [NEAR]})
     with ResultsFile(tmp_path / "results.db", create=True) as results:
         chances = []

@@ -62,7 +62,9 @@ def plans_of(lung: Lung, system: la.System, share: float, count: int, seed: int)
     found: list[la.Plan] = []
     for point in np.random.default_rng(seed).permutation(peripheral_targets(lung, 10 * count, seed)):
         try:
-            *_, best = la.plan(lung, held_back, point_target(lung, point), atlas=atlas, goal="default", iterations=100)
+            *_, best = la.plan(
+                lung, held_back, point_target(lung, point), atlas=atlas, goal="default", iterations=100
+            )
         except la.NoPlan:
             continue
         found.append(replace(best, system=replace(held_back, needle=system.needle)))

@@ -2,8 +2,8 @@
 
 A goal is a function of a plan and its lung, and a word on which way is better. All that can be asked with
 other goals can be asked with it: every device, constraint and search. A plan states its value, and is proved
-and checked as any other. This one keeps the tip of the scope near the carina, where it is steered more easily.
-The picture shows what that costs.
+and checked as any other. This one keeps the tip of the scope near the carina, where it is steered easily. The
+picture shows what that costs.
 """
 
 import matplotlib.pyplot as plt

@@ -20,7 +20,7 @@ from lungaccess.planning.coupled.search.separated_arcs import separated_candidat
 from lungaccess.planning.driver import ProgressEvent
 from lungaccess.planning.one_system import run
 from lungaccess.planning.searches import plan_of, search_of
-from lungaccess.planning.success.judges import Judge, judge_of
+from lungaccess.planning.success.ratings import Rating, rating_of
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.goals import SUCCESS
@@ -131,23 +131,23 @@ def alternatives(
 def _others(request: Request, atlas: Atlas, count: int, separation_mm: float) -> Iterator[Plan]:
     """Yield direct ways that are separated, with what they state of the goal."""
     task = replace(request.task, method=METHOD)
-    search, judge = search_of(request, task, atlas), judge_of(request)
+    search, rating = search_of(request, task, atlas), rating_of(request)
     if not isinstance(search, AtlasBound):
         return
     arcs: DirectCandidates = search.arcs
-    if judge is not None:
-        arcs = RankedArcs(arcs, judge)
+    if rating is not None:
+        arcs = RankedArcs(arcs, rating)
     for each in separated_candidates(arcs, count, separation_mm):
         made = plan_of(request, task, atlas, each, 0, 0.0)
         if holds(request, made):
-            yield made if judge is None else judge.stated(made)
+            yield made if rating is None else rating.stated(made)
 
 
 class RankedArcs:
-    """Direct ways whose cost is what a judge expects of them, better first; see `DirectCandidates`."""
+    """Direct ways whose cost is what a rating expects of them, better first; see `DirectCandidates`."""
 
-    def __init__(self, arcs: DirectCandidates, judge: Judge) -> None:
-        self._arcs, self._judge = arcs, judge
+    def __init__(self, arcs: DirectCandidates, rating: Rating) -> None:
+        self._arcs, self._rating = arcs, rating
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._arcs, name)
@@ -156,7 +156,7 @@ class RankedArcs:
         """Return what blocks the ways from deployments, and how little is expected of each."""
         blockers, costs, _best = self._arcs.evaluate(chosen, slack)
         clear = blockers == 0
-        costs[clear] = -self._judge.expected(self._arcs, chosen[clear])
+        costs[clear] = -self._rating.expected(self._arcs, chosen[clear])
         return blockers, costs, float(costs.min(initial=best))
 
 

@@ -48,7 +48,12 @@ def path_cost(
 
 
 def path_costs(
-    lung: Lung, path: ArcPath, *, with_fissures: bool, wall_mm: float = 0.0, parts: Sequence[InTissue] = ()
+    lung: Lung,
+    path: ArcPath,
+    *,
+    with_fissures: bool,
+    wall_mm: float = 0.0,
+    parts: Sequence[InTissue] | None = None,
 ) -> dict[str, float]:
     """Return every cost of a path by its key; see `path_cost`.
 

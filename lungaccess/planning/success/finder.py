@@ -23,13 +23,13 @@ from lungaccess.planning.coupled.search.base import AtlasBound, Step
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.planning.coupled.search.variation import SMALLEST, random_change, varied
 from lungaccess.planning.driver import Turn
-from lungaccess.planning.success.judges import (
-    ChanceJudge,
-    FunctionJudge,
-    Judge,
+from lungaccess.planning.success.ratings import (
+    ChanceRating,
+    FunctionRating,
+    Rating,
     Scorer,
-    judge_of,
     ranked,
+    rating_of,
     standard_error,
 )
 from lungaccess.plans.assemble import with_devices
@@ -94,12 +94,12 @@ class Contender:
 
 
 class ContestFinder:
-    """Finds plans that are better and better by a judge; see `lungaccess.planning.driver.Finder`."""
+    """Finds plans that are better and better by a rating; see `lungaccess.planning.driver.Finder`."""
 
     def __init__(self, request: Request, task: Task, atlas: Atlas, counterfactuals: bool) -> None:
         self._request, self._task, self._atlas = request, task, atlas
         self._counterfactuals = counterfactuals
-        self._judge = judge_of(request) or FunctionJudge(request)
+        self._rating = rating_of(request) or FunctionRating(request)
         self._search = searches.search_of(request, task, atlas)
         self._steps = self._search.steps()
         self._model: Plan | None = None
@@ -119,18 +119,18 @@ class ContestFinder:
         self._leader = first
         yield Turn(iteration=0, phase="search", make=partial(self._unstated, first))
         of_cost = yield from self._by_cost(first)
-        entries = [] if self._direct is None else ranked(self._judge, self._direct).tolist()
+        entries = [] if self._direct is None else ranked(self._rating, self._direct).tolist()
         pool = (made for made in map(self._entry, entries) if made)
         screened = (yield from self._screened(of_cost)) if self._measures else []
-        started = [*of_cost, *screened, *islice(pool, self._judge.rounds.pool)]
-        order = yield from self._halved(self._judge, started)
+        started = [*of_cost, *screened, *islice(pool, self._rating.rounds.pool)]
+        order = yield from self._halved(self._rating, started)
         yield self._turn(0)
         yield from self._challenged(order[0], pool)
 
     @property
     def _measures(self) -> bool:
         """Whether procedures are simulated that measure on their way."""
-        return isinstance(self._judge, ChanceJudge) and not self._judge.procedure.is_open_loop
+        return isinstance(self._rating, ChanceRating) and not self._rating.procedure.is_open_loop
 
     def _first(self) -> Generator[Turn, None, Contender | None]:
         """Return the first plan of the search by cost that keeps the constraints, None if there is none."""
@@ -155,12 +155,12 @@ class ContestFinder:
 
     def _screened(self, of_cost: Sequence[Contender]) -> Generator[Turn, None, list[Contender]]:
         """Return those that do best in open loop; the first of them stays to the end."""
-        judge = ChanceJudge(self._request, open_loop=True)
+        rating = ChanceRating(self._request, open_loop=True)
         direct = self._direct
-        entries = [] if direct is None else ranked(judge, direct).tolist()
-        others = (made for made in map(partial(self._entry, judge=judge), entries) if made)
-        again = [self._contender(each.candidate, judge) for each in of_cost]
-        order = yield from self._halved(judge, [*again, *islice(others, judge.rounds.pool)], leads=False)
+        entries = [] if direct is None else ranked(rating, direct).tolist()
+        others = (made for made in map(partial(self._entry, rating=rating), entries) if made)
+        again = [self._contender(each.candidate, rating) for each in of_cost]
+        order = yield from self._halved(rating, [*again, *islice(others, rating.rounds.pool)], leads=False)
         best = [self._contender(each.candidate) for each in order[:SCREENED]]
         return [replace(each, stays=n == 0) for n, each in enumerate(best)]
 
@@ -168,32 +168,32 @@ class ContestFinder:
         """Return what a step of the search by cost has found, if it keeps the constraints."""
         return None if step.candidate is None else self._contender(step.candidate)
 
-    def _entry(self, entry: int, judge: Judge | None = None) -> Contender | None:
+    def _entry(self, entry: int, rating: Rating | None = None) -> Contender | None:
         direct = self._direct
         candidate = None if direct is None else direct.proved(entry)
-        return None if candidate is None else self._contender(candidate, judge)
+        return None if candidate is None else self._contender(candidate, rating)
 
-    def _contender(self, candidate: Candidate, judge: Judge | None = None) -> Any:
+    def _contender(self, candidate: Candidate, rating: Rating | None = None) -> Any:
         """Return a candidate as a contender, None if it misses a constraint."""
         plan = self._plan(candidate)
         if not holds(self._request, plan):
             return None
-        return Contender(candidate=candidate, plan=plan, scorer=(judge or self._judge).scorer(plan))
+        return Contender(candidate=candidate, plan=plan, scorer=(rating or self._rating).scorer(plan))
 
     def _plan(self, candidate: Candidate) -> Plan:
-        """Return a plan with the devices of a candidate, a whole one for a judge that may ask for all."""
-        if isinstance(self._judge, FunctionJudge) or self._model is None:
+        """Return a plan with the devices of a candidate, a whole one for a rating that may ask for all."""
+        if isinstance(self._rating, FunctionRating) or self._model is None:
             self._model = searches.plan_of(self._request, self._task, self._atlas, candidate, 0, 0.0)
             return self._model
         made = with_devices(self._task, candidate, self._model)
         return searches.with_aim(made, self._request) if self._request.is_for_window else made
 
     def _halved(
-        self, judge: Judge, contenders: Sequence[Contender], *, leads: bool = True
+        self, rating: Rating, contenders: Sequence[Contender], *, leads: bool = True
     ) -> Generator[Turn, None, list[Contender]]:
         """Return contenders, the best first: in each round fewer of them have more draws."""
         left, factor = list(contenders), 1.0
-        for number, (draws, kept) in enumerate(zip_longest(judge.rounds.draws, judge.rounds.kept)):
+        for number, (draws, kept) in enumerate(zip_longest(rating.rounds.draws, rating.rounds.kept)):
             counted = []
             for each in left:
                 counted.append(_counted(each, number, draws))
@@ -211,7 +211,7 @@ class ContestFinder:
     def _challenged(self, best: Contender, pool: Iterator[Contender]) -> Iterator[Turn]:
         """Let the rest of the pool, variations of the best, and the search by cost challenge the best."""
         rng = np.random.Generator(np.random.PCG64(self._task.seed))
-        size, varies = 1.0, not (isinstance(self._judge, ChanceJudge) and self._judge.replans)
+        size, varies = 1.0, not (isinstance(self._rating, ChanceRating) and self._rating.replans)
         for tried in count(1):
             other = None
             if tried % 3 == 0:
@@ -245,7 +245,7 @@ class ContestFinder:
 
     def _beats(self, best: Contender, other: Contender) -> Contender | None:
         """Return another contender if it gains more: after each round it has to be near the best."""
-        for number, draws in enumerate(self._judge.rounds.draws):
+        for number, draws in enumerate(self._rating.rounds.draws):
             other = _counted(other, number, draws)
             error = standard_error(best.share, other.draws) if draws > 1 else 0.0
             if other.share < best.share - 2.0 * error:
@@ -255,7 +255,7 @@ class ContestFinder:
     @property
     def _message(self) -> str:
         leader = self._leader
-        if leader is None or not leader.draws or isinstance(self._judge, FunctionJudge):
+        if leader is None or not leader.draws or isinstance(self._rating, FunctionRating):
             return ""
         return f"succeeds in {leader.share:.0%} of the draws"
 
@@ -282,7 +282,7 @@ class ContestFinder:
         made = searches.plan_of(
             self._request, self._task, self._atlas, contender.candidate, iteration, elapsed_s
         )
-        return self._judge.stated(made)
+        return self._rating.stated(made)
 
     def is_met(self, best: Plan, iteration: int) -> bool:
         """Tell that nothing is good enough: the best possible is not known."""

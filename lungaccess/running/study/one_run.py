@@ -29,7 +29,7 @@ from lungaccess.planning.coupled.atlas_store import open_atlas
 from lungaccess.planning.one_stage import plan_needle
 from lungaccess.planning.one_system import run as plan
 from lungaccess.planning.success.estimate import FRESH_SEED, chance_of, estimate_success
-from lungaccess.planning.success.judges import MEASURED, OPEN_LOOP
+from lungaccess.planning.success.ratings import MEASURED, OPEN_LOOP
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan

@@ -9,7 +9,7 @@ import pytest
 
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.planning.success.judges import OPEN_LOOP
+from lungaccess.planning.success.ratings import OPEN_LOOP
 from lungaccess.plans.plan import Plan
 
 

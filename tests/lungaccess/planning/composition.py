@@ -21,7 +21,7 @@ from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
 from lungaccess.planning.constraints import holds
 from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
-from lungaccess.planning.success import finder, judges
+from lungaccess.planning.success import finder, ratings
 from lungaccess.problem.request import Request, StatedPlace
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, point_target
@@ -56,7 +56,7 @@ CONSTRAINTS = (
     "several systems",
 )  # fmt: skip
 COMMANDS = ("plan", "alternatives")
-FEW = judges.Rounds(pool=4, of_a_tip=2, draws=(32,), kept=(), fresh=32)
+FEW = ratings.Rounds(pool=4, of_a_tip=2, draws=(32,), kept=(), fresh=32)
 """So few candidates and draws show whether a cell can be done."""
 
 
@@ -82,7 +82,7 @@ class Table:
     def __init__(self, lung: Lung) -> None:
         self.still, self.lung = lung, moving(lung, 0.05)
 
-    @cache
+    @cache  # noqa: B019  # One table in a process.
     def case(self, name: str) -> tuple[System, la.Atlas, Target]:
         """Return a kind of system with its atlas and a target that it reaches in many ways."""
         thin = load_system("ultrathin")
@@ -110,7 +110,7 @@ class Table:
             found.append((len(direct_candidates(task, atlas).clear()), goal))
         return max(found, key=lambda each: each[0])[1]
 
-    @cache
+    @cache  # noqa: B019  # One table in a process.
     def _any_plan(self, name: str) -> la.Plan:
         system, atlas, target = self.case(name)
         return list(la.plan(self.lung, system, target, goal="default", atlas=atlas, iterations=0))[-1]
@@ -151,7 +151,7 @@ class Table:
         options = {} if lasting else {"atlas": atlas}
         ask: Callable[..., Any] = la.plan if cell.command == "plan" else la.alternatives
         few = mock.patch.multiple(
-            judges, OPEN_LOOP=FEW, MEASURED=FEW, SCREENING=FEW, EXACT=replace(judges.EXACT, pool=4)
+            ratings, OPEN_LOOP=FEW, MEASURED=FEW, SCREENING=FEW, EXACT=replace(ratings.EXACT, pool=4)
         )
         try:
             with few, mock.patch.object(finder, "BY_COST", 400 if cell.constraint == "kuntz2015" else 5):
@@ -183,7 +183,7 @@ def page(outcomes: dict[Cell, str]) -> str:
         "",
         "Goals, constraints and kinds of systems compose: "
         f"of {len(outcomes)} combinations on a small phantom that breathes {count} are done, "
-        "each with a plan that the independent check accepts, and the others are refused for the reasons below. "
+        "each with a plan that the check accepts, and the others are refused for the reasons below. "
         "The table is made by `python -m tests.lungaccess.planning.composition`, and a test runs it.",
         "",
         f"- Goals: {'; '.join(GOALS)}.",

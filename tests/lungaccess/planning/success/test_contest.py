@@ -10,8 +10,8 @@ import pytest
 
 import lungaccess as la
 from anatomy.lung import Lung
-from lungaccess.planning.success import finder, judges
-from lungaccess.planning.success.judges import ChanceJudge, Rounds
+from lungaccess.planning.success import finder, ratings
+from lungaccess.planning.success.ratings import ChanceRating, Rounds
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.goals import Goal
 from lungaccess.problem.request import Request
@@ -35,7 +35,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         "EXACT": Rounds(pool=20, of_a_tip=4, draws=(1,), kept=(), fresh=0),
     }
     for name, each in rounds.items():
-        monkeypatch.setattr(judges, name, each)
+        monkeypatch.setattr(ratings, name, each)
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +55,9 @@ def asked(small_lung: Lung, small_atlas: la.Atlas, target: Target) -> dict[str, 
 def gained(plan: Plan, asked: dict[str, Any]) -> float:
     """Return the successes of a plan in the draws of a whole contest."""
     fields = {name: value for name, value in asked.items() if name != "atlas"}
-    judge = ChanceJudge(Request.of(**fields))
-    scorer = judge.scorer(plan)
-    return sum(scorer(batch, draws, 1.0) for batch, draws in enumerate(judge.rounds.draws))
+    rating = ChanceRating(Request.of(**fields))
+    scorer = rating.scorer(plan)
+    return sum(scorer(batch, draws, 1.0) for batch, draws in enumerate(rating.rounds.draws))
 
 
 def share(plan: Plan) -> float:
@@ -85,7 +85,7 @@ class TestChances:
         assert first.chance is None and first.costs == by_cost.costs
         assert stated and all(later > sooner for sooner, later in pairwise(map(share, stated)))
         for each in stated:
-            assert each.chance is not None and each.chance.samples == judges.OPEN_LOOP.fresh
+            assert each.chance is not None and each.chance.samples == ratings.OPEN_LOOP.fresh
             assert (each.chance.errors, each.chance.procedure) == ("gated-ct", "open-loop")
 
     def test_the_same_seed_gives_the_same_plans(self, asked: dict[str, Any]) -> None:
@@ -145,7 +145,7 @@ def test_a_procedure_that_measures_is_the_one_of_whoever_states_none(asked: dict
     assert first.chance is None and stated
     for each in stated:
         assert each.chance is not None
-        assert (each.chance.procedure, each.chance.samples) == ("measured-tip", judges.MEASURED.fresh)
+        assert (each.chance.procedure, each.chance.samples) == ("measured-tip", ratings.MEASURED.fresh)
 
 
 def depth(plan: Plan, _lung: Lung) -> float:

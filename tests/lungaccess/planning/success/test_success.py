@@ -14,7 +14,7 @@ from anatomy.lung import Lung
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.planning.procedure import load_procedure
 from lungaccess.planning.procedure.spread import Spread
-from lungaccess.planning.success.judges import OPEN_LOOP
+from lungaccess.planning.success.ratings import OPEN_LOOP
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target

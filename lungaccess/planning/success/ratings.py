@@ -1,4 +1,4 @@
-"""Judges of a contest of plans: by draws of their chance of success, or by a function of the plan."""
+"""Ratings of a contest of plans: by draws of their chance of success, or by a function of the plan."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ EXACT = Rounds(pool=150, of_a_tip=8, draws=(1,), kept=(), fresh=0)
 """What a function says of a plan is certain."""
 
 
-class Judge(Protocol):
+class Rating(Protocol):
     """Says how good plans are; larger is better."""
 
     rounds: Rounds
@@ -84,7 +84,7 @@ class Judge(Protocol):
         """Return a plan with what it states of the goal."""
 
 
-class ChanceJudge:
+class ChanceRating:
     """Counts successes under errors and a procedure.
 
     Parameters
@@ -154,7 +154,7 @@ class ChanceJudge:
         return replace(plan, chance=chance_of(found))
 
 
-class FunctionJudge:
+class FunctionRating:
     """Asks a function of the plan, or what the plan states of a goal."""
 
     def __init__(self, request: Request) -> None:
@@ -179,21 +179,21 @@ class FunctionJudge:
         return replace(plan, goals={self._goal.name: self._goal.computed(plan, self._lung)})
 
 
-def judge_of(request: Request) -> Judge | None:
-    """Return the judge of a request's goal; None where cost or window decide."""
+def rating_of(request: Request) -> Rating | None:
+    """Return the rating of a request's goal; None where cost or window decide."""
     if request.goal is SUCCESS:
-        return ChanceJudge(request)
-    return FunctionJudge(request) if request.counts else None
+        return ChanceRating(request)
+    return FunctionRating(request) if request.counts else None
 
 
-def ranked(judge: Judge, direct: DirectCandidates) -> Int:
+def ranked(rating: Rating, direct: DirectCandidates) -> Int:
     """Return entries (E,) of an atlas with a clear way, the most promising first, some of each scope tip."""
     clear, taken, kept = direct.clear(), Counter[int](), []
-    order = clear[np.argsort(-judge.expected(direct, clear), kind="stable")]
+    order = clear[np.argsort(-rating.expected(direct, clear), kind="stable")]
     sites = direct.atlas.deployments.site[order].tolist()
     for entry, site in zip(order.tolist(), sites, strict=True):
         taken[site] += 1
-        if taken[site] <= judge.rounds.of_a_tip:
+        if taken[site] <= rating.rounds.of_a_tip:
             kept.append(entry)
     return np.array(kept, dtype=np.int64)
 

@@ -48,9 +48,9 @@ from lungaccess.problem import preset_names as preset_names
 from lungaccess.problem import presets_by_invasiveness as presets_by_invasiveness
 from lungaccess.problem import resolve_target as resolve_target
 from lungaccess.problem.goals import Goal as Goal
-from lungaccess.problem.goals import register_goal as register_goal
 from lungaccess.problem.request import Request as Request
 from lungaccess.problem.request import StatedPlace as StatedPlace
+from lungaccess.problem.request import register_goal as register_goal
 from lungaccess.running.study import read_study as read_study
 from lungaccess.running.study import run_study as run_study
 from lungaccess.showing.report.html import plan_page as plan_page

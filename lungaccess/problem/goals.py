@@ -14,7 +14,6 @@ from typing import Any
 from anatomy.base.errors import SettingsError
 from anatomy.base.plugins import registered
 from anatomy.base.records import frozen_record
-from stages.needle import TERMS, Objective
 
 PlanFunction = Callable[[Any, Any], float]
 """A number of a `lungaccess.plans.plan.Plan` in a `anatomy.lung.Lung`."""
@@ -36,7 +35,7 @@ class Goal:
     of : callable, optional
         Returns its value of a plan in a lung, finite; the plan states it, and the check computes it again.
         None for costs, success and windows, which a plan states by itself.
-    objective : Objective, optional
+    objective : stages.needle.Objective, optional
         The costs that it weighs, where it is a cost.
     """
 
@@ -45,11 +44,11 @@ class Goal:
     unit: str = ""
     larger_is_better: bool = False
     of: PlanFunction | None = None
-    objective: Objective | None = None
+    objective: Any = None
 
     @classmethod
-    def of_costs(cls, objective: Objective) -> Goal:
-        """Return the goal to make a weighted sum of costs small."""
+    def of_costs(cls, objective: Any) -> Goal:
+        """Return the goal to make a weighted sum of costs small: a `stages.needle.Objective`."""
         return cls(name=str(objective), words=objective.words, objective=objective)
 
     @property
@@ -118,27 +117,10 @@ LOSSES = {SUCCESS.name: "chance of failure", WINDOW.name: "share of the breath o
 """What is left to improve of shares, in words."""
 PLUGINS = "lungaccess.goals"
 """The group of entry points by which packages add goals."""
-_OWN: dict[str, Goal] = {}
-
-
-def register_goal(goal: Goal) -> Goal:
-    """Make a goal known by its name in this process, and return it; a package does so by an entry point.
-
-    Raises
-    ------
-    SettingsError
-        If the name is that of another goal or of a cost.
-    """
-    taken = {SUCCESS.name, WINDOW.name, *(name for term in TERMS for name in (term.key, term.option))}
-    if goal.name in taken or not goal.name.isidentifier():
-        raise SettingsError(
-            f"A goal cannot be called {goal.name!r}",
-            expected=f"a name of letters, digits and _, and none of {', '.join(sorted(taken))}",
-        )
-    _OWN[goal.name] = goal
-    return goal
+REGISTERED: dict[str, Goal] = {}
+"""The goals that this process has registered; see `lungaccess.problem.request.register_goal`."""
 
 
 def goals() -> dict[str, Goal]:
     """Return all goals but costs, by their names: those of the package, of other packages, and registered."""
-    return {each.name: each for each in (SUCCESS, WINDOW)} | registered(PLUGINS) | _OWN
+    return {each.name: each for each in (SUCCESS, WINDOW)} | registered(PLUGINS) | REGISTERED

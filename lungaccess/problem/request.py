@@ -21,12 +21,12 @@ from anatomy.base.words import did_you_mean
 from anatomy.lung import Lung
 from anatomy.motion.motion import require_phase
 from anatomy.organ import Organ
-from lungaccess.problem.goals import SUCCESS, WINDOW, Goal, PlanFunction, goals
+from lungaccess.problem.goals import REGISTERED, SUCCESS, WINDOW, Goal, PlanFunction, goals
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.system import System, load_system, require_own_name, with_fissure_rule
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
-from stages.needle import OMPL_PLANNERS, Objective, require_planner
+from stages.needle import OMPL_PLANNERS, TERMS, Objective, require_planner
 
 if TYPE_CHECKING:
     from lungaccess.planning.procedure import Procedure
@@ -262,6 +262,24 @@ class Request:
     def with_system(self, system: System) -> Request:
         """Return the request for one system alone."""
         return replace(self, systems=(system,))
+
+
+def register_goal(goal: Goal) -> Goal:
+    """Make a goal known by its name in this process, and return it; a package does so by an entry point.
+
+    Raises
+    ------
+    SettingsError
+        If the name is that of another goal or of a cost.
+    """
+    taken = {SUCCESS.name, WINDOW.name, *(name for term in TERMS for name in (term.key, term.option))}
+    if goal.name in taken or not goal.name.isidentifier():
+        raise SettingsError(
+            f"A goal cannot be called {goal.name!r}",
+            expected=f"a name of letters, digits and _, and none of {', '.join(sorted(taken))}",
+        )
+    REGISTERED[goal.name] = goal
+    return goal
 
 
 def goal_of(stated: str | Goal | Objective | PlanFunction, lung: Organ | None = None) -> Goal:

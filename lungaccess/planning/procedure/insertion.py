@@ -217,7 +217,7 @@ def insert_plan(
     drawn = inserter.draw(samples, seed)
     return InsertionStudy(
         steering=steering, errors=inserter.errors, seed=seed, tolerance_mm=tolerance_mm, query=inserter.query,
-        path=inserter.path, open_loop=Summary.of(map(inserter.blind, drawn)),
+        path=inserter.path, open_loop=Summary.of(map(inserter.in_open_loop, drawn)),
         closed_loop=Summary.of(inserter.watched(each, (seed, n)) for n, each in enumerate(drawn)),
     )  # fmt: skip
 
@@ -263,9 +263,9 @@ class _Inserter:
         aim = self.query.target
         return [Attempt(errors=one, start=start, target_lps=aim + one.target_mm[0]) for one in each]
 
-    def blind(self, attempt: Attempt) -> Insertion:
+    def in_open_loop(self, attempt: Attempt) -> Insertion:
         """Carry out the plan as it stands."""
-        return self._judged(attempt, attempt.pieces(self.plan), None)
+        return self._checked(attempt, attempt.pieces(self.plan), None)
 
     def watched(self, attempt: Attempt, luck: tuple[int, int]) -> Insertion:
         """Insert the needle with the tracker; `luck` is the seed and the number of the needle."""
@@ -284,9 +284,9 @@ class _Inserter:
         arcs = np.array(found.arcs)
         arcs[:1, 1] += rolled
         needle = needle_pieces(arcs, self.plan.system.track_radius_mm)
-        return self._judged(attempt, np.concatenate([pieces[: -len(self.path.arcs)], needle]), found)
+        return self._checked(attempt, np.concatenate([pieces[: -len(self.path.arcs)], needle]), found)
 
-    def _judged(self, attempt: Attempt, pieces: Float, steered: Steered | None) -> Insertion:
+    def _checked(self, attempt: Attempt, pieces: Float, steered: Steered | None) -> Insertion:
         """Return what a chain of true arcs has come to."""
         n_tube = len(attempt.pieces(self.plan)) - len(self.path.arcs)
         flags = int(self._assessor.follow(attempt.start[None], pieces[None], n_tube)[0][0])

@@ -11,11 +11,13 @@ from typing import Any
 import pytest
 
 import lungaccess as la
+from anatomy.base import plugins
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
-from lungaccess.problem import goals, plugins
-from lungaccess.problem.goals import SUCCESS, WINDOW, Goal, goal_of, register_goal
+from lungaccess.problem import goals
+from lungaccess.problem.goals import SUCCESS, WINDOW, Goal
+from lungaccess.problem.request import goal_of, register_goal
 from stages.needle import Objective
 
 
@@ -29,7 +31,8 @@ DEEP = Goal(name="deep", words="way in tissue", unit="mm", larger_is_better=True
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """No goal of another test, and no entry point of another package that was looked up before."""
-    monkeypatch.setattr(goals, "_OWN", {})
+    for known in list(goals.REGISTERED):
+        monkeypatch.delitem(goals.REGISTERED, known)
     plugins.registered.cache_clear()
     yield
     plugins.registered.cache_clear()
@@ -96,11 +99,11 @@ class TestRegistered:
             register_goal(replace(DEEP, name=name))
 
     def test_a_package_adds_one_by_an_entry_point(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        registering(monkeypatch, plugins.GOALS, deep=DEEP)
-        assert goal_of("deep") is DEEP and plugins.registered(plugins.PLANNERS) == {}
+        registering(monkeypatch, goals.PLUGINS, deep=DEEP)
+        assert goal_of("deep") is DEEP and plugins.registered("lungaccess.planners") == {}
 
     def test_one_that_cannot_be_imported_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        registering(monkeypatch, plugins.GOALS, deep=ImportError("no module named their"))
+        registering(monkeypatch, goals.PLUGINS, deep=ImportError("no module named their"))
         with pytest.raises(SettingsError, match=r"'deep'.*no module named their"):
             goal_of("deep")
 

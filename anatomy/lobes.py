@@ -24,7 +24,7 @@ LOBES: Mapping[int, str] = MappingProxyType(
 """Number of a lobe in a volume of lobes, and its name; 0 is no lobe."""
 
 FISSURES_UNKNOWN = "no fissure mask, so that nobody knows whether a fissure is crossed"
-"""What check, plan and report say where a patient has no mask of the fissures."""
+"""Check, plan and report say this where a patient has no mask of the fissures."""
 GAP_VOXELS = 2
 """Masks of two lobes may leave so many voxels between them to neither: a fissure as drawn by hand."""
 MAIN_PIECE_SHARE = 0.1

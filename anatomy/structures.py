@@ -30,7 +30,7 @@ MAX_BRANCHES = (1 << (16 - BRANCH_SHIFT)) - 1
 """Most branches that a label can tell apart."""
 
 OBSTACLES = AIRWAY | VESSEL | OUTSIDE
-"""What a needle must always avoid."""
+"""A needle must always avoid these."""
 
 BITS: dict[str, int] = {
     "airway": AIRWAY,

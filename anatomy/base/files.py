@@ -24,7 +24,7 @@ DAMAGE = (
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,
     SyntaxError, TypeError, ValueError, BadZipFile, struct.error, zlib.error,
 )  # fmt: skip
-"""What code raises that reads a damaged file."""
+"""These errors are raised by code that reads a damaged file."""
 REPLACE_TRIES = 20 if sys.platform == "win32" else 1
 """For a second: readers and scanners of viruses have a file open no longer."""
 MOST_REASON = 300

@@ -17,7 +17,7 @@ from anatomy.io.totalsegmentator import has_lobes, is_totalsegmentator, load_tot
 from anatomy.patient import PatientImages
 
 _SHOWN = 12
-"""So many names of a long list are shown."""
+"""A long list shows this many of its names."""
 
 
 def load_patient(path: str | Path) -> PatientImages:

@@ -18,7 +18,7 @@ WORKING_MM = 4.0
 CONTROL_MM = 40.0
 """Distance of the control points of the spline: a lung has several along each axis."""
 ITERATIONS = 60
-"""Of the optimiser on each level; it has converged before in a lung."""
+"""The optimiser makes at most so many on each level; in a lung it has converged before."""
 DEPTH_MM = 20.0
 """Masks are compared by their distance to the border, up to so far from it."""
 

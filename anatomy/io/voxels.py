@@ -94,9 +94,9 @@ def _chunks(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Iterato
 
 
 OBSTACLE_COST = 1000.0
-"""What a file holds where passing is forbidden: finite, exact in every type, and far from costs of 0 to 1."""
+"""A file holds this where passing is forbidden: it is finite, exact in every type, and far from 0 to 1."""
 COST_MAP_NOTE = f"cost of passing a voxel, 0 to 1; {OBSTACLE_COST:g} is an obstacle"
-"""What the header of the file says."""
+"""The header of the file says this of its voxels."""
 
 
 def as_stored(cost: Float32) -> Float32:

@@ -14,7 +14,7 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 
 MOST_STEPS = 60
-"""Of a fixed point whose error falls by the norm of the gradient, 0.2 to 0.4 in a lung, with each step."""
+"""The error of the fixed point falls by the norm of the gradient, 0.2 to 0.4 in a lung, with each step."""
 CONVERGED_MM = 1e-9
 """A step below this ends the search; what is left is returned, and counts."""
 

@@ -12,7 +12,7 @@ SHARE_OF_MOTION = np.array([0.04, 0.08, 0.15, 0.21, 0.29, 0.39, 0.52, 0.65, 0.74
 """g at these heights: means over ten patients with 4-D CT of quiet breathing (DIR-Lab), computed from the
 landmarks of [Fu2019]."""
 POPULATION_ERROR_MM = 4.7
-"""What this model leaves of those patients' motion: more than most nodules forgive."""
+"""This model leaves so much of those patients' motion: more than most nodules forgive."""
 
 
 def share_of_motion(height: float) -> float:

@@ -29,9 +29,9 @@ SAMPLE_MM = 4.0
 FITTED_NODES = 2
 """A fit is evaluated so many nodes beyond its lung, which is slow; farther out it is continued."""
 INVERSE_STEPS = 60
-"""Of the fixed point that brings a field to the masks' phase; it converges as a lung's motion contracts."""
+"""The fixed point that brings a field to the masks' phase converges, as a lung's motion contracts."""
 LEAST_EMPTY = 0.01
-"""More displacements of exactly 0 than this are not measured but left out."""
+"""A larger share of displacements of exactly 0 is not measured but left out."""
 SIDES = {RIGHT: "right", LEFT: "left"}
 
 At = Callable[[Float], Float]

@@ -24,9 +24,9 @@ from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
 
 TRACHEA_DIAMETER_MM = 18.0
-"""Of an adult [Weibel1963]."""
+"""This is the diameter in an adult [Weibel1963]."""
 TRACHEA_LENGTH_MM = 110.0
-"""Of an adult [Weibel1963]; what lies in the chest."""
+"""This is the part that lies in the chest of an adult [Weibel1963]."""
 SMALLEST_GROWN_MM = 1.25
 """Below what any CT shows, so that the drawing decides where airways end."""
 MIDDLE_WEIGHT = 0.4
@@ -34,7 +34,7 @@ MIDDLE_WEIGHT = 0.4
 GREATEST_SLENDERNESS = 4.2 / 3.0
 """Branches are at most so many times as long as is aimed at."""
 STUMP_SHARE, STUMP_DIAMETER_MM = 0.45, 7.0
-"""What an operation leaves of a lobar bronchus."""
+"""An operation leaves this share and diameter of a lobar bronchus."""
 BALANCE_ROUNDS = 25
 """Shares need only be about equal: each round moves the weights half-way."""
 DIRECTION_JITTER = 0.07

@@ -245,7 +245,7 @@ def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...], hilar: Mask 
 
 
 AIR_HU = -1000.0
-"""By definition of the scale."""
+"""The scale defines air so."""
 BULLA_HU = -985.0
 """Air with a trace of tissue."""
 PARENCHYMA_HU = -860.0

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 BOX_MARGIN_MM = 3.0
-"""More than the wall reaches beyond the lumen."""
+"""The wall reaches less far beyond the lumen."""
 EDGE_MM = 3.0
 """How far the wall may lie from the rough central airway."""
 IN_PLANE = np.array([0, 1, 0])[:, None, None]
@@ -34,7 +34,7 @@ around it to be seen by, and the tissue of the lung is nowhere so dark."""
 SMOOTH_MM = 0.6
 """Standard deviation of the smoothing that tells a dark voxel from noise."""
 NOISE_PERCENTILE = 97.0
-"""So much of the lung lies below the shallowest minimum that is followed."""
+"""This percentage of the lung lies below the shallowest minimum that is followed."""
 LEAST_DEPTH_HU = 20.0
 """Below it the map holds only the noise of a low-dose CT."""
 SAMPLE_STEP = 7

@@ -23,7 +23,7 @@ from anatomy.segmentation.folder import onto_grid
 from anatomy.segmentation.lungs import Lungs
 
 BOX_PAD_MM = 10.0
-"""More than any filter of the segmentation looks beyond a voxel of the lung."""
+"""No filter of the segmentation looks farther beyond a voxel of the lung."""
 VOXEL_MM = 0.75
 """About the pixel of a chest CT and its blur: finer voxels show no more, and take more memory."""
 VOXEL_RANGE_MM = (0.3, 3.0)

@@ -41,7 +41,7 @@ GREATEST_ML = 180.0
 SMOOTHING_VOXELS = 1.0
 """Standard deviation of the filter for images too noisy to follow the trachea in."""
 WIDE_SHARE = 0.35
-"""Of the radius of the trachea: what is narrower is left to the segmentation of the airways."""
+"""Airways narrower than this share of the trachea's radius are left to the segmentation of the airways."""
 
 
 @frozen_record
@@ -280,7 +280,7 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
 
 
 NARROW_SHARE = 0.6
-"""Of the cross-section of the trachea; what is narrower at its upper end is larynx or a partial slice."""
+"""An upper end below this share of the trachea's cross-section is larynx or a partial slice."""
 TRACHEA_MM = 20.0
 """The cross-section is the median over this length above and below the seed."""
 

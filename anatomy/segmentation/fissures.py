@@ -19,7 +19,7 @@ BRIGHTEST_HU = 350.0
 AGREEMENT_MM = 3.0
 """Sigma of the neighbourhood in which normals are compared: wider than a vessel, narrower than folds."""
 SURFACE_VOXELS = 3
-"""So near to the surface of the lung a plate may be the pleura."""
+"""A plate this near to the surface of the lung may be the pleura."""
 BLOCK = 2
 """Normals are compared over blocks of so many voxels."""
 NOISE_PERCENTILE = 90.0

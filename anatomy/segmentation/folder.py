@@ -26,13 +26,13 @@ FORMAT = 1
 _MADE_SUFFIX = ".nii.gz"
 CORRECTIONS = "corrections"
 IMAGES = ("lungs", "airway", "airway_wall", "nodule", "vessels", "all_vessels", "lobes", "fissures")
-"""What a person may correct."""
+"""A person may correct these."""
 NOTES = {
     "cost": COST_MAP_NOTE,
     "lobes": ", ".join(f"{number} {name}" for number, name in LOBES.items()).replace(" lobe", ""),
     "fissures": "1 border of lobes without a fissure to be seen, 2 fissure seen",
 }
-"""What the headers of images say that are no masks."""
+"""The headers of images that are no masks say this."""
 _SHIFT_TOLERANCE = 0.05
 """Largest deviation from a whole number of voxels, in voxels."""
 

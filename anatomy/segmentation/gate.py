@@ -27,7 +27,7 @@ CHECKS: Mapping[str, str] = MappingProxyType(
         "masks": "masks from elsewhere lie on what they show in the CT",
     }
 )
-"""What is checked, by the name that `--accept` takes."""
+"""The checks, by the name that `--accept` takes."""
 LUNGS_L = (0.3, 11.0)
 """From a child of one year after breathing out to the total capacity of a very tall man, with a margin."""
 DENSITY_HU = (-975.0, -300.0)
@@ -211,7 +211,7 @@ LEAST_UP = 0.5
 LEAST_TILT = 0.05
 """The trachea runs backwards on its way down, by 8 to 40 degrees; less than 3 degrees say nothing."""
 LOWEST_SHARE = 0.15
-"""So much of each lung is its base, which lies behind, where the diaphragm slopes down."""
+"""This share of each lung is its base, which lies behind, where the diaphragm slopes down."""
 LEAST_BACK_MM = 3.0
 """The base lies 9 to 30 mm behind the rest; less says nothing."""
 LEAST_RATIO = 1.2

@@ -34,7 +34,7 @@ LABELLED = ("lungs", "lobes", "fissures")
 GREATEST_LOSS = 0.02
 """Share of a mask that may lie outside the CT: more is another patient, or another frame."""
 GREATEST_TURN = 0.01
-"""Of an axis, in radians: over 300 mm a mask is then 3 mm off."""
+"""An axis may turn by so many radians: over 300 mm a mask is then 3 mm off."""
 
 
 @frozen_record

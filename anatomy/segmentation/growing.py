@@ -15,7 +15,7 @@ from anatomy.segmentation.thin_airways import follow_thin_airways
 AIR_HU = -1024
 """Around the image is air, which is neither wall nor, for want of depth, lumen."""
 GREATEST_LUMEN_ML = 400.0
-"""More than the airways of any patient hold; what would make more is a leak."""
+"""No patient's airways hold as much; what would make more is a leak."""
 FIRST_LEVEL_HU = 600.0
 """Only the trachea and main bronchi are darker than their walls by this much."""
 LEVEL_RATIO = 0.92
@@ -27,7 +27,7 @@ FRONT_FACTOR, FRONT_SLACK_MM2 = 3.0, 200.0
 WIDE_MM2 = 20.0
 """A bronchus of this cross-section or more is dark inside."""
 RIM_MM = 1.5
-"""What lies so near to a wider one that is not dark is its rim."""
+"""A place that is not dark, and this near to a wider one, is its rim."""
 SKIN_SHARE = 0.5
 """The edge of a lumen is where the map is half as deep as inside."""
 

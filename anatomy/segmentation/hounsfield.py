@@ -10,9 +10,9 @@ from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
 
 AIR_HU = -1000.0
-"""By definition of the scale."""
+"""The scale defines air so."""
 CORE_SHARE = 0.6
-"""Of the greatest depth in the airway: so far from its wall nothing but air is measured."""
+"""At this share of the airway's greatest depth nothing but air is measured."""
 GREATEST_OFFSET_HU = 25.0
 """Scanners keep air around the patient within 10 HU; more is another scale."""
 GREATEST_SCATTER_HU = 45.0
@@ -23,7 +23,7 @@ LEAST_SCATTER_HU = -10.0
 AROUND_HU = (-1099.0, -880.0)
 """Air around the patient, shifted or not: lower values are padding, higher ones table and clothes."""
 LEAST_AROUND_SHARE = 0.01
-"""Of the sides of the image; less air at the sides may be lung that the image cuts off."""
+"""Air over less than this share of the image's sides may be lung that the image cuts off."""
 
 
 def air_offset_hu(coarse: CoarseCt, airway: Mask) -> float:

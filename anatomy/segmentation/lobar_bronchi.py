@@ -33,7 +33,7 @@ LEAST_SHARE = 0.03
 TRUNK_SHARE = 0.9
 """A branch that leads to so much of a lung is a main bronchus."""
 STARTS = 10
-"""So many of the best cuts are tried to be made better: where the tree is wrong, no cut parts the lobes."""
+"""This many of the best cuts are improved: where the tree is wrong, no cut parts the lobes."""
 ROUNDS = 5
 """Moving twigs between lobes settles after one or two."""
 

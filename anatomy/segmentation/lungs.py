@@ -41,7 +41,7 @@ TISSUE_HU = (-150.0, 250.0)
 CLOSING_MM = 5.0
 """Ball of the closing: vessels, bronchi and notches of up to 10 mm across become lung."""
 WALL_MM = 2.0
-"""What is this close to the lumen of trachea and main bronchi is their wall, not lung."""
+"""Tissue this close to the lumen of trachea and main bronchi is their wall, not lung."""
 
 
 @frozen_record

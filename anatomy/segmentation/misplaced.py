@@ -14,9 +14,9 @@ from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.gate import Implausible
 
 STEP_MM = 3.0
-"""More than the width of an airway's wall, less than the distance of vessels."""
+"""The step is wider than an airway's wall, and less than the distance of vessels."""
 SAMPLES = 200_000
-"""Of the voxels of a mask: their mean is then known to 1 HU."""
+"""The mean of so many voxels of a mask is known to 1 HU."""
 CLIPPED_HU = (-1100.0, 200.0)
 """Bone, metal and contrast medium count as tissue."""
 LEAST_INSIDE = 0.7

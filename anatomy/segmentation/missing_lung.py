@@ -15,11 +15,11 @@ from anatomy.segmentation.closing import distance_mm
 SAMPLE_MM = 4.0
 """The shape of the chest is looked at on voxels of this size."""
 LEAST_FILLED = 0.6
-"""Of a zone: half-way between healthy phantoms, 0.92 and more, and those with a solid lobe, 0.2 and less."""
+"""Half-way between the zones of healthy phantoms, 0.92 up, and those with a solid lobe, up to 0.2."""
 FROM_MIDDLE_SHARE = 0.4
-"""Of the half width: nearer to the middle lie heart, spine and large vessels."""
+"""Within this share of the half width lie heart, spine and large vessels."""
 TOP_SHARE, BASE_SHARE = 0.1, 0.3
-"""Of the height: the shoulders narrow the chest above, and the diaphragm rises below."""
+"""At these shares of the height the shoulders narrow the chest, and the diaphragm rises."""
 ABOVE_CARINA_MM = -10.0
 """Below this, the heart takes part of the front."""
 LEAST_BACK, LEAST_BASE = 0.24, 0.48

@@ -18,7 +18,7 @@ PATCH_MM = 6.0
 MOST_PATCHES = 20_000
 """A tenth of them lie in soft tissue: the spread of the quietest is then known to a few per cent."""
 QUIET_SHARE = 0.2
-"""Of the cubes: the others hold the edge of something."""
+"""This share of the cubes is taken as quiet: the others hold the edge of something."""
 LEAST_PATCHES = 20
 """From fewer no noise is told."""
 LOUD_HU = 30.0

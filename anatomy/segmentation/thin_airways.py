@@ -19,7 +19,7 @@ N_PLACES = 400
 LEAST_PLACES = 50
 """From fewer places no spread can be told."""
 LOOKED_AT = 100
-"""So many voxels are looked at for each place."""
+"""This many voxels are looked at for each place."""
 WAY_STEP = 7
 """The direction at each place lies so far behind that of the last in the list of all."""
 SPREAD_OF_MEDIAN = 1.4826

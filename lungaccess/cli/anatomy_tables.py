@@ -29,7 +29,7 @@ MOTION_WORDS = {
     "lungs_dice_unmoved": "the same of the lungs as they are",
     "lungs_borders_mm": "distance of the borders of moved and other lungs, mean, mm",
 }
-"""What the figures of a motion are, see `anatomy.motion`."""
+"""The figures of a motion in words, see `anatomy.motion`."""
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

@@ -81,7 +81,7 @@ With a patient, which is a folder of masks:
 
 lungaccess --help lists all commands; each explains itself, as in: lungaccess plan --help
 """
-"""What `lungaccess` prints if it is given no command."""
+"""`lungaccess` prints this if it is given no command."""
 
 
 def epilogue(command: str) -> str:

@@ -11,15 +11,15 @@ from cyclopts import Parameter, Token
 from anatomy.base.records import frozen_value
 
 LARGEST_PORT = 2**16 - 1
-"""Of TCP."""
+"""TCP has no larger one."""
 FASTEST_HZ = 1000.0
 """No tracker and no robot in a patient needs more."""
 LARGEST_SEED = 2**32 - 1
 """Compiled kernels take seeds of 32 bits."""
 MOST = 10**9
-"""More of anything that is counted would run for years."""
+"""A larger count of anything would run for years."""
 MOST_PROCESSES = 1024
-"""More than the cores of any machine that these commands run on."""
+"""No machine that these commands run on has as many cores."""
 MOST_SAMPLES = 10_000_000
 """Their random numbers fit into memory, and shares are then known to 0.03 %."""
 FARTHEST_MM = 1e4

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff]")
-"""What a terminal obeys or hides instead of showing it, except for the new line and the tab."""
+"""A terminal obeys or hides these instead of showing them; the new line and the tab are not among them."""
 
 
 class _Console(Console):

@@ -25,7 +25,7 @@ KINDS = {
     kernel.START_BLOCKED: "start too near to an obstacle",
     kernel.OUT_OF_REACH: "target out of reach",
 }
-"""What is told of a pose that was tried."""
+"""The kinds of a pose that was tried, in words."""
 REACHING = (kernel.DIRECT, kernel.VIA, kernel.SEARCHED)
 
 LEAST_MM, LEAST_DEG = 0.1, 0.1

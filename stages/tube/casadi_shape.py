@@ -23,7 +23,7 @@ STEP_MM = 1.0
 LARGEST_TURN_RAD = 0.2
 """Largest turn of a tip in a step that is no jump: where the tubes are about to snap they turn faster."""
 LEAST_SHARE = 1.0 / 64.0
-"""Of a step, by which tips that still turn as far are said to jump."""
+"""Tips that still turn as far in this share of a step are said to jump."""
 
 
 @frozen_record

@@ -31,7 +31,7 @@ INCREMENTS_MM = (2.0, 5.0, 10.0)
 WALLS, LENGTHS, CURVATURES = 4, 13, 36
 """How many values of each dimension are tried."""
 SAME_MM, SAME_RAD = 0.05, 0.02
-"""What differs less is taken to be equal."""
+"""Values that differ by less are taken to be equal."""
 ROUNDING = 1e-12
 """Share of the strain limit that stays unused, so that rounding does not exceed it."""
 

@@ -216,7 +216,7 @@ def joint_steps(
 
 
 NUDGE_MM = 1e-12
-"""More than the last digit of a length."""
+"""The last digit of a length is less."""
 
 
 def _in_order(beta: Float, lengths: Float) -> Float:

@@ -6,7 +6,7 @@ from anatomy.kernels.compiling import inner_kernel
 
 THIRD_TURN = np.float64(2.0 * np.pi / 3.0)
 ALL_EQUAL = np.float64(1e-12)
-"""Of the largest entry: a smaller spread of the eigenvalues has no angle that could be trusted."""
+"""A spread of the eigenvalues below this share of the largest entry has no angle that could be trusted."""
 ZERO, HALF, ONE, TWO, THREE = (np.float64(x) for x in (0.0, 0.5, 1.0, 2.0, 3.0))
 
 

@@ -17,11 +17,11 @@ TURN_COS = np.cos(np.radians(30.0))
 ADVANCE_MM = 1.5
 """The next stretch begins so far along the one before: most of each is seen again."""
 TAIL_MM = 4.0
-"""So much of the last stretch is airway: its end may lie beyond the end of the tube."""
+"""This much of the last stretch is airway: its end may lie beyond the end of the tube."""
 HALF_SHARE = 0.3
 """Each half of the last stretch has this share of the contrast asked of a tube: no end is half a tube."""
 DRIFT = 0.6
-"""Of the contrast asked of a tube a place without one has about half, and a tube as thin as a voxel 0.8."""
+"""A place without a tube has about half of the contrast asked of one, and a tube as thin as a voxel 0.8."""
 GREATEST = 1.5
 """No stretch alone, however dark, counts for more."""
 EVIDENCE = 1.3
@@ -29,7 +29,7 @@ EVIDENCE = 1.3
 DEBT = 1.0
 """A gap may cost so much: where mucus, noise or a narrow place hides some mm of a tube."""
 LEAST_STRETCHES = 2
-"""What is followed is longer than one stretch."""
+"""A tube that is followed is longer than one stretch."""
 MOST_STRETCHES = 60
 """90 mm: longer than any airway goes on behind the lumen that is seen well."""
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 DRAWS = 2000
 """A share of one half is then known to 2 % with 95 % confidence, within a tenth of a second."""
 MEASURED_DRAWS = 120
-"""Of a procedure that plans again on its way, some 15 ms each: one half is then known to 9 %."""
+"""A procedure that plans again on its way takes some 15 ms; one half is known to 9 % from so many."""
 SEED = 0
 """The same draws for every plan, so that two plans differ by themselves and not by luck."""
 

@@ -27,7 +27,7 @@ FAILURES = {
     "stays in the airway": "stays in the airway",
     NO_PATH: "has no path left",
 }
-"""What a failed procedure does, by the names of `lungaccess.uncertainty.risk.STRUCTURES` and `NO_PATH`."""
+"""The failures in words, by the names of `lungaccess.uncertainty.risk.STRUCTURES` and `NO_PATH`."""
 
 BESIDE_TARGET = (
     "The plan was made for a window of the breath: in the phase of the masks it ends beside the target."

@@ -40,7 +40,7 @@ from stages.needle import DEFAULT, Objective, needle_environment
 DEFAULT_TIME_S = 10.0
 """All parts of a patient whose atlases are cached take about so long, and a user still waits."""
 ITERATIONS = 20
-"""Of the search with each preset: those that reach the target mostly do so with a direct arc."""
+"""Each preset is searched this long: those that reach the target mostly do so with a direct arc."""
 PROOF_BOXES = 2_000_000
 """Boxes for the proof: a tenth of what `certify` looks at, which can take half a minute."""
 NO_NEEDLE = "the system has no needle"

@@ -26,7 +26,7 @@ RADII_MM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 22.0, 30.0, 40.0)
 POINTS_A_SPHERE = 64
 """Points of a sphere, about 25 degrees apart."""
 HALVINGS = 4
-"""So often the distance between the sphere that is reached and the one before it is halved."""
+"""The distance between the sphere that is reached and the one before it is halved this often."""
 AROUND_MM = 20.0
 """Radius of the surroundings of a target whose reached share is told."""
 DRAWS = 120

@@ -12,7 +12,7 @@ from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.tables import QUERIES, TIMES, table
 
 MOST = 20
-"""So many differences are listed: enough to see what kind they are."""
+"""At most this many differences are listed: enough to see what kind they are."""
 
 
 def differences(first: Path, second: Path) -> list[str]:

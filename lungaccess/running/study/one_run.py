@@ -46,7 +46,7 @@ KEPT_PATIENTS = 2
 """Runs come case by case, so that a worker needs the last patient and sometimes the next."""
 MIB = 2.0**20
 FIRST_CPU, SEARCH_CPU = "first_plan_cpu_s", "search_cpu_s"
-"""What a stored plan says in its `timing`: processor time to the first plan, and of the whole search."""
+"""A stored plan says both in its `timing`: processor time to the first plan, and of the whole search."""
 ANSWERS = (AnatomyError, PlanFileError, SettingsError, TargetError)
 """Errors that the run would end with on any machine, at any time."""
 

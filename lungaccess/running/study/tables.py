@@ -50,7 +50,7 @@ SELECT r.key, t.reason, t.count FROM rejections t JOIN runs r ON r.id = t.runid 
     "plans": """
 SELECT r.key, t.digest, t.plan FROM plans t JOIN runs r ON r.id = t.runid ORDER BY r.key""",
 }
-"""What is exported and compared, by the name of the table."""
+"""The queries whose rows are exported and compared, by the name of the table."""
 
 INTEGERS = frozenset(
     {

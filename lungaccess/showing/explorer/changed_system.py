@@ -133,7 +133,7 @@ def plan_command(
 
 
 DIGITS = 3
-"""Of the point in mm, as the command states it; the search takes the same number."""
+"""The command states the point in mm with so many digits; the search takes the same number."""
 
 
 @frozen_value

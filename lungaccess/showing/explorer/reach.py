@@ -16,7 +16,7 @@ from lungaccess.problem import System
 from lungaccess.showing.explorer.worker import Part, Turn
 
 Reached = MutableMapping[tuple[Any, ...], Int]
-"""By scope, tubes, margins and rule for fissures: the deployment that reached each voxel."""
+"""The deployment that reached each voxel, by scope, tubes, margins and rule for fissures."""
 
 
 def reach_parts(

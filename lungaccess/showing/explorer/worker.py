@@ -16,7 +16,7 @@ from lungaccess.showing.explorer.messages import Frame, error_message, frame
 from lungaccess.showing.explorer.questions import Question
 
 GONE = (EOFError, BrokenPipeError, ConnectionResetError)
-"""What a connection raises when the server is gone."""
+"""A connection raises one of these when the server is gone."""
 Key = tuple[str, str]
 """A page, and what it asked: a later question with the same key supersedes an earlier one."""
 

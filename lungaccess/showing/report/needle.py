@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 WIDTH_IN, HEIGHT_IN = 12.4, 6.9
 WHOLE_IN, CLOSE_IN = (0.25, 1.05, 5.8, 5.0), (6.35, 1.05, 5.8, 5.0)
 CLOSE_MM = 6.0
-"""So far around its middle the right panel shows: a needle of 1 mm is then well seen."""
+"""The right panel shows this much around its middle: a needle of 1 mm is then well seen."""
 STEP_MM = 0.25
 """Between drawn points of a path."""
 BLOCKED = "#D62728"

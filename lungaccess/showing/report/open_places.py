@@ -26,7 +26,7 @@ PANELS_IN = ((0.6, 1.0, 5.3, 5.3), (6.6, 1.0, 5.3, 5.3))
 NARROWEST = "#D55E00"
 """Colour of a place that is too small to halve."""
 LEAST_SIZE, GREATEST_SIZE = 8.0, 60.0
-"""Of the dots: their area grows with the share of the deployment space that is open there."""
+"""The area of a dot grows with the share of the deployment space that is open there."""
 NAMED = 3
 """Places that are numbered and named in the legend."""
 

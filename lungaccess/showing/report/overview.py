@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 WIDTH_IN, HEIGHT_IN = 18.0, 11.9
 HEADLINE_TOP_IN = 0.47
 HEADLINE_CHARACTERS = 240
-"""So many letters of the headline's size fill the width of the picture."""
+"""This many letters of the headline's size fill the width of the picture."""
 # left, bottom, width, height of each panel, inches
 PROJECTIONS_IN = ((0.55, 6.0, 4.75, 4.7), (5.85, 6.0, 4.75, 4.7), (11.15, 6.0, 3.35, 4.7))
 EXIT_IN, NEEDLE_IN = (0.3, 0.75, 4.3, 4.3), (4.8, 0.75, 4.3, 4.3)

@@ -17,7 +17,7 @@ Packed = dict[str, Any]
 
 TYPES = {"u1": np.uint8, "u2": np.uint16, "i4": np.int32, "f4": np.float32}
 LEVEL = 6
-"""Of zlib: level 9 takes eight times as long to save less than one part in a hundred."""
+"""Level 9 of zlib takes eight times as long to save less than one part in a hundred."""
 
 
 def pack(values: ArrayLike, kind: str) -> Packed:

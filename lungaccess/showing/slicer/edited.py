@@ -36,7 +36,7 @@ DEVICES = ("scope", "tubes", "needle")
 MOVED_MM = 0.01
 """Points nearer to the planned curve are taken to lie on it: drawn on a screen, none is moved by less."""
 EDITED = "edited in 3D Slicer"
-"""What the method of a plan with such a needle is called."""
+"""The method of a plan with such a needle is called so."""
 SAME_MM = 1e-6
 """Arcs are joined to one whose ends are as near as this, and points nearer to each other are one."""
 

@@ -40,13 +40,13 @@ STRUCTURES: dict[str, tuple[tuple[float, float, float], float]] = {
 """Models of the anatomy: colour and opacity."""
 
 PROVED_COLOUR, TRIED_COLOUR = (0.0, 0.45, 0.7), (0.94, 0.89, 0.26)
-"""Of the bodies of the safe start region."""
+"""The bodies of the safe start region have these colours."""
 
 STEP_MM = 1.0
 """Spacing of the control points of tubes and needle: fine enough to measure, few enough to read."""
 
 BREATHING_SHARE = 0.9
-"""Of the work before it."""
+"""The work before it takes this share of the time."""
 
 Progress = Callable[[str, float], None]
 

@@ -16,12 +16,12 @@ from stages.needle.infeasibility.kernels.backward_reach import SHELL_MM, Backwar
 CELL = 0.008
 """Side of a cell of the plane of directions: 0.016 rad in the middle, 0.8 mm at 50 mm."""
 HALF_WIDTH = 1.2
-"""Of the window in this plane: directions up to 100 degrees from the middle."""
+"""The window in this plane holds directions up to 100 degrees from the middle."""
 
 NOT_BOUNDED = BackwardReach(
     frame=np.zeros((4, 3)), cell=CELL, kappa=0.0, angles=np.zeros((0, 1, 1), dtype=np.uint8)
 )
-"""Of a needle that may come from everywhere."""
+"""The backward reach of a needle that may come from everywhere."""
 
 
 def backward_reach(

@@ -34,7 +34,7 @@ CUBES_MM = (0.5, 0.25)
 FIRST_CELL_MM, LARGEST_SLOPE_CELL = 0.5, 0.17
 """Largest sides of the first cells: of the size of a voxel, and of about 10 degrees."""
 ALL_CUBES = 1 << 31
-"""More than there are."""
+"""There are fewer cubes than this."""
 LEVELS = 9
 """How often cells are halved at most: then positions are known to 2 um."""
 CELLS_PER_BOW = 16.0
@@ -46,7 +46,7 @@ SLOPE_CHANGE_EDGES = np.array([0.5, 0.75, 0.92, 1.0])
 PROBES_PER_DEPTH = 8
 """Depths of a slab at which clearance is looked at."""
 SLACK_RATIO = 1.08
-"""Of the amounts of missing clearance that are told apart."""
+"""Amounts of missing clearance that are told apart differ by this factor."""
 SLACKS = 48
 LARGEST_DEPTH_MM = 12.5
 """Greatest distance of the planes, however little the needle bends."""

@@ -21,7 +21,7 @@ from stages.needle.kernels.tree import (
 )
 
 SAMPLE_TRIES = 50
-"""So many points are drawn in search of one in the workspace; then the iteration draws none."""
+"""At most this many points are drawn in search of one in the workspace; then the iteration draws none."""
 
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _ROOT = np.int64(0)

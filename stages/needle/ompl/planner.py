@@ -23,7 +23,7 @@ from stages.needle.search.base import Search, TreeSearch, in_slices
 from stages.needle.violations import SAME_MM
 
 ROUNDING_MM = 1e-6
-"""What every goal tolerance is larger for OMPL, whose states are rounded."""
+"""Every goal tolerance is larger by this for OMPL, whose states are rounded."""
 NO_LIMIT = 2**62
 
 

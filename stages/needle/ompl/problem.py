@@ -233,7 +233,7 @@ class NeedleProblem:
 
 
 _seeds: list[int] = []
-"""What OMPL was seeded with in this process."""
+"""OMPL was seeded with these in this process."""
 
 
 def seed_ompl(seed: int) -> None:

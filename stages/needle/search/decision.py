@@ -19,7 +19,7 @@ from stages.needle.search.resolution import ResolutionSearch
 ENDS_FROM = 100
 """Iterations before start and target are looked at, which takes a tenth as long."""
 FIRST_ITERATIONS = 400
-"""Of the tree alone: nearly all paths that it finds sooner than the resolution search are found by then."""
+"""The tree goes first: nearly all paths that it finds sooner than the resolution search are found by then."""
 PIECE = 200
 """Iterations between two steps of the proof, a few tenths of a millisecond."""
 RESOLUTION_SHARE = 5 / 6

@@ -141,7 +141,7 @@ SKEWS = 6
 REACH_CELLS = 9
 """How many cells from a guide path the lattice around it goes."""
 ANYWHERE_CELLS = 1 << 14
-"""More cells than any lattice over all of the space has."""
+"""No lattice over all of the space has as many cells."""
 SAMPLE_MM = 0.05
 """Distance of the points of a path between which its controls are interpolated."""
 

@@ -38,7 +38,7 @@ FIRST_ENTRIES = 4096
 MOST_STEPS = 128
 """The greatest power of two of which the kernel's bytes can hold the number of steps."""
 MOST_ROLLS = 64
-"""More directions would differ by less than 6 degrees."""
+"""The directions of a larger number would differ by less than 6 degrees."""
 EQUAL_CELL_MM = 1e-3
 """Where only equal poses are duplicates, poses are looked for in cells of this size."""
 

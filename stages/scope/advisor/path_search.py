@@ -51,7 +51,7 @@ RETREATS_MM = (3.0, 6.0, 12.0, 24.0, 48.0)
 LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
 """For a retry one of these shares of the look-ahead is drawn: a shorter one fits into a tighter turn."""
 LOOKS_PER_MM = 4
-"""So many poses a mm of advance are tried for collision: the body moves by less than a voxel between two."""
+"""Collision is tested this often a mm of advance: the body moves by less than a voxel between two poses."""
 SAME_POTENTIAL = 1e-9
 """Potentials nearer than this are equal: rounding of sums of steps."""
 

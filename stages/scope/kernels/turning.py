@@ -21,7 +21,7 @@ SIDES = 3
 OFF_AXIS_MM = 1.0
 """Nearer to the axis tips count as on it: about a voxel and a half."""
 TRIES = 12
-"""So many of a kind are tried before a kind is given up: most are refused for the same wall."""
+"""A kind is given up after so many tries: most are refused for the same wall."""
 TWIST_TO, BEND_TO, BY_STRAIGHT, TIP_ROOM, TIP_CURVATURE, SOURCE = 9, 10, 11, 12, 13, 14
 TIP_COLUMNS = 15
 """Columns of a tip: point, direction and +x, twist and bend to which the section turns, whether it is

@@ -24,13 +24,13 @@ MIN_CELL_MM = 1.0
 SAME_POINT_MM = 1e-3
 """Points of a file that are nearer are one point, written twice with rounding."""
 MAX_CELLS = 2_000_000
-"""More cells than this would cost more memory than they save time."""
+"""A larger number of cells would cost more memory than it saves time."""
 THIN_VOXELS = 6.0
 """Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to half."""
 FINE_MM = 0.05
 """Spacing of the places at which a cone is compared with the mask."""
 TINY_MM = 1e-9
-"""More than the rounding of lengths."""
+"""The rounding of lengths is less."""
 SMOOTHING_ROUNDS = 30
 KEPT_DEPTH = 0.9
 """Smoothing never takes a point of a skeleton to less than this share of the depth it had."""

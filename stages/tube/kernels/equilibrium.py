@@ -20,7 +20,7 @@ from stages.tube.kernels.torsion import twist
 
 TOLERANCE = 1e-12
 LARGEST_TURN = 0.8
-"""Of the angles between tubes in one step of Newton's method, rad."""
+"""The angles between tubes turn by no more in one step of Newton's method, rad."""
 NEWTON_STEPS = 25
 """Newton's method converges in fewer than 10 steps from a guess nearby."""
 NEAR_ENOUGH = 1e-3

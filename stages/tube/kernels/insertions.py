@@ -13,7 +13,7 @@ from stages.tube.kernels.planar import (
 )
 
 INSERTION_STEP_MM = 0.05
-"""Of the outer tube, in the table of greatest insertions."""
+"""The step of the outer tube in the table of greatest insertions."""
 
 SAMPLED_EVERY = 25
 """Samples of the sweep of which one is looked at for that table: the sweep peaks elsewhere."""

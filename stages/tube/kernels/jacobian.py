@@ -13,7 +13,7 @@ from stages.tube.kernels.assembly import BENT, BENT_TUBE, SOFTNESS
 from stages.tube.kernels.pose import COMMUTATOR, GAUSS, step_of
 
 TERMS = 14
-"""Of the series of the exponential's derivative: for a step of a radian the rest is below rounding."""
+"""After so many terms of the exponential's derivative the rest is below rounding for a step of a radian."""
 
 
 @inner_kernel

@@ -22,7 +22,7 @@ UNSUSPICIOUS_RAD = 0.02
 """A smaller turn cannot be a jump that matters."""
 SAME_BRANCH_RAD = 1e-6
 LEAST_SHARE = 2.0**-12
-"""Of a step, by which its branch of equilibria is said to end."""
+"""The branch of equilibria is said to end where this share of a step fails."""
 ARC_ERROR_MM = 0.005
 """Wanted error of each arc that replaces a piece of changing curvature: far below the margins of plans."""
 MOST_ARCS = 12

@@ -25,7 +25,7 @@ from lungaccess.running.benchmark.synthetic.phantoms import TARGETS_A_LUNG, VERS
 
 MANIFEST = "manifest.json"
 MASKS = ("lumen", "wall", "vessels", "lung", "fissures")
-"""What an answer depends on; CT, labels and lobes are for looking at."""
+"""An answer depends on these masks; CT, labels and lobes are for looking at."""
 DIGITS = 3
 """Targets are stated to a micrometre."""
 Point = tuple[float, float, float]

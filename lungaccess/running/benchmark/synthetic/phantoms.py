@@ -24,7 +24,7 @@ ADULT_MM, CHILD_MM = 1.0, 0.8
 BRONCHUS_LENGTH, VESSEL_LIMIT_MM, VESSEL_RIM_MM, HILAR_VESSEL_MM = 1.35, 0.9, 5.0, 9.0
 """Set so that the medians of a phantom come near those of two patients' masks, see the measurements."""
 OPEN_SHARES = (0.0, 0.45)
-"""Of the fissures: every second phantom has complete ones."""
+"""These shares of the fissures are open in turn: every second phantom has complete ones."""
 LOBES = ("right upper", "left upper", "right lower", "left lower", "right middle")
 
 

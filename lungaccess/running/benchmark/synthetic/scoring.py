@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 SOLVED, REFUSED, NONE, CLAIMED, CERTIFIED, MISSING = (
     "solved", "refused", "no plan", "claimed unreachable", "proved unreachable", "no answer",
 )  # fmt: skip
-"""What an answer comes to.  Only `SOLVED` and `CERTIFIED` are proved; a mere claim is not."""
+"""An answer comes to one of these.  Only `SOLVED` and `CERTIFIED` are proved; a mere claim is not."""
 SAMPLES = 1000
 """Deviated plans for the chance of success, which is then known to 1.6 % or better."""
 SUCCESS_SEED = 281

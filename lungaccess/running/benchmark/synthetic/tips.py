@@ -16,9 +16,9 @@ from lungaccess.planning.coupled.atlas import motions_of
 from lungaccess.problem.system import load_system
 
 SPACING_MM = 5.0
-"""Of the tips along the airway: a handful in every segmental bronchus."""
+"""The tips lie this far apart along the airway: a handful in every segmental bronchus."""
 DIGITS = 7
-"""Of states in mm and rad: a micrometre at the tip is what the check allows."""
+"""States are rounded to so many in mm and rad: the check allows a micrometre at the tip."""
 
 
 def tips_file(system: str) -> str:

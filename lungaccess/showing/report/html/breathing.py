@@ -31,7 +31,7 @@ SAMPLES = 21
 VALUE_STEP_MM = 0.01
 """Distances at phases are stored in such steps."""
 REACH_MM = 1.4 * CAP_MM
-"""So near to the devices tissue of the masks is looked at: enough for `CAP_MM` where it shrinks by 0.7."""
+"""Tissue of the masks is looked at this near to the devices: enough for `CAP_MM` where it shrinks by 0.7."""
 
 
 def shown_window(plan: Plan, lung: Lung) -> BreathingWindow | None:

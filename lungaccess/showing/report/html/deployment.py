@@ -34,7 +34,7 @@ TUBE_POINTS = 40
 SCOPE_SHOWN_MM = 15.0
 """Length of the scope behind its tip that a view of the devices shows: about its bending section."""
 MM_PER_STEP = 0.01
-"""Of a stored distance across the lumen."""
+"""A distance across the lumen is stored in steps of this."""
 SECTION_POINTS = 12
 """Points of a stored bending section: 1 to 2 mm apart."""
 CAP_MM = 15.0

@@ -88,7 +88,7 @@ START_LOOKS = (
         colour="#F0E442", opacity=0.25, shown=False, cell_mm=0.0, most_faces=20_000,
     ),
 )  # fmt: skip
-"""Of the safe start region, whose bodies are small already."""
+"""The looks of the safe start region, whose bodies are small already."""
 
 
 def structure_meshes(lung: Lung) -> list[Packed]:

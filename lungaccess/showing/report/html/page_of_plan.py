@@ -45,7 +45,7 @@ MODULES = (
 NO_REGION = "No safe start region"
 THICKER = "; seen from afar, devices are drawn thicker than they are"
 FOLLOW = '<label><input type="checkbox" id="follow" checked> follow the foremost tip</label>'
-"""Of the slices: whether they go with the devices, or with the cross."""
+"""The box that tells whether the slices go with the devices, or with the cross."""
 
 
 @frozen_record

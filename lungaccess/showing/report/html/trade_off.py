@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 560.0, 366.0
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 26.0, 14.0, 72.0
 COLOURS = ("#D81B60", "#E69F00", "#56B4E9", "#0072B2")
-"""Of clearances up to each of `CLEARANCES`, and beyond; told apart by readers who see no red or green."""
+"""The colours of clearances up to each of `CLEARANCES` and beyond; readers who see no red or green can tell
+them apart."""
 CLEARANCES_MM = (1.0, 2.0, 4.0)
 CAPTION = (
     "Success, length and clearance of each plan. Filled and joined: the Pareto front, which no other plan "

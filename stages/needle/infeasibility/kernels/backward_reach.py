@@ -29,7 +29,7 @@ UNITS_A_CELL = 2.0
 """Angles are stored in units of a cell's side in the plane by this number, rounded down."""
 MOST_UNITS = 255
 HALF_DIAGONAL = 0.7072
-"""Of a cell, in its sides."""
+"""Half of a cell's diagonal, in its sides."""
 SPARE = 1e-6
 """For rounding, rad and mm."""
 

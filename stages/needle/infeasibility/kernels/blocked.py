@@ -16,7 +16,7 @@ _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
 
 FIELD_STEP_MM = 0.005
-"""What a clearance field rounds off is less."""
+"""A clearance field rounds off less."""
 
 
 @inner_kernel

@@ -15,7 +15,7 @@ ROUNDING = 1e-9
 LEAST_RADIUS_MM = 0.2
 """Violations of the wall are measured in radii, but never in smaller ones."""
 GUIDED_MM = 6.0
-"""So far along the guide path the cones reach that lead a sample back into the lumen."""
+"""The cones that lead a sample back into the lumen reach this far along the guide path."""
 
 PROVED, BENDS, LEAVES, UNDECIDED = 0, 1, 2, 3
 

@@ -1,7 +1,5 @@
 """From images to a `Lung`: working grid, labels, airway tree, clearance fields."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Small HTML tables and drawings for notebooks, made of plain values; every text is escaped."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from html import escape
 

@@ -5,8 +5,6 @@ from every corner to a union of solid voxel boxes is the Euclidean distance tran
 corners that touch the structure: exact, with voxels as solid boxes and any voxel size.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """A liver as a needle sees it: the liver is where it may go, veins and artery are what it avoids."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

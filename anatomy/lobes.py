@@ -1,7 +1,5 @@
 """The five lobes: their numbers and names, and the fissures that lie between them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """The patient as the devices see it: one immutable `Lung`."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The distances kept from the masks on top of a device's own radius."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from anatomy.base.settings import quantity, settings

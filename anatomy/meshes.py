@@ -15,8 +15,6 @@ Two kinds of mesh, each with a stated bound of its distance from the mask, whose
 A surface is hollow: what lies wholly inside touches nothing.  Test containment as well.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

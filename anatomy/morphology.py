@@ -1,7 +1,5 @@
 """Masks by whole voxels: their bounds, and growing."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Everything that was read from disk for one patient, on one voxel grid."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from types import MappingProxyType

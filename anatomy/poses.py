@@ -1,7 +1,5 @@
 """Poses `lps_from_tip`: 4x4 rigid frames whose +z axis points the way the device moves."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A filled lung mask often joins the lungs along the anterior and posterior juncti
 layers of pleura lie together.  A path through it would leave one lung and enter the other.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Array, Float, Int32, Mask

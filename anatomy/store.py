@@ -1,7 +1,5 @@
 """Lungs on disk: a folder of memory-mapped arrays, named by the hash of what it was made from."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

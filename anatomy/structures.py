@@ -4,8 +4,6 @@ Every voxel of a lung carries one `uint16`: a bit for each structure it belongs 
 voxels, the number of its branch.  The bits themselves stand in `anatomy.kernels.labels`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Labels

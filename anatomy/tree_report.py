@@ -1,7 +1,5 @@
 """What was changed or left out while an airway tree was made."""
 
-from __future__ import annotations
-
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 

@@ -1,7 +1,5 @@
 """Where prepared anatomies are kept, and how large that folder may grow."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -4,8 +4,6 @@ Every entry is published and removed by one renaming, so a process that is kille
 time, never leaves or meets half an entry.  Files of others in the folder are not touched.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """What tells that stored values are those that were stored: checksums of files, arrays and plain values."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import warnings

@@ -1,7 +1,5 @@
 """Processes that help another one: they end when it ends, however it ends."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

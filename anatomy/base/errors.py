@@ -1,7 +1,5 @@
 """The typed errors of every layer: what was found, what was expected, what to do."""
 
-from __future__ import annotations
-
 
 class LungaccessError(Exception):
     """Base of all errors that a user can cause and mend.

@@ -1,7 +1,5 @@
 """Hashes of inputs, and writing that leaves either the old file or the whole new one."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

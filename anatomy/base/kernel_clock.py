@@ -4,8 +4,6 @@ A kernel is compiled when it is first called, and kept on disk; in the next proc
 Either takes time that says nothing about the problem being solved, so budgets of searches do not count it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

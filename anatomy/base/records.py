@@ -1,7 +1,5 @@
 """Frozen classes of keyword-only fields: what functions return, and what they are given as one thing."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeVar, dataclass_transform
 

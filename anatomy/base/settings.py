@@ -1,7 +1,5 @@
 """Validated settings: one frozen class serves the TOML file, the command line and the stored record."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import functools

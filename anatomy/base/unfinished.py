@@ -1,7 +1,5 @@
 """Folders that a process is filling: a lock tells whether that process still lives."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import time

@@ -1,7 +1,5 @@
 """Numbers in sentences, and which of several names was meant."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from difflib import get_close_matches
 

@@ -1,7 +1,5 @@
 """From masks that were read to a patient: what is missing is named, what is empty refused or left out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Centreline files: .vtp and .vtu with a radius at every point, as an `AirwayTree` and back."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

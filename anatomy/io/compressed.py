@@ -1,7 +1,5 @@
 """Compressed bytes read in pieces, with the checksum proved at the end."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@ Their cases are not patients yet, because the vessels are missing; `lungaccess s
 masks from the CT.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

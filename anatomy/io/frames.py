@@ -1,7 +1,5 @@
 """Points and poses from text, flipped to LPS millimetres at this border only."""
 
-from __future__ import annotations
-
 import warnings
 from io import StringIO
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the header of an image file says, whatever its format, and whether the file can hold it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which files make a patient, and their hashes, without reading a single voxel."""
 
-from __future__ import annotations
-
 import os.path
 import re
 import tomllib

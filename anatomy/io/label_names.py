@@ -1,7 +1,5 @@
 """Which label value of a label map is which structure: header, side-car file, or the published table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

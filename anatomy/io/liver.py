@@ -1,7 +1,5 @@
 """Livers of the UNC Med-RAD collection: liver, nodules and three vessel trees, with starts and targets."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Lungs made of lobes: their union, the rims at airways and vessels, the fissures."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 A reference names one of them: `scene.mrml#target`, `points.mrk.json#target`.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import zipfile

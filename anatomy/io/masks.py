@@ -1,7 +1,5 @@
 """Many mask files of one patient, each placed on one grid by its own header."""
 
-from __future__ import annotations
-
 import os.path
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Lungs of the UNC Med-RAD collection, and the starts and targets of its folders, which are RAS text."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

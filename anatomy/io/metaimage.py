@@ -3,8 +3,6 @@
 The header is read here for the reasons that `anatomy.io.nrrd` gives.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reads what a patient.toml says of breathing: a displacement field, a transform, landmarks, two images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """File names that are meant although they are spelt in another way, or nearly."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches

@@ -4,8 +4,6 @@ The affine is read here and not by an image library, because libraries silently 
 another transform when the stored one is sheared, and to an invented one when none is stored.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ The header is read here and not by an image library, because such libraries are 
 damaged text, and return damaged voxels without a word.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

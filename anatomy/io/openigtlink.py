@@ -4,8 +4,6 @@
 pyigtl (extra `live`); what is damaged is dropped and counted.
 """
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """A folder of masks from any source, described by a `patient.toml`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path

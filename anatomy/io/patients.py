@@ -1,7 +1,5 @@
 """Finds out what kind of patient a path holds, and reads it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn

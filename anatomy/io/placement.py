@@ -1,7 +1,5 @@
 """A mask on a grid of its own, placed on the grid of the other masks by its own header."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Registers the lungs at end-exhale and end-inhale: two CTs, or two masks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Output of TotalSegmentator: a folder of masks, a label map, or both side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

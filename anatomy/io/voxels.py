@@ -1,7 +1,5 @@
 """Voxels of an image file of any format, streamed so that a mask never exists as anything but bool."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """How kernels are compiled: by numba, for every processor of a kind, their code bound to all its sources."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Compile kernels before they are called: `python -m anatomy.machine_code [COMMAND ...]`; or all."""
 
-from __future__ import annotations
-
 import sys
 
 from anatomy.machine_code.ahead import compile_ahead

@@ -5,8 +5,6 @@ kinds of their arguments; `make kernel-calls` writes it.  A call that is missing
 comes, and one that is there in vain costs time alone: nothing depends on the file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping

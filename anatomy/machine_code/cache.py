@@ -6,8 +6,6 @@ damaged file counts as none.  `lungaccess-kernels`, where it is installed, has f
 beforehand: they are looked at first, and never written.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

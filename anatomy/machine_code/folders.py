@@ -1,7 +1,5 @@
 """Where machine code of kernels is kept, and where it may have been made beforehand."""
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Kinds of arguments of kernels as plain JSON values, and back."""
 
-from __future__ import annotations
-
 from functools import reduce
 from importlib import import_module
 from typing import Any

@@ -6,8 +6,6 @@ module of a kernel and everything of this project that the module imports, direc
 calls its module has imported, so nothing else can be in the code.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -1,7 +1,5 @@
 """A smooth displacement from pairs of landmarks, and how well half of the pairs predicts the other half."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The breathing of one patient: where each place of the masks is in each phase."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from functools import cached_property

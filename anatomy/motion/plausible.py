@@ -1,7 +1,5 @@
 """Whether a motion can be that of lungs: it does not fold, and inhaling moves the bases to the feet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

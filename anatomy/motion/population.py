@@ -1,7 +1,5 @@
 """Motion of the lung by breathing when nothing is known of the patient: that of ten others by height."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float

@@ -1,7 +1,5 @@
 """From what was read of a patient's breathing to its `Motion`: at places of the masks, on coarse nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

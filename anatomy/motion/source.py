@@ -1,7 +1,5 @@
 """What is known of a patient's breathing, as it was read: a field, landmark pairs, or other people's."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from anatomy.base.records import frozen_record

@@ -5,8 +5,6 @@ the feet and by A t^2 / 4 to the front until end-inhale.  The left lung moves a 
 one.
 """
 
-from __future__ import annotations
-
 from typing import Self
 
 import numpy as np

@@ -8,8 +8,6 @@ References
 [Horsfield1971], [Weibel1963]
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bullae of an emphysematous phantom: balls of air below the pleura, which tissue and vessels leave free."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

@@ -4,8 +4,6 @@ All lengths in the code are those of an adult in mm, with the carina at the orig
 `Chest` of another size scales them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_value

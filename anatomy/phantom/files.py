@@ -1,7 +1,5 @@
 """Write a phantom as a patient folder that `anatomy.io.load_patient` reads."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

@@ -5,8 +5,6 @@ References
 [Kitaoka1999] flow-splitting diameters and lengths; [Tawhai2000] splitting of a cloud of points.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator
 

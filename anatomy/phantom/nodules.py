@@ -1,7 +1,5 @@
 """Where nodules grow: in the outer lung, away from fissures and from airways of some size."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import AnatomyError

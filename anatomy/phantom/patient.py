@@ -1,7 +1,5 @@
 """Make a whole synthetic patient from a seed and a size."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from copy import deepcopy

@@ -1,7 +1,5 @@
 """Plan the trees and nodules of a phantom: what runs where and how thick, before anything is drawn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

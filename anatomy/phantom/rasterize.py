@@ -1,7 +1,5 @@
 """From shapes to voxels: body, lungs, lobes, fissures, trees and nodules drawn into one label image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

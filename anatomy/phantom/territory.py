@@ -1,7 +1,5 @@
 """Where trees grow: a coarse map of the lobes, its depths, and points spread evenly in it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import AnatomyError

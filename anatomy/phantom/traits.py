@@ -1,7 +1,5 @@
 """What makes one phantom differ from the next besides its seed and size: build, disease, operation."""
 
-from __future__ import annotations
-
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_value
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER

@@ -1,7 +1,5 @@
 """Pulmonary vessels: an artery beside every airway, veins grown into the gaps between them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

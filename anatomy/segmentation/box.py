@@ -4,8 +4,6 @@ The voxels of a box divide those of the CT, whose edges they share.  Each axis a
 voxels than asked is interpolated; the others are taken as they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Self

@@ -1,7 +1,5 @@
 """Images in one order of voxels: what a segmentation makes does not depend on how a file stores its image."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float

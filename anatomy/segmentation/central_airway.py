@@ -1,7 +1,5 @@
 """Trachea and main bronchi on coarse voxels: found as a round column of air, followed to the lungs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Morphological closing with a ball by exact distances, and filling of enclosed holes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

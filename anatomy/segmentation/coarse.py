@@ -1,7 +1,5 @@
 """A CT on coarse voxels with axes along LPS, where decisions about the whole chest are cheap."""
 
-from __future__ import annotations
-
 from typing import Self
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The CT on cubic voxels of 1 mm, on which plates look the same in every direction."""
 
-from __future__ import annotations
-
 from typing import Self
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The `patient.toml` of a folder while its images change."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

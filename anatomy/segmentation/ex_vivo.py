@@ -1,7 +1,5 @@
 """An inflated lung outside a body: in air, in a bag, or on a tray."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import AnatomyError

@@ -5,8 +5,6 @@ or a fissure.  Only a fissure goes on in its plane: around it normals agree, and
 together.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

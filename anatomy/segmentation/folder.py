@@ -1,7 +1,5 @@
 """The folder a segmentation writes: what was made from what, and which masks a person corrected."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Masks that other programs or people made, put on the voxels of the CT in place of steps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

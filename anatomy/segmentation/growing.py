@@ -1,7 +1,5 @@
 """Grow the airway through a map of local minima, and around it its wall [Fu2018, III-A.2]."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

@@ -1,7 +1,5 @@
 """Whether air measures -1000 HU in an image, and the image as if it did."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Mask

@@ -1,7 +1,5 @@
 """Whether an image is a CT of the chest that can be segmented: refused if not, warned of if in doubt."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import AnatomyError

@@ -1,7 +1,5 @@
 """Lungs and other masks made by other programs or by hand, in place of a step of the segmentation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """Which lobe each bronchus supplies: the parting of the tree whose regions meet at the fissures."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from types import MappingProxyType

@@ -4,8 +4,6 @@ As in [Lassen2013] and [Ukil2009] seeds come from the bronchi and borders from f
 are no vessels.  Lobes are shared out by diffusion, which passes a gap in a fissure by no more than its width.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

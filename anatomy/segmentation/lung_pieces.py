@@ -1,7 +1,5 @@
 """Which pieces of air in a chest are lungs: those that lie at the bronchi, without the gas beside them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import AnatomyError

@@ -1,7 +1,5 @@
 """Both lungs in a CT of the chest: filled, apart from each other, without trachea and main bronchi."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Whether masks from elsewhere lie on what they show in the CT: moved by a little, they must fit worse."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

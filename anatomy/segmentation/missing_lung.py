@@ -1,8 +1,6 @@
 """Where lung is missing that a chest of this shape would have: consolidation, fluid, collapse, large
 masses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The target of a procedure: radiologists' contours, a mask or a point; and its removal from the vessels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The air around the patient, told apart from lungs that reach the edge of the image."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float32, Mask

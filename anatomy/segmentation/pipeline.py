@@ -1,7 +1,5 @@
 """From a CT to a patient folder: every step that is not up to date, in order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version

@@ -1,7 +1,5 @@
 """Nodules that lie on the chest wall: notches of the lung too wide for its closing."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Int, Mask

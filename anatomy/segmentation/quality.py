@@ -1,7 +1,5 @@
 """Figures of a segmentation that tell a person where to look before trusting it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a segmentation starts from: a CT, and whatever other programs or people have made already."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path

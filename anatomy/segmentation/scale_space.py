@@ -1,7 +1,5 @@
 """The lung of a CT smoothed to rising scales, one image in memory at a time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor

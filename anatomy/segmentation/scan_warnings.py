@@ -1,7 +1,5 @@
 """What a user should look at before trusting a segmentation: noise and slices of the CT, and the airway."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree

@@ -1,7 +1,5 @@
 """Follow airways on from the ends of a grown lumen, where they are too thin for the map of minima."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_value

@@ -1,7 +1,5 @@
 """Join broken-off pieces of a lumen across short gaps that lie in the direction of both sides."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Make an `AirwayTree` from a lumen mask or from a centreline graph."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

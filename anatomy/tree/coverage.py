@@ -5,8 +5,6 @@ eaten from its end, and with it a whole branch.  So every voxel must be near the
 it to the skeleton is added.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Bool, Float, Float32, Int

@@ -1,7 +1,5 @@
 """Exact geometry of a mask whose voxels are solid boxes: depth of points, segments inside."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Bool, Float, Int

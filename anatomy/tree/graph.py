@@ -1,7 +1,5 @@
 """Check a centreline graph and span it by a tree."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

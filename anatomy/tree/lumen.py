@@ -1,7 +1,5 @@
 """Prepare a lumen mask for thinning: crop it, keep one piece, bridge short breaks, find cavities."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import AnatomyError

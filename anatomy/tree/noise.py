@@ -1,7 +1,5 @@
 """Masks that are no tree of airways: noise, or a leak into the lung, is refused before it costs minutes."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Unite lines of a voxel tree that run side by side, so that a branching lies where they really part."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Bool

@@ -1,7 +1,5 @@
 """Space the points of every branch evenly and measure their radius."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float

@@ -1,7 +1,5 @@
 """From a mask to a pruned spanning tree of its skeleton voxels."""
 
-from __future__ import annotations
-
 import heapq
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 The rule is stated with its reasons in `docs/explanation/airway_tree.md`.
 """
 
-from __future__ import annotations
-
 from typing import NoReturn
 
 import numpy as np

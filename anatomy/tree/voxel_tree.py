@@ -1,7 +1,5 @@
 """Lay a smooth, centred voxel tree through the lumen that never leaves it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -4,8 +4,6 @@ Exit codes: 0, a plan was found and the independent check accepts it; 1, there i
 refuses it; 2, the input is bad.
 """
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import sys

@@ -3,8 +3,6 @@
 The examples work as they stand, in this order, in an empty folder: each uses what those before it wrote.
 """
 
-from __future__ import annotations
-
 from types import MappingProxyType
 
 EXAMPLES = MappingProxyType(

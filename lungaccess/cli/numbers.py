@@ -1,7 +1,5 @@
 """Numbers that options take, each with the range in which it makes sense."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Progress on standard error: what is being done, how much of it is done, and about how long it takes."""
 
-from __future__ import annotations
-
 from types import TracebackType
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Words of a command line that make no sense, as an error of the same form as all others."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

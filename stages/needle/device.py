@@ -1,7 +1,5 @@
 """What the planner has to know of a steerable needle."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from anatomy.base.settings import quantity, settings

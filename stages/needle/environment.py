@@ -1,7 +1,5 @@
 """The environment of a needle: obstacles as arrays, and the needle's limits, as the kernels take them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import field, replace
 

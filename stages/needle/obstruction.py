@@ -1,7 +1,5 @@
 """Why a query has no path: what stands in the way, where, and by how much."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Needle paths as a person steers them: roll, then insert along an arc."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Whether a planner of the needle can be chosen here: its name is known, and its library is there."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from anatomy.base.errors import MissingLibraryError, SettingsError

@@ -1,7 +1,5 @@
 """What a needle planner is asked: from which pose to which target."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

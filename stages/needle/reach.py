@@ -1,7 +1,5 @@
 """Which of many points the needle reaches from many start poses, and how well."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """An index of many start poses: which of them have a target in their workspace, without a look at each."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

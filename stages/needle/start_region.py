@@ -1,7 +1,5 @@
 """The safe start region: from which poses near a planned start the needle still reaches its target."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Start poses near a planned one, tried one by one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

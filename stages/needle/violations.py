@@ -1,7 +1,5 @@
 """Why a path is no answer to a query, whoever found it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the planner has to know of a bronchoscope."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

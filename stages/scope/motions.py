@@ -1,7 +1,5 @@
 """All tips that a bronchoscope is brought to by proved motions: one tree of states for the whole airway."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

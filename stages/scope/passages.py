@@ -1,7 +1,5 @@
 """Where a bronchoscope passes along the medial axis, and where an airway can be left ahead of it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tips before and after a tip along its own motion, each with a proved motion of its own."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

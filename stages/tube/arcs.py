@@ -1,7 +1,5 @@
 """The shape of any deployed tubes: the arcs of their centreline, and points along it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

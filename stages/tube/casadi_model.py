@@ -9,8 +9,6 @@ Units are mm, N and rad.  Tubes are listed innermost first.  The base frame has 
 plate, where the arc length is 0, and +z forward.  Tubes are held straight behind the plate.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from functools import cached_property

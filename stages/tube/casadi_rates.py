@@ -4,8 +4,6 @@ The state is the position and the quaternion of the innermost tube's frame, its 
 others relative to it, and the torsional moments in N mm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

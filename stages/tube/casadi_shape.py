@@ -3,8 +3,6 @@
 Nothing of the kernels takes part: neither their integration nor their judgement of stability.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The shapes of the tubes of a system: made or read once a process, and the same for every patient."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Sequence

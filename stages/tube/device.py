@@ -1,7 +1,5 @@
 """What the planner has to know of concentric tubes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import field
 from functools import cached_property

@@ -1,7 +1,5 @@
 """What the tubes collide with, and the numbers of a pair of tubes, as the kernels take them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One equilibrium of nested tubes: its shape, torsion, stability, and the motion of its tip."""
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """Where the tubes of many deployments leave the airway."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float, Int

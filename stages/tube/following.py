@@ -1,7 +1,5 @@
 """Carry out a sequence of joint motions: every step's equilibrium, sideways motion, and snaps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence as SequenceOf
 
 import numpy as np

@@ -5,8 +5,6 @@ at the front plate, which is the tip of the bronchoscope, and +z forward; a tube
 and whose precurvature has direction 0, bends towards -y.  Behind the front plate tubes are held straight.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

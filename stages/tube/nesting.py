@@ -1,7 +1,5 @@
 """Nested tubes: whether they fit into each other, and their numbers as the kernels take them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

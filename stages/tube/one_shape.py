@@ -1,7 +1,5 @@
 """Single deployments of any joint values, proved by the way to them, and as arrays that a search changes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

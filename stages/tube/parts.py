@@ -1,7 +1,5 @@
 """The parts of a tube: where it is curved at rest, and where a laser has cut slots into it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple
 

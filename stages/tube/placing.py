@@ -1,7 +1,5 @@
 """The shapes of a design, placed in a patient: which leave the airway safely, and from which scope tips."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Sequences and designs that keep the tubes' sideways motion small, and what reach that costs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as SequenceOf

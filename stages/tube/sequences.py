@@ -1,7 +1,5 @@
 """In which order joints move: turn and insert nested tubes from the scope tip to their final place."""
 
-from __future__ import annotations
-
 import collections.abc
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Shapes with equal beginnings as a tree, so that each beginning is compared with an anatomy once."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

@@ -1,7 +1,5 @@
 """How much tubes straighten a scope's bent tip."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """Validation of single deployments: shape, tip pose and exit through the wall, or why one is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

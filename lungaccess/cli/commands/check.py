@@ -1,7 +1,5 @@
 """The command `lungaccess check`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

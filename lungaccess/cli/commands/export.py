@@ -1,7 +1,5 @@
 """The command `lungaccess export`: a plan and its patient for other programs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

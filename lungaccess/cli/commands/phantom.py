@@ -1,7 +1,5 @@
 """The command `lungaccess phantom`: a synthetic patient as a folder, to try the other commands on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """The command `lungaccess steps`: what hands or motors do with the bronchoscope of a plan."""
 
-from __future__ import annotations
-
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile

@@ -1,7 +1,5 @@
 """The command `lungaccess template`: an example of each file that a user writes."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """The command `lungaccess view`: the explorer of a patient on a page of this machine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """How good the news about a plan is: the one place where chances become grades, and grades get their mark."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 from lungaccess.uncertainty.risk.statistics import Share

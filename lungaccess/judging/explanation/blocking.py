@@ -1,7 +1,5 @@
 """What stops the direct arcs to a target, where, and the arc that comes nearest to being allowed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

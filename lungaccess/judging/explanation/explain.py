@@ -1,7 +1,5 @@
 """Explain why a search found no plan: part by part, the most useful first, until the time is spent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial

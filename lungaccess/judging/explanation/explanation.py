@@ -1,7 +1,5 @@
 """`Explanation`: what was learned from a search that found no plan, and what was not tried."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 

@@ -1,7 +1,5 @@
 """What is reached near a target that is not: the nearest point, and the share of points around it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """An explanation as plain values, and as files."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

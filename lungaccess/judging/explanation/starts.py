@@ -1,7 +1,5 @@
 """The needle starts that a patient and a system have, and why each does not reach the target."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """An explanation in words: sections of rows, for the terminal and the page alike."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from anatomy.base.records import frozen_value

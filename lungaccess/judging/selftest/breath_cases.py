@@ -1,7 +1,5 @@
 """Cases of the window: the phases of the breath in which devices are proved clear and on target."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float, Labels

@@ -1,7 +1,5 @@
 """Cases of the tubes' proof, of the cost bound, and of proofs that no deployment reaches a target."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

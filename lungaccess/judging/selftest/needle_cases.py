@@ -1,7 +1,5 @@
 """Cases of clearance bounds, arcs of the needle, its start region, and proofs that it has no path."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@
 NUMBA_DISABLE_JIT=1 the sources of the kernels run as they are, and numpy tests every index of an array.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

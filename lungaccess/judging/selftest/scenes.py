@@ -1,7 +1,5 @@
 """Tiny lungs drawn voxel by voxel, and distances to their voxels without any of the kernels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Cases of the proof that a motion of the bronchoscope touches no wall."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

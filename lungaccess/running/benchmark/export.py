@@ -1,7 +1,5 @@
 """Rows of a benchmark as CSV or JSON, one a run, and gathered over seeds, as people read them."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Recorded results of another planner on the same queries."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

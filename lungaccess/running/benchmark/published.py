@@ -1,7 +1,5 @@
 """The needle queries that were published with patients: every start pose with every target."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs of needle planners on published queries, and what each came to."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 

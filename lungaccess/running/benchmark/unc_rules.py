@@ -5,8 +5,6 @@ every obstacle voxel's centre is at least the needle's radius and half a voxel d
 around the start do not count.  A path ends within a tolerance of the target, at any angle.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

@@ -1,7 +1,5 @@
 """Whether two results files hold the same runs with the same answers."""
 
-from __future__ import annotations
-
 import json
 from itertools import zip_longest
 from pathlib import Path

@@ -3,8 +3,6 @@
 That command reads a run as JSON on standard input and writes its answer as JSON on standard output.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import subprocess

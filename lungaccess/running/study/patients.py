@@ -1,7 +1,5 @@
 """The patients of a study, as any process on any machine opens them."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

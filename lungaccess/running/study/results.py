@@ -1,7 +1,5 @@
 """The results file of a study: SQLite, one transaction a run, each run at most once."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sqlite3

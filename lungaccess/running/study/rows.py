@@ -1,7 +1,5 @@
 """The rows of a results file, as SQL and values."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import platform

@@ -1,7 +1,5 @@
 """What a study is: cases, planners, seeds and a budget, read from a TOML file."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import field

@@ -1,7 +1,5 @@
 """What a results file says, by case and planner."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from statistics import median
 from typing import Any

@@ -1,7 +1,5 @@
 """The tables of a results file as a user wants them: without the file's own row numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 

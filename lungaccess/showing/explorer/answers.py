@@ -1,7 +1,5 @@
 """The answers to the questions of the page, each a generator of parts; one instance serves a process."""
 
-from __future__ import annotations
-
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Why there is no plan, for the page: in the words of the command, and never more than is proved."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from anatomy.base.errors import SettingsError

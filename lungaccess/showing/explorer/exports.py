@@ -1,7 +1,5 @@
 """Files about a plan: what the command line writes, one at a time."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from collections.abc import Sequence

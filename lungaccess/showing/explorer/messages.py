@@ -1,7 +1,5 @@
 """What the explorer sends: JSON as text, or JSON and arrays as one binary message."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Mapping

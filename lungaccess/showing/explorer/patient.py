@@ -1,7 +1,5 @@
 """What the page needs of the patient: its facts, surfaces, voxels, and the target that a text names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path

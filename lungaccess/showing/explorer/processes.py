@@ -1,7 +1,5 @@
 """The processes that compute for the explorer, from the side of the server."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import threading

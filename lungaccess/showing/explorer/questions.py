@@ -1,7 +1,5 @@
 """What the page may ask: every message is read into one of these, and anything else is refused in words."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal

@@ -1,7 +1,5 @@
 """The reach of a system for the page: voxel by voxel as it becomes known, from the target outward."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, MutableMapping
 from typing import Any
 

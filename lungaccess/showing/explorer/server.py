@@ -1,7 +1,5 @@
 """The server of the explorer: an address of this machine, a token, the page, a socket for its questions."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac

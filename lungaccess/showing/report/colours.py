@@ -1,7 +1,5 @@
 """Colours that pictures and pages share: of the devices, and of what explains a missing plan."""
 
-from __future__ import annotations
-
 import json
 import re
 from importlib import resources

@@ -1,7 +1,5 @@
 """What all anatomical pictures share: layers, edge letters, scale bar, curves with a halo."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes

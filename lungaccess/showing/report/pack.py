@@ -1,7 +1,5 @@
 """Arrays as text inside a page: deflated, in base64, with their type and shape beside them."""
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib

@@ -1,7 +1,5 @@
 """Overlays of a segmentation on its CT, on three planes."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

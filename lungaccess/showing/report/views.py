@@ -1,7 +1,5 @@
 """Directions of view: the three of radiology, and the plane that shows a curve best."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

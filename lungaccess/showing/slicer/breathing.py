@@ -4,8 +4,6 @@ A sequence is a bundle `.seq.mrb`, a zip archive of a scene and its files.  Tran
 does 3D Slicer: from a place in a phase back to that in the masks.
 """
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence

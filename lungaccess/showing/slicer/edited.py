@@ -1,7 +1,5 @@
 """A curve of a plan that was edited in 3D Slicer: what of it still holds, and what broke."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

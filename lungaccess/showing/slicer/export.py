@@ -1,7 +1,5 @@
 """Write a plan and its patient as a folder for 3D Slicer, and say what is in it."""
 
-from __future__ import annotations
-
 import json
 import textwrap
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Markups for 3D Slicer: curves with radius and pose at every point, and points with a name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any

@@ -1,7 +1,5 @@
 """Surfaces for 3D Slicer: small meshes of the structures, and the devices true to their radius."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scene file: one `.mrml` that makes 3D Slicer load every file of the folder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal

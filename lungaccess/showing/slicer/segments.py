@@ -1,7 +1,5 @@
 """The structures as one `.seg.nrrd` label map with names, colours and terminology."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 docs/explanation/unreachable.md derives it.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

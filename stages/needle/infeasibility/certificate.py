@@ -9,8 +9,6 @@ over-estimates.  If some are left, those that lie on a chain of cells from start
 smaller ones and the same is done again.  docs/explanation/certificate.md has the inequalities.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator, Iterator
 

@@ -1,7 +1,5 @@
 """The tightest place of the states that a proof of no path has left."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

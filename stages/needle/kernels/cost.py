@@ -6,8 +6,6 @@ three; in such a piece no voxel is met twice, and the voxels at its two ends say
 crosses a face, and where is the root of a quadratic equation.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

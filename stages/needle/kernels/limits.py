@@ -1,7 +1,5 @@
 """The needle's limits, as the kernels take them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 TINY = 1e-9

@@ -3,8 +3,6 @@
 `pose` and `bend` are the tuples of `anatomy.kernels.arcs`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

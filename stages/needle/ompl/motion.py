@@ -1,7 +1,5 @@
 """How the needle moves in OMPL: bounds, and steps that are proved clear one by one."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A needle search as a planner of OMPL, its goal, and the question that both are asked."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The needle problem as OMPL takes it, made once and asked many times."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """States and paths of OMPL as frames and arcs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

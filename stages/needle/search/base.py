@@ -1,7 +1,5 @@
 """Searches for a needle path, each advanced in slices by whoever has the clock."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Guide paths for searches: from state lattices over all of the space, and from finer ones around a path."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import product

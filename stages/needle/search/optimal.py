@@ -1,7 +1,5 @@
 """An asymptotically optimal search: trees in state and cost, and refinement of the best path."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float

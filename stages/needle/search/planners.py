@@ -1,7 +1,5 @@
 """The searches of the needle stage by name."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from anatomy.base.plugins import registered

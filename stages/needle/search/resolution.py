@@ -1,7 +1,5 @@
 """The search that ends: with the best path at its resolution, or with the statement that it has none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from enum import StrEnum

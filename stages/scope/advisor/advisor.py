@@ -1,7 +1,5 @@
 """The advisor: which motion leads on from wherever the scope is, and the path to the goal [Rosell2012]."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Literal

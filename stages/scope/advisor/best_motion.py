@@ -4,8 +4,6 @@ Where all valid candidates have the same potential, K_NF1 is 0 for all; the same
 adds nothing to K_alpha.  Among equals the first wins, in the order of the table.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import Annotated

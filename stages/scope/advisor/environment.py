@@ -4,8 +4,6 @@ Eq. 1 compares an L1 distance, which is up to sqrt(3) times the Euclidean one, i
 side, and looks at the joints alone: it lets a scope touch the wall.  It is there for reproduction only.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 

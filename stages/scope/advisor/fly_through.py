@@ -1,7 +1,5 @@
 """A path as the camera at the tip sees it: poses as densely as a film or 3D Slicer needs them."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Instructions for a person: at every bifurcation of a path, how far to turn, bend and advance."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The interior voxels of the airways as a graph, and how wide the lumen is there."""
 
-from __future__ import annotations
-
 from dataclasses import field
 from functools import cached_property
 

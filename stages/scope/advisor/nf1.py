@@ -5,8 +5,6 @@ edges cost what entering a voxel costs, and it is solved as such.  All edges cos
 without a lower neighbour can only be the goal.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

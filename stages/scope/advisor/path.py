@@ -1,7 +1,5 @@
 """The path of a scope: its states one sub-step apart, and where its body lies."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

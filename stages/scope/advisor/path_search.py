@@ -5,8 +5,6 @@ scope is pulled back along its path and tries again with other weights and anoth
 comes nearest is kept.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

@@ -5,8 +5,6 @@ A base frame is `(12,)`: the columns +x, +y and +z, and the point.  A section's 
 advance carries the frame along the arc without roll (a Bishop frame), so that the vector keeps its parts.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

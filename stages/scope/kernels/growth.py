@@ -1,7 +1,5 @@
 """One layer of the tree of states of a bronchoscope: a beam search that follows a route of the airway."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

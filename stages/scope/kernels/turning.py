@@ -1,7 +1,5 @@
 """The tips that a bronchoscope reaches from states by twisting and bending in place, one of each kind."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

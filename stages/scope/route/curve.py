@@ -1,7 +1,5 @@
 """A cubic B-spline in space: interpolation and sampling."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

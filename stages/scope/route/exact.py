@@ -1,7 +1,5 @@
 """Repair a route by a nonlinear program on its spline."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from functools import partial

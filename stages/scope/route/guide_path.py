@@ -1,7 +1,5 @@
 """The guide path of a route: the centreline nodes that the search found, with start and goal."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import SettingsError

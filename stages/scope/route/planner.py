@@ -1,7 +1,5 @@
 """Plan a route: search, spline, repair, proof; and plan it again when the anatomy has moved."""
 
-from __future__ import annotations
-
 from concurrent.futures import Executor
 from typing import Literal, get_args
 

@@ -1,7 +1,5 @@
 """The proof that a whole curve keeps to its limits, by bounds on pieces; and what [Li2021] measures of it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record, frozen_value

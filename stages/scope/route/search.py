@@ -1,7 +1,5 @@
 """The global planner of [Li2021]: breadth-first search (BFS) along the nodes of a centreline."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import LungaccessError, SettingsError

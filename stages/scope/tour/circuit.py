@@ -1,7 +1,5 @@
 """The choice of exits by minimum resistance [Pan2025, algorithms 1 and 2]."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The exits of a lesion: the target positions P1, P2 and P3 of [Pan2025], with eqs. 1 and 2."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated
 

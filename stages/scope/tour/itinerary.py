@@ -1,7 +1,5 @@
 """The order of visits for chosen exits, and how often each stretch is passed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The shortest tour over all choices of exits: a group Steiner problem on a tree, solved exactly."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

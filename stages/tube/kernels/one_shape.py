@@ -4,8 +4,6 @@ Joints `(2 n,)` are the insertions in mm, then the rotations of the rear ends in
 first.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@
 it left the lumen, and how much of its body is in the wall since.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

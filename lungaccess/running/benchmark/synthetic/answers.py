@@ -1,7 +1,5 @@
 """Answers of a submission as motions of the devices: made from a plan of ours, and handed to the check."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

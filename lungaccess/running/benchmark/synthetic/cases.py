@@ -11,8 +11,6 @@ FOLDER/adult-01/tips-NAME.json     for each device, where a scope can stand, wit
 `benchmark.json` is written last, so that a folder that has it is complete.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path

@@ -3,8 +3,6 @@
 A phantom whose masks have another hash is another problem: making it is refused, and so are its scores.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The fifty phantoms of `synthetic-v1`: families, seeds and traits; a released version never changes."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from anatomy.base.errors import SettingsError

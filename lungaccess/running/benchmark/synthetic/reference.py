@@ -1,7 +1,5 @@
 """Runs of our methods and OMPL's planners on the benchmark, as a study; and what they hand in."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 

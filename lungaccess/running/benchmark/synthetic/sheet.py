@@ -1,7 +1,5 @@
 """The score sheet: one line a planner, and one a planner, family and device."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterable, Sequence

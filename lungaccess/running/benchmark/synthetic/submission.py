@@ -3,8 +3,6 @@
 `docs/reference/submission.md` describes the file with an example; `submission_schema` is its JSON Schema.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 They let a planner start from a bronchoscope without having one of its own.  A submission names one by number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """One HTML file of templates, style sheet, scripts and data: complete in itself, nothing is fetched."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Mapping, Sequence

@@ -13,8 +13,6 @@ A direction is a point of the plane: its stereographic projection from the direc
 points |P| and |Q| from the middle and e from each other are 2 asin(e / sqrt((1 + |P|^2) (1 + |Q|^2))) apart.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

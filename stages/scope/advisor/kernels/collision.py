@@ -1,7 +1,5 @@
 """Collision of the scope: its radius against the Euclidean depth, or eq. 1 of [Rosell2012] as printed."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ The terms of a sample are the objective (distance from the reference, bending), 
 the lumen; at free ends, the distance from the wanted points.  See `repair` for the program.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -26,7 +26,11 @@ from lungaccess.planning.one_stage import plan_needle as plan_needle
 from lungaccess.planning.one_stage import replan_from_scope as replan_from_scope
 from lungaccess.planning.one_stage import replan_from_tube as replan_from_tube
 from lungaccess.planning.one_stage import safe_scope_region as safe_scope_region
+from lungaccess.planning.procedure import Decision as Decision
+from lungaccess.planning.procedure import Measurements as Measurements
+from lungaccess.planning.procedure import Policy as Policy
 from lungaccess.planning.procedure import Procedure as Procedure
+from lungaccess.planning.procedure import ProcedureRecord as ProcedureRecord
 from lungaccess.planning.procedure import load_procedure as load_procedure
 from lungaccess.planning.procedure import simulate_procedure as simulate_procedure
 from lungaccess.planning.reachability import UnreachableProof as UnreachableProof

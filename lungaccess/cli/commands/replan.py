@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-import numpy as np
 from cyclopts import Parameter
 from rich.table import Table
 
@@ -12,8 +13,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.io.frames import Frame
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Seed
+from lungaccess.cli.numbers import Count, Positive, Seed
 from lungaccess.cli.options import (
+    ErrorOptions,
     ObjectiveText,
     PatientFolder,
     PatientOptions,
@@ -27,6 +29,8 @@ from stages.needle import DEFAULT, Objective
 if TYPE_CHECKING:
     from anatomy.base.typed import Float
     from lungaccess.planning.one_stage import RestOfPlan
+    from lungaccess.planning.procedure import Decision
+    from lungaccess.plans.parts import TubeDeployment
     from lungaccess.plans.plan import Plan
 
 
@@ -48,24 +52,51 @@ def replan(
             "point moved in 3D Slicer, scene.mrml#name; or a plan.json."
         ),
     ] = None,
+    needle: Annotated[
+        str | None,
+        Parameter(help="Where the tip of the needle really is, with --procedure: stated as for --tube."),
+    ] = None,
     frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
+    plan: Annotated[
+        Path | None,
+        Parameter(
+            help="plan.json that is carried out, with --procedure: its policy then says what to do next."
+        ),
+    ] = None,
+    errors: ErrorOptions = ErrorOptions(),
+    placement: Annotated[Count, Parameter(help="How often the scope has been placed, with --procedure.")] = 1,
+    radius: Annotated[Positive | None, Parameter(help="Radius of the goal in mm, with --procedure.")] = None,
+    record: Annotated[
+        Path | None,
+        Parameter(
+            help="File to which what was measured and decided is added, with --procedure; it is played "
+            "again first."
+        ),
+    ] = None,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     objective: Annotated[ObjectiveText, Parameter(help="What to make small, as for `plan`.")] = DEFAULT,
     seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the rest from a measured pose: tubes and needle from the scope's tip, or the needle alone."""
+    """Plan the rest from a measured pose: tubes and needle from the scope's tip, or the needle alone.
+
+    With --plan and --procedure the policy of the procedure says what to do next, with its chance of success.
+    """
+    if plan is not None or errors.procedure is not None:
+        poses = {"scope": scope, "tubes": tube, "needle": needle}
+        followed = _Followed(plan, errors, placement, radius, record)
+        return _decided(patient, poses, frame, followed, output)
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.planning.one_stage import replan_from_scope, replan_from_tube
     from lungaccess.plans.no_plan import NoPlan
 
     Objective.of(objective)
     stated, device = target.stated(), system.load()
-    pose, plan = _measured(scope, tube, frame)
+    pose, of_plan = _measured(scope, tube, frame)
     lung = output.load(patient)
-    if plan is not None:
-        plan.require_lung(lung)
+    if of_plan is not None:
+        of_plan.require_lung(lung)
     require_map(lung, objective)
     aim, ask = stated.resolve(lung), replan_from_tube if scope is None else replan_from_scope
     try:
@@ -83,12 +114,51 @@ def replan(
     return ExitCode.OK
 
 
-def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float, Plan | None]:
-    """Return the pose as measured, and the plan that it is of if it is one of a plan."""
-    from anatomy.io.frames import read_pose
-    from anatomy.io.markups import parse_reference, read_named_pose
+class _Followed(NamedTuple):
+    """What a policy follows, as it is stated."""
+
+    plan: Path | None
+    errors: ErrorOptions
+    placement: int
+    radius: float | None
+    record: Path | None
+
+
+def _decided(
+    patient: Path, stated: dict[str, str | None], frame: Frame, followed: _Followed, output: PatientOptions
+) -> ExitCode:
+    """Show what the policy of a procedure says about measured poses."""
+    from lungaccess.planning.procedure import Measurements, Policy, ProcedureRecord
     from lungaccess.plans.plan import Plan
 
+    procedure = followed.errors.given_procedure()
+    if followed.plan is None or procedure is None:
+        raise SettingsError(
+            "Only one of --plan and --procedure is given",
+            expected="both: the plan that is carried out, and what is measured on the way",
+            remedy="For instance --plan plan.json --procedure measured-tip",
+        )
+    poses = {name: [_pose(text, name, frame)[0]] for name, text in stated.items() if text is not None}
+    plan, lung = Plan.load(followed.plan), output.load(patient)
+    kept = followed.record
+    if kept is not None and kept.exists():
+        record = ProcedureRecord.load(kept, plan, lung)
+    else:
+        policy = Policy(plan, lung, followed.errors.load(), procedure, radius_mm=followed.radius)
+        record = ProcedureRecord(policy)
+    with progress("asking the policy"):
+        decision = record.decide(Measurements.of(**poses, placements=followed.placement))  # type: ignore[arg-type]
+    if kept is not None:
+        record.save(kept)
+    if output.json:
+        terminal.show_json(decision.record())
+    else:
+        terminal.show(decision_tables(decision))
+    return ExitCode.OK if decision.goes_on else ExitCode.NEGATIVE
+
+
+def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float, Plan | None]:
+    """Return the pose as measured, and the plan that it is of if it is one of a plan."""
     given = scope if tube is None else tube
     if given is None or (scope is not None and tube is not None):
         raise SettingsError(
@@ -96,33 +166,30 @@ def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float,
             expected="one of them: where the tip of the scope or of the tubes really is",
             remedy="`lungaccess template pose` prints a file to start from",
         )
+    return _pose(given, "scope" if tube is None else "tubes", frame)
+
+
+def _pose(given: str, stage: str, frame: Frame) -> tuple[Float, Plan | None]:
+    """Return a pose as it is stated, and the plan that it is of if it is one of a plan."""
+    from anatomy.io.frames import read_pose
+    from anatomy.io.markups import parse_reference, read_named_pose
+    from lungaccess.plans.plan import Plan
+
     saved = parse_reference(given)
     if saved is not None:
         return read_named_pose(saved), None
     if not given.endswith(".json"):
         return read_pose(given, frame), None
     plan = Plan.load(given)
-    return (plan.tube.lps_from_tip if scope is None else plan.scope.lps_from_scope_tip), plan
+    return (plan.scope.lps_from_scope_tip if stage == "scope" else plan.tube.lps_from_tip), plan
 
 
 def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
     from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.plans.costs import costs_in_words, known_costs
 
-    rows, tube, needle = [], found.tube, found.needle
-    if tube is not None:
-        rows += [
-            ("turn the tubes, from +x of the scope", f"{np.degrees(tube.rotation_rad):.1f} deg"),
-            *(
-                (f"turn the {name} tube on by", f"{np.degrees(angle):.1f} deg")
-                for name, angle in ({} if tube.shape is None else tube.shape.relative_rotations_rad).items()
-                if angle
-            ),
-            ("outer tube", f"{tube.outer_insertion_mm:.1f} mm"),
-            *([("middle tube", f"{tube.middle_insertion_mm:.1f} mm")] if tube.middle_insertion_mm else []),
-            ("inner tube", f"{tube.inner_insertion_mm:.1f} mm"),
-            ("exit through branch", f"{tube.exit.branch}"),
-        ]
+    tube, needle = found.tube, found.needle
+    rows = [] if tube is None else tube_rows(tube)
     rows += [
         (
             "needle",
@@ -139,3 +206,38 @@ def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
         arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in needle.arcs]
         tables.append(arcs_table(arcs))
     return tables
+
+
+def tube_rows(tube: TubeDeployment) -> list[tuple[str, str]]:
+    """Return how tubes are to be turned and inserted."""
+    turned = {} if tube.shape is None else tube.shape.relative_rotations_rad
+    middle = [("middle tube", f"{tube.middle_insertion_mm:.1f} mm")] if tube.middle_insertion_mm else []
+    return [
+        ("turn the tubes, from +x of the scope", f"{math.degrees(tube.rotation_rad):.1f} deg"),
+        *(
+            (f"turn the {name} tube on by", f"{math.degrees(angle):.1f} deg")
+            for name, angle in turned.items()
+            if angle
+        ),
+        ("outer tube", f"{tube.outer_insertion_mm:.1f} mm"),
+        *middle,
+        ("inner tube", f"{tube.inner_insertion_mm:.1f} mm"),
+        ("exit through branch", f"{tube.exit.branch}"),
+    ]
+
+
+def decision_tables(decision: Decision) -> list[Table]:
+    """Return what a policy says is to be done next."""
+    from lungaccess.cli.plan_tables import arcs_table
+
+    rows = [("estimated chance of success so", f"{100.0 * decision.chance:.0f} of 100")]
+    if decision.again:
+        rows.append(("if the scope is placed again", f"{100.0 * decision.again:.0f} of 100"))
+    if not decision.goes_on:
+        return [terminal.table(str(decision.action), ("", ""), rows)]
+    rows += [] if decision.tube is None else tube_rows(decision.tube)
+    if decision.needle is None:
+        return [terminal.table(str(decision.action), ("", ""), rows)]
+    rows.append(("needle", f"{decision.needle.length_mm:.1f} mm"))
+    arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in decision.needle.arcs]
+    return [terminal.table(str(decision.action), ("", ""), rows), arcs_table(arcs)]

@@ -12,7 +12,7 @@ from rich.table import Table
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Hertz, Port, Seconds
-from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
+from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
 
 if TYPE_CHECKING:
     from lungaccess.showing.live import Answer, LiveCounts
@@ -38,15 +38,18 @@ def stream(
     seconds: Annotated[
         Seconds | None, Parameter(help="End after so long; until Ctrl-C if not given.")
     ] = None,
+    errors: ErrorOptions = ErrorOptions(),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Send poses, paths and phases of a plan by OpenIGTLink, and plan again from tracked poses.
 
+    With --procedure the policy of the procedure decides about tracked poses, else the cheapest way is taken.
     A plan that the check refuses is not sent: exit code 1.
     """
     from lungaccess.cli.plan_tables import show_headline
     from lungaccess.judging.appraisal import Headline
     from lungaccess.judging.checking import check
+    from lungaccess.planning.procedure import Policy
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.live import Link, LiveSession
 
@@ -61,9 +64,11 @@ def stream(
             else:
                 show_headline(Headline.of(report, None))
             return ExitCode.NEGATIVE
+        followed = errors.given_procedure()
         session = LiveSession(
-            stored, lung, link, rate_hz=rate, loop=loop, on_answer=None if output.json else _say
-        )
+            stored, lung, link, rate_hz=rate, loop=loop, on_answer=None if output.json else _say,
+            policy=None if followed is None else Policy(stored, lung, errors.load(), followed),
+        )  # fmt: skip
         if not output.json:
             done = "Connecting to" if connect else "Listening at"
             terminal.say(f"{done} {host}:{link.port}. Ctrl-C ends.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, OptimalSearch, workspace_lengths
-from stages.tube import Deployment, Deployments, Enumerator, design_arrays, one_site_enumerator
+from stages.tube import Deployment, Enumerator, design_arrays, one_site_enumerator
 
 SEARCHED = 30
 """So many deployments get a search of the needle where no direct arc is clear: some ten milliseconds."""
@@ -26,26 +25,6 @@ SEARCH_ITERATIONS = 300
 """Iterations of such a search, as the first of the coupled search."""
 TRIES = 400
 """Variations of rotation, insertions and needle that improve the first answer: some milliseconds."""
-
-RANKED = 128
-"""So many deployments are ranked first, spread over all of them: those between are much like them."""
-FORESEEN = 8
-"""So many with a clear arc, the likeliest, are looked at closely; further ones are alike or worse."""
-
-
-ENOUGH = 1024
-"""So many deployments towards the target are looked at where they are ranked: several times what is ranked,
-since most are refused."""
-
-
-class DeploymentRank(Protocol):
-    """Tells how good deployments from a scope tip are, which is a row `(1, 9)`."""
-
-    def likely(self, tip: Float, deployments: Deployments) -> Float:
-        """Return it roughly for N of them whose arcs are not tested, `(N,)`."""
-
-    def foreseen(self, tip: Float, deployments: Deployments) -> Float:
-        """Return it exactly for a few whose arcs are clear, `(N,)`."""
 
 
 class ScopeReplanner:
@@ -56,21 +35,16 @@ class ScopeReplanner:
     task : Task
     tries, searches : int
         As those of `replan_from_scope`.
-    rank : DeploymentRank, optional
-        The best by it is taken, instead of the cheapest, and not varied.
     """
 
-    def __init__(
-        self, task: Task, *, tries: int = TRIES, searches: int = SEARCHED, rank: DeploymentRank | None = None
-    ) -> None:
-        self._task, self._evaluator, self._rank = task, CandidateEvaluator(task), rank
-        self._tries, self._searches = tries if rank is None else 0, searches
+    def __init__(self, task: Task, *, tries: int = TRIES, searches: int = SEARCHED) -> None:
+        self._task, self._evaluator = task, CandidateEvaluator(task)
+        self._tries, self._searches = tries, searches
         self._enumerate: Enumerator | None = None
         if task.system.needle is not None:
             self._enumerate = one_site_enumerator(
-                task.lung, task.system.tubes, task.system.margins, with_fissures=task.with_fissures,
-                enough=None if rank is None else ENOUGH,
-            )  # fmt: skip
+                task.lung, task.system.tubes, task.system.margins, with_fissures=task.with_fissures
+            )
 
     def replan(self, lps_from_scope_tip: Float) -> RestOfPlan:
         """Return the rest from a rigid pose `(4, 4)`; NoPlan if there is none."""
@@ -79,7 +53,7 @@ class ScopeReplanner:
         search = (
             AimedFromPose(evaluator, frame)
             if self._enumerate is None
-            else _FromScope(evaluator, self._enumerate, frame, self._tries, self._searches, self._rank)
+            else _FromScope(evaluator, self._enumerate, frame, self._tries, self._searches)
         )
         found = search.best()
         if found is None:
@@ -98,16 +72,10 @@ class _FromScope:
     """The search from one pose of the scope."""
 
     def __init__(
-        self,
-        evaluator: CandidateEvaluator,
-        enumerator: Enumerator,
-        frame: Float,
-        tries: int,
-        searches: int,
-        rank: DeploymentRank | None,
+        self, evaluator: CandidateEvaluator, enumerator: Enumerator, frame: Float, tries: int, searches: int
     ) -> None:
         self._evaluator, self._frame, self._task = evaluator, frame, evaluator.task
-        self._tries, self._searches, self._rank = tries, searches, rank
+        self._tries, self._searches = tries, searches
         self._target = self._task.target.lps_mm
         self._row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
         self._outside = 0
@@ -128,7 +96,7 @@ class _FromScope:
 
     def best(self) -> tuple[Deployment, ArcPath] | None:
         """Return the cheapest deployment and path found, None if there is none."""
-        first = (self._direct() if self._rank is None else self._ranked(self._rank)) or self._searched()
+        first = self._direct() or self._searched()
         return None if first is None else self._improved(*first)
 
     def _direct(self) -> tuple[Deployment, ArcPath] | None:
@@ -148,24 +116,6 @@ class _FromScope:
                 break
         self._evaluator.count_blockers(blockers)
         return found
-
-    def _ranked(self, rank: DeploymentRank) -> tuple[Deployment, ArcPath] | None:
-        """Return the best proved direct arc: of some deployments, or of the others if they have none."""
-        some = np.arange(len(self._near)) % -(-len(self._near) // RANKED or 1) == 0
-        for near in (self._near[some], self._near[~some]):
-            near = near[np.argsort(-rank.likely(self._row, self.entries.only(near)), kind="stable")]
-            clear = np.zeros(0, dtype=np.int64)
-            while len(near) and len(clear) < FORESEEN:
-                part, near = near[: 2 * FORESEEN], near[2 * FORESEEN :]
-                blockers, costs = self._arcs(part, math.inf)
-                self._evaluator.count_blockers(blockers)
-                clear = np.concatenate([clear, part[(blockers == 0) & np.isfinite(costs)]])
-            clear = clear[:FORESEEN]
-            good = rank.foreseen(self._row, self.entries.only(clear))
-            found = self._first_proved(clear[np.argsort(-good, kind="stable")])
-            if found is not None:
-                return found
-        return None
 
     def _arcs(self, entries: Int, slack: float) -> tuple[Int, Float]:
         """Return what blocks the direct arcs of some deployments, and what they cost; see `evaluate_arcs`."""

@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.planning.procedure.decision import Action, Decision, Measurements
     from lungaccess.planning.procedure.insertion import WATCHED, InsertionStudy, insert_plan
+    from lungaccess.planning.procedure.policy import Policy
+    from lungaccess.planning.procedure.record import ProcedureRecord
     from lungaccess.planning.procedure.report import ProcedureReport, StageReport
     from lungaccess.planning.procedure.settings import (
         DEFAULT_PROCEDURE,

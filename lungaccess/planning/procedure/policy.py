@@ -1,135 +1,331 @@
-"""One simulated procedure: measure after each stage, plan the rest again, and carry it out with errors."""
+"""The policy of a procedure: what was measured goes in, what to do next comes out, with its chance.
+
+Going on with the plan as it is, from where things were measured to be, is always one of the choices, and all
+have their chance from the same kernels.  The simulator of procedures decides by the same functions.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import cached_property
-from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
-from anatomy import poses
-from anatomy.base.errors import TargetError
-from anatomy.base.typed import Float
+from anatomy.base.errors import SettingsError, TargetError
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
-from lungaccess.planning.one_stage import RestOfPlan, ScopeReplanner, replan_from_tube
-from lungaccess.planning.procedure.foresight import Foresight
-from lungaccess.planning.procedure.fusion import fused, fused_share, scope_moves, tip_moves
-from lungaccess.planning.procedure.history import NEEDLE, SCOPE, TUBE, History
-from lungaccess.planning.procedure.residuals import Residuals
-from lungaccess.planning.procedure.settings import Procedure
-from lungaccess.planning.procedure.spread import ASIDE, bend_per_mm
-from lungaccess.planning.procedure.truth import (
-    Attempt,
-    as_measured,
-    carried_out,
-    insert_needle,
-    needle_pieces,
-    path_of,
-    unknown_of,
+from anatomy.structures import AIRWAY, OUTSIDE, VESSEL, obstacle_bits
+from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
+from lungaccess.planning.one_stage import replan_from_tube
+from lungaccess.planning.procedure.choices import (
+    DRAWS,
+    Offer,
+    offered,
+    planned_choice,
+    scope_frames,
+    with_choices,
 )
+from lungaccess.planning.procedure.decision import Action, Decision, Measurements
+from lungaccess.planning.procedure.fusion import (
+    as_measured,
+    fused,
+    fused_share,
+    mean_pose,
+    scope_moves,
+    tip_moves,
+)
+from lungaccess.planning.procedure.kernels import decisions as kernel
+from lungaccess.planning.procedure.kernels.spread import Sizes
+from lungaccess.planning.procedure.residuals import Residuals
+from lungaccess.planning.procedure.settings import Procedure, load_procedure
+from lungaccess.planning.procedure.spread import ASIDE, around, bend_per_mm, sizes
+from lungaccess.plans.assemble import needle_part, tube_part
+from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
-from lungaccess.problem.target import Target, require_free
+from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor
-from lungaccess.uncertainty.risk.deviations import deviated_starts
+from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, load_errors
+from lungaccess.uncertainty.risk.breathing import model_for
+from lungaccess.uncertainty.risk.deviations import deviated_starts, judging
 from lungaccess.uncertainty.risk.errors import BREATHING
-from stages.needle import (
-    ArcPath,
-    Failure,
-    NeedleEnvironment,
-    Objective,
-    Query,
-    Replan,
-    Replanner,
-    ReplanSettings,
-    needle_environment,
-)
+from stages.needle import ArcPath, Limits, NeedleEnvironment, Objective, Obstacles, needle_environment
+from stages.tube import tube_constants, tube_environment
 
-SIDES = np.concatenate([np.eye(3), -np.eye(3)])
 ASIDES = 2
-"""So many points beside the target are tried, the two that the needle has to bend least for."""
+"""Points beside the target that are tried, the two that the needle has to bend least for."""
 SHARES = 9
 """Shares of an error of measuring that are tried until a scope's tip lies in the lumen."""
-AIMING_ITERATIONS = 100
-"""Iterations from a tip of the tubes as measured: most targets are reached by one arc, which they improve."""
-SEARCH_ITERATIONS = 1500
-"""Iterations where that finds no path, or the plan that is left cannot be aimed again on the way."""
-IMAGINED = 16
+SEARCH_ITERATIONS = 300
+"""Iterations of the needle's search where neither a single arc nor the planned turns are clear."""
+LEAST_CHANCE = 0.01
+"""Below it nothing is left to do: chances are known to some percent."""
+SEARCHED_BELOW = 0.2
+"""A search may find more where no path is proved and going on as planned succeeds less often than this."""
+ANOTHER_CHANNEL = 2.0
+"""Tubes that are out are drawn back only where another placement promises so many times as much, since each
+leaves a channel in tissue."""
+IMAGINED = 24
 """Placements of the scope that are imagined beforehand: their mean chance is then known to some percent."""
+PLACES = 1024
+"""Places of the scope's tip that are imagined before it is measured: dozens are near any that is."""
+OFFERED = 6
+"""Tips from which deployments to choose from are looked for: the planned one, and imagined ones."""
+NEAREST_MM = 0.25
+"""Spacing of the points of a path of which the one nearest to a needle's tip tells how much is inserted."""
+LONGEST = 12
+"""Arcs of a path of the needle for which there is room; more where the plan has more."""
 _SEED = 2
-"""Of their draws, which have nothing to do with those of a simulated procedure."""
+"""Seed of imagined placements, which have nothing to do with the draws of a simulated procedure."""
 
 
-class Policy:
-    """Carries out a plan in simulated procedures.
+class Placed(NamedTuple):
+    """Where N tips of the scope are that were measured.
 
     Parameters
     ----------
-    assessor : RiskAssessor
-        Of the plan.
-    lung : Lung
-        The patient that it is for.
-    errors : ErrorModel
-        By which measurements are weighed against what was expected, and deployments chosen.
-    procedure : Procedure
+    frames : (N, 4, 4) float64
+        Their most likely poses.
+    drawn : (N, DRAWS, 3) float64
+        Places where each may be.
     """
 
-    def __init__(self, assessor: RiskAssessor, lung: Lung, errors: ErrorModel, procedure: Procedure) -> None:
-        self._plan = plan = assessor.plan
-        self._assessor, self._lung, self.errors, self.procedure = assessor, lung, errors, procedure
-        # Where the centre of the goal cannot be reached, other points in it are aimed at.
-        self._aside_mm = ASIDE * assessor.radius_mm
-        self._foresight = Foresight(assessor, lung, errors, procedure)
-        self._left = Residuals.of(errors, procedure, assessor.stretch)
-        # Fissures are obstacles of the replan exactly where they are of the plan.
+    frames: Float
+    drawn: Float
+
+
+@frozen_record
+class Chosen:
+    """What was chosen in N procedures.
+
+    Parameters
+    ----------
+    frames : (N, 4, 4) float64
+        Most likely poses of the scope's tip.
+    tips : (N, 4, 4) float64
+        Where the needle is expected to start.
+    found : (N, 3) int64
+        Number of the deployment, arcs of the needle's path, and pierced branch.
+    chances : (N,) float64
+    arcs : (N, A, 3) float64
+        Paths of the needle.
+    changed : (N,) bool
+        Whether the path is another one than was planned before.
+    tubes : (N, 11) float64
+        Planar tubes as kernels take them; none of others.
+    deployed : tuple of TubeDeployment
+        Of each procedure, where the system has no needle or its tubes are not planar; else empty.
+    """
+
+    frames: Float
+    tips: Float
+    found: Int
+    chances: Float
+    arcs: Float
+    changed: Bool
+    tubes: Float
+    deployed: tuple[TubeDeployment, ...] = ()
+
+    def only(self, chosen: Int) -> Chosen:
+        """Return some of the procedures, by their numbers."""
+        arrays = {
+            each.name: getattr(self, each.name)[chosen] for each in fields(self) if each.name != "deployed"
+        }
+        arrays["tubes"] = self.tubes[chosen] if len(self.tubes) else self.tubes
+        kept = tuple(self.deployed[n] for n in chosen.tolist()) if self.deployed else ()
+        return Chosen(**arrays, deployed=kept)
+
+
+class OnTheWay(NamedTuple):
+    """A needle on its way.
+
+    Parameters
+    ----------
+    rest : (A, 3) float64
+        Arcs that were to follow.
+    inserted_mm, turned_rad : float
+        What lies behind, from the tip of the tubes.
+    reference : (3,) float64
+        Direction of the needle at that tip.
+    branch : int
+        The pierced branch.
+    """
+
+    rest: Float
+    inserted_mm: float
+    turned_rad: float
+    reference: Float
+    branch: int
+
+
+class Policy:
+    """Tells what to do next in a procedure that carries out a plan; what it prepares serves all answers.
+
+    Attributes
+    ----------
+    plan, lung
+    assessor : RiskAssessor
+        Of the plan.
+    errors : ErrorModel
+        By which measurements are weighed against what was expected.
+    procedure : Procedure
+
+    Parameters
+    ----------
+    plan, lung
+        The plan, and the patient that it is for.
+    errors : ErrorModel, optional
+        The preset `breath-hold` if None.
+    procedure : Procedure, optional
+        The preset `open-loop` if None: then nothing is measured, and nothing to decide.
+    radius_mm : float, optional
+        Radius of the goal; see `RiskAssessor`.
+
+    Raises
+    ------
+    PlanFileError, SettingsError
+        See `RiskAssessor`.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        lung: Lung,
+        errors: ErrorModel | None = None,
+        procedure: Procedure | None = None,
+        *,
+        radius_mm: float | None = None,
+    ) -> None:
+        self.plan, self.lung = plan, lung
+        self.assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
+        self.errors = model_for(errors or load_errors(), plan, lung)
+        self.procedure = procedure or load_procedure()
+        self._left = Residuals.of(self.errors, self.procedure, self.assessor.stretch)
+        self._target = np.asarray(plan.target_lps)
+        # Fissures are obstacles of what follows exactly where they are of the plan.
         whole = replace(plan.system, fissures_allowed=not plan.fissures_are_obstacles)
-        share = procedure.least_margin_share
-        self._systems = (whole,) if share == 1.0 else (whole, _with_margins(whole, share))
-        self._environments = [
-            needle_environment(lung, system.needle, system.margins, with_fissures=plan.fissures_are_obstacles)
-            for system in self._systems
-            if system.needle is not None
-        ]
+        self.system = _with_margins(whole, self.procedure.least_margin_share)
+        arcs = [] if plan.needle is None else plan.needle.arcs
+        self._planned = np.array([(a.length_mm, a.roll_rad, a.curvature_per_mm) for a in arcs]).reshape(-1, 3)
+        path = ArcPath(lps_from_start=np.eye(4), arcs=self._planned)
+        self._vias = np.array([frame[:3, 3] for frame in path.frames()[1:-1]]).reshape(-1, 3)
 
-    def attempt(self, history: History, attempt: Attempt, rng: np.random.Generator) -> bool:
-        """Place the scope once and go on from there; tell whether the procedure is over.
+    @property
+    def aside_mm(self) -> float:
+        """How far from the centre of the goal the needle may be aimed at where it cannot be reached."""
+        return ASIDE * self.assessor.radius_mm
 
-        Parameters
-        ----------
-        history : History
-            Receives what happens.
-        attempt : Attempt
-        rng : numpy.random.Generator
-            Of the errors of measuring.
+    # Scope ----------------------------------------------------------------------------------------
+
+    def scopes_measured(self, measured: Float, count: int = 1) -> Placed:
+        """Return where tips of the scope most likely are, `(N, 4, 4)`, each measured `count` times.
+
+        It is in the lumen, as the planned tip is, as deep as the scope is thick or as the planned tip is.
         """
-        history.placements += 1
-        placing, plan = self.procedure.scope, self._plan
-        noise = rng.standard_normal((3, 5))
-        if placing.measured:
-            found = self._from_scope(history, self._scope_measured(attempt.frame(), noise[0]))
-            left = placing.placements - history.placements
-            if found is None or self._foresight.best < self.worth[left]:
-                return False
-            plan = found
-        pieces = attempt.pieces(plan)
-        if plan.needle is None:
-            history.chains.append((attempt.start, pieces, len(pieces)))
-            history.complete = True
-            return True
-        n_tube = len(pieces) - len(plan.needle.arcs)
-        if self.procedure.tubes.measured or self.procedure.needle.closed_loop:
-            after = self._from_tube(history, attempt, plan, pieces, noise[1:], rng)
-            if after is None:
-                history.chains.append((attempt.start, pieces[:n_tube], n_tube))
-                return False
-            pieces = np.concatenate([pieces[:n_tube], after])
-        history.chains.append((attempt.start, pieces, n_tube))
-        history.complete = True
-        return True
+        placing, expected = self.procedure.scope, np.asarray(self.plan.scope.lps_from_scope_tip)
+        term = self.errors.term
+        known = term("scope_position").rms, math.radians(term("scope_direction").rms)
+        noise = placing.position_mm / math.sqrt(count), math.radians(placing.direction_deg) / math.sqrt(count)
+        every = np.broadcast_to(expected, measured.shape)
+        likely = np.array(fused(every, scope_moves(every, *known), measured, *noise))
+        likely[:, :3, 3] = self._in_lumen(likely[:, :3, 3])
+        drawn = np.zeros((len(likely), DRAWS, 3))
+        shifts = self._planned_choice.errors[:, :3]
+        fallback = self._in_lumen((likely[:, None, :3, 3] + shifts).reshape(-1, 3)).reshape(drawn.shape)
+        mean = np.ascontiguousarray(likely[:, :3, 3])
+        kernel.find_places(
+            self._places, np.ascontiguousarray(measured[:, :3, 3]), noise[0], fallback,
+            (np.arange(DRAWS) + 0.5) / DRAWS, mean, drawn,
+        )  # fmt: skip
+        likely[:, :3, 3] = self._in_lumen(mean)
+        return Placed(likely, drawn)
+
+    def _in_lumen(self, points: Float) -> Float:
+        """Return the first point `(N, 3)` on the way to the planned tip where the lumen is deep enough."""
+        inside = np.asarray(self.plan.scope.lps_from_scope_tip)[:3, 3]
+        shares = np.linspace(1.0, 0.0, SHARES)[:, None]
+        way = inside + shares * (points[:, None] - inside)
+        depths = self.lung.lumen_depth.lower_bound_mm(way.reshape(-1, 3)).reshape(-1, SHARES)
+        enough = np.minimum(self.plan.system.scope.radius_mm, depths[:, -1:])
+        return np.asarray(way[np.arange(len(way)), np.argmax(depths >= enough, axis=1)])
+
+    @cached_property
+    def _places(self) -> Float:
+        """Where the scope's tip may stand before it is measured, `(PLACES, 3)`."""
+        drawn = self.assessor.draws(PLACES, _SEED + 1).deviations(self.errors)
+        return np.ascontiguousarray(deviated_starts(self.plan, self.lung, drawn)[:, :3])
+
+    def from_scopes(self, placed: Placed) -> Chosen:
+        """Return what is chosen where N tips of the scope were measured."""
+        if self.plan.needle is None:
+            return self._aimed(placed)
+        return self._chosen(placed, self._offer.choices)
+
+    def as_planned(self, count: int) -> Chosen:
+        """Return that the plan is carried out as it is where the scope is not measured, N times."""
+        frame = np.asarray(self.plan.scope.lps_from_scope_tip)[None]
+        every = np.ascontiguousarray(self._places[:DRAWS])[None]
+        alone = self._chosen(Placed(frame, every), self._planned_choice)
+        arcs = np.zeros_like(alone.arcs)
+        arcs[0, : len(self._planned)] = self._planned
+        found = np.array([[0, len(self._planned), self.plan.exemption.branch]])
+        return replace(alone, arcs=arcs, found=found, changed=np.zeros(1, dtype=bool)).only(
+            np.zeros(count, int)
+        )
+
+    def _chosen(self, placed: Placed, choices: kernel.Choices) -> Chosen:
+        frames, count = placed.frames, len(placed.frames)
+        found, chances = np.zeros((count, 3), dtype=np.int64), np.zeros(count)
+        arcs = np.zeros((count, max(LONGEST, len(self._planned)), 3))
+        x, y, z = self._target.tolist()
+        kernel.choose_tubes(
+            self._scene, self._sizes, *self._tube_arrays, choices, self._planned, self._vias,
+            self.plan.exemption.branch, (x, y, z), (np.ascontiguousarray(frames), placed.drawn),
+            found, chances, arcs,
+        )  # fmt: skip
+        chosen = found[:, 0]
+        same = (arcs[:, : len(self._planned)] == self._planned).all(axis=(1, 2))
+        deployed: tuple[TubeDeployment, ...] = ()
+        if not self.plan.system.tubes.planar:
+            deployed = tuple(
+                self._deployed(frame, n) for frame, n in zip(frames, chosen.tolist(), strict=True)
+            )
+        return Chosen(
+            frames=frames, tips=frames @ choices.scope_from_tip[chosen], found=found, chances=chances,
+            arcs=arcs, changed=(chosen > 0) | ~same,
+            tubes=choices.tubes[chosen] if len(choices.tubes) else choices.tubes, deployed=deployed,
+        )  # fmt: skip
+
+    def _aimed(self, placed: Placed) -> Chosen:
+        """Return the same without a needle: the tubes are aimed at the target again, or go as planned."""
+        each = []
+        for n, frame in enumerate(placed.frames):
+            found = AimedFromPose(self._evaluator, frame).best()
+            made = [] if found is None else [found[0]]
+            chosen = self._chosen(
+                Placed(frame[None], placed.drawn[n : n + 1]),
+                with_choices(self._planned_choice, self.system, made, [frame] * len(made)),
+            )
+            tube = self.plan.tube
+            if found is not None and chosen.found[0, 0] > 0:
+                tube = tube_part(self._task, frame, found[0])
+            each.append(replace(chosen, deployed=(tube,)))
+        return _joined(each)
+
+    def _deployed(self, frame: Float, number: int) -> TubeDeployment:
+        """Return a deployment of the offer from a scope's tip as a plan states it."""
+        if number == 0 or self.plan.needle is None:
+            return self.plan.tube
+        made = self._evaluator.tubes.choose(frame, *self._offer.deployed[number - 1])
+        if isinstance(made, str):
+            raise NoPlan(f"The tubes are refused on a second look: {made}", reasons={f"tube: {made}": 1})
+        return tube_part(self._task, frame, made)
 
     @cached_property
     def worth(self) -> tuple[float, ...]:
@@ -140,236 +336,329 @@ class Policy:
         """
         worth, scope = [0.0], self.procedure.scope
         if scope.measured and scope.placements > 1:
-            drawn = self._assessor.draws(IMAGINED, _SEED).deviations(self.errors)
-            starts = deviated_starts(self._plan, self._lung, drawn)
-            rng = np.random.default_rng(_SEED)
-            chances = [self._chance_from(poses.pose(*np.split(each, 3)), rng) for each in starts]
+            chances = self.from_scopes(self._imagined).chances
             for _ in range(scope.placements - 1):
                 worth.append(float(np.maximum(chances, worth[-1]).mean()))
         return (*worth, *[0.0] * (scope.placements - len(worth)))
 
-    def _chance_from(self, true: Float, rng: np.random.Generator) -> float:
-        """Return the chance that is foreseen where the scope's tip truly stands at a pose."""
-        found = self._from_scope(History(), self._scope_measured(true, rng.standard_normal(5)))
-        return 0.0 if found is None else self._foresight.best
+    def goes_on(self, chances: Float, left: int, *, tubes_out: bool = False) -> Bool:
+        """Tell which procedures go on with what was chosen: the others place the scope again, or stop.
 
-    def _scope_measured(self, true: Float, noise: Float) -> Float:
-        """Return where the scope's tip most likely is: in the lumen, where it is known to be."""
-        placing, plan = self.procedure.scope, self._plan
-        measured = as_measured(true, placing.position_mm, placing.direction_deg, noise)
-        measured[:3, 3] = self._in_lumen(measured[:3, 3], true[:3, 3])
-        expected, errors = np.asarray(plan.scope.lps_from_scope_tip), self.errors
-        sizes = errors.term("scope_position").rms, math.radians(errors.term("scope_direction").rms)
-        moves = scope_moves(expected, *sizes)
-        likely = fused(expected, moves, measured, placing.position_mm, math.radians(placing.direction_deg))
-        likely[:3, 3] = self._in_lumen(likely[:3, 3], measured[:3, 3])
-        return likely
+        Parameters
+        ----------
+        chances : (N,) float64
+        left : int
+            How often the scope may be placed again.
+        tubes_out : bool
+            Whether the tubes are out already.
+        """
+        least = self.worth[left] / (ANOTHER_CHANNEL if tubes_out else 1.0)
+        return np.asarray(chances >= max(least, LEAST_CHANCE))
 
-    def _in_lumen(self, point: Float, inside: Float) -> Float:
-        """Return the first point on the way inside where the lumen is as deep as the scope, or as inside."""
-        points = inside + np.linspace(1.0, 0.0, SHARES)[:, None] * (point - inside)
-        depths = self._lung.lumen_depth.lower_bound_mm(points)
-        enough = min(self._plan.system.scope.radius_mm, float(depths[-1]))
-        return np.asarray(points[np.argmax(depths >= enough)])
+    # Tubes ----------------------------------------------------------------------------------------
 
-    def _from_scope(self, history: History, measured: Float) -> Plan | None:
-        """Return the plan with tubes and needle from the scope's tip as measured, None if there is none."""
-        plan = self._plan
-        history.corrected_mm[SCOPE].append(self._miss_from(measured))
+    def tips_measured(self, chosen: Chosen, measured: Float, count: int = 1) -> Float:
+        """Return where tips of the tubes most likely are, `(N, 4, 4)`, see `scopes_measured`."""
+        stage, root = self.procedure.tubes, math.sqrt(count)
+        moves = tip_moves(chosen.frames, chosen.tips, self._left, bend_per_mm(self.plan.system))
+        noise = stage.position_mm / root, math.radians(stage.direction_deg) / root
+        return fused(chosen.tips, moves, measured, *noise)
+
+    def doubt_of(self, lps_from_scope_tip: Float, lps_from_tip: Float) -> Float:
+        """Return the covariance `(6, 6)` of the pose in which a needle begins, mm and rotation vector."""
+        stage = self.procedure.tubes
+        if stage.measured:
+            return np.diag(np.repeat((stage.position_mm, math.radians(stage.direction_deg)), 3) ** 2)
+        moves = tip_moves(lps_from_scope_tip, lps_from_tip, self._left, bend_per_mm(self.plan.system))
+        return np.asarray(moves @ moves.T)
+
+    def targets_measured(self, measured: Float) -> Float:
+        """Return where targets most likely are, `(N, 3)`, that an image before the needle shows."""
+        errors, breath = self.errors.term("target_position").rms, self.errors.term(BREATHING).size
+        expected = np.array([errors, errors, math.hypot(errors, self.assessor.stretch * breath)])
+        found = self._target + fused_share(expected, self.procedure.imaging.position_mm) * (
+            measured - self._target
+        )
+        grid = self.lung.grid
+        at = np.floor(grid.ijk(found) + 0.5).astype(np.int64)
+        inside = ((at >= 0) & (at < np.array(grid.shape))).all(axis=1)
+        at[~inside] = 0
+        # The masks say that a nodule cannot be there: the measurement is not believed.
+        free = (self.lung.labels[tuple(at.T)] & (OUTSIDE | VESSEL | AIRWAY)) == 0
+        return np.where((inside & free)[:, None], found, self._target)
+
+    def from_tubes(self, chosen: Chosen, tips: Float, targets: Float) -> Chosen:
+        """Return what is chosen from the most likely poses of the tubes' tip to targets, `(N, 3)`."""
+        if self.plan.needle is None:
+            return replace(chosen, tips=tips)
+        branches = np.ascontiguousarray(chosen.found[:, 2])
+        found, chances, arcs = self._paths(chosen.arcs, chosen.found[:, 1], tips, branches, targets)
+        for n in np.flatnonzero((found[:, 2] == 0) & (chances < SEARCHED_BELOW)).tolist():
+            path = self._searched(tips[n], targets[n])
+            if path is None or len(path) > arcs.shape[1]:
+                continue
+            row = np.zeros((1, *arcs.shape[1:]))
+            row[0, : len(path)] = path
+            one = slice(n, n + 1)
+            size = np.array([len(path)])
+            other = self._paths(row, size, tips[one], branches[one], targets[one])
+            if other[1][0] > chances[n]:
+                found[n], chances[n], arcs[n] = (each[0] for each in other)
+        found[:, 0], found[:, 2] = chosen.found[:, 0], branches
+        changed = (arcs != chosen.arcs).any(axis=(1, 2))
+        return replace(chosen, tips=tips, found=found, chances=chances, arcs=arcs, changed=changed)
+
+    def _paths(
+        self, arcs: Float, counts: Int, tips: Float, branches: Int, targets: Float
+    ) -> tuple[Int, Float, Float]:
+        """Return what `choose_needles` finds: its numbers, chances, and arcs."""
+        found, chances = np.zeros((len(tips), 3), dtype=np.int64), np.zeros(len(tips))
+        found[:, 1], arcs = counts, np.array(arcs)
+        kernel.choose_needles(
+            self._scene, self._sizes[0], np.ascontiguousarray(tips), branches, np.ascontiguousarray(targets),
+            ASIDES, found, chances, arcs,
+        )  # fmt: skip
+        return found, chances, arcs
+
+    def _searched(self, tip: Float, target: Float) -> Float | None:
+        """Return the arcs that the needle's own search finds, None without."""
         try:
-            rest = self._replanner.replan(measured)
-        except NoPlan:
-            history.replans[SCOPE].append(False)
+            rest = replan_from_tube(
+                self.lung, self.system, tip, Target(lps_mm=target, origin=self.plan.target_origin),
+                objective=self.plan.objective, seed=self.plan.seed, iterations=SEARCH_ITERATIONS,
+            )  # fmt: skip
+        except (NoPlan, TargetError):
             return None
-        history.replans[SCOPE].append(True)
-        scope = replace(plan.scope, lps_from_scope_tip=rest.lps_from_measured)
-        exemption = replace(plan.exemption, branch=rest.branch)
-        tube = plan.tube if rest.tube is None else rest.tube
-        return replace(plan, scope=scope, tube=tube, needle=rest.needle, exemption=exemption)
+        return np.asarray(rest.path.arcs)
+
+    # Needle ---------------------------------------------------------------------------------------
+
+    def from_needle(
+        self, way: OnTheWay, lps_from_tip: Float, target: Float, curvature_share: float = 1.0
+    ) -> tuple[Float, float]:
+        """Return the arcs `(A, 3)` that are left for a needle on its way, and their chance.
+
+        Parameters
+        ----------
+        way : OnTheWay
+            What has been done and was to follow.
+        lps_from_tip : (4, 4) float64
+            Where the needle's tip is taken to be.
+        target : (3,) float64, LPS mm
+        curvature_share : float
+            Share of its largest curvature that the needle reaches in this tissue.
+        """
+        limits, count, steering = self._scene.limits, len(way.rest), self.procedure.needle
+        turned = math.acos(min(max(float(way.reference @ lps_from_tip[:3, 2]), -1.0), 1.0))
+        left = limits._replace(
+            kappa=curvature_share * limits.kappa,
+            max_length_mm=limits.max_length_mm - way.inserted_mm,
+            max_angle_rad=max(limits.max_angle_rad - turned, 0.0),
+            max_turn_rad=max(limits.max_turn_rad - way.turned_rad, 0.0),
+            exempt_mm=max(limits.exempt_mm - way.inserted_mm, 0.0),
+        )
+        known = self._sizes[0]._replace(
+            tip_known=True, tip=steering.position_mm, tip_turn=math.radians(steering.direction_deg),
+            exempt=left.exempt_mm,
+        )  # fmt: skip
+        found, chances = np.array([[0, count, 0]]), np.zeros(1)
+        arcs = np.zeros((1, max(LONGEST, count), 3))
+        arcs[0, :count] = way.rest
+        kernel.choose_needles(
+            self._scene._replace(limits=left), known, np.array(lps_from_tip)[None], np.array([way.branch]),
+            np.array(target)[None], ASIDES, found, chances, arcs,
+        )  # fmt: skip
+        return arcs[0, : found[0, 1]], float(chances[0])
+
+    # One answer -----------------------------------------------------------------------------------
+
+    def decide(self, measured: Measurements) -> Decision:
+        """Return what to do next after what was measured since the scope was placed last.
+
+        The same measurements give the same decision.  A stage that the procedure does not measure may be left
+        out; one that it measures may not.
+
+        Raises
+        ------
+        SettingsError
+            If nothing was measured that the procedure decides by.
+        FrameError, TargetError
+            If a pose is not rigid, or a point lies outside the images.
+        """
+        procedure, poses = self.procedure, measured.poses(self.lung)
+        if procedure.scope.measured and not len(poses.scope):
+            raise SettingsError(
+                f"The scope is not measured, which the procedure {procedure.name!r} does",
+                expected="where its tip is",
+                remedy="Measure the scope, or choose a procedure that does not",
+            )
+        left = max(procedure.scope.placements - measured.placements, 0)
+        chosen = self.as_planned(1)
+        if procedure.scope.measured:
+            chosen = self.from_scopes(self._mean_scope(poses.scope))
+        if not len(poses.tubes) and not len(poses.needle):
+            return self._decision(chosen, left, tubes_out=False)
+        target = self._target[None]
+        if measured.target_lps is not None and procedure.imaging.measured:
+            target = self.targets_measured(np.asarray(measured.target_lps)[None])
+        if len(poses.tubes) and self.plan.needle is not None:
+            tips = self.tips_measured(chosen, mean_pose(poses.tubes)[None], len(poses.tubes))
+            chosen = self.from_tubes(chosen, tips, target)
+        if not len(poses.needle) or self.plan.needle is None:
+            return self._decision(chosen, left, tubes_out=True)
+        return self._on_the_way(chosen, mean_pose(poses.needle), target[0])
+
+    def _mean_scope(self, poses: Float) -> Placed:
+        return self.scopes_measured(mean_pose(poses)[None], len(poses))
+
+    def _decision(self, chosen: Chosen, left: int, *, tubes_out: bool) -> Decision:
+        """Return what was chosen in one procedure as a decision."""
+        chance, changed = float(chosen.chances[0]), bool(chosen.changed[0])
+        action = (
+            Action.DEPLOY if chosen.found[0, 0] or (changed and self.plan.needle is None) else Action.NEEDLE
+        )
+        if tubes_out and action is Action.DEPLOY:
+            action = Action.NEEDLE
+        if not changed:
+            action = Action.GO_ON
+        if not self.goes_on(chosen.chances, left, tubes_out=tubes_out)[0]:
+            action = Action.PLACE_AGAIN if left else Action.STOP
+        needle = None
+        if self.plan.needle is not None:
+            path = ArcPath(lps_from_start=chosen.tips[0], arcs=chosen.arcs[0, : chosen.found[0, 1]])
+            needle = needle_part(path)
+        tube = None
+        if not tubes_out:
+            tube = (
+                chosen.deployed[0]
+                if chosen.deployed
+                else self._deployed(chosen.frames[0], chosen.found[0, 0])
+            )
+            tube = replace(tube, lps_from_tip=chosen.tips[0])
+        return Decision(
+            action=action, chance=chance, again=self.worth[left],
+            lps_from_device=chosen.tips[0] if tubes_out else chosen.frames[0], tube=tube, needle=needle,
+            branch=int(chosen.found[0, 2]),
+        )  # fmt: skip
+
+    def _on_the_way(self, chosen: Chosen, pose: Float, target: Float) -> Decision:
+        """Return the decision about a needle on its way: what lies behind the nearest point is inserted."""
+        path = ArcPath(lps_from_start=chosen.tips[0], arcs=chosen.arcs[0, : chosen.found[0, 1]])
+        points, lengths = path.sample(NEAREST_MM)
+        inserted = float(lengths[np.linalg.norm(points - pose[:3, 3], axis=1).argmin()])
+        rest, turned = rest_of(path.arcs, inserted)
+        branch = int(chosen.found[0, 2])
+        way = OnTheWay(rest, inserted, turned, path.lps_from_start[:3, 2], branch)
+        arcs, chance = self.from_needle(way, pose, target)
+        action = Action.GO_ON if np.array_equal(arcs, rest) else Action.NEEDLE
+        return Decision(
+            action=action if chance >= LEAST_CHANCE else Action.STOP, chance=chance, again=0.0,
+            lps_from_device=pose, tube=None, branch=branch,
+            needle=needle_part(ArcPath(lps_from_start=pose, arcs=arcs)),
+        )  # fmt: skip
+
+    # What is prepared -----------------------------------------------------------------------------
 
     @cached_property
-    def _replanner(self) -> ScopeReplanner:
-        """Plans tubes and needle again, by direct arcs: what else could be searched is left to the needle.
+    def _imagined(self) -> Placed:
+        """Tips of the scope as they may be measured, IMAGINED of them."""
+        drawn = self.assessor.draws(IMAGINED, _SEED).deviations(self.errors)
+        true = scope_frames(deviated_starts(self.plan, self.lung, drawn))
+        noise = np.random.default_rng(_SEED).standard_normal((IMAGINED, 5))
+        placing = self.procedure.scope
+        return self.scopes_measured(as_measured(true, placing.position_mm, placing.direction_deg, noise))
 
-        The chance of a deployment weighs clearance by itself, so that the least margins suffice.
-        """
-        plan = self._plan
-        task = Task(
-            lung=self._lung,
-            system=self._systems[-1],
-            target=Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin),
-            objective=Objective.of(plan.objective),
-            method="replan",
-            seed=plan.seed,
-        )
-        return ScopeReplanner(task, searches=0, rank=self._foresight)
-
-    def _from_tip(self, history: History, measured: Float, target: Target) -> RestOfPlan | None:
-        """Return the needle from a tip as measured: to the target or beside it, with all margins or fewer."""
-        aims = [target, *self._aside(measured, target)]
-        first, last = (AIMING_ITERATIONS, self._systems), (SEARCH_ITERATIONS, self._systems[-1:])
-        for iterations, systems in (first, last):
-            for system, aim in product(systems, aims):
-                try:
-                    rest = replan_from_tube(
-                        self._lung, system, measured, aim, objective=self._plan.objective,
-                        seed=self._plan.seed, iterations=iterations,
-                    )  # fmt: skip
-                except (NoPlan, TargetError):
-                    continue
-                history.replans[TUBE].append(True)
-                return rest
-        history.replans[TUBE].append(False)
-        return None
-
-    def _aside(self, frame: Float, target: Target) -> list[Target]:
-        """Return the points of the goal to aim at where its centre cannot be reached, straightest first."""
-        points = target.lps_mm + self._aside_mm * SIDES
-        away = (points - frame[:3, 3]) @ frame[:3, :3]
-        bends = 2.0 * np.hypot(away[:, 0], away[:, 1]) / (away**2).sum(axis=1)
-        order = np.argsort(bends, kind="stable")[:ASIDES]
-        return [Target(lps_mm=points[n], origin=target.origin) for n in order]
-
-    def _miss_from(self, measured: Float) -> float:
-        """Return how far from the target the plan ends, carried on without errors from another scope tip."""
-        plan = self._plan
-        planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip))
-        last = plan.tube.lps_from_tip[:3, 3] if plan.needle is None else plan.needle.end_lps
-        moved = measured @ planned @ np.append(last, 1.0)
-        return float(np.linalg.norm(moved[:3] - plan.target_lps))
-
-    def _from_tube(
-        self,
-        history: History,
-        attempt: Attempt,
-        plan: Plan,
-        pieces: Float,
-        noise: Float,
-        rng: np.random.Generator,
-    ) -> Float | None:
-        """Return the true arcs `(A, 4)` of the needle behind the tubes, None if no path was left."""
-        stage, needle = self.procedure.tubes, plan.needle
-        if needle is None:
-            return None
-        true_tip, rolled = attempt.needle_tip(plan, pieces)
-        path, tip = path_of(needle), np.asarray(needle.lps_from_start)
-        target = self._target(attempt, noise[1])
-        moves = tip_moves(
-            np.asarray(plan.scope.lps_from_scope_tip), tip, self._left, bend_per_mm(plan.system)
-        )
-        doubt = moves @ moves.T
-        if stage.measured:
-            sizes = stage.position_mm, math.radians(stage.direction_deg)
-            measured = as_measured(true_tip, stage.position_mm, stage.direction_deg, noise[0])
-            tip = fused(tip, moves, measured, *sizes)
-            doubt = np.diag(np.repeat(sizes, 3) ** 2)
-            history.corrected_mm[TUBE].append(
-                _miss(ArcPath(lps_from_start=tip, arcs=path.arcs), target.lps_mm)
-            )
-            rest = self._from_tip(history, tip, target)
-            if rest is None or rest.needle is None:
-                return None
-            path = path_of(rest.needle)
-        if self.procedure.needle.closed_loop:
-            arcs = self._steered(history, attempt, plan, path, true_tip, doubt, target, rng)
-        else:
-            arcs = carried_out(path, attempt)
-        if not len(arcs):
-            return np.zeros((0, 4))
-        arcs[0, 1] += rolled
-        return needle_pieces(arcs, plan.system.track_radius_mm)
-
-    def _target(self, attempt: Attempt, noise: Float) -> Target:
-        """Return the target as it is found in an image before the needle starts, or as planned."""
-        plan, imaging = self._plan, self.procedure.imaging
-        planned = Target(lps_mm=np.asarray(plan.target_lps), origin=plan.target_origin)
-        if not imaging.measured:
-            return planned
-        errors, breath = self.errors.term("target_position").rms, self.errors.term(BREATHING).size
-        expected = np.array([errors, errors, math.hypot(errors, self._assessor.stretch * breath)])
-        shares = np.array([fused_share(each, imaging.position_mm) for each in expected.tolist()])
-        measured = attempt.target_lps + imaging.position_mm * noise[:3]
-        found = planned.lps_mm + shares * (measured - planned.lps_mm)
-        try:
-            require_free(self._lung, found)
-        except TargetError:
-            # The masks say that a nodule cannot be there: the measurement is not believed.
-            return planned
-        return Target(lps_mm=found, origin=plan.target_origin)
-
-    def _steered(
-        self,
-        history: History,
-        attempt: Attempt,
-        plan: Plan,
-        path: ArcPath,
-        true_tip: Float,
-        doubt: Float,
-        target: Target,
-        rng: np.random.Generator,
-    ) -> Float:
-        """Return the arcs `(A, 3)` of a needle that is measured and planned again on its way.
-
-        `doubt` is the covariance `(6, 6)` of where it is taken to begin.
-        """
-        steering = self.procedure.needle
-        start = np.asarray(path.lps_from_start)
-        query = Query(lps_from_start=start, target=target.lps_mm, branch=plan.exemption.branch)
-        preferred, environment = self._environments[0], self._environments[-1]
-        allowed = ReplanSettings(largest_miss_mm=min(self._aside_mm, 10.0))
-        replanner = _FrugalReplanner(preferred, environment, query, path, allowed)
-        found = insert_needle(
-            environment, query, path, replanner, attempt, true_tip, steering,
-            unknown_of(self.errors, steering, doubt), rng,
+    @cached_property
+    def _offer(self) -> Offer:
+        """The deployments to choose from."""
+        planned = np.asarray(self.plan.scope.lps_from_scope_tip)[None]
+        frames = np.concatenate([planned, self._imagined.frames[: OFFERED - 1]])
+        return offered(
+            self.plan, self.lung, self.system, self.errors, self.procedure, self.assessor.radius_mm,
+            self._left, frames,
         )  # fmt: skip
-        history.replans[NEEDLE] += [each.path is not None for each in found.replans]
-        history.stopped = found.stopped is not None
-        return found.arcs
+
+    @cached_property
+    def _planned_choice(self) -> kernel.Choices:
+        return planned_choice(self.plan, self._left)
+
+    @cached_property
+    def environment(self) -> NeedleEnvironment:
+        """What the needle collides with, and its limits, with the margins that are kept by then."""
+        needle = self.system.require_needle("A path of the needle")
+        return needle_environment(
+            self.lung, needle, self.system.margins, with_fissures=self.plan.fissures_are_obstacles
+        )
+
+    @cached_property
+    def _scene(self) -> kernel.Scene:
+        plan, lung, fissures = self.plan, self.lung, self.plan.fissures_are_obstacles
+        field, every = lung.obstacle_field(with_fissures=fissures), lung.obstacle_field(with_fissures=True)
+        obstacles = Obstacles(field.corners, lung.labels, field.geometry, obstacle_bits(fissures))
+        limits = Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0)
+        if plan.needle is not None:
+            obstacles, limits = self.environment.obstacles, self.environment.limits
+        judged = judging(plan, lung)
+        forbidden = sum(self.assessor.structures[name] for name in self.assessor.forbidden)
+        tubes = self.procedure.tubes.measured
+        return kernel.Scene(
+            around=around(lung, with_fissures=fissures), obstacles=obstacles, limits=limits,
+            judged=Obstacles(every.corners, lung.labels, every.geometry, obstacle_bits(lung.has_fissures)),
+            forbidden=forbidden, depth=judged.depth, depth_geometry=judged.geometry,
+            mediastinal=judged.mediastinal, radius=self.assessor.radius_mm,
+            aside=self.aside_mm, with_needle=plan.needle is not None,
+            replanned=tubes or self.procedure.needle.closed_loop,
+        )  # fmt: skip
+
+    @cached_property
+    def _sizes(self) -> tuple[Sizes, Sizes]:
+        """What is left of the errors for a needle that is planned again behind the tubes, and for another."""
+        aside = self.aside_mm if self.procedure.tubes.measured else 0.0
+        blind = replace(self._left, tip_mm=None)
+        known, unknown = (sizes(self.system, left, self.errors, aside) for left in (self._left, blind))
+        return known, unknown
+
+    @cached_property
+    def _tube_arrays(self) -> tuple[object, Float]:
+        tubes = self.system.tubes
+        fissures = self.plan.fissures_are_obstacles
+        return tube_environment(self.lung, with_fissures=fissures), tube_constants(tubes, self.system.margins)
+
+    @cached_property
+    def _task(self) -> Task:
+        return Task(
+            lung=self.lung, system=self.system, method="replan", seed=self.plan.seed,
+            target=Target(lps_mm=self._target, origin=self.plan.target_origin),
+            objective=Objective.of(self.plan.objective),
+        )  # fmt: skip
+
+    @cached_property
+    def _evaluator(self) -> CandidateEvaluator:
+        return CandidateEvaluator(self._task)
 
 
-class _FrugalReplanner(Replanner):
-    """Aims the plan that is left again, and searches only where that finds no path.
-
-    Parameters
-    ----------
-    preferred : NeedleEnvironment
-        The one with all margins, in which a path is looked for first.
-    environment, query, plan, settings
-        As those of `Replanner`.
-    """
-
-    def __init__(
-        self,
-        preferred: NeedleEnvironment,
-        environment: NeedleEnvironment,
-        query: Query,
-        plan: ArcPath,
-        settings: ReplanSettings,
-    ) -> None:
-        super().__init__(environment, query, plan, settings=settings)
-        if preferred is not environment:
-            self._variants.insert(0, preferred)
-
-    def replan(
-        self, lps_from_tip: Float, target: Float, inserted_mm: float, *, turned_rad: float | None = None
-    ) -> Replan:
-        """Plan from the pose that the tip is in; see `Replanner.replan`."""
-        self._iterations = 0
-        found = super().replan(lps_from_tip, target, inserted_mm, turned_rad=turned_rad)
-        if found.failure is Failure.NOT_FOUND:
-            self._iterations = SEARCH_ITERATIONS
-            found = super().replan(lps_from_tip, target, inserted_mm, turned_rad=turned_rad)
-        return found
+def rest_of(arcs: Float, behind_mm: float) -> tuple[Float, float]:
+    """Return the arcs that are left of a path `(A, 3)`, and the turn of those that lie behind."""
+    rest, turned = [], 0.0
+    for length, roll, curvature in arcs.tolist():
+        done = min(max(behind_mm, 0.0), length)
+        turned += curvature * done
+        if length > done:
+            rest.append((length - done, roll if done == 0.0 else 0.0, curvature))
+        behind_mm -= length
+    return np.array(rest).reshape(-1, 3), turned
 
 
 def _with_margins(system: System, share: float) -> System:
     """Return a system with a share of its margins."""
-    names = [each.name for each in fields(system.margins)]
-    return replace(
-        system,
-        margins=replace(system.margins, **{name: share * getattr(system.margins, name) for name in names}),
-    )
+    margins = {each.name: share * getattr(system.margins, each.name) for each in fields(system.margins)}
+    return replace(system, margins=replace(system.margins, **margins))
 
 
-def _miss(path: ArcPath, target: Float) -> float:
-    return float(np.linalg.norm(path.frames()[-1][:3, 3] - target))
+def _joined(parts: Sequence[Chosen]) -> Chosen:
+    arrays = {
+        each.name: np.concatenate([getattr(part, each.name) for part in parts])
+        for each in fields(Chosen)
+        if each.name != "deployed"
+    }
+    return Chosen(**arrays, deployed=tuple(tube for part in parts for tube in part.deployed))

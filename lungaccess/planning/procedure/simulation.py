@@ -15,18 +15,28 @@ from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
-from lungaccess.planning.procedure.history import STAGES, History
-from lungaccess.planning.procedure.policy import Policy
+from lungaccess.planning.procedure.choices import scope_frames
+from lungaccess.planning.procedure.fusion import as_measured
+from lungaccess.planning.procedure.policy import Chosen, Policy
 from lungaccess.planning.procedure.report import NO_PATH, ProcedureReport, StageReport
 from lungaccess.planning.procedure.settings import Procedure, load_procedure
-from lungaccess.planning.procedure.truth import ARCS, Attempt
+from lungaccess.planning.procedure.steering import steered
+from lungaccess.planning.procedure.truth import (
+    ARCS,
+    Attempt,
+    ends_of,
+    needles_carried_out,
+    rows_of,
+    tube_pieces,
+    turned_about,
+)
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk import MISSES, Deviations, ErrorModel, RiskAssessor, Share, load_errors
+from lungaccess.uncertainty.risk import MISSES, Deviations, ErrorModel, Share, load_errors
 from lungaccess.uncertainty.risk.assessment import MISS_QUANTILES
-from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import deviated_starts
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.statistics import share_of
+from stages.needle import ArcPath
 
 DEFAULT_SAMPLES = 1000
 """A share of one half is then known to 3 % with 95 % confidence."""
@@ -37,13 +47,26 @@ ORDER = ("pleura", "vessel", "airway", "fissure", "stays in the airway")
 """What a procedure with several failures is counted under: the first, the worst for the patient."""
 
 
+STAGES = ("scope", "tube", "needle")
+"""What may be measured, in its order."""
+
+
+class _Decided(NamedTuple):
+    """What was decided after measurements of one stage: which found nothing left, and what they corrected."""
+
+    without_path: Bool
+    corrected_mm: Float
+
+
 class _Found(NamedTuple):
-    """What came of N procedures: flags touched, distance from the target, no path left, and histories."""
+    """What came of N procedures: flags touched, distance from the target, no path left, placements of the
+    scope; and what was decided, by stage, which is not in the order of the procedures."""
 
     touched: Int
     miss_mm: Float
     stopped: Bool
-    histories: tuple[History, ...]
+    placements: Int
+    decided: dict[str, list[_Decided]]
 
 
 def simulate_procedure(
@@ -59,11 +82,10 @@ def simulate_procedure(
 ) -> ProcedureReport:
     """Return how often a procedure succeeds that measures on its way and plans the rest again.
 
-    Each sample is a new patient.  The scope is placed, measured, tubes and needle are planned again by
-    `replan_from_scope`; the tubes go out and are measured, the needle is planned again by
-    `replan_from_tube`; the needle is inserted, blindly or measured and planned again.  What the devices then
-    really did is looked at by the kernel of `assess`.  The same seed gives the same report, whatever the
-    number of processes; without measuring it is that of `assess` with these draws.
+    Each sample is a new patient.  The scope is placed and measured; the tubes go out and are measured; the
+    needle is inserted, blindly or measured on its way.  After each measurement `Policy` says what to do next.
+    What the devices then really did is looked at by the kernel of `assess`.  The same seed gives the same
+    report, whatever the number of processes; without measuring it is that of `assess` with these draws.
 
     Parameters
     ----------
@@ -93,6 +115,7 @@ class Simulator:
 
     Attributes
     ----------
+    policy : Policy
     assessor : RiskAssessor
     errors : ErrorModel
     procedure : Procedure
@@ -107,33 +130,33 @@ class Simulator:
         *,
         radius_mm: float | None = None,
     ) -> None:
-        self.assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
-        errors = model_for(errors, plan, lung)
-        self.errors, self.procedure, self._lung = errors, procedure, lung
-        self._policy = Policy(self.assessor, lung, errors, procedure)
+        self.policy = Policy(plan, lung, errors, procedure, radius_mm=radius_mm)
+        self.assessor, self.errors, self.procedure = self.policy.assessor, self.policy.errors, procedure
 
     def report(self, samples: int, seed: int, processes: int = 1) -> ProcedureReport:
         """Return what comes of so many procedures."""
         if processes < 1:
             raise SettingsError(f"{processes} processes are asked for", expected="at least 1")
-        found = _Run(self.assessor, self._policy, self._lung, samples, seed).all(processes)
+        found = _Run(self.policy, samples, seed).all(processes)
         return _report(self, found, samples, seed)
 
 
 class _Run:
     """Procedures of one plan with the draws of one seed."""
 
-    def __init__(self, assessor: RiskAssessor, policy: Policy, lung: Lung, samples: int, seed: int) -> None:
-        self.assessor, self._policy = assessor, policy
+    def __init__(self, policy: Policy, samples: int, seed: int) -> None:
+        self._policy, self.assessor = policy, policy.assessor
         self.samples, self._seed = samples, seed
-        plan, procedure = assessor.plan, policy.procedure
+        plan, procedure = policy.plan, policy.procedure
         count = procedure.scope.placements if procedure.scope.measured or procedure.tubes.measured else 1
         n_arcs = ARCS if plan.needle is not None else 0
         self._attempts: list[Deviations] = [
-            assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs).deviations(policy.errors)
+            policy.assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs).deviations(policy.errors)
             for number in range(count)
         ]
-        self._starts = [deviated_starts(plan, lung, each) for each in self._attempts]
+        self._starts = [deviated_starts(plan, policy.lung, each) for each in self._attempts]
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_MEASURING,)))
+        self._noise = rng.standard_normal((samples, count, 3, 5))
 
     def all(self, processes: int) -> _Found:
         """Return what comes of all procedures."""
@@ -168,45 +191,149 @@ class _Run:
         errors, arcs = self._attempts[0], self.assessor.n_arcs
         fitted = replace(errors, roll_rad=errors.roll_rad[:, :arcs], stop_mm=errors.stop_mm[:, :arcs])
         outcomes = self.assessor.outcomes(fitted)
-        return _Found(outcomes.touched, outcomes.miss_mm, np.zeros(self.samples, dtype=bool), ())
+        ones = np.ones(self.samples, dtype=np.int64)
+        return _Found(outcomes.touched, outcomes.miss_mm, np.zeros(self.samples, dtype=bool), ones, {})
 
     def _part(self, numbers: Int) -> _Found:
-        histories = tuple(self._history(int(number)) for number in numbers)
-        touched, miss = np.zeros(len(numbers), dtype=np.int64), np.full(len(numbers), np.inf)
-        for place, (number, history) in enumerate(zip(numbers, histories, strict=True)):
-            touched[place], miss[place] = self._looked_at(int(number), history)
-        stopped = np.array([each.stopped or not each.complete for each in histories], dtype=bool)
-        return _Found(touched, miss, stopped, histories)
+        """Go through some procedures: the scope is placed again where the policy says so."""
+        count = len(numbers)
+        found = _Found(
+            np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.ones(count, dtype=bool),
+            np.zeros(count, dtype=np.int64), {stage: [] for stage in STAGES},
+        )  # fmt: skip
+        active = np.arange(count)
+        for attempt in range(len(self._attempts)):
+            if len(active):
+                active = active[~self._attempt(attempt, numbers, active, found)]
+        return found
 
-    def _history(self, number: int) -> History:
-        """Go through one procedure: the scope is placed again where no path is left."""
-        history = History()
-        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(_MEASURING, number)))
-        for errors, starts in zip(self._attempts, self._starts, strict=True):
-            if self._policy.attempt(history, self._attempt(errors, starts, number), rng):
-                break
-        return history
-
-    def _attempt(self, errors: Deviations, starts: Float, number: int) -> Attempt:
-        row = slice(number, number + 1)
-        one = Deviations(**{name: values[row] for name, values in vars(errors).items()})
-        return Attempt(
-            errors=one, start=starts[number], target_lps=self.assessor.plan.target_lps + one.target_mm[0]
+    def _attempt(self, attempt: int, numbers: Int, active: Int, found: _Found) -> Bool:
+        """Place the scope once in the active procedures; tell which `(N,)` are over."""
+        policy, procedure, rows = self._policy, self._policy.procedure, numbers[active]
+        errors, noise = rows_of(self._attempts[attempt], rows), self._noise[rows, attempt]
+        starts, left = self._starts[attempt][rows], len(self._attempts) - 1 - attempt
+        found.placements[active] += 1
+        goes = np.arange(len(rows))
+        if procedure.scope.measured:
+            placing = procedure.scope
+            seen = as_measured(scope_frames(starts), placing.position_mm, placing.direction_deg, noise[:, 0])
+            likely = policy.scopes_measured(seen)
+            chosen = policy.from_scopes(likely)
+            found.decided["scope"].append(
+                _Decided(~policy.goes_on(chosen.chances, 0), self._misses(likely.frames))
+            )
+            goes = np.flatnonzero(policy.goes_on(chosen.chances, left))
+            chosen = chosen.only(goes)
+        else:
+            chosen = policy.as_planned(len(rows))
+        went = _Went(
+            chosen, rows_of(errors, goes), np.ascontiguousarray(starts[goes]), noise[goes, 1:], rows[goes]
         )
+        complete = self._devices_out(went, attempt, left, active[goes], found)
+        over = np.zeros(len(rows), dtype=bool)
+        over[goes] = complete
+        return over
 
-    def _looked_at(self, number: int, history: History) -> tuple[int, float]:
-        """Return what the devices touched in all attempts, and how far from the target the last ended."""
-        flags, miss = 0, np.inf
-        for place, (start, pieces, n_tube) in enumerate(history.chains):
-            last = history.complete and place == len(history.chains) - 1
-            touched, ends = self.assessor.follow(start[None], pieces[None], n_tube)
+    def _misses(self, likely: Float) -> Float:
+        """Return how far from the target the plan would end without further errors from scope tips."""
+        plan = self._policy.plan
+        planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip)) @ np.append(plan.end_lps, 1.0)
+        return np.asarray(np.linalg.norm((likely @ planned)[:, :3] - plan.target_lps, axis=1))
+
+    def _devices_out(self, went: _Went, attempt: int, left: int, at: Int, found: _Found) -> Bool:
+        """Let tubes and needles out, and note what came of it; tell which needles were inserted."""
+        policy, plan, procedure = self._policy, self._policy.plan, self._policy.procedure
+        chosen, errors = went.chosen, went.errors
+        tubes, rolled = tube_pieces(plan, chosen, errors)
+        done = np.ones(len(at), dtype=bool)
+        pieces, n_tube = tubes, tubes.shape[1]
+        if plan.needle is not None:
+            true_tips = turned_about(ends_of(scope_frames(went.starts), tubes), -rolled)
+            targets = np.tile(np.asarray(plan.target_lps), (len(at), 1))
+            if procedure.imaging.measured:
+                shown = targets + errors.target_mm + procedure.imaging.position_mm * went.noise[:, 1, :3]
+                targets = policy.targets_measured(shown)
+            if procedure.tubes.measured:
+                stage = procedure.tubes
+                seen = as_measured(true_tips, stage.position_mm, stage.direction_deg, went.noise[:, 0])
+                tips = policy.tips_measured(chosen, seen)
+                ends = ends_of(tips, _as_pieces(chosen.arcs, 0.0))[:, :3, 3]
+                chosen = policy.from_tubes(chosen, tips, targets)
+                corrected = np.linalg.norm(ends - targets, axis=1)
+                found.decided["tube"].append(_Decided(~policy.goes_on(chosen.chances, 0), corrected))
+                done = policy.goes_on(chosen.chances, left, tubes_out=True)
+            if procedure.needle.closed_loop:
+                arcs = self._steered(went, chosen, done, true_tips, targets, at, found)
+            else:
+                arcs = needles_carried_out(chosen.arcs, chosen.found[:, 1], errors, self._longest_mm)
+            pieces = _as_pieces(arcs, plan.system.track_radius_mm)
+            pieces[:, 0, kernel.ROLL] -= rolled
+            pieces = np.concatenate([tubes, pieces], axis=1)
+        touched, ends = self.assessor.follow(went.starts, pieces, n_tube)
+        back = np.flatnonzero(~done)
+        if len(back):
             # Tubes that were drawn back again may have stayed in the airway: nothing came of it.
-            flags |= int(touched[0]) if last else int(touched[0]) & ~kernel.STAYS_INSIDE
-            if last:
-                attempt = self._attempts[history.placements - 1]
-                target = self.assessor.plan.target_lps + attempt.target_mm[number]
-                miss = float(np.linalg.norm(ends[0] - target))
-        return flags, miss
+            alone = self.assessor.follow(went.starts[back], np.ascontiguousarray(tubes[back]), n_tube)[0]
+            touched[back] = alone & ~kernel.STAYS_INSIDE
+        found.touched[at] |= touched
+        miss = np.linalg.norm(ends - plan.target_lps - errors.target_mm, axis=1)
+        found.miss_mm[at[done]] = miss[done]
+        found.stopped[at[done]] &= went.stopped[done]
+        return done
+
+    @property
+    def _longest_mm(self) -> float:
+        return float(self._policy.plan.system.require_needle("A procedure").max_length_mm)
+
+    def _steered(
+        self,
+        went: _Went,
+        chosen: Chosen,
+        done: Bool,
+        true_tips: Float,
+        targets: Float,
+        at: Int,
+        found: _Found,
+    ) -> Float:
+        """Return the true arcs of needles that are measured on their way, and note where they stopped."""
+        made: list[Float] = []
+        for n in range(len(at)):
+            if not done[n]:
+                made.append(np.zeros((0, 3)))
+                continue
+            path = ArcPath(lps_from_start=chosen.tips[n], arcs=chosen.arcs[n, : chosen.found[n, 1]])
+            key = (_MEASURING, int(went.rows[n]))
+            errors = rows_of(went.errors, np.array([n]))
+            attempt = Attempt(
+                errors=errors, start=went.starts[n],
+                target_lps=self._policy.plan.target_lps + errors.target_mm[0],
+            )  # fmt: skip
+            one = steered(
+                self._policy, path, int(chosen.found[n, 2]), true_tips[n], targets[n], attempt,
+                self._policy.doubt_of(chosen.frames[n], chosen.tips[n]),
+                np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key)),
+            )  # fmt: skip
+            made.append(one.arcs)
+            went.stopped[n] = one.stopped is not None
+            none = np.array([each.path is None for each in one.replans], dtype=bool)
+            found.decided["needle"].append(_Decided(none, np.zeros(0)))
+        arcs = np.zeros((len(at), max((len(each) for each in made), default=0) or 1, 3))
+        for n, each in enumerate(made):
+            arcs[n, : len(each)] = each
+        return arcs
+
+
+class _Went:
+    """Procedures in which the tubes go out, N of them."""
+
+    def __init__(self, chosen: Chosen, errors: Deviations, starts: Float, noise: Float, rows: Int) -> None:
+        self.chosen, self.errors, self.starts, self.noise, self.rows = chosen, errors, starts, noise, rows
+        self.stopped = np.zeros(len(rows), dtype=bool)
+
+
+def _as_pieces(arcs: Float, radius_mm: float) -> Float:
+    """Return arcs `(N, A, 3)` of needles as the kernel takes them, `(N, A, 4)`."""
+    return np.concatenate([arcs, np.full((*arcs.shape[:2], 1), radius_mm)], axis=2)
 
 
 def _received(end: Connection) -> _Found:
@@ -224,8 +351,9 @@ def _received(end: Connection) -> _Found:
 
 def _joined(parts: Iterable[_Found]) -> _Found:
     found = list(parts)
-    touched, miss, stopped = (np.concatenate([each[n] for each in found]) for n in range(3))
-    return _Found(touched, miss, stopped, tuple(history for each in found for history in each.histories))
+    touched, miss_mm, stopped, placements = (np.concatenate([each[n] for each in found]) for n in range(4))
+    decided = {stage: [one for each in found for one in each.decided.get(stage, [])] for stage in STAGES}
+    return _Found(touched, miss_mm, stopped, placements, decided)
 
 
 def _report(simulator: Simulator, found: _Found, samples: int, seed: int) -> ProcedureReport:
@@ -251,8 +379,10 @@ def _report(simulator: Simulator, found: _Found, samples: int, seed: int) -> Pro
         touches=MappingProxyType({name: share_of(mask) for name, mask in touched.items()}),
         ends=MappingProxyType(ends),
         miss_mm=MappingProxyType(quantiles),
-        placements=float(np.mean([each.placements for each in found.histories])) if found.histories else 1.0,
-        stages=tuple(_stage(stage, found.histories) for stage in STAGES if _used(procedure, stage)),
+        placements=float(found.placements.mean()),
+        stages=tuple(
+            _stage(stage, found.decided.get(stage, [])) for stage in STAGES if _used(procedure, stage)
+        ),
         with_needle=assessor.plan.needle is not None,
     )
 
@@ -262,12 +392,12 @@ def _used(procedure: Procedure, stage: str) -> bool:
     return dict(zip(STAGES, used, strict=True))[stage]
 
 
-def _stage(stage: str, histories: tuple[History, ...]) -> StageReport:
-    found = [each for history in histories for each in history.replans[stage]]
-    corrected = [each for history in histories for each in history.corrected_mm[stage]]
+def _stage(stage: str, decided: list[_Decided]) -> StageReport:
+    without = np.concatenate([np.zeros(0, dtype=bool), *(each.without_path for each in decided)])
+    corrected = np.concatenate([np.zeros(0), *(each.corrected_mm for each in decided)])
     return StageReport(
         stage=stage,
-        replans=len(found),
-        without_path=Share(count=len(found) - sum(found), samples=max(len(found), 1)),
-        corrected_mm=float(np.median(corrected)) if corrected else float("nan"),
+        replans=len(without),
+        without_path=Share(count=int(np.count_nonzero(without)), samples=max(len(without), 1)),
+        corrected_mm=float(np.median(corrected)) if len(corrected) else float("nan"),
     )

@@ -56,6 +56,7 @@ class Spread:
         height = share_of_motion(lung.height_share(target_lps))
         scope = share_of_motion(lung.height_share(tips[0, :3])) if len(tips) else height
         left = Residuals.of(errors, procedure, height - scope)
+        system.require_needle("A chance of success")
         aside = ASIDE * radius_mm if procedure.tubes.measured else 0.0
         self._radius_mm = radius_mm
         self._replanned = system.needle is not None and (
@@ -67,8 +68,9 @@ class Spread:
         if system.needle is None:
             ends = np.ascontiguousarray(np.broadcast_to(target_lps, ends.shape))
         kernel.find_spread(
-            _around(lung, system), _sizes(system, left, errors, aside), np.ascontiguousarray(tips),
-            ends, deployments.tangents, deployments.exit_mm, deployments.inner_mm,
+            around(lung, with_fissures=fissures_are_obstacles(lung, system)),
+            sizes(system, left, errors, aside), np.ascontiguousarray(tips), ends,
+            deployments.tangents, deployments.exit_mm, deployments.inner_mm,
             (x, y, z), self._found,
         )  # fmt: skip
 
@@ -79,12 +81,6 @@ class Spread:
         What deviated tubes meet of the airway that they leave is not in it.
         """
         margin = self._found[:, [kernel.OF_TUBE, kernel.OF_NEEDLE]].min(axis=1)
-        return np.asarray(self.goal_chances * self.reach_chances * _below(margin))
-
-    @cached_property
-    def needle_chances(self) -> Float:
-        """The same of the needle alone, `(N,)`: as if the tubes stayed clear for certain."""
-        margin = self._found[:, kernel.OF_NEEDLE]
         return np.asarray(self.goal_chances * self.reach_chances * _below(margin))
 
     @cached_property
@@ -112,17 +108,18 @@ class Spread:
         return np.asarray(gammainc(0.5 * freedom, squared))
 
 
-def _around(lung: Lung, system: System) -> kernel.Around:
+def around(lung: Lung, *, with_fissures: bool) -> kernel.Around:
+    """Return what the devices may meet, for the kernels."""
     vessel = lung.fields["vessel"]
-    fissure = lung.fields["fissure"] if fissures_are_obstacles(lung, system) else vessel
+    fissure = lung.fields["fissure"] if with_fissures else vessel
     return kernel.Around(
         vessel.corners, lung.fields["pleura"].corners, fissure.corners, lung.fields["airway"].corners,
         vessel.geometry,
     )  # fmt: skip
 
 
-def _sizes(system: System, left: Residuals, errors: ErrorModel, aside_mm: float) -> kernel.Sizes:
-    """Return the errors and devices; without a needle nothing of the tip of the tubes is exempt."""
+def sizes(system: System, left: Residuals, errors: ErrorModel, aside_mm: float) -> kernel.Sizes:
+    """Return the errors and devices for the kernels; without a needle no length of the tubes is exempt."""
     needle, tubes = system.needle, system.tubes
     tip_mm = None if needle is None else left.tip_mm
     return kernel.Sizes(

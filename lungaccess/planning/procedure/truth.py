@@ -1,4 +1,4 @@
-"""What really happens in one attempt: the devices as they go, and what is measured of them."""
+"""What really happens in procedures: the devices with their errors, and what is measured of them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ import numpy as np
 
 from anatomy import poses
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float
+from anatomy.base.typed import Float, Int
+from lungaccess.planning.procedure.fusion import as_measured
+from lungaccess.planning.procedure.kernels.decisions import deviated_planar
+from lungaccess.planning.procedure.policy import Chosen
 from lungaccess.planning.procedure.settings import NeedleSteering
-from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from lungaccess.uncertainty.risk import ErrorModel
-from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces
+from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, in_rows
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
+from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
+from lungaccess.uncertainty.risk.twisted import twisted_shapes
 from stages.needle import (
     ArcPath,
     Belief,
@@ -28,7 +32,6 @@ from stages.needle import (
     Unknown,
     arc_transform,
     steer,
-    tilt,
 )
 
 ARCS = 12
@@ -78,18 +81,66 @@ def end_of(frame: Float, pieces: Float) -> Float:
     return np.asarray(frame)
 
 
-def as_measured(frame: Float, position_mm: float, direction_deg: float, noise: Float) -> Float:
-    """Return a pose as it is measured with errors: `noise` has five standard normal numbers."""
-    a, b = math.radians(direction_deg) * noise[:2]
-    seen = frame @ tilt(math.hypot(a, b), math.atan2(b, a))
-    seen[:3, 3] += position_mm * noise[2:5]
-    return np.asarray(seen)
+def rows_of(errors: Deviations, numbers: Int) -> Deviations:
+    """Return the errors of some procedures, by their numbers."""
+    return Deviations(**{name: values[numbers] for name, values in vars(errors).items()})
 
 
-def path_of(needle: NeedlePath) -> ArcPath:
-    """Return the needle of a plan as a path."""
-    arcs = np.array([(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in needle.arcs])
-    return ArcPath(lps_from_start=np.asarray(needle.lps_from_start), arcs=arcs.reshape(-1, 3))
+def tube_pieces(plan: Plan, chosen: Chosen, errors: Deviations) -> tuple[Float, Float]:
+    """Return the arcs `(N, T, 4)` of the tubes as they really go, and how far their ends are overturned."""
+    if len(chosen.tubes):
+        pieces = np.zeros((errors.count, TUBE_PIECES, kernel.N_PIECE))
+        deviated_planar(np.ascontiguousarray(chosen.tubes), in_rows(errors), pieces)
+        return pieces, errors.rotation_rad
+    made: list[tuple[Float, float]] = []
+    for n, tube in enumerate(chosen.deployed):
+        one = rows_of(errors, np.array([n]))
+        shapes, rolled, which = twisted_shapes(replace(plan, tube=tube), one.insertion_mm, one.relative_rad)
+        made.append((shapes[which[0]], float(rolled[which[0]])))
+    pieces = np.zeros((len(made), max((len(each) for each, _ in made), default=1), kernel.N_PIECE))
+    for n, (shape, _rolled) in enumerate(made):
+        pieces[n, :, kernel.RADIUS] = shape[-1, kernel.RADIUS]
+        pieces[n, : len(shape)] = shape
+    pieces[:, 0, kernel.ROLL] += errors.rotation_rad
+    return pieces, errors.rotation_rad + np.array([rolled for _, rolled in made])
+
+
+def ends_of(frames: Float, pieces: Float) -> Float:
+    """Return the poses `(N, 4, 4)` at the ends of chains `(N, P, 4)` from poses."""
+    for piece in np.moveaxis(pieces, 1, 0):
+        frames = turned_about(frames, piece[:, kernel.ROLL])
+        length, curvature = piece[:, kernel.LENGTH], piece[:, kernel.CURVATURE]
+        angle = length * curvature
+        arc = np.tile(np.eye(4), (len(frames), 1, 1))
+        arc[:, 0, 0] = arc[:, 2, 2] = np.cos(angle)
+        arc[:, 0, 2], arc[:, 2, 0] = np.sin(angle), -np.sin(angle)
+        arc[:, 2, 3] = length * np.sinc(angle / np.pi)
+        arc[:, 0, 3] = 0.5 * length * angle * np.sinc(0.5 * angle / np.pi) ** 2
+        frames = frames @ arc
+    return frames
+
+
+def turned_about(frames: Float, angles: Float) -> Float:
+    """Return poses turned by angles `(N,)` about their +z."""
+    turn = np.tile(np.eye(4), (len(frames), 1, 1))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angles)
+    turn[:, 0, 1], turn[:, 1, 0] = -np.sin(angles), np.sin(angles)
+    return np.asarray(frames @ turn)
+
+
+def needles_carried_out(arcs: Float, counts: Int, errors: Deviations, longest_mm: float) -> Float:
+    """Return the arcs `(N, A, 3)` of needles that carry out paths blindly, each in the frame of its path."""
+    numbers = np.arange(arcs.shape[1])
+    there = numbers < counts[:, None]
+    columns = numbers % ARCS
+    ends = np.cumsum(arcs[:, :, 0], axis=1) + errors.stop_mm[:, columns]
+    ends = np.where(there, np.clip(ends, 0.0, longest_mm), 0.0)
+    ends = np.maximum.accumulate(ends, axis=1)
+    angles = np.where(there, np.cumsum(arcs[:, :, 1], axis=1) + errors.roll_rad[:, columns], 0.0)
+    rolls = np.where(there, np.diff(angles, prepend=0.0, axis=1), 0.0)
+    return np.stack(
+        [np.diff(ends, prepend=0.0, axis=1), rolls, errors.factor[:, None] * arcs[:, :, 2]], axis=2
+    )
 
 
 class SteeredTruth:
@@ -216,15 +267,3 @@ def needle_pieces(arcs: Float, radius_mm: float) -> Float:
     pieces[:, [kernel.LENGTH, kernel.ROLL, kernel.CURVATURE]] = arcs
     pieces[:, kernel.RADIUS] = radius_mm
     return pieces
-
-
-def carried_out(path: ArcPath, attempt: Attempt) -> Float:
-    """Return the arcs `(A, 3)` of a needle that carries out a path blindly, in the path's own frame."""
-    count = len(path.arcs)
-    numbers = np.arange(count) % ARCS
-    ends = np.cumsum(path.arcs[:, 0]) + attempt.errors.stop_mm[0, numbers]
-    ends = np.maximum.accumulate(np.maximum(ends, 0.0))
-    angles = np.cumsum(path.arcs[:, 1]) + attempt.errors.roll_rad[0, numbers]
-    return np.column_stack(
-        [np.diff(ends, prepend=0.0), np.diff(angles, prepend=0.0), attempt.errors.factor[0] * path.arcs[:, 2]]
-    )

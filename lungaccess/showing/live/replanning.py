@@ -15,7 +15,7 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_pieces
 from lungaccess.planning.one_stage import RestOfPlan, ScopeReplanner, measured_pose, replan_from_tube
-from lungaccess.planning.procedure import WATCHED
+from lungaccess.planning.procedure import WATCHED, Measurements, Policy
 from lungaccess.plans.curves import SHORTEST_MM, STEP_MM, needle_pieces, tube_pieces
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target, point_target
@@ -79,6 +79,9 @@ class TrackedReplanner:
     ----------
     plan, lung
         The plan that is followed, and its patient.
+    policy : Policy, optional
+        What then decides about the tracked poses of scope, tubes and needle, as long as the target is where
+        the plan has it; else the cheapest way is taken.
     clock : callable
         Returns the processor time in seconds.
 
@@ -88,9 +91,16 @@ class TrackedReplanner:
         If the plan was made for another patient.
     """
 
-    def __init__(self, plan: Plan, lung: Lung, clock: Callable[[], float] = time.process_time) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        lung: Lung,
+        policy: Policy | None = None,
+        clock: Callable[[], float] = time.process_time,
+    ) -> None:
         plan.require_lung(lung)
-        self._plan, self._lung, self._clock = plan, lung, clock
+        self._plan, self._lung, self._policy, self._clock = plan, lung, policy, clock
+        self._seen: dict[str, Float] = {}
         self._target = Target(lps_mm=np.asarray(plan.end_lps), origin=plan.target_origin)
 
     @property
@@ -122,6 +132,8 @@ class TrackedReplanner:
         if name == TARGET:
             self._retarget(pose[:3, 3])
             return None, None, "target moved"
+        if self._policy is not None:
+            return self._decided(self._policy, name, pose)
         if name == NEEDLE_TIP:
             return self._from_needle(pose)
         rest = self._from_scope(pose) if name == SCOPE_TIP else self._from_tube(pose)
@@ -132,9 +144,29 @@ class TrackedReplanner:
         needle = rest.path.sample(PATH_STEP_MM)[0] if rest.needle is not None else None
         return tubes, needle, f"plan: cost {rest.cost:.4g}, needle {rest.path.length_mm:.1f} mm"
 
+    def _decided(self, policy: Policy, name: str, pose: Float) -> tuple[Float | None, Float | None, str]:
+        """Return what the policy says about a pose, after those of the stages before it."""
+        stages = TRACKED[: TRACKED.index(name)]
+        self._seen = {each: self._seen[each] for each in stages if each in self._seen} | {name: pose}
+        scope, tubes, needle = ([self._seen[each]] if each in self._seen else [] for each in TRACKED)
+        decision = policy.decide(Measurements.of(scope=scope, tubes=tubes, needle=needle))
+        words = f"{decision.action}: {100.0 * decision.chance:.0f} of 100"
+        if not decision.goes_on:
+            return None, None, words
+        out = None
+        if decision.tube is not None:
+            pieces = tube_pieces(decision.tube, self._plan.system.tubes)
+            out = poses_on_pieces(decision.lps_from_device, pieces, PATH_STEP_MM)[0][:, :3, 3]
+        if decision.needle is None:
+            return out, None, words
+        start = np.asarray(decision.needle.lps_from_start)
+        path = ArcPath(lps_from_start=start, arcs=needle_pieces(decision.needle))
+        return out, path.sample(PATH_STEP_MM)[0], words
+
     def _retarget(self, place: Float) -> None:
         """Take another target from now on; TargetError if a needle may not end there."""
         self._target = point_target(self._lung, place, origin="tracked")
+        self._policy = None
         self.__dict__.pop("_scope_replanner", None)
 
     @cached_property

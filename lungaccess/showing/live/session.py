@@ -13,6 +13,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.io.openigtlink import Received, points_message, pose_message, text_message
 from anatomy.lung import Lung
+from lungaccess.planning.procedure import Policy
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.live.link import Link, LinkCounts
 from lungaccess.showing.live.replanning import TARGET, TRACKED, Answer, TrackedReplanner
@@ -76,6 +77,8 @@ class LiveSession:
         Whether the motion begins again when it has ended; otherwise its end is sent on and on.
     on_answer : callable, optional
         Gets every `Answer`.
+    policy : Policy, optional
+        What decides about tracked poses, see `TrackedReplanner`.
     clock, wall_clock : callable
         Return the time since some moment, and since 1970, in seconds.
 
@@ -97,12 +100,13 @@ class LiveSession:
         speeds: Speeds | None = None,
         loop: bool = False,
         on_answer: Callable[[Answer], None] | None = None,
+        policy: Policy | None = None,
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
         if not 0.0 < rate_hz <= 1000.0:
             raise SettingsError(f"The rate is {rate_hz} Hz", expected="above 0 and at most 1000 Hz")
-        self._replanner = TrackedReplanner(plan, lung)
+        self._replanner = TrackedReplanner(plan, lung, policy)
         self._trajectory: Trajectory = plan_trajectory(plan, speeds)
         self._moving = None if lung.motion is None else Moving.of(plan, lung)
         self._masks_phase = None if lung.motion is None else lung.motion.masks_phase

@@ -64,17 +64,17 @@ class Sizes(NamedTuple):
 
 
 @borrowing_kernel
-def _dot(a, b):
+def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @borrowing_kernel
-def _cross(a, b):
+def cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @borrowing_kernel
-def _add(sums, size, v):
+def add(sums, size, v):
     """Add `size^2 v v^T` to the sums xx, yy, zz, xy, xz, yz."""
     s = size * size
     return (
@@ -88,17 +88,17 @@ def _add(sums, size, v):
 
 
 @borrowing_kernel
-def _shift(sums, size):
+def shift(sums, size):
     s = size * size
     return sums[0] + s, sums[1] + s, sums[2] + s, sums[3], sums[4], sums[5]
 
 
 @borrowing_kernel
-def _tilt(sums, size, arm, forward):
+def tilt(sums, size, arm, forward):
     """Add what turns about all axes across `forward` do at the end of an arm."""
     s = size * size
-    long = s * _dot(arm, arm)
-    side = _cross(forward, arm)
+    long = s * dot(arm, arm)
+    side = cross(forward, arm)
     return (
         sums[0] + long - s * (arm[0] * arm[0] + side[0] * side[0]),
         sums[1] + long - s * (arm[1] * arm[1] + side[1] * side[1]),
@@ -110,28 +110,28 @@ def _tilt(sums, size, arm, forward):
 
 
 @borrowing_kernel
-def _of_scope(sizes, sums, point, base, forward):
+def of_scope(sizes, sums, point, base, forward):
     """Add the errors of the scope's tip and of the rotation of the tubes."""
     arm = (point[0] - base[0], point[1] - base[1], point[2] - base[2])
-    sums = _tilt(_shift(sums, sizes.scope), sizes.scope_turn, arm, forward)
-    return _add(sums, sizes.rotation, _cross(forward, arm))
+    sums = tilt(shift(sums, sizes.scope), sizes.scope_turn, arm, forward)
+    return add(sums, sizes.rotation, cross(forward, arm))
 
 
 @borrowing_kernel
-def _of_insertion(sizes, sums, point, at, ahead, about):
+def of_insertion(sizes, sums, point, at, ahead, about):
     """Add the error of the inner tube's insertion, which bends on as it goes."""
     arm = (point[0] - at[0], point[1] - at[1], point[2] - at[2])
-    turned = _cross(about, arm)
+    turned = cross(about, arm)
     moved = (
         ahead[0] + sizes.bend * turned[0],
         ahead[1] + sizes.bend * turned[1],
         ahead[2] + sizes.bend * turned[2],
     )
-    return _add(sums, sizes.insertion, moved)
+    return add(sums, sizes.insertion, moved)
 
 
 @borrowing_kernel
-def _clearance(around, point, with_airway):
+def clearance_at(around, point, with_airway):
     x, y, z = point
     least = distance_bound(around.vessel, around.geometry, x, y, z)
     least = min(least, distance_bound(around.pleura, around.geometry, x, y, z))
@@ -142,22 +142,22 @@ def _clearance(around, point, with_airway):
 
 
 @borrowing_kernel
-def _margin(clear, sums):
+def margin_of(clear, sums):
     """Return a clearance in standard deviations: two of three directions lie across a device."""
     variance = (sums[0] + sums[1] + sums[2]) / 1.5
     return min(max(clear / math.sqrt(max(variance, SMALL)), -CAP), CAP)
 
 
 @borrowing_kernel
-def _unit(v):
-    size = math.sqrt(_dot(v, v))
+def unit(v):
+    size = math.sqrt(dot(v, v))
     if size < 1e-9:
         return (0.0, 0.0, 0.0), size
     return (v[0] / size, v[1] / size, v[2] / size), size
 
 
 @borrowing_kernel
-def _tube_margin(around, sizes, base, forward, at, ahead, exit_mm, length):
+def tube_margin(around, sizes, base, forward, at, ahead, exit_mm, length):
     """Return the least margin of the tubes beyond the exit, along the cubic through both ends."""
     least = CAP
     begin = min(max(exit_mm / max(length, 1e-9), 0.0), 1.0)
@@ -170,14 +170,14 @@ def _tube_margin(around, sizes, base, forward, at, ahead, exit_mm, length):
             a * base[1] + b * forward[1] + c * at[1] + d * ahead[1],
             a * base[2] + b * forward[2] + c * at[2] + d * ahead[2],
         )
-        sums = _of_scope(sizes, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), point, base, forward)
-        clear = _clearance(around, point, False) - sizes.tube_radius
-        least = min(least, _margin(clear, sums))
+        sums = of_scope(sizes, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), point, base, forward)
+        clear = clearance_at(around, point, False) - sizes.tube_radius
+        least = min(least, margin_of(clear, sums))
     return least
 
 
 @borrowing_kernel
-def _reach(sizes, along, off, normal, sums):
+def reach_margin(sizes, along, off, normal, sums):
     """Return by how many standard deviations the target lies within what the needle can bend to."""
     most = 1.0 / sizes.steepest
     bends_less = sizes.slack * off
@@ -213,19 +213,19 @@ def find_spread(around, sizes, tips, positions, tangents, exits, lengths, target
         base, forward = (tips[n, 0], tips[n, 1], tips[n, 2]), (tips[n, 3], tips[n, 4], tips[n, 5])
         at = (positions[n, 0], positions[n, 1], positions[n, 2])
         ahead = (tangents[n, 0], tangents[n, 1], tangents[n, 2])
-        found[n, OF_TUBE] = _tube_margin(around, sizes, base, forward, at, ahead, exits[n], lengths[n])
+        found[n, OF_TUBE] = tube_margin(around, sizes, base, forward, at, ahead, exits[n], lengths[n])
         offset = (target[0] - at[0], target[1] - at[1], target[2] - at[2])
-        along = _dot(offset, ahead)
+        along = dot(offset, ahead)
         aside = (offset[0] - along * ahead[0], offset[1] - along * ahead[1], offset[2] - along * ahead[2])
-        normal, off = _unit(aside)
+        normal, off = unit(aside)
         kappa = 2.0 * off / max(off * off + along * along, SMALL)
         turn = 2.0 * math.atan2(off, along)
         length = turn / max(kappa, SMALL) if turn > 1e-9 else along
-        binormal = _cross(ahead, normal)
-        about, _size = _unit(_cross(forward, ahead))
-        rigid = _of_scope(sizes, nothing, target, base, forward)
-        rigid = _of_insertion(sizes, rigid, target, at, ahead, about)
-        found[n, REACH] = _reach(sizes, along, off, normal, rigid)
+        binormal = cross(ahead, normal)
+        about, _size = unit(cross(forward, ahead))
+        rigid = of_scope(sizes, nothing, target, base, forward)
+        rigid = of_insertion(sizes, rigid, target, at, ahead, about)
+        found[n, REACH] = reach_margin(sizes, along, off, normal, rigid)
         least, sums = CAP, nothing
         for s in range(NEEDLE_STATIONS):
             share = (s + 1) / NEEDLE_STATIONS
@@ -240,18 +240,18 @@ def find_spread(around, sizes, tips, positions, tangents, exits, lengths, target
             )
             if sizes.tip_known:
                 arm = (point[0] - at[0], point[1] - at[1], point[2] - at[2])
-                sums = _tilt(_shift(nothing, sizes.tip), sizes.tip_turn, arm, ahead)
+                sums = tilt(shift(nothing, sizes.tip), sizes.tip_turn, arm, ahead)
             else:
-                sums = _of_scope(sizes, nothing, point, base, forward)
-                sums = _of_insertion(sizes, sums, point, at, ahead, about)
+                sums = of_scope(sizes, nothing, point, base, forward)
+                sums = of_insertion(sizes, sums, point, at, ahead, about)
             bow = 0.5 * kappa * (share * length) ** 2
-            sums = _add(_add(sums, sizes.curvature * bow, normal), sizes.roll * bow, binormal)
+            sums = add(add(sums, sizes.curvature * bow, normal), sizes.roll * bow, binormal)
             beyond = math.sqrt(gone * gone + bent * bent) > sizes.exempt
-            clear = _clearance(around, point, beyond) - sizes.needle_radius
-            least = min(least, _margin(clear, sums))
+            clear = clearance_at(around, point, beyond) - sizes.needle_radius
+            least = min(least, margin_of(clear, sums))
         found[n, OF_NEEDLE] = least
-        ends = _add(_shift(sums, sizes.target), sizes.stop, ahead)
-        ends = _add(ends, sizes.breathing, (0.0, 0.0, 1.0))
+        ends = add(shift(sums, sizes.target), sizes.stop, ahead)
+        ends = add(ends, sizes.breathing, (0.0, 0.0, 1.0))
         found[n, MEAN] = ends[0] + ends[1] + ends[2]
         found[n, VARIANCE] = 2.0 * (
             ends[0] ** 2 + ends[1] ** 2 + ends[2] ** 2 + 2.0 * (ends[3] ** 2 + ends[4] ** 2 + ends[5] ** 2)

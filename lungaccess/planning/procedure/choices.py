@@ -1,0 +1,171 @@
+"""Deployments that a policy may choose from after a measurement: prepared once for a plan.
+
+What tubes do does not depend on where the scope's tip stands, so that a deployment is a pose of their tip in
+the scope's frame; whether it is clear is looked at where the scope is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float
+from anatomy.lung import Lung
+from lungaccess.planning.procedure.kernels.decisions import Choices
+from lungaccess.planning.procedure.residuals import Residuals
+from lungaccess.planning.procedure.settings import Procedure
+from lungaccess.planning.procedure.spread import Spread
+from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
+from lungaccess.uncertainty.risk import Deviations, ErrorModel
+from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_deviations, tubes_alone
+from stages.needle import needle_environment, workspace_lengths
+from stages.tube import Deployment, Deployments, DeploymentValidator, one_site_enumerator
+
+ENOUGH = 512
+"""Deployments towards the target that are looked at from a scope's tip: several times what is ranked, since
+most are refused."""
+RANKED = 96
+"""Deployments that are ranked from one tip, spread over all of them: those between are much like them."""
+KEPT = 12
+"""Deployments that are kept from one tip, the likeliest: further ones are alike or worse."""
+DRAWS = 16
+"""Draws in which the tubes of a choice are followed: they compare choices, which have the same luck."""
+_SEED = 1
+"""Seed of these draws, which have nothing to do with those of a simulated procedure."""
+
+
+@frozen_record
+class Offer:
+    """Deployments to choose from, the planned one first.
+
+    Parameters
+    ----------
+    choices : Choices
+        As the kernels take them.
+    deployed : tuple of (float, float, float, int)
+        Rotation, insertions and shape of each but the planned one, see `DeploymentValidator.choose`.
+    """
+
+    choices: Choices
+    deployed: tuple[tuple[float, float, float, int], ...]
+
+
+def scope_frames(starts: Float) -> Float:
+    """Return the poses `(N, 4, 4)` of scope tips given as point, direction and +x axis, `(N, 9)`."""
+    frames = np.zeros((len(starts), 4, 4))
+    frames[:, :3, 3], frames[:, :3, 2], frames[:, :3, 0] = np.split(starts, 3, axis=1)
+    frames[:, :3, 1] = np.cross(frames[:, :3, 2], frames[:, :3, 0])
+    frames[:, 3, 3] = 1.0
+    return frames
+
+
+def residual_rows(left: Residuals) -> Float:
+    """Return what is left of the errors of scope and tubes in some draws, as kernels take it."""
+    rng = np.random.default_rng(_SEED)
+    drawn = {
+        "scope_mm": left.scope_mm * rng.standard_normal((DRAWS, 3)),
+        "tilt_rad": left.scope_rad * rng.standard_normal((DRAWS, 2)),
+        "rotation_rad": left.rotation_rad * rng.standard_normal(DRAWS),
+        "insertion_mm": left.insertion_mm * rng.standard_normal((DRAWS, 2)),
+        "target_mm": left.target_mm * rng.standard_normal((DRAWS, 3)),
+    }
+    return in_rows(Deviations(**(no_deviations(DRAWS, 0) | drawn)))
+
+
+def planned_choice(plan: Plan, left: Residuals) -> Choices:
+    """Return the planned deployment alone."""
+    tube, frame = plan.tube, np.array(plan.scope.lps_from_scope_tip)
+    tubes = np.zeros((0, 11))
+    shapes, counts = np.zeros((1, 0, 4)), np.zeros(1, dtype=np.int64)
+    if tube.shape is None:
+        tubes = DeviatedPlan(plan).kernel_inputs(_none(plan))[0].tubes[None]
+    else:
+        shapes, counts = np.array(tube.shape.arcs)[None], np.array([len(tube.shape.arcs)])
+    return Choices(
+        scope_from_tip=np.asarray(np.linalg.inv(frame) @ np.asarray(tube.lps_from_tip))[None],
+        rotations=np.array([tube.rotation_rad]), exits=np.array([tube.exit.arc_length_mm]),
+        lengths=np.array([tube.inner_insertion_mm]), tubes=tubes, shapes=shapes, n_arcs=counts,
+        beside=np.array([tube.clearance_loss_mm]), errors=residual_rows(left),
+    )  # fmt: skip
+
+
+def with_choices(planned: Choices, system: System, made: list[Deployment], frames: list[Float]) -> Choices:
+    """Return choices with further deployments `made` from scope tips."""
+    if not made:
+        return planned
+    tips = [np.linalg.inv(frame) @ each.lps_from_tip for frame, each in zip(frames, made, strict=True)]
+    if system.tubes.planar:
+        own = [
+            tubes_alone(system.tubes, frame, (each.rotation_rad, each.outer_mm, each.inner_mm)).tubes
+            for frame, each in zip(frames, made, strict=True)
+        ]
+        tubes, shapes = np.concatenate([planned.tubes, own]), np.zeros((1 + len(made), 0, 4))
+        counts = np.zeros(1 + len(made), dtype=np.int64)
+    else:
+        arcs = [planned.shapes[0], *(np.asarray(each.shape.arcs) for each in made if each.shape is not None)]
+        tubes, counts = planned.tubes, np.array([len(each) for each in arcs])
+        shapes = np.zeros((len(arcs), counts.max(), arcs[0].shape[1]))
+        for number, each in enumerate(arcs):
+            shapes[number, : len(each)] = each
+    return planned._replace(
+        scope_from_tip=np.concatenate([planned.scope_from_tip, tips]),
+        rotations=np.append(planned.rotations, [each.rotation_rad for each in made]),
+        exits=np.append(planned.exits, [each.exit_mm for each in made]),
+        lengths=np.append(planned.lengths, [each.inner_mm for each in made]), tubes=tubes, shapes=shapes,
+        n_arcs=counts,
+        beside=np.append(
+            planned.beside,
+            [0.0 if each.shape is None else each.shape.required_beside_mm for each in made],
+        ),
+    )  # fmt: skip
+
+
+def offered(
+    plan: Plan, lung: Lung, system: System, errors: ErrorModel, procedure: Procedure, radius_mm: float,
+    left: Residuals, frames: Float,
+) -> Offer:  # fmt: skip
+    """Return the planned deployment, and the likeliest from some scope tips `(K, 4, 4)` that may be measured.
+
+    `system` is that of the plan with the margins that are kept after a measurement.
+    """
+    fissures, target = plan.fissures_are_obstacles, np.asarray(plan.target_lps)
+    planned = planned_choice(plan, left)
+    needle = system.require_needle("A choice of deployments")
+    environment = needle_environment(lung, needle, system.margins, with_fissures=fissures)
+    validator = DeploymentValidator(lung, system.tubes, system.margins, with_fissures=fissures)
+    enumerate_from = one_site_enumerator(
+        lung, system.tubes, system.margins, with_fissures=fissures, enough=ENOUGH
+    )
+
+    def worthwhile(positions: Float, tangents: Float) -> Bool:
+        return np.isfinite(workspace_lengths(environment, positions, tangents, target))
+
+    found: dict[tuple[float, float, float, int], tuple[Deployment, Float]] = {}
+    for frame in frames:
+        row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
+        entries = _some(enumerate_from(row, worthwhile), worthwhile)
+        tips = np.repeat(row[None], entries.count, axis=0)
+        spread = Spread(lung, system, tips, entries, target, errors, procedure, radius_mm)
+        for number in np.argsort(-spread.chances, kind="stable")[:KEPT].tolist():
+            deployed = entries.choice(number)
+            if deployed not in found:
+                made = validator.choose(frame, *deployed)
+                if not isinstance(made, str):
+                    found[deployed] = made, frame
+    every = [each for each, _frame in found.values()], [frame for _each, frame in found.values()]
+    return Offer(choices=with_choices(planned, system, *every), deployed=tuple(found))
+
+
+def _some(entries: Deployments, worthwhile: Callable[[Float, Float], Bool]) -> Deployments:
+    """Return some of the deployments towards the target, evenly."""
+    near = np.flatnonzero(worthwhile(entries.positions, entries.tangents))
+    return entries.only(near[:: -(-len(near) // RANKED) or 1])
+
+
+def _none(plan: Plan) -> Deviations:
+    n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
+    twisted = 0 if plan.tube.shape is None else len(plan.system.tubes.nested)
+    return Deviations(**no_deviations(1, n_arcs, twisted))

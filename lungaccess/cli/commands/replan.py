@@ -59,9 +59,7 @@ def replan(
     frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
     plan: Annotated[
         Path | None,
-        Parameter(
-            help="plan.json that is carried out, with --procedure: its policy then says what to do next."
-        ),
+        Parameter(help="plan.json that is carried out, with --procedure: the policy says what to do next."),
     ] = None,
     errors: ErrorOptions = ErrorOptions(),
     placement: Annotated[Count, Parameter(help="How often the scope has been placed, with --procedure.")] = 1,

@@ -79,6 +79,8 @@ OFFERED = 6
 """Tips from which deployments to choose from are looked for: the planned one, and imagined ones."""
 NEAREST_MM = 0.25
 """Spacing of the points of a path of which the one nearest to a needle's tip tells how much is inserted."""
+SAME = 1e-4
+"""Arcs that differ by less, in mm, rad and 1/mm, are the same: no hand or drive tells them apart."""
 LONGEST = 12
 """Arcs of a path of the needle for which there is room; more where the plan has more."""
 _SEED = 2
@@ -290,7 +292,7 @@ class Policy:
             found, chances, arcs,
         )  # fmt: skip
         chosen = found[:, 0]
-        same = (arcs[:, : len(self._planned)] == self._planned).all(axis=(1, 2))
+        same = _same(arcs[:, : len(self._planned)], self._planned)
         deployed: tuple[TubeDeployment, ...] = ()
         if not self.plan.system.tubes.planar:
             deployed = tuple(
@@ -405,7 +407,7 @@ class Policy:
             if other[1][0] > chances[n]:
                 found[n], chances[n], arcs[n] = (each[0] for each in other)
         found[:, 0], found[:, 2] = chosen.found[:, 0], branches
-        changed = (arcs != chosen.arcs).any(axis=(1, 2))
+        changed = ~_same(arcs, chosen.arcs)
         return replace(chosen, tips=tips, found=found, chances=chances, arcs=arcs, changed=changed)
 
     def _paths(
@@ -550,7 +552,8 @@ class Policy:
         branch = int(chosen.found[0, 2])
         way = OnTheWay(rest, inserted, turned, path.lps_from_start[:3, 2], branch)
         arcs, chance = self.from_needle(way, pose, target)
-        action = Action.GO_ON if np.array_equal(arcs, rest) else Action.NEEDLE
+        same = arcs.shape == rest.shape and bool(_same(arcs[None], rest[None])[0])
+        action = Action.GO_ON if same else Action.NEEDLE
         return Decision(
             action=action if chance >= LEAST_CHANCE else Action.STOP, chance=chance, again=0.0,
             lps_from_device=pose, tube=None, branch=branch,
@@ -647,6 +650,11 @@ def rest_of(arcs: Float, behind_mm: float) -> tuple[Float, float]:
             rest.append((length - done, roll if done == 0.0 else 0.0, curvature))
         behind_mm -= length
     return np.array(rest).reshape(-1, 3), turned
+
+
+def _same(arcs: Float, others: Float) -> Bool:
+    """Tell which paths `(N, A, 3)` are the same but for rounding."""
+    return np.asarray((np.abs(arcs - others) <= SAME).all(axis=(1, 2)))
 
 
 def _with_margins(system: System, share: float) -> System:

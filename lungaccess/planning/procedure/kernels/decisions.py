@@ -45,6 +45,8 @@ LOOKED_AT = 5
 """Deployments whose tubes are followed in draws from one pose, the likeliest to first order."""
 BETTER = 0.01
 """Another deployment than the best so far has to promise so much more: less is not told by the draws."""
+TIE = 1e-3
+"""Of paths whose chances differ by less, the one that is aimed again is taken: it ends in the target."""
 PLANNED, THROUGH, DIRECT = range(3)
 """What a path is made of: the planned arcs, arcs through where these would have turned, and a single arc."""
 
@@ -450,9 +452,11 @@ def choose_tubes(
                         through = path_chance(
                             scene, known, base, forward, tip, paths[THROUGH], size, target, rolls
                         )
-                        if through > needles[0] and _is_clear(scene, tip, paths[THROUGH], size, pierced):
+                        if through > needles[0] - TIE and _is_clear(
+                            scene, tip, paths[THROUGH], size, pierced
+                        ):
                             needles[0], kinds[0] = through, THROUGH
-                    if direct > needles[0]:
+                    if direct > max(needles[0] - TIE, 0.0):
                         needles[0], kinds[0] = direct, DIRECT
                 found[n, 2] = pierced
                 ranked = np.argsort(order)
@@ -561,7 +565,7 @@ def choose_needles(scene, sizes, tips, branches, targets, asides, found, chances
                 continue
             proved += 1
             chance = path_chance(scene, sizes, nowhere, nowhere, tip, path, count, target, rolls)
-            if chance > best:
+            if chance > best - TIE:
                 best, found[n, 1] = chance, count
                 arcs[n] = 0.0
                 arcs[n, :count] = path[:count]

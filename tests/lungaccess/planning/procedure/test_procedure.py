@@ -13,15 +13,15 @@ import pytest
 
 from anatomy.base.errors import FileError, SettingsError
 from anatomy.lung import Lung
-from anatomy.poses import pose
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning.procedure import Procedure, load_procedure, procedure_names, simulate_procedure
-from lungaccess.planning.procedure.policy import History, Policy
+from lungaccess.planning.procedure.choices import scope_frames
+from lungaccess.planning.procedure.policy import Policy
 from lungaccess.planning.procedure.report import NO_PATH
 from lungaccess.planning.procedure.settings import Imaging, NeedleSteering, ScopePlacing, TubesOut
 from lungaccess.planning.procedure.simulation import ORDER, SUCCESS
-from lungaccess.planning.procedure.truth import end_of, with_stop
+from lungaccess.planning.procedure.truth import ends_of, with_stop
 from lungaccess.plans.plan import Plan
 from lungaccess.uncertainty.risk import (
     MISSES,
@@ -76,10 +76,9 @@ def test_without_errors_every_procedure_succeeds(plan: Plan, small_lung: Lung) -
 
 
 def test_an_error_that_is_measured_exactly_does_no_harm(plan: Plan, small_lung: Lung) -> None:
-    """Where a path is found from the true pose, it is carried out exactly and touches nothing."""
     found = simulate_procedure(plan, small_lung, errors=SCOPE_ONLY, procedure=SEEN_EXACTLY, samples=40)
-    assert found.succeeds.count + found.ends[NO_PATH].count == 40
-    assert found.succeeds.count > 10
+    blind = simulate_procedure(plan, small_lung, errors=SCOPE_ONLY, samples=40)
+    assert found.succeeds.count >= max(blind.succeeds.count, 30)
     scope, tube = found.stages
     assert scope.replans == 40 and scope.corrected_mm > 0.3
     assert tube.corrected_mm < 1e-6
@@ -154,22 +153,16 @@ def test_every_procedure_ends_once(plan: Plan, small_lung: Lung) -> None:
 
 
 def test_a_scope_is_measured_in_the_lumen(plan: Plan, small_lung: Lung) -> None:
-    class Recorded(Policy):
-        def _from_scope(self, history: History, measured: np.ndarray) -> Plan | None:
-            seen.append(measured)
-            return None
-
-    seen: list[np.ndarray] = []
     procedure = Procedure(scope=ScopePlacing(measured=True, position_mm=5.0))
     model = ErrorModel(scope_position=PositionError(attempt_mm=5.0))
-    from lungaccess.planning.procedure import simulation
-
-    simulator = simulation.Simulator(plan, small_lung, model, procedure)
-    simulator._policy = Recorded(simulator.assessor, small_lung, model, procedure)
-    simulator.report(20, 0)
-    tips = np.array([each[:3, 3] for each in seen])
-    assert len(tips) == 20 and np.linalg.norm(tips - tips.mean(axis=0), axis=1).max() > 0.2
-    assert (small_lung.lumen_depth.lower_bound_mm(tips) > 0.0).all()
+    policy = Policy(plan, small_lung, model, procedure)
+    seen = np.tile(np.asarray(plan.scope.lps_from_scope_tip), (20, 1, 1))
+    seen[:, :3, 3] += 5.0 * np.random.default_rng(0).standard_normal((20, 3))
+    placed = policy.scopes_measured(seen)
+    tips = placed.frames[:, :3, 3]
+    assert np.linalg.norm(tips - tips.mean(axis=0), axis=1).max() > 0.2
+    for points in (tips, placed.drawn.reshape(-1, 3)):
+        assert (small_lung.lumen_depth.lower_bound_mm(points) > 0.0).all()
 
 
 # Geometry ----------------------------------------------------------------------------------------
@@ -191,7 +184,7 @@ def test_the_tubes_end_where_the_plan_has_their_tip(plan: Plan, small_lung: Lung
     there = RiskAssessor(plan, small_lung)
     exact = there.draws(1, 0).deviations(ErrorModel())
     start, pieces = deviated_starts(plan, small_lung, exact)[0], deviated_pieces(plan, exact)[0]
-    tip = end_of(pose(start[:3], start[3:6], start[6:]), pieces[: len(pieces) - there.n_arcs])
+    tip = ends_of(scope_frames(start[None]), pieces[None, : len(pieces) - there.n_arcs])[0]
     assert np.allclose(tip[:3, 3], plan.needle.lps_from_start[:3, 3], atol=1e-6)
 
 

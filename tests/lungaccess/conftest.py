@@ -53,9 +53,14 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def breathing_lung(small_phantom: Phantom, small_lung: Lung) -> Lung:
     """The lung of the small phantom with its breathing; its masks show end-inhale."""
-    source = PhantomBreathing.of(small_phantom).source(small_phantom)
-    middle_mm = float(small_lung.tree.carina_lps[0])
-    return replace(small_lung, motion=prepare_motion(source, small_lung.labels, small_lung.grid, middle_mm))
+    return breathing(small_phantom, small_lung)
+
+
+def breathing(phantom: Phantom, lung: Lung) -> Lung:
+    """Return the lung of a phantom with its breathing."""
+    source = PhantomBreathing.of(phantom).source(phantom)
+    middle_mm = float(lung.tree.carina_lps[0])
+    return replace(lung, motion=prepare_motion(source, lung.labels, lung.grid, middle_mm))
 
 
 @pytest.fixture(scope="session")

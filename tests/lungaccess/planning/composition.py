@@ -17,6 +17,7 @@ import numpy as np
 
 import lungaccess as la
 from anatomy.base.errors import SettingsError, TargetError
+from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
 from lungaccess.planning.constraints import holds
@@ -26,8 +27,8 @@ from lungaccess.problem.request import Request, StatedPlace
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, point_target
 from lungaccess.problem.task import Task
+from tests.lungaccess.conftest import breathing
 from tests.lungaccess.planning.coupled.planning import KUNTZ_TARGET
-from tests.lungaccess.planning.coupled.test_window_planner import moving
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "composition.md"
@@ -77,10 +78,10 @@ def cells() -> Iterator[Cell]:
 
 
 class Table:
-    """Runs cells on a small phantom that breathes."""
+    """Runs cells on a small lung that breathes."""
 
     def __init__(self, lung: Lung) -> None:
-        self.still, self.lung = lung, moving(lung, 0.05)
+        self.lung = lung
 
     @cache  # noqa: B019  # One table in a process.
     def case(self, name: str) -> tuple[System, la.Atlas, Target]:
@@ -137,7 +138,7 @@ class Table:
             case "two processes":
                 words["processes"] = 2
             case "kuntz2015":
-                words |= {"method": "kuntz2015", "iterations": 400}
+                words |= {"method": "kuntz2015", "iterations": 3000}
             case "several systems":
                 other = replace(system, name="another", description="the same by another name")
                 return [system, other], words
@@ -154,7 +155,7 @@ class Table:
             ratings, OPEN_LOOP=FEW, MEASURED=FEW, SCREENING=FEW, EXACT=replace(ratings.EXACT, pool=4)
         )
         try:
-            with few, mock.patch.object(finder, "BY_COST", 400 if cell.constraint == "kuntz2015" else 5):
+            with few, mock.patch.object(finder, "BY_COST", 3000 if cell.constraint == "kuntz2015" else 5):
                 found = list(ask(self.lung, systems, target, counterfactuals=False, **options, **words))
         except SettingsError as error:
             return error.found
@@ -204,9 +205,8 @@ def page(outcomes: dict[Cell, str]) -> str:
 
 def main() -> None:
     """Run all cells and write the page."""
-    from anatomy.build import build_lung
-
-    table = Table(build_lung(make_phantom(seed=3, size="small").images))
+    phantom = make_phantom(seed=3, size="small")
+    table = Table(breathing(phantom, build_lung(phantom.images)))
     outcomes = {}
     for cell in cells():
         outcomes[cell] = table.run(cell)

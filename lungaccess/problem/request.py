@@ -27,9 +27,16 @@ from lungaccess.problem.system import System, load_system, require_own_name, wit
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
 from stages.needle import OMPL_PLANNERS, TERMS, Objective, require_planner
+from lungaccess.problem.goals import SUCCESS, WINDOW, Goal, PlanFunction, goal_of
+from stages.needle import OMPL_PLANNERS, Objective, require_planner
 
 if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from anatomy.organ import Organ
     from lungaccess.planning.procedure import Procedure
+    from lungaccess.problem.system import System
+    from lungaccess.problem.target import Target
+    from lungaccess.problem.task import Task
     from lungaccess.uncertainty.risk import ErrorModel
 
 ATLAS = "atlas"
@@ -188,6 +195,8 @@ class Request:
         )  # fmt: skip
 
     def __post_init__(self) -> None:
+        from lungaccess.problem.system import require_own_name
+
         for system in self.systems:
             require_own_name(system)
         if self.needle_planner:
@@ -252,6 +261,8 @@ class Request:
         TargetError
             If the target lies outside the lung or inside an obstacle.
         """
+        from lungaccess.problem.task import Task, objective_of
+
         named = self.goal.name if self.counts else WINDOW.name if self.is_for_window else self.method
         return Task(
             lung=self.lung, system=self.system, target=self.target,
@@ -306,6 +317,8 @@ def goal_of(stated: str | Goal | Objective | PlanFunction, lung: Organ | None = 
         name = getattr(stated, "__name__", "function")
         name = name if name.isidentifier() else "function"
         return Goal(name=name, words=name.replace("_", " "), of=stated)
+    from lungaccess.problem.task import objective_of
+
     try:
         weighed = Objective.of(stated) if lung is None else objective_of(lung, stated)
     except SettingsError as error:
@@ -322,6 +335,9 @@ def systems_of(
     least_clearance_mm: float = 0.0,
 ) -> tuple[System, ...]:
     """Return the systems that are stated, the least invasive first; see `Request.of`."""
+    from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
+    from lungaccess.problem.system import System, load_system, with_fissure_rule
+
     if stated == AUTO:
         found = presets_by_invasiveness(fissures_allowed=fissures_allowed)
     else:
@@ -358,6 +374,8 @@ def with_least_clearance(system: System, least_clearance_mm: float) -> System:
 
 def require_phases(first: float, last: float) -> tuple[float, float]:
     """Return two phases, or raise SettingsError unless they are two of 0 to 1 in order."""
+    from anatomy.motion.motion import require_phase
+
     if not require_phase(first) < require_phase(last):
         raise SettingsError(
             f"The phases are {first:g} to {last:g}",

@@ -153,8 +153,10 @@ def test_tubes_alone_cost_what_they_cost(small_lung: Lung, atlas: la.Atlas) -> N
     made = la.build_atlas(small_lung, system, rotations=12, stop_spacing_mm=4.0)
     found: list[Any] = []
     for entry in np.linspace(0, made.deployments.count - 1, 12).astype(int):
-        place = la.resolve_target(small_lung, f"lps:{','.join(map(str, made.deployments.positions[entry]))}")
         try:
+            place = la.resolve_target(
+                small_lung, f"lps:{','.join(map(str, made.deployments.positions[entry]))}"
+            )
             *_, plan = la.plan(
                 small_lung, system, place, objective="tissue", atlas=made, iterations=5, counterfactuals=False
             )

@@ -18,17 +18,8 @@ from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Float
 from anatomy.base.words import did_you_mean
-from anatomy.lung import Lung
-from anatomy.motion.motion import require_phase
-from anatomy.organ import Organ
 from lungaccess.problem.goals import REGISTERED, SUCCESS, WINDOW, Goal, PlanFunction, goals
-from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
-from lungaccess.problem.system import System, load_system, require_own_name, with_fissure_rule
-from lungaccess.problem.target import Target
-from lungaccess.problem.task import Task, objective_of
 from stages.needle import OMPL_PLANNERS, TERMS, Objective, require_planner
-from lungaccess.problem.goals import SUCCESS, WINDOW, Goal, PlanFunction, goal_of
-from stages.needle import OMPL_PLANNERS, Objective, require_planner
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung

@@ -21,8 +21,9 @@ DRIFT_RAD = math.radians(0.1)
 """Standard deviation of what the direction drifts in 1 mm beside all that is modelled [assumption]."""
 WANDER = 0.05
 """Share of the factor's own uncertainty by which it changes in 1 mm, as tissue differs [assumption]."""
-LEAST = 1e-9
+LEAST = 1e-5
 """A measurement is taken to be no better than this, mm or rad, so that exact ones can be weighed as well."""
+_TINY = 1e-9
 FACTORS = (0.25, 4.0)
 """Factors beyond these are not believed: a needle that goes straight has no curvature to steer by."""
 PLACE, TURN, BEND = slice(0, 3), slice(3, 6), 6
@@ -129,7 +130,7 @@ class Belief:
     def correct(self, seen: Float, target: Float | None = None) -> None:
         """Take a measured pose into account, whose roll says nothing, and a target if it is seen."""
         then = max(self._at_mm[-1] - self._latency_mm, 0.0)
-        row = int(np.searchsorted(self._at_mm, then + LEAST, side="right")) - 1
+        row = int(np.searchsorted(self._at_mm, then + _TINY, side="right")) - 1
         seen = seen @ np.linalg.inv(self._reckoned[row]) @ self._reckoned[-1]
         axes, ahead = self.frame[:3, :2].T, self.frame[:3, 2]
         looks = np.zeros((5, 7))
@@ -139,7 +140,9 @@ class Belief:
         noise = np.diag(np.maximum(sizes, LEAST) ** 2)
         seen_with = looks @ self._covariance
         gain = np.linalg.solve(seen_with @ looks.T + noise, seen_with).T
-        self._covariance = self._covariance - gain @ seen_with
+        # In this form rounding makes no variance negative, however exact a measurement is.
+        left = np.eye(7) - gain @ looks
+        self._covariance = left @ self._covariance @ left.T + gain @ noise @ gain.T
         self._step(gain @ gap)
         if target is not None:
             share = self._target_variance / max(
@@ -174,7 +177,7 @@ class Belief:
     def _step(self, step: Float) -> None:
         """Change what is believed by what a measurement says."""
         angle = float(np.linalg.norm(step[TURN]))
-        x, y, z = (step[TURN] / max(angle, LEAST)).tolist()
+        x, y, z = (step[TURN] / max(angle, _TINY)).tolist()
         across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         turn = np.eye(3) + math.sin(angle) * across + (1.0 - math.cos(angle)) * across @ across
         self.lag_rad += float(step[TURN] @ self.frame[:3, 2])

@@ -124,6 +124,20 @@ def test_a_bevel_that_lags_is_seen_and_turned_back() -> None:
     assert belief.lag_rad == pytest.approx(0.5, abs=0.1)
 
 
+def test_an_exact_measurement_is_taken_as_it_is_wherever_the_needle_began() -> None:
+    moved = np.array(BESIDE @ tilt(0.1, 0.4))
+    moved[:3, 3] += [1.0, -2.0, 0.5]
+    start = np.diag([4.0, 4.0, 4.0, 0.01, 0.01, 0.01])
+    start[0, 4] = start[4, 0] = 0.2
+    belief = Belief(query(BESIDE), Unknown(start=start, factor_ln=0.4))
+    for _ in range(3):
+        belief.insert(3.0, KAPPA)
+        moved = moved @ arc_transform(3.0, 0.0, KAPPA)
+        belief.correct(moved)
+        assert np.allclose(belief.frame[:3, 3], moved[:3, 3], atol=1e-6)
+        assert np.linalg.norm(belief.frame[:3, 2] - moved[:3, 2]) < 2e-4
+
+
 def test_a_needle_that_goes_straight_is_not_divided_by_nothing() -> None:
     _needle, belief, miss = inserted(Bent(0.0, 1), known())
     assert FACTORS[0] <= belief.factor < 0.6 and math.isfinite(miss)

@@ -24,11 +24,11 @@ from stages.needle import OMPL_PLANNERS, TERMS, Objective, require_planner
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.organ import Organ
-    from lungaccess.planning.procedure import Procedure
+    from lungaccess.problem.errors import ErrorModel
+    from lungaccess.problem.procedures import Procedure
     from lungaccess.problem.system import System
     from lungaccess.problem.target import Target
     from lungaccess.problem.task import Task
-    from lungaccess.uncertainty.risk import ErrorModel
 
 ATLAS = "atlas"
 """The method of whoever states none: the search over all that scope and tubes can do."""

@@ -135,12 +135,12 @@ def _text_targets() -> dict[str, Target]:
     from anatomy.io.own_masks import _read_description, thick_slices_mm
     from anatomy.segmentation.nodules import nodule_from_contours
     from lungaccess.planning.one_stage.tubes import load_tubes
-    from lungaccess.planning.procedure.settings import load_procedure
     from lungaccess.planning.tour import read_lesions
     from lungaccess.plans.plan import Plan
+    from lungaccess.problem.error_files import load_errors
+    from lungaccess.problem.procedures import load_procedure
     from lungaccess.problem.system import load_system
     from lungaccess.running.study.settings import read_study
-    from lungaccess.uncertainty.risk.error_files import load_errors
     from tests.lungaccess.conftest import make_plan
 
     def preset(folder: Path) -> None:

@@ -9,10 +9,10 @@ import pytest
 
 from lungaccess.judging.checking import CheckReport, Finding
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.system import System
 from lungaccess.uncertainty.risk.assessment import RiskReport
-from lungaccess.uncertainty.risk.error_files import load_errors
-from lungaccess.uncertainty.risk.errors import ErrorModel
 from lungaccess.uncertainty.risk.statistics import Share
 
 TOUCHES = ("vessel", "pleura", "airway", "stays in the airway")

@@ -15,9 +15,9 @@ from anatomy.base.typed import Bool, Float
 from anatomy.lung import Lung
 from lungaccess.planning.procedure.kernels.decisions import Choices
 from lungaccess.planning.procedure.residuals import Residuals
-from lungaccess.planning.procedure.settings import Procedure
 from lungaccess.planning.procedure.spread import Spread
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.procedures import Procedure
 from lungaccess.problem.system import System
 from lungaccess.uncertainty.risk import Deviations, ErrorModel
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_deviations, tubes_alone

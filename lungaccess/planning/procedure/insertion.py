@@ -14,7 +14,6 @@ from anatomy.base.records import frozen_record
 from anatomy.base.settings import to_mapping
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from lungaccess.planning.procedure.settings import NeedleSteering
 from lungaccess.planning.procedure.truth import (
     ARCS,
     Attempt,
@@ -25,6 +24,7 @@ from lungaccess.planning.procedure.truth import (
 )
 from lungaccess.plans import curves
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.procedures import NeedleSteering
 from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, Share, load_errors
 from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import Deviations

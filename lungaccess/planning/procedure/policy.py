@@ -41,20 +41,20 @@ from lungaccess.planning.procedure.fusion import (
 from lungaccess.planning.procedure.kernels import decisions as kernel
 from lungaccess.planning.procedure.kernels.spread import Sizes
 from lungaccess.planning.procedure.residuals import Residuals
-from lungaccess.planning.procedure.settings import Procedure, load_procedure
 from lungaccess.planning.procedure.spread import ASIDE, around, bend_per_mm, sizes
 from lungaccess.plans.assemble import needle_part, tube_part
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.errors import BREATHING
+from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, load_errors
 from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import deviated_starts, judging
-from lungaccess.uncertainty.risk.errors import BREATHING
 from stages.needle import ArcPath, Limits, NeedleEnvironment, Objective, Obstacles, needle_environment
 from stages.tube import tube_constants, tube_environment
 

@@ -14,9 +14,9 @@ from anatomy.base.settings import parse, to_mapping
 from anatomy.lung import Lung
 from lungaccess.planning.procedure.decision import Decision, Measurements
 from lungaccess.planning.procedure.policy import Policy
-from lungaccess.planning.procedure.settings import Procedure
 from lungaccess.plans.file import to_json
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.procedures import Procedure
 from lungaccess.uncertainty.risk import ErrorModel
 
 

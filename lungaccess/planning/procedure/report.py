@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from anatomy.base.records import frozen_value
-from lungaccess.planning.procedure.settings import Procedure
+from lungaccess.problem.procedures import Procedure
 from lungaccess.uncertainty.risk import ErrorModel, Share
 
 NO_PATH = "no path left"

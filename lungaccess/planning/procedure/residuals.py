@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from anatomy.base.records import frozen_record
-from lungaccess.planning.procedure.settings import Procedure
-from lungaccess.uncertainty.risk.errors import BREATHING, CURVATURE, ErrorModel
+from lungaccess.problem.errors import BREATHING, CURVATURE, ErrorModel
+from lungaccess.problem.procedures import Procedure
 
 
 @frozen_record

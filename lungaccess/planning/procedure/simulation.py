@@ -19,7 +19,6 @@ from lungaccess.planning.procedure.choices import scope_frames
 from lungaccess.planning.procedure.fusion import as_measured
 from lungaccess.planning.procedure.policy import Chosen, Policy
 from lungaccess.planning.procedure.report import NO_PATH, ProcedureReport, StageReport
-from lungaccess.planning.procedure.settings import Procedure, load_procedure
 from lungaccess.planning.procedure.steering import steered
 from lungaccess.planning.procedure.truth import (
     ARCS,
@@ -31,6 +30,7 @@ from lungaccess.planning.procedure.truth import (
     turned_about,
 )
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.uncertainty.risk import MISSES, Deviations, ErrorModel, Share, load_errors
 from lungaccess.uncertainty.risk.assessment import MISS_QUANTILES
 from lungaccess.uncertainty.risk.deviations import deviated_starts

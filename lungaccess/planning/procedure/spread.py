@@ -16,10 +16,10 @@ from anatomy.lung import Lung
 from anatomy.motion.population import share_of_motion
 from lungaccess.planning.procedure.kernels import spread as kernel
 from lungaccess.planning.procedure.residuals import Residuals
-from lungaccess.planning.procedure.settings import Procedure
+from lungaccess.problem.errors import CURVATURE, ErrorModel
+from lungaccess.problem.procedures import Procedure
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
-from lungaccess.uncertainty.risk.errors import CURVATURE, ErrorModel
 from stages.tube import Deployments
 
 ASIDE = 0.6

@@ -7,12 +7,8 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.uncertainty.risk.assessment import MISSES, RiskReport, assess, rare_touch, safest
-    from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
-    from lungaccess.uncertainty.risk.deviations import Deviations
-    from lungaccess.uncertainty.risk.draws import Draws
-    from lungaccess.uncertainty.risk.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
-    from lungaccess.uncertainty.risk.errors import (
+    from lungaccess.problem.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
+    from lungaccess.problem.errors import (
         CURVATURE,
         UNITS,
         AngleError,
@@ -23,6 +19,10 @@ if TYPE_CHECKING:
         PositionError,
         with_known,
     )
+    from lungaccess.uncertainty.risk.assessment import MISSES, RiskReport, assess, rare_touch, safest
+    from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
+    from lungaccess.uncertainty.risk.deviations import Deviations
+    from lungaccess.uncertainty.risk.draws import Draws
     from lungaccess.uncertainty.risk.rare import RareShare, rare_share
     from lungaccess.uncertainty.risk.sensitivity import Sensitivity, sensitivities
     from lungaccess.uncertainty.risk.start_bodies import proved_body, tried_body

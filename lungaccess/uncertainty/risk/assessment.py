@@ -11,10 +11,10 @@ import numpy as np
 from anatomy.base.records import frozen_value
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
-from lungaccess.uncertainty.risk.error_files import load_errors
-from lungaccess.uncertainty.risk.errors import ErrorModel
 from lungaccess.uncertainty.risk.rare import RARE, Luck, RareShare, rare_share
 from lungaccess.uncertainty.risk.sensitivity import Sensitivity, sensitivities
 from lungaccess.uncertainty.risk.statistics import Share, share_of

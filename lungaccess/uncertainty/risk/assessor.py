@@ -17,10 +17,10 @@ from anatomy.morphology import components
 from anatomy.motion.population import share_of_motion
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.breathing import PatientMotion
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations
 from lungaccess.uncertainty.risk.draws import Draws
-from lungaccess.uncertainty.risk.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_successes, follow_chains

@@ -19,8 +19,8 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.motion import LEFT, Motion
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.errors import IN_WINDOW, BreathingError, ErrorModel
 from lungaccess.uncertainty.breathing.window import carrier
-from lungaccess.uncertainty.risk.errors import IN_WINDOW, BreathingError, ErrorModel
 
 EXHALE_POWER = 6
 """The phase in time is cos^6, the form that [Lujan1999] fits to quiet breathing: long at end-exhale."""

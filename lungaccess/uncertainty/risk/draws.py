@@ -8,9 +8,9 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Float
+from lungaccess.problem.errors import BOUNDED, BREATHING, CURVATURE, IN_WINDOW, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.breathing import PatientMotion, phase
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, no_deviations
-from lungaccess.uncertainty.risk.errors import BOUNDED, BREATHING, CURVATURE, IN_WINDOW, UNITS, ErrorModel
 
 PATIENT, ATTEMPT = 0, 1
 """Levels at which errors are drawn."""

@@ -18,8 +18,8 @@ import numpy as np
 
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Bool, Float
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.uncertainty.risk.draws import Draws
-from lungaccess.uncertainty.risk.errors import ErrorModel
 from lungaccess.uncertainty.risk.statistics import Z_95
 
 RARE = 1e-3

@@ -8,9 +8,9 @@ import numpy as np
 
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
+from lungaccess.problem.errors import BREATHING, CURVATURE, ErrorModel
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
-from lungaccess.uncertainty.risk.errors import BREATHING, CURVATURE, ErrorModel
 from lungaccess.uncertainty.risk.statistics import Share, share_of
 
 _SECOND = 1
@@ -24,7 +24,7 @@ class Sensitivity:
     Parameters
     ----------
     kind : str
-        See `lungaccess.uncertainty.risk.errors.UNITS`.
+        See `lungaccess.problem.errors.UNITS`.
     alone : Share
         Successes with errors of this kind only.
     first_order : float

@@ -13,12 +13,12 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import BREATHING, CURVATURE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
 from lungaccess.uncertainty.risk.draws import Draws
-from lungaccess.uncertainty.risk.error_files import load_errors
-from lungaccess.uncertainty.risk.errors import BREATHING, CURVATURE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.statistics import Share
 
 DEFAULT_PROBABILITY = 0.95
@@ -44,10 +44,10 @@ class Tolerance:
     Parameters
     ----------
     kind, unit : str
-        See `lungaccess.uncertainty.risk.errors.UNITS`.
+        See `lungaccess.problem.errors.UNITS`.
     stated : float
         The size in the error model, of patient and attempt together; see
-        `lungaccess.uncertainty.risk.errors.Term`.
+        `lungaccess.problem.errors.Term`.
     largest : float
         The largest size at which successes are that probable, at most `LARGEST`; 0 if none was found.
     margin : (float, float)

@@ -20,9 +20,9 @@ from lungaccess.planning.one_stage import ScopeReplanner
 from lungaccess.planning.procedure import Procedure, Simulator, load_procedure
 from lungaccess.planning.procedure.fusion import as_measured, fused, fused_share, scope_moves, tip_moves
 from lungaccess.planning.procedure.residuals import Residuals, fused_size
-from lungaccess.planning.procedure.settings import ScopePlacing
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.procedures import ScopePlacing
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.uncertainty.risk import load_errors

@@ -19,10 +19,10 @@ from lungaccess.planning.procedure import Procedure, load_procedure, procedure_n
 from lungaccess.planning.procedure.choices import scope_frames
 from lungaccess.planning.procedure.policy import Policy
 from lungaccess.planning.procedure.report import NO_PATH
-from lungaccess.planning.procedure.settings import Imaging, NeedleSteering, ScopePlacing, TubesOut
 from lungaccess.planning.procedure.simulation import ORDER, SUCCESS
 from lungaccess.planning.procedure.truth import ends_of, with_stop
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.procedures import Imaging, NeedleSteering, ScopePlacing, TubesOut
 from lungaccess.uncertainty.risk import (
     MISSES,
     AngleError,

@@ -18,6 +18,8 @@ from anatomy.base.errors import FileError, SettingsError
 from anatomy.base.settings import parse, to_mapping
 from anatomy.lung import Lung
 from anatomy.motion.population import share_of_motion
+from lungaccess.problem.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
+from lungaccess.problem.errors import BREATHING
 from lungaccess.uncertainty.risk import (
     UNITS,
     AngleError,
@@ -29,8 +31,6 @@ from lungaccess.uncertainty.risk import (
 from lungaccess.uncertainty.risk.breathing import phase
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
 from lungaccess.uncertainty.risk.draws import Draws
-from lungaccess.uncertainty.risk.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
-from lungaccess.uncertainty.risk.errors import BREATHING
 
 PAGE = Path(__file__).parents[4] / "docs/reference/errors.md"
 MODELS = st.sampled_from([load_errors(name) for name in error_preset_names()])

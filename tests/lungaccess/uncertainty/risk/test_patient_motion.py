@@ -13,10 +13,10 @@ from anatomy.base.errors import SettingsError
 from anatomy.grid import Grid
 from anatomy.motion.motion import Motion
 from lungaccess.judging.checking.breath import Breath
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import IN_WINDOW, ErrorModel
 from lungaccess.uncertainty.risk.breathing import BREATHS_LN, PatientMotion, model_for, phase
 from lungaccess.uncertainty.risk.draws import Draws
-from lungaccess.uncertainty.risk.error_files import load_errors
-from lungaccess.uncertainty.risk.errors import IN_WINDOW, ErrorModel
 
 TARGET, TIP = np.array([20.0, 5.0, -30.0]), np.array([3.0, -4.0, 12.0])
 WINDOW = np.array([[0.1, 0.3], [0.6, 0.65]])

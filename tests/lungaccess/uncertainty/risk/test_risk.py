@@ -23,12 +23,8 @@ from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk.assessment import assess, safest
-from lungaccess.uncertainty.risk.assessor import RiskAssessor
-from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
-from lungaccess.uncertainty.risk.draws import Draws
-from lungaccess.uncertainty.risk.error_files import load_errors
-from lungaccess.uncertainty.risk.errors import (
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import (
     BREATHING,
     CURVATURE,
     UNITS,
@@ -38,6 +34,10 @@ from lungaccess.uncertainty.risk.errors import (
     Place,
     PositionError,
 )
+from lungaccess.uncertainty.risk.assessment import assess, safest
+from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
+from lungaccess.uncertainty.risk.draws import Draws
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
 from lungaccess.uncertainty.risk.statistics import Share

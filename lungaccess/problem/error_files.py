@@ -9,8 +9,8 @@ from typing import Any
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.settings import parse, to_mapping
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.preset_files import PresetFiles
-from lungaccess.uncertainty.risk.errors import ErrorModel
 
 DEFAULT_ERRORS = "breath-hold"
 """Images for planning are taken in breath hold, and so is the procedure that repeats it."""

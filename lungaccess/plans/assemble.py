@@ -112,10 +112,13 @@ def stated_costs(
 ) -> dict[str, float]:
     """Return the costs of a path beyond a deployment, or of its tubes, as a plan states them.
 
-    Without a deployment they are those of a needle alone, from tubes of which nothing is known.
+    Without a deployment they are those of a needle alone, from tubes of which nothing is known.  The cost of
+    all in tissue is stated where the objective weighs it.
     """
     wall_mm = 0.0 if deployment is None else wall_in_path_mm(task.system, deployment)
-    if deployment is not None:
+    if task.objective.tissue == 0.0:
+        parts = None
+    elif deployment is not None:
         parts = parts_in_tissue(task.system, lps_from_scope_tip, deployment, path)
     else:
         parts = [InTissue(path, task.system.require_needle("A path of the needle alone").diameter_mm)]

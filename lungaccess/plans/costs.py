@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from anatomy.base.typed import Float
@@ -57,12 +56,10 @@ def path_costs(
 ) -> dict[str, float]:
     """Return every cost of a path by its key; see `path_cost`.
 
-    A cost of all in tissue is left out where nothing is said of that, and where it is infinite: tubes may
-    cross voxels that the map forbids to the needle.
+    A cost of all in tissue is left out where nothing is said of that.
     """
-    found = _costs(lung, path, TERMS, with_fissures, wall_mm, parts)
-    unknown = {term.key for term in TERMS if term.of_all and (parts is None or found[term.key] == math.inf)}
-    return {key: cost for key, cost in found.items() if key not in unknown}
+    terms = [term for term in TERMS if parts is not None or not term.of_all]
+    return _costs(lung, path, terms, with_fissures, wall_mm, parts)
 
 
 def _costs(

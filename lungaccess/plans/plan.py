@@ -65,8 +65,8 @@ class Plan(Record):
         may be left out.
     costs : mapping of str to float
         By the keys of `stages.needle.TERMS`: of the needle, or without one of the tubes beyond the lumen
-        (costs of the map: beyond the wall); "tissue" of both; and the cost under the objective where that is
-        a weighted sum.  A plan of an earlier version may lack "voxel_sum" and "tissue".
+        (costs of the map: beyond the wall); "tissue" of both, where the objective weighs it; and the cost
+        under the objective where that is a weighted sum.  A plan of an earlier version may lack "voxel_sum".
     kernels : str
         What the planner's machine code was compiled from: `lungaccess.plans.version.software_kernels`; "" in
         a plan that was not planned, or of an earlier version.

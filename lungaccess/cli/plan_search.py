@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from lungaccess.planning import ProgressEvent
     from lungaccess.planning.coupled import Atlas
     from lungaccess.plans.plan import Plan
+    from lungaccess.problem.errors import ErrorModel
     from lungaccess.problem.goals import Goal
+    from lungaccess.problem.procedures import Procedure
     from lungaccess.problem.request import Request
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget
@@ -162,9 +164,7 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     display = SearchDisplay(limits.time_s, limits.iterations, goal.words)
     best, history = run_search(request, job, display)
     # After the search: the first plan does not wait for these.
-    from lungaccess.judging.advice import advise
     from lungaccess.judging.appraisal import appraise, plan_record
-    from lungaccess.problem.preset_order import presets_by_invasiveness
     from lungaccess.uncertainty.breathing.window import with_window
 
     found = best if best.window is not None else with_window(best, lung)
@@ -180,10 +180,7 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
             target_lps=request.target.lps_mm,
         )
     with progress("looking for what would help"):
-        advice = advise(
-            found, lung, appraisal, errors=request.errors, procedure=request.procedure,
-            atlas_of=partial(kept_atlas, lung, job.output.cache), systems=presets_by_invasiveness(),
-        )  # fmt: skip
+        advice = advised(found, lung, request.errors, request.procedure, job.output.cache, appraisal)
     record = plan_record(found, lung, appraisal, job.out, job.files, [each.to_mapping() for each in advice])
     write_text(job.out / SUMMARY_FILE, terminal.json_text(record))
     if not job.output.json:
@@ -194,6 +191,26 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     else:
         terminal.say(f"Written to {job.out}: {', '.join(job.files)}")
     return ExitCode.of(appraisal.accepted)
+
+
+def advised(
+    plan: Plan,
+    lung: Lung,
+    errors: ErrorModel | None,
+    procedure: Procedure | None,
+    cache: Path | None,
+    appraisal: Appraisal | None = None,
+) -> tuple[Advice, ...]:
+    """Return what would lift the chance of a plan, with the presets whose atlases the cache holds."""
+    from lungaccess.judging.advice import advise
+    from lungaccess.judging.appraisal import appraise
+    from lungaccess.problem.preset_order import presets_by_invasiveness
+
+    known = appraisal or appraise(plan, lung, errors=errors, procedure=procedure)
+    return advise(
+        plan, lung, known, errors=errors, procedure=procedure, atlas_of=partial(kept_atlas, lung, cache),
+        systems=presets_by_invasiveness(),
+    )  # fmt: skip
 
 
 def kept_atlas(lung: Lung, cache: Path | None, system: System) -> Atlas | None:

@@ -11,6 +11,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import Appraisal
+from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.judging.checking import Checker
 from lungaccess.planning import run
 from lungaccess.planning.coupled import Atlas
@@ -69,6 +70,11 @@ class Advice:
     words: str
     success: Share
     options: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """The advice as a sentence."""
+        return f"With {self.words}: {of_hundred(self.success.value)} of 100."
 
     def to_mapping(self) -> dict[str, object]:
         """Return plain JSON values."""

@@ -59,6 +59,7 @@ def report(
 
     A plan that states its chance of success shows that, unless errors, procedure, samples or seed are given.
     """
+    from lungaccess.cli.plan_search import advised
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.report.html import PageOptions, bronchoscopy_webp, plan_page
     from lungaccess.showing.report.html.volumes import find_ct, read_ct
@@ -81,6 +82,7 @@ def report(
             risk_samples=samples,
             risk_seed=seed,
             instructions=instructions,
+            advice=advised(stored, lung, model, followed, output.cache),
         )
         plan_page(stored, lung, page, options)
         if movie is not None:

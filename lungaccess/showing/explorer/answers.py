@@ -18,7 +18,8 @@ from lungaccess.planning.coupled import Atlas, atlas_is_kept, feasible_exits, op
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
-from lungaccess.problem.request import Request
+from lungaccess.problem.goals import Goal
+from lungaccess.problem.request import Request, goal_of
 from lungaccess.showing.explorer import questions as ask
 from lungaccess.showing.explorer.changed_system import ChosenPlace, plan_command, system_of
 from lungaccess.showing.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
@@ -30,6 +31,8 @@ from stages.tube import exit_points, shapes_digest
 
 KEPT_ATLASES = 3
 """In memory; others come from the cache within a second."""
+ADVICE_S = 3.0
+"""Seconds for what would lift the chance of success."""
 TELL_EVERY_S = 0.25
 """Exits and plans that become better are sent so often: more often, nobody sees the difference."""
 
@@ -178,7 +181,7 @@ class Answers:
         atlas = self._atlas(system, turn)
         place = _place_of(atlas, question)
         request = Request.of(
-            self.lung, system, target, goal=question.objective, seed=question.seed,
+            self.lung, system, target, goal=question.goal, seed=question.seed,
             iterations=question.iterations, place=None if place is None else place.stated,
         )  # fmt: skip
         began = time.monotonic()
@@ -223,7 +226,8 @@ class Answers:
         own = {each.name: path for path, each in self._source.own}
         message = {
             "answer": "plan", "final": final, "digest": found.digest, "curve": curve,
-            "cost": float(found.cost), "iterations": found.iterations, "system": system.name,
+            "cost": float(found.cost), "goal": _goal_words(goal_of(question.goal, self.lung), found),
+            "iterations": found.iterations, "system": system.name,
             "objective": found.objective, "generation": found.scope.generation,
             "needle_mm": None if found.needle is None else found.needle.length_mm,
             "arcs": 0 if found.needle is None else len(found.needle.arcs), "insertions": found.insertions,
@@ -252,6 +256,7 @@ class Answers:
         yield from reach_parts(self.lung, system, atlas, asked.question.around, self._reached, turn)
 
     def _appraise(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        from lungaccess.judging.advice import advise
         from lungaccess.judging.appraisal import Appraiser
 
         found = self._plan_asked(asked)
@@ -265,6 +270,7 @@ class Answers:
                 "answer": "appraisal", "digest": found.digest, **appraisal.to_mapping(),
                 "window": window or motion, "breathing_known": window is not None,
                 "findings": len(appraisal.check.findings), "refusals": len(appraisal.check.refusals),
+                "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=ADVICE_S)],
             }
         )  # fmt: skip
 
@@ -328,6 +334,13 @@ def _tip(atlas: Atlas, tip: int) -> Float:
 def _require_below(number: int, count: int, what: str) -> None:
     if number >= count:
         raise SettingsError(f"There is no {what} {number}", expected=f"a number below {count}")
+
+
+def _goal_words(goal: Goal, found: Plan) -> dict[str, str]:
+    """Return what a plan was made good at, and how good it is, in words."""
+    value = goal.value(found)
+    text = "not known yet" if value is None else f"{value:.4g}"
+    return {"words": goal.words_with_unit, "value": text, "loss_words": goal.loss_words}
 
 
 def _why(failure: LungaccessError) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from anatomy.base.records import frozen_value
 from lungaccess.planning import TIP_WITHIN_MM
 from lungaccess.planning.coupled.exits import PLACE_MM
 from lungaccess.problem import System, load_system, shipped_names
+from lungaccess.problem.goals import SUCCESS
 from lungaccess.problem.request import StatedPlace
 from lungaccess.showing.explorer.questions import PlanQuestion, WhatIf
 
@@ -124,8 +125,8 @@ def plan_command(
     target = ["--nodule", number] if kind == "nodule" else ["--target", question.target]
     through = [] if place is None else place.words
     words = ["lungaccess", "plan", str(patient), *target, *through, "--system", *device]
-    if question.objective != "default":
-        words += ["--objective", question.objective]
+    if question.goal != SUCCESS.name:
+        words += ["--goal", question.goal]
     words += ["--iterations", str(question.iterations), "--seed", str(question.seed)]
     if cache is not None:
         words += ["--cache", str(cache)]

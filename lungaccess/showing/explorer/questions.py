@@ -9,6 +9,7 @@ from pydantic import Field
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.settings import parse, quantity, settings, text
+from lungaccess.problem.goals import SUCCESS
 
 MOST_CHARACTERS = 20_000
 """A message of the page is shorter by far."""
@@ -139,8 +140,8 @@ class PlanQuestion(_Question):
 
     target: Annotated[str, Len(1, 200)]
     what_if: WhatIf = WhatIf()
-    objective: Annotated[str, Len(1, 200)] = "default"
-    iterations: Annotated[int, Field(strict=True, ge=0, le=MOST_ITERATIONS)] = 1000
+    goal: Annotated[str, Len(1, 200)] = SUCCESS.name
+    iterations: Annotated[int, Field(strict=True, ge=0, le=MOST_ITERATIONS)] = 20
     seed: Number = 0
     scope_tip: Number | None = None
     entry: Number | None = None

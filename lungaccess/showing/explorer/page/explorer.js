@@ -272,7 +272,7 @@ class ExplorerPage extends DevicePage {
     this.showPlan();
     if (first && this.orbit) this.lookAtPlan();
     if (!plan.final) return;
-    this.say(`Plan with cost ${plan.cost.toPrecision(4)} after ${this.state.asked.iterations} iterations.`);
+    this.say(`Plan with ${plan.goal.words} ${plan.goal.value} after ${this.state.asked.iterations} iterations.`);
     if (!plan.appraisal) await this.appraise(plan);
     else this.planPanel.appraised(plan);
   }

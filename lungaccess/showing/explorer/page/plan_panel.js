@@ -59,7 +59,7 @@ export class PlanPanel {
       ["system", plan.system], ["scope", `to generation ${plan.generation}`], ["tubes", plan.insertions],
       ["needle", plan.needle_mm === null ? "none" : `${mm(plan.needle_mm)} in ${plan.arcs} ${plan.arcs === 1 ? "arc" : "arcs"}`],
       ["least clearance", least ? `${least.device} to ${least.name === "outside" ? "pleura" : least.name}: ${mm(least.value, 2)}` : "5 mm or more"],
-      ["cost", `${plan.cost.toPrecision(4)} (${plan.objective.replaceAll("_", " ")})`],
+      [plan.goal.words, plan.goal.value],
       ["found at", `iteration ${plan.iterations}`],
     ]);
     byId("window-words").textContent = "";
@@ -71,22 +71,20 @@ export class PlanPanel {
       `The plan is the same, byte for byte but for its times.${plan.command.includes("system.toml") ? " Export system.toml first." : ""}`;
   }
 
-  drawCurve({ curve }) {
+  drawCurve({ curve, goal }) {
+    if ((byId("curve").hidden = !curve.length)) return;
     const xs = curve.map(([seconds]) => 1000 * seconds), ys = curve.map(([, , cost]) => cost);
-    if (xs.length === 1) {
-      xs.push(xs[0] + 1);
-      ys.push(ys[0]);
-    }
+    if (xs.length === 1) [xs[1], ys[1]] = [xs[0] + 1, ys[0]];
     lineChart(byId("curve"), {
-      x: { name: "ms" }, y: { name: "cost", from: 0.9 * Math.min(...ys) },
-      series: [{ name: "best cost", colour: "#3A9BD5", xs, ys, stairs: true }],
+      x: { name: "ms" }, y: { name: goal.loss_words, from: 0.9 * Math.min(...ys) },
+      series: [{ name: "best so far", colour: "#3A9BD5", xs, ys, stairs: true }],
       top: Math.max(...ys) * 1.02,
     });
   }
 
   appraised(plan) {
-    const { headline, limits, window: words } = plan.appraisal;
-    this.say(headline.text, headline.grade);
+    const { headline, limits, window: words, advice } = plan.appraisal;
+    this.say([headline.text, ...advice].join(" "), headline.grade);
     byId("window-words").textContent = words;
     byId("limits-box").hidden = false;
     fillRows(byId("limits"), limits.slice(0, MOST_LIMITS).map(({ what, value, bound, side, unit, ok }) => [

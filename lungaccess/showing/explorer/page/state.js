@@ -3,7 +3,7 @@
 // What a plan follows from; numbers are null where the system's own value holds.
 const NUMBERS = { scope: "scope_diameter_mm", radius: "needle_radius_mm", length: "needle_length_mm", margin: "margin_mm" };
 const START = {
-  target: "", system: "", scope: null, radius: null, length: null, margin: null, fissures: null, iterations: 1000, seed: 0,
+  target: "", system: "", scope: null, radius: null, length: null, margin: null, fissures: null, iterations: 20, seed: 0,
   tip: null, exit: null,
 };
 export const MOST_COMPARED = 5;

@@ -13,6 +13,7 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.words import plural
+from lungaccess.judging.advice import Advice
 from lungaccess.judging.appraisal import Appraiser
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
 from lungaccess.judging.appraisal.headline import Geometry, of_hundred
@@ -67,6 +68,8 @@ class PageOptions:
         are None, a plan that states its chance shows that, and its alternatives are estimated as it was.
     instructions : bool
         Whether the steps that bring the scope to its place are listed.
+    advice : sequence of Advice
+        What would lift the chance of success, see `lungaccess.judging.advice.advise`.
     """
 
     alternatives: Sequence[Plan] = ()
@@ -78,6 +81,7 @@ class PageOptions:
     risk_samples: int | None = None
     risk_seed: int | None = None
     instructions: bool = True
+    advice: Sequence[Advice] = ()
 
 
 def plan_page(
@@ -114,7 +118,7 @@ def plan_page(
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
         "glance": glance_section(first),
-        "headline": words.headline(first.headline),
+        "headline": words.headline(first.headline) + words.advice(chosen.advice),
         "breathing": phase.window_headline(plan, lung, first.accepted),
         "phase_player": phase.player(window, first.accepted),
         "phase_chart": phase.chart(window),

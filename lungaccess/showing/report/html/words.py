@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from lungaccess.judging.advice import Advice
     from lungaccess.judging.appraisal import Grade, Headline
 
 Cell = str
@@ -78,6 +80,14 @@ def headline(said: Headline) -> str:
         f"<strong>{text(said.verdict.capitalize())}.</strong> "
         f'<span class="said">{text(said.text)}</span></p>{folded}</div>'
     )
+
+
+def advice(given: Sequence[Advice]) -> str:
+    """Return what would lift the chance of success as a list, nothing where there is nothing."""
+    items = "".join(
+        f"<li>{text(each.sentence)} <code>{text(shlex.join(each.options))}</code></li>" for each in given
+    )
+    return f"<div class='note'>What was found to lift it:<ul>{items}</ul></div>" if items else ""
 
 
 def grade(which: Grade, said: str) -> str:

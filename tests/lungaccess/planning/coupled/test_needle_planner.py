@@ -38,7 +38,7 @@ class TestNeedlePlanner:
     ) -> None:
         lung, target = mapped(small_lung), la.resolve_target(small_lung, KUNTZ_TARGET)
         iterations = 60 if method == "atlas" else 300
-        options = {"method": method, "needle_planner": name, "seed": 1, "objective": "cost-map"}
+        options = {"method": method, "needle_planner": name, "seed": 1, "goal": "cost-map"}
         try:
             plan = plans_of(lung, target, atlas, iterations=iterations, **options)[-1]
         except la.NoPlan:
@@ -107,7 +107,7 @@ from anatomy.phantom import make_phantom
 lung = build_lung(make_phantom(seed=3, size="small").images)
 system = la.load_system("ultrathin")
 target = la.resolve_target(lung, nodule=1)
-asked = dict(iterations=60, seed=3, needle_planner="control.RRT", objective="length", counterfactuals=False)
+asked = dict(iterations=60, seed=3, needle_planner="control.RRT", goal="length", counterfactuals=False)
 plan = list(la.plan(lung, system, target, **asked))[-1]
 try:
     la.plan(lung, system, target, **asked)

@@ -56,7 +56,6 @@ class Spread:
         height = share_of_motion(lung.height_share(target_lps))
         scope = share_of_motion(lung.height_share(tips[0, :3])) if len(tips) else height
         left = Residuals.of(errors, procedure, height - scope)
-        system.require_needle("A chance of success")
         aside = ASIDE * radius_mm if procedure.tubes.measured else 0.0
         self._radius_mm = radius_mm
         self._replanned = system.needle is not None and (

@@ -352,8 +352,12 @@ class SearchOptions(BudgetOptions):
         ),
     ] = None
     processes: Annotated[
-        Processes, Parameter(help="How many processes refine the plan at the same time; not on Windows.")
-    ] = 1
+        Processes | None,
+        Parameter(
+            help="How many processes share the work; not on Windows. For success they simulate, the plan is "
+            "the same, and all cores are used if not given; a cost is made small in one if not given."
+        ),
+    ] = None
     cpu_budget: Annotated[Seconds | None, Parameter(help="Stop after so many seconds of processor time.")] = (
         None
     )
@@ -384,17 +388,18 @@ class SearchOptions(BudgetOptions):
         SettingsError
             If there is no such goal or method, or a value is wrong.
         """
+        from anatomy.machine_code.ahead import usable_cores
         from lungaccess.planning.searches import planners, unknown_method
 
-        goal_of(self.goal)
         if self.method not in planners():
             raise unknown_method(self.method)
+        processes = self.processes or (usable_cores() if goal_of(self.goal) is SUCCESS else 1)
         return Asked(
             systems=systems,
             fields={
                 "goal": self.goal, "phases": stated_phases(self.phases),
                 "least_clearance_mm": self.least_clearance, "method": self.method,
-                "needle_planner": self.needle_planner or "", "processes": self.processes, "gap": self.gap,
+                "needle_planner": self.needle_planner or "", "processes": processes, "gap": self.gap,
                 "seed": self.seed, "iterations": self.iterations, "time_s": self.time_s,
                 "cpu_s": self.cpu_budget, "errors": errors, "procedure": procedure, "place": place,
             },

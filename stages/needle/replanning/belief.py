@@ -135,7 +135,10 @@ class Belief:
         axes, ahead = self.frame[:3, :2].T, self.frame[:3, 2]
         looks = np.zeros((5, 7))
         looks[:3, PLACE], looks[3:, TURN] = np.eye(3), axes
-        gap = np.concatenate([seen[:3, 3] - self.frame[:3, 3], axes @ np.cross(ahead, seen[:3, 2])])
+        across = np.cross(ahead, seen[:3, 2])
+        sine = float(np.linalg.norm(across))
+        turn = across * (math.atan2(sine, float(ahead @ seen[:3, 2])) / max(sine, _TINY))
+        gap = np.concatenate([seen[:3, 3] - self.frame[:3, 3], axes @ turn])
         sizes = [self._unknown.tip_mm] * 3 + [self._unknown.tip_rad] * 2
         noise = np.diag(np.maximum(sizes, LEAST) ** 2)
         seen_with = looks @ self._covariance

@@ -11,15 +11,8 @@ import numpy as np
 
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
+from anatomy.io import image_header
 from anatomy.io.compressed import inflate, plain_pieces
-from anatomy.io.image_header import (
-    MOST_HEADER_BYTES,
-    ImageHeader,
-    image_shape,
-    not_begun,
-    not_of_components,
-    right_handed_grid,
-)
 
 _DTYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",
@@ -29,7 +22,7 @@ _PLAIN = {"BinaryData": "true", "HeaderSize": "0"}
 """Fields that may be missing, and the only value that is read."""
 
 
-def open_metaimage(path: Path, components: int = 1) -> tuple[ImageHeader, Iterator[bytes]]:
+def open_metaimage(path: Path, components: int = 1) -> tuple[image_header.ImageHeader, Iterator[bytes]]:
     """Read the header of a file, and return it with the bytes of the voxels; the frame is LPS by definition.
 
     `components` is how many numbers a voxel must have.
@@ -45,14 +38,14 @@ def open_metaimage(path: Path, components: int = 1) -> tuple[ImageHeader, Iterat
     _require_plain(fields, path)
     channels = fields.get("ElementNumberOfChannels", "1")
     if channels != str(components):
-        raise not_of_components(path, channels[:40], components)
+        raise image_header.not_of_components(path, channels[:40], components)
     dtype = np.dtype((">" if _big_endian(fields) else "<") + _DTYPES[fields["ElementType"]])
     data_path, at = _data_file(fields, path, offset)
     sizes = tuple(int(n) for n in fields.get("DimSize", "").split()[:8])
-    shape = image_shape(sizes, dtype.itemsize * components, path, data_path.stat().st_size)
-    grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path), path)
+    shape = image_header.image_shape(sizes, dtype.itemsize * components, path, data_path.stat().st_size)
+    grid, is_reversed = image_header.right_handed_grid(shape, _lps_from_ijk(fields, path), path)
     compressed = fields.get("CompressedData", "false").lower() == "true"
-    header = ImageHeader(
+    header = image_header.ImageHeader(
         grid=grid,
         is_reversed=is_reversed,
         dtype=dtype,
@@ -65,10 +58,10 @@ def open_metaimage(path: Path, components: int = 1) -> tuple[ImageHeader, Iterat
 def _text(path: Path) -> tuple[dict[str, str], int]:
     """Return the fields, and where the data begin if they follow."""
     with path.open("rb") as stream:
-        start = stream.read(MOST_HEADER_BYTES)
+        start = stream.read(image_header.MOST_HEADER_BYTES)
     end = re.search(rb"^ElementDataFile *= *([^\r\n]*?) *(\r?\n|\Z)", start, re.MULTILINE)
     if end is None:
-        raise not_begun(path, "MetaImage", "a .mha or .mhd file")
+        raise image_header.not_begun(path, "MetaImage", "a .mha or .mhd file")
     pairs = [
         line.partition("=") for line in start[: end.end()].decode("utf-8", errors="replace").splitlines()
     ]

@@ -17,16 +17,9 @@ import numpy as np
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
 from anatomy.grid import transform_points
+from anatomy.io import image_header
 from anatomy.io.compressed import pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
-from anatomy.io.image_header import (
-    MOST_HEADER_BYTES,
-    ImageHeader,
-    image_shape,
-    not_begun,
-    not_of_components,
-    right_handed_grid,
-)
 
 _VERSION_1: dict[str, tuple[int, str]] = {
     "dim": (40, "8h"), "datatype": (70, "2h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),
@@ -63,7 +56,7 @@ def begins_as_nifti(path: Path) -> bool:
 
 def open_nifti(
     path: Path, frame: Frame | None = None, components: int = 1
-) -> tuple[ImageHeader, Iterator[bytes]]:
+) -> tuple[image_header.ImageHeader, Iterator[bytes]]:
     """Read everything before the voxels, and return it with the bytes of the voxels.
 
     Parameters
@@ -98,14 +91,14 @@ def _at_least(start: bytes, n_bytes: int, stream: Iterator[bytes]) -> bytes:
 
 def _header(
     fields: dict[str, tuple[Any, ...]], before_voxels: bytes, path: Path, frame: Frame | None, components: int
-) -> ImageHeader:
+) -> image_header.ImageHeader:
     dtype, sizes = _dtype(fields, path), _sizes(fields["dim"])
     if components > 1:
         sizes = _sizes_of_field(fields, sizes, path, components)
-    shape = image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
+    shape = image_header.image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
     slope, intercept = _scale(fields["slope"], path)
-    grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path, shape, frame), path)
-    return ImageHeader(
+    grid, is_reversed = image_header.right_handed_grid(shape, _lps_from_ijk(fields, path, shape, frame), path)
+    return image_header.ImageHeader(
         grid=grid,
         is_reversed=is_reversed,
         dtype=dtype,
@@ -122,7 +115,7 @@ def _sizes_of_field(
 ) -> tuple[int, ...]:
     """Return the three sizes of a field whose vectors have a known frame."""
     if len(sizes) != 5 or sizes[3:] != (1, components):
-        raise not_of_components(path, f"the dimensions {sizes}, not {components}", components)
+        raise image_header.not_of_components(path, f"the dimensions {sizes}, not {components}", components)
     code, name = fields["intent"][0], fields["intent_name"][0].rstrip(b"\0").decode("ascii", "replace")
     if code not in (_RAS_VECTORS, _LPS_VECTORS) or name.startswith("NREG"):
         raise FrameError(
@@ -138,10 +131,11 @@ def _data_offset(fields: dict[str, tuple[Any, ...]], path: Path) -> int:
     stated, header_bytes = float(fields["vox_offset"][0]), int(fields["size"][0])
     if stated == 0:
         return header_bytes + 4
-    if not header_bytes <= stated <= MOST_HEADER_BYTES or stated != int(stated):
+    most = image_header.MOST_HEADER_BYTES
+    if not header_bytes <= stated <= most or stated != int(stated):
         raise FileError(
             f"{path} says that its voxels begin at byte {stated:g}",
-            expected=f"a whole number from {header_bytes}, the length of the header, to {MOST_HEADER_BYTES}",
+            expected=f"a whole number from {header_bytes}, the length of the header, to {most}",
             remedy="Copy or export the file again",
         )
     return int(stated)
@@ -189,7 +183,7 @@ def _fields(start: bytes, path: Path) -> dict[str, tuple[Any, ...]]:
                 name: struct.unpack_from(order + code, start, at) for name, (at, code) in layout.items()
             }
             return fields | {"order": (order,), "size": (size,)}
-    raise not_begun(path, "NIfTI", "a single-file NIfTI image (.nii or .nii.gz)")
+    raise image_header.not_begun(path, "NIfTI", "a single-file NIfTI image (.nii or .nii.gz)")
 
 
 def _lps_from_ijk(

@@ -12,16 +12,9 @@ import numpy as np
 
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
+from anatomy.io import image_header
 from anatomy.io.compressed import inflate, plain_pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
-from anatomy.io.image_header import (
-    MOST_HEADER_BYTES,
-    ImageHeader,
-    image_shape,
-    not_begun,
-    not_of_components,
-    right_handed_grid,
-)
 
 _LPS_FROM_LAS = np.diag([1.0, -1.0, 1.0, 1.0])
 _LPS_WORDS = ("left-posterior-superior", "lps")
@@ -48,7 +41,9 @@ _NUMBER = r"\s*([-+0-9.eE]{1,40})\s*"
 _VECTOR = re.compile(rf"\({_NUMBER},{_NUMBER},{_NUMBER}\)")
 
 
-def open_nrrd(path: Path, frame: Frame | None, components: int = 1) -> tuple[ImageHeader, Iterator[bytes]]:
+def open_nrrd(
+    path: Path, frame: Frame | None, components: int = 1
+) -> tuple[image_header.ImageHeader, Iterator[bytes]]:
     """Read the header of a file, and return it with the bytes of the voxels.
 
     `components` is how many numbers a voxel must have; those of a displacement field stand on the first axis
@@ -69,9 +64,9 @@ def open_nrrd(path: Path, frame: Frame | None, components: int = 1) -> tuple[Ima
         is_first = _is_first_axis(fields, sizes, path, components)
         _require_lps_vectors(fields, path)
         sizes = sizes[1:] if is_first else sizes[:-1]
-    shape = image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
-    grid, is_reversed = right_handed_grid(shape, _lps_from_ijk(fields, path, frame), path)
-    header = ImageHeader(
+    shape = image_header.image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
+    grid, is_reversed = image_header.right_handed_grid(shape, _lps_from_ijk(fields, path, frame), path)
+    header = image_header.ImageHeader(
         grid=grid,
         is_reversed=is_reversed,
         dtype=dtype,
@@ -88,7 +83,7 @@ def _is_first_axis(fields: Mapping[str, str], sizes: tuple[int, ...], path: Path
     without = [n for n, axis in enumerate(axes) if axis == "none"]
     if len(sizes) != 4 or len(axes) != 4 or without not in ([0], [3]) or sizes[without[0]] != components:
         stated = f"the sizes {sizes} and the directions {' '.join(axes)[:120] or 'missing'}, not {components}"
-        raise not_of_components(path, stated, components)
+        raise image_header.not_of_components(path, stated, components)
     return without == [0]
 
 
@@ -108,10 +103,10 @@ def _require_lps_vectors(fields: Mapping[str, str], path: Path) -> None:
 def _text(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     """Return the `field: value` and the `key:=value` lines, and where the data begin."""
     with path.open("rb") as stream:
-        start = stream.read(MOST_HEADER_BYTES)
+        start = stream.read(image_header.MOST_HEADER_BYTES)
     end = re.search(rb"\r?\n\r?\n", start)
     if not start.startswith(b"NRRD") or end is None:
-        raise not_begun(path, "NRRD", "a complete .nrrd file")
+        raise image_header.not_begun(path, "NRRD", "a complete .nrrd file")
     fields: dict[str, str] = {}
     keys: dict[str, str] = {}
     for line in start[: end.start()].decode("utf-8", errors="replace").splitlines()[1:]:

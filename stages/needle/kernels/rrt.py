@@ -7,18 +7,10 @@ import numpy as np
 from anatomy.kernels.arcs import any_normal, arc_to_point
 from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.random import uniform
+from stages.needle.kernels import tree
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.limits import MIN_ARC_MM
-from stages.needle.kernels.tree import (
-    PATH_LENGTH,
-    PATH_TURN,
-    ROWS_PER_STEP,
-    add_arc,
-    add_goal,
-    pose_of,
-    within,
-)
 
 SAMPLE_TRIES = 50
 """At most this many points are drawn in search of one in the workspace; then the iteration draws none."""
@@ -72,12 +64,12 @@ def _nearest(nodes, count, q, limits):
     nearest = -1
     for m in range(count):
         node = nodes[m]
-        length, bend, turn = arc_to_point(pose_of(node), q)
+        length, bend, turn = arc_to_point(tree.pose_of(node), q)
         if (
             length < best
             and bend[0] <= limits.kappa
-            and node[PATH_LENGTH] + length <= limits.max_length_mm
-            and node[PATH_TURN] + turn <= limits.max_turn_rad
+            and node[tree.PATH_LENGTH] + length <= limits.max_length_mm
+            and node[tree.PATH_TURN] + turn <= limits.max_turn_rad
         ):
             best = length
             nearest = m
@@ -99,12 +91,14 @@ def random_arc(pose, limits, state):
 @inner_kernel
 def goal_from_root(obstacles, limits, objective, branch, goal, nodes, parents, count, state, best):
     """Try the goal from a tree's root; return the new `count`, if growing ends here, and if it is solved."""
-    rho, h = seen_from(pose_of(nodes[0]), goal)
+    rho, h = seen_from(tree.pose_of(nodes[0]), goal)
     if math.hypot(rho, h) < MIN_ARC_MM:
         return count, True, False
     if count > 1:
         return count, False, False
-    count = add_goal(obstacles, limits, objective, branch, nodes, parents, count, _ROOT, goal, best, state)
+    count = tree.add_goal(
+        obstacles, limits, objective, branch, nodes, parents, count, _ROOT, goal, best, state
+    )
     return count, count > 1, count > 1
 
 
@@ -139,31 +133,33 @@ def grow_rrt(
     count, used, solved : int, int, bool
         Rows in use, iterations spent, and whether the last row is at the goal.
     """
-    start = pose_of(nodes[0])
+    start = tree.pose_of(nodes[0])
     count, ends, solved = goal_from_root(
         obstacles, limits, objective, branch, goal, nodes, parents, count, state, best
     )
     if ends:
         return count, 0, solved
     for used in range(iterations):
-        if count + ROWS_PER_STEP > nodes.shape[0]:
+        if count + tree.ROWS_PER_STEP > nodes.shape[0]:
             return count, used, False
         if uniform(state) < random_share:
             near = int(uniform(state) * count)
-            bend, length = random_arc(pose_of(nodes[near]), limits, state)
+            bend, length = random_arc(tree.pose_of(nodes[near]), limits, state)
         else:
-            q, drawn = sample_between(start, within(goal, limits.goal_tolerance_mm, state), limits, state)
+            q, drawn = sample_between(
+                start, tree.within(goal, limits.goal_tolerance_mm, state), limits, state
+            )
             near = _nearest(nodes, count, q, limits) if drawn else -1
             if near < 0:
                 continue
-            length, bend, _turn = arc_to_point(pose_of(nodes[near]), q)
+            length, bend, _turn = arc_to_point(tree.pose_of(nodes[near]), q)
             length = min(length, limits.max_step_mm)
-        if not add_arc(
+        if not tree.add_arc(
             obstacles, limits, objective, branch, nodes, parents, count, near, bend, length, goal, best
         ):
             continue
         count += 1
-        rows = add_goal(
+        rows = tree.add_goal(
             obstacles, limits, objective, branch, nodes, parents, count, count - 1, goal, best, state
         )
         if rows > count:

@@ -14,19 +14,8 @@ import math
 import numpy as np
 
 from anatomy.kernels.compiling import kernel, merged_kernel
+from stages.needle.infeasibility.kernels import bounds
 from stages.needle.infeasibility.kernels.bitmaps import dilate, find_box, or_box, or_shifted
-from stages.needle.infeasibility.kernels.bounds import (
-    CELL,
-    HALF_DIAGONAL,
-    SLOPE_CELL,
-    SPARE,
-    TOP_SINE,
-    largest_aside,
-    largest_reach,
-    largest_slope_change,
-    slope_of,
-    steepest_sine,
-)
 
 
 @kernel(nogil=True)
@@ -64,7 +53,7 @@ def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_wi
     """
     nv, nu = now.shape[0], now.shape[1]
     to_v, to_u, rows, words = out.shape
-    most = largest_reach(scale, depth, blur, out_window, to_v, to_u)
+    most = bounds.largest_reach(scale, depth, blur, out_window, to_v, to_u)
     levels, _nv, _nu, mid_rows, mid_words = table_shape(now, most)
     table = np.zeros((levels, nv, nu, mid_rows, mid_words), np.uint64)
     boxes = np.zeros((levels, nv, nu, 4), np.int64)
@@ -83,8 +72,8 @@ def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_wi
                 for other in range(u, u + span + 1, span):
                     or_box(table[level, v, u], boxes[level, v, u], table[level - 1, v, other],
                             boxes[level - 1, v, other])  # fmt: skip
-    widest = largest_aside(scale[TOP_SINE], scale, depth, 0.0, 1e9) / scale[CELL]
-    square = blur + SPARE
+    widest = bounds.largest_aside(scale[bounds.TOP_SINE], scale, depth, 0.0, 1e9) / scale[bounds.CELL]
+    square = blur + bounds.SPARE
     gathered = np.zeros((mid_rows, mid_words), np.uint64)
     wide = np.zeros((rows, words), np.uint64)
     row = np.zeros(words, np.uint64)
@@ -98,21 +87,25 @@ def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_wi
                 continue
             move_y = direction * (tv + out_window[0]) + first_v + now_window[2] - out_window[2]
             move_x = direction * (tu + out_window[1]) + first_u + now_window[3] - out_window[3]
-            slope_v, slope_u = slope_of(tv, tu, out_window, scale)
-            sine = steepest_sine(slope_v, slope_u, scale)
-            change = largest_slope_change(sine, scale, depth)
+            slope_v, slope_u = bounds.slope_of(tv, tu, out_window, scale)
+            sine = bounds.steepest_sine(slope_v, slope_u, scale)
+            change = bounds.largest_slope_change(sine, scale, depth)
             wide[allowed[0] : allowed[1] + 1] = 0
             for c in range(edges.shape[0]):
                 low = edges[c - 1] if c > 0 else 0.0
                 disc = (
-                    largest_aside(sine, scale, depth, low * change, edges[c] * change) / scale[CELL] + SPARE
+                    bounds.largest_aside(sine, scale, depth, low * change, edges[c] * change)
+                    / scale[bounds.CELL]
+                    + bounds.SPARE
                 )
                 far = int(math.ceil(square + disc))
                 limits[0] = max(allowed[0] - far - move_y, 0)
                 limits[1] = min(allowed[1] + far - move_y, mid_rows - 1)
                 limits[2] = max((64 * allowed[2] - far - move_x) // 64, 0)
                 limits[3] = min((64 * allowed[3] + 63 + far - move_x) // 64, mid_words - 1)
-                reach = edges[c] * change / scale[SLOPE_CELL] + blur * HALF_DIAGONAL + SPARE
+                reach = (
+                    edges[c] * change / scale[bounds.SLOPE_CELL] + blur * bounds.HALF_DIAGONAL + bounds.SPARE
+                )
                 box[1] = -1
                 _gather(
                     gathered, box, limits, table, boxes, tv + out_window[0] - now_window[0],

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from stages.needle.kernels.cost import ObjectiveArrays
     from stages.needle.kernels.limits import Limits
     from stages.needle.kernels.proof import Obstacles, blocker_on_arc
-    from stages.needle.objective import DEFAULT, DEFAULT_COST, NO_MAP, SHORTEST, TERMS, Objective, Term
+    from stages.needle.objective import DEFAULT, NO_MAP, SHORTEST, TERMS, Objective, Term
     from stages.needle.obstruction import Obstruction, easiest_obstruction, find_obstruction
     from stages.needle.path import (
         CURVATURE,

@@ -22,8 +22,6 @@ MAX_CLEARANCE_MM = 256.0
 
 DEFAULT = "default"
 """The objective of whoever states none: far from obstacles, and from thin vessels where there is a map."""
-DEFAULT_COST = "tissue"
-"""The cost of a plan of least cost where none is named: it alone sees the tubes in the tissue."""
 DEFAULT_MAP_WEIGHT = 1.0
 """A mm in a thin vessel costs as much as one at 1 mm from an obstacle: hardly any axis may lie nearer."""
 

@@ -21,10 +21,10 @@ from lungaccess.plans.curves import device_curves
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from stages.needle import DEFAULT_COST, SHORTEST, Objective
+from stages.needle import SHORTEST, Objective
 from tests.lungaccess.planning.coupled.planning import SYSTEM, mapped, plans_of
 
-TISSUE = Objective.of(DEFAULT_COST)
+TISSUE = Objective.of("tissue")
 
 
 @pytest.fixture(scope="module", params=["plain", "mapped"])
@@ -39,7 +39,7 @@ def arcs(lung: Lung, target: Target, atlas: la.Atlas) -> DirectArcs:
 
 @pytest.fixture(scope="module")
 def plans(lung: Lung, target: Target, atlas: la.Atlas) -> list[Plan]:
-    return plans_of(lung, target, replace(atlas, lung=lung), objective=DEFAULT_COST)
+    return plans_of(lung, target, replace(atlas, lung=lung), goal="tissue")
 
 
 def sampled_tissue(plan: Plan, lung: Lung) -> float:
@@ -69,7 +69,7 @@ def test_searches_make_it_small(plans: list[Plan], lung: Lung, target: Target, a
     """It falls, below what the plan of the least cost of the needle costs, whose tubes go farther."""
     costs = [plan.cost for plan in plans]
     assert costs == sorted(costs, reverse=True) and costs[-1] < costs[0]
-    *_, old = plans_of(lung, target, replace(atlas, lung=lung), objective="default")
+    *_, old = plans_of(lung, target, replace(atlas, lung=lung), goal="default")
     assert costs[-1] < 0.9 * sampled_tissue(old, lung)
     tubes = [each.tube.inner_insertion_mm - each.tube.exit.arc_length_mm for each in (plans[-1], old)]
     assert tubes[0] < tubes[1] - 1.0
@@ -156,7 +156,7 @@ def test_tubes_alone_cost_what_they_cost(small_lung: Lung, atlas: la.Atlas) -> N
                 small_lung, f"lps:{','.join(map(str, made.deployments.positions[entry]))}"
             )
             *_, plan = la.plan(
-                small_lung, system, place, objective="tissue", atlas=made, iterations=5, counterfactuals=False
+                small_lung, system, place, goal="tissue", atlas=made, iterations=5, counterfactuals=False
             )
             found.append(plan)
         except la.LungaccessError:

@@ -13,9 +13,10 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.plugins import registered
 from anatomy.base.words import did_you_mean
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.cost_bound import CostBound, GapGoal, guided
+from lungaccess.planning.coupled.cost_bound import GapGoal, guided
 from lungaccess.planning.coupled.explanation import explain
 from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
+from lungaccess.planning.coupled.layer_bound import beside_in_window_mm, cost_bound
 from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
 from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
@@ -110,7 +111,10 @@ class CostFinder:
         self._request, self._task, self._atlas = request, task, atlas
         self._counterfactuals = counterfactuals
         self.search = search_of(request, task, atlas)
-        self._gap = None if request.gap is None else GapGoal(CostBound(task, atlas), request.gap)
+        self._gap = None
+        if request.gap is not None:
+            beside_mm = 0.0 if request.phases is None else beside_in_window_mm(task, request.phases)
+            self._gap = GapGoal(cost_bound(task, atlas, beside_mm), request.gap)
 
     def turns(self) -> Iterator[Turn]:
         """Yield the steps of the search as turns."""

@@ -205,16 +205,12 @@ class Request:
 
     def _require_bound(self) -> None:
         """Refuse a gap where no bound can be known."""
-        if self.gap is None or (self.goal.objective is not None and self.phases is None):
+        if self.gap is None or self.goal.objective is not None:
             return
-        why = (
-            "in a window every scope tip has an aim of its own, so that a bound for one target says nothing"
-            if self.phases is not None
-            else f"nothing bounds {self.goal.words} but what is computed of each plan"
-        )
         raise SettingsError(
-            f"A gap is asked for with the goal {self.goal.name}: {why}",
-            expected="a gap with a cost, and no phases",
+            f"A gap is asked for with the goal {self.goal.name}: nothing bounds {self.goal.words} but what is "
+            "computed of each plan",
+            expected="a gap with a cost",
             remedy="Leave out the gap, or choose a cost such as inverse-clearance",
         )
 

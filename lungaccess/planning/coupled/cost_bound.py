@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -48,6 +48,29 @@ INSERTION_SPACING_MM = 0.01
 """Spacing of the insertions that are tried for the greatest one."""
 
 
+class LowerBound(Protocol):
+    """What bounds from below what plans to a target cost."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether it rises no more."""
+
+    @property
+    def value(self) -> float:
+        """The bound."""
+
+    @property
+    def known(self) -> float:
+        """The bound as far as it is known without waiting."""
+
+    @property
+    def lowest(self) -> Sequence[tuple[int, float, float, float]]:
+        """Scope tip, rotation (rad) and insertions (mm) of some deployments that may cost least."""
+
+    def start(self, cost: float, boxes: int) -> None:
+        """Begin to improve it, knowing the cost of a plan; the property `value` waits for the end."""
+
+
 class CostBound:
     """Bounds from below what plans to a target cost, better and better.
 
@@ -61,6 +84,8 @@ class CostBound:
     atlas : Atlas
     most_boxes : int
         Boxes that may wait.
+    beside_mm : float
+        How far beside the target the needle may end.
 
     Raises
     ------
@@ -69,7 +94,9 @@ class CostBound:
         curvature.
     """
 
-    def __init__(self, task: Task, atlas: Atlas, *, most_boxes: int = MOST_BOXES) -> None:
+    def __init__(
+        self, task: Task, atlas: Atlas, *, most_boxes: int = MOST_BOXES, beside_mm: float = 0.0
+    ) -> None:
         system = task.system
         needle = system.require_needle("A lower bound of the cost")
         system.tubes.require_planar("A lower bound of the cost")
@@ -80,7 +107,7 @@ class CostBound:
                 expected="a needle no longer than half a circle, so that its paths lie near a straight line",
                 remedy="Leave out the gap",
             )
-        self._most_boxes = most_boxes
+        self._most_boxes, self._beside_mm = most_boxes, beside_mm
         self._task = task
         self._tubes = tube_constants(system.tubes, system.margins)
         self._tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
@@ -126,7 +153,7 @@ class CostBound:
             return
         self._left_out = min(self._left_out, cost)
         if not self.queues:
-            environment = _environment(self._task, self._tips[:, 0], cost)
+            environment = _environment(self._task, self._tips[:, 0], cost, self._beside_mm)
             insertions = np.zeros(int(self._tubes[MAX_EXTENSION] / INSERTION_STEP_MM) + 1)
             greatest_insertions(self._tubes, self._tubes[MAX_EXTENSION], INSERTION_SPACING_MM, insertions)
             x, y, z = self._task.target.lps_mm.tolist()
@@ -214,7 +241,7 @@ class BoxQueue:
         return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
 
 
-def guided(search: AtlasSearch, steps: Iterator[Step], bound: CostBound) -> Iterator[Step]:
+def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Iterator[Step]:
     """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
 
     Each of those becomes the search's best candidate, which it then improves.  Who takes the steps improves
@@ -236,7 +263,7 @@ class GapGoal:
 
     Parameters
     ----------
-    bound : CostBound
+    bound : LowerBound
     gap : float
         Share of the best possible cost.
 
@@ -246,7 +273,7 @@ class GapGoal:
         If the gap is negative or not finite.
     """
 
-    def __init__(self, bound: CostBound, gap: float) -> None:
+    def __init__(self, bound: LowerBound, gap: float) -> None:
         if not 0.0 <= gap < math.inf:
             raise SettingsError(
                 f"The gap is {gap}", expected="a share of 0 or more", remedy="State 0.05 for five per cent"
@@ -273,10 +300,11 @@ class GapGoal:
         return met
 
 
-def _environment(task: Task, tips: Float, limit: float) -> BoundEnvironment:
+def _environment(task: Task, tips: Float, limit: float, beside_mm: float) -> BoundEnvironment:
     lung = task.lung
     evaluator = CandidateEvaluator(task)
     limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
+    limits = limits._replace(goal_tolerance_mm=limits.goal_tolerance_mm + beside_mm)
     tubes = tube_environment(lung, with_fissures=task.with_fissures)
     weights = objective.inverse_clearance, objective.length
     x, y, z = task.target.lps_mm.tolist()

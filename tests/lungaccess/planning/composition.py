@@ -20,6 +20,7 @@ from anatomy.base.errors import SettingsError, TargetError
 from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
+from lungaccess.judging import answer, answer_with_several
 from lungaccess.planning.constraints import holds
 from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
 from lungaccess.planning.success import finder, ratings
@@ -82,6 +83,7 @@ class Table:
 
     def __init__(self, lung: Lung) -> None:
         self.lung = lung
+        self._atlases: dict[Any, la.Atlas] = {}
 
     @cache  # noqa: B019  # One table in a process.
     def case(self, name: str) -> tuple[System, la.Atlas, Target]:
@@ -94,9 +96,18 @@ class Table:
             SYSTEMS[2]: twisted,
             SYSTEMS[3]: replace(twisted, name="twisted alone", needle=None),
         }
-        options = COARSE if "twisted" in name else {"rotations": 12, "stop_spacing_mm": 4.0}
-        atlas = la.build_atlas(self.lung, systems[name], **options)
+        atlas = self.atlas_of(systems[name])
         return systems[name], atlas, self._best_target(systems[name], atlas)
+
+    def atlas_of(self, system: System) -> la.Atlas:
+        """Return a coarse atlas of a system, made once for equal tubes, margins and rules."""
+        key = (system.scope, system.tubes, system.margins, system.fissures_allowed)
+        if key not in self._atlases:
+            planar = {"rotations": 12, "stop_spacing_mm": 4.0}
+            self._atlases[key] = la.build_atlas(
+                self.lung, system, **(planar if system.tubes.planar else COARSE)
+            )
+        return replace(self._atlases[key], system=system)
 
     def _best_target(self, system: System, atlas: la.Atlas) -> Target:
         if system.name == "ultrathin":
@@ -146,23 +157,21 @@ class Table:
 
     def run(self, cell: Cell) -> str:
         """Return DONE, or why a cell is refused; a plan has to be accepted and to keep its constraints."""
-        _system, atlas, target = self.case(cell.system)
+        _system, _atlas, target = self.case(cell.system)
         systems, words = self.asked(cell)
-        lasting = cell.constraint in ("fissures", "least clearance", "several systems")
-        options = {} if lasting else {"atlas": atlas}
-        ask: Callable[..., Any] = la.plan if cell.command == "plan" else la.alternatives
+        ask: Callable[..., Any] = answer if cell.command == "plan" else answer_with_several
         few = mock.patch.multiple(
             ratings, OPEN_LOOP=FEW, MEASURED=FEW, SCREENING=FEW, EXACT=replace(ratings.EXACT, pool=4)
         )
         try:
             with few, mock.patch.object(finder, "BY_COST", 3000 if cell.constraint == "kuntz2015" else 5):
-                found = list(ask(self.lung, systems, target, counterfactuals=False, **options, **words))
+                request = Request.of(self.lung, systems, target, **words)
+                found = list(ask(request, atlas_of=self.atlas_of, counterfactuals=False))
         except SettingsError as error:
             return error.found
         except la.NoPlan as failure:
             return f"NO PLAN: {failure}"
         plans = [getattr(each, "plan", each) for each in found]
-        request = Request.of(self.lung, systems, target, **words)
         for plan in (plans[-1], plans[0]):
             report = la.check(plan, self.lung)
             assert report.accepted, [str(each) for each in report.refusals]

@@ -208,8 +208,7 @@ class Request:
         if self.gap is None or self.goal.objective is not None:
             return
         raise SettingsError(
-            f"A gap is asked for with the goal {self.goal.name}: nothing bounds the {self.goal.words} but what "
-            "is computed of each plan",
+            f"A gap is asked for with the goal {self.goal.name}: no bound of the best possible is known",
             expected="a gap with a cost",
             remedy="Leave out the gap, or choose a cost such as inverse-clearance",
         )

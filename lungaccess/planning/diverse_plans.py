@@ -34,6 +34,8 @@ SEPARATION_MM = 5.0
 WINDOW = "window_share"
 ITERATIONS = 100
 """Iterations of the search for the best plan: some seconds."""
+STATED = 1000
+"""Draws of the chance that each of the other plans states: one half is then known to 1.5 %."""
 METHOD = "alternatives"
 """What the method of the other plans is called."""
 
@@ -82,10 +84,11 @@ def alternatives(
     """Return a diverse plan set: the needles of every two of its plans are separated by `separation_mm`.
 
     Two needles are separated if some point of either is at least so far from all points of the other.  The
-    first plan is the best that the request's search finds within its limits, in ITERATIONS if it states
-    none.  The others are direct ways from the atlas, those without a needle tubes aimed at the target, whose
-    parts beyond the lumen are separated: the best through each airway branch comes first, then the others.
-    Each plan is proved and complete as any other, and states what the goal is of it.
+    first plan is the best that the request's search finds within its limits; if it states none, in ITERATIONS
+    of a search by cost, or in the rounds of a contest.  The others are direct ways from the atlas, those
+    without a needle tubes aimed at the target, whose parts beyond the lumen are separated: the best through
+    each airway branch comes first, then the others.  Each plan is proved and complete as any other, and
+    states what the goal is of it.
 
     Parameters
     ----------
@@ -116,9 +119,10 @@ def alternatives(
     if atlas is not None:
         require_same(atlas, request.lung, request.system)
     atlas = atlas or build_atlas(request.lung, request.system)
-    limited = (
-        request if request.limits != Limits() else replace(request, limits=Limits(iterations=ITERATIONS))
-    )
+    limited = request
+    if request.limits == Limits():
+        # The contest of whole plans is over before its iterations begin.
+        limited = replace(request, limits=Limits(iterations=0 if request.counts else ITERATIONS))
     *_, best = run(limited, atlas=atlas, counterfactuals=counterfactuals, on_progress=on_progress)
     plans = [best]
     for each in _others(request, place_part(request, atlas), count, separation_mm):
@@ -140,7 +144,7 @@ def _others(request: Request, atlas: Atlas, count: int, separation_mm: float) ->
     for each in separated_candidates(arcs, count, separation_mm):
         made = plan_of(request, task, atlas, each, 0, 0.0)
         if holds(request, made):
-            yield made if rating is None else rating.stated(made)
+            yield made if rating is None else rating.stated(made, STATED)
 
 
 class RankedArcs:

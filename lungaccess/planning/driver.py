@@ -115,13 +115,13 @@ def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None
                 )
             )  # fmt: skip
     if best is None:
-        raise _beside(request) if beside else finder.no_plan(iteration)
+        raise no_plan_beside(request) if beside else finder.no_plan(iteration)
     last = finder.last(best, iteration, clock.elapsed_s)
     if last is not None:
         yield last
 
 
-def _beside(request: Request) -> NoPlan:
+def no_plan_beside(request: Request) -> NoPlan:
     """Return why there is no plan where all that were found miss a constraint."""
     place = request.place
     if place is None:

@@ -22,7 +22,7 @@ from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.search.base import AtlasBound, Step
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.planning.coupled.search.variation import SMALLEST, random_change, varied
-from lungaccess.planning.driver import Turn
+from lungaccess.planning.driver import Turn, no_plan_beside
 from lungaccess.planning.success.ratings import (
     ChanceRating,
     FunctionRating,
@@ -54,6 +54,8 @@ SMALLER, LEAST_FACTOR = 0.7, 0.1
 """The step by which the errors are made smaller, and the least size."""
 SHRUNKEN_ROUNDS = 2
 """Rounds that smaller errors decide where successes are rare: later ones have enough draws."""
+LEAST_STATED = 250
+"""Draws of the chance that a plan states at least: one half is then known to 3 %."""
 STEPS = 20
 """Steps of the search by cost for one challenge, which take as long as some thousand draws."""
 
@@ -105,6 +107,7 @@ class ContestFinder:
         self._model: Plan | None = None
         self._leader: Contender | None = None
         self._shown: Plan | None = None
+        self._beside = 0
 
     @property
     def _direct(self) -> DirectCandidates | None:
@@ -177,6 +180,7 @@ class ContestFinder:
         """Return a candidate as a contender, None if it misses a constraint."""
         plan = self._plan(candidate)
         if not holds(self._request, plan):
+            self._beside += 1
             return None
         return Contender(candidate=candidate, plan=plan, scorer=(rating or self._rating).scorer(plan))
 
@@ -277,12 +281,14 @@ class ContestFinder:
     def _unstated(self, contender: Contender, elapsed_s: float) -> Plan:
         return searches.plan_of(self._request, self._task, self._atlas, contender.candidate, 0, elapsed_s)
 
-    def _stated(self, contender: Contender, iteration: int, elapsed_s: float) -> Plan:
+    def _stated(
+        self, contender: Contender, iteration: int, elapsed_s: float, most: int | None = None
+    ) -> Plan:
         """Return the whole plan of a contender with what it states of the goal."""
         made = searches.plan_of(
             self._request, self._task, self._atlas, contender.candidate, iteration, elapsed_s
         )
-        return self._rating.stated(made)
+        return self._rating.stated(made, most)
 
     def is_met(self, best: Plan, iteration: int) -> bool:
         """Tell that nothing is good enough: the best possible is not known."""
@@ -292,10 +298,13 @@ class ContestFinder:
         """Return the leader with what it states, where the search ended before that was shown."""
         if self._shown is not None or self._leader is None:
             return None
-        return self._stated(self._leader, iteration, elapsed_s)
+        # Where the time is over, no more is counted than the contest did.
+        return self._stated(self._leader, iteration, elapsed_s, max(self._leader.draws, LEAST_STATED))
 
     def no_plan(self, iteration: int) -> NoPlan:
         """Return why there is no plan."""
+        if self._beside:
+            return no_plan_beside(self._request)
         return searches.why_none(self._task, self._atlas, self._search, iteration, self._counterfactuals)
 
 

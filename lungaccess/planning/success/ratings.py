@@ -82,8 +82,8 @@ class Rating(Protocol):
     def scorer(self, plan: Plan) -> Scorer:
         """Return what scores a plan; what it prepares serves all batches."""
 
-    def stated(self, plan: Plan) -> Plan:
-        """Return a plan with what it states of the goal."""
+    def stated(self, plan: Plan, most: int | None = None) -> Plan:
+        """Return a plan with what it states of the goal, of at most so many draws."""
 
 
 class ChanceRating:
@@ -148,10 +148,11 @@ class ChanceRating:
     def _batch_seed(self, batch: int) -> int:
         return self._seed + BATCH_SEED * (batch + 1)
 
-    def stated(self, plan: Plan) -> Plan:
+    def stated(self, plan: Plan, most: int | None = None) -> Plan:
         """Return a plan with its chance, counted on draws that no round has seen."""
+        samples = min(self.rounds.fresh, most or self.rounds.fresh)
         found = estimate_success(
-            plan, self._lung, errors=self.errors, procedure=self.procedure, samples=self.rounds.fresh,
+            plan, self._lung, errors=self.errors, procedure=self.procedure, samples=samples,
             seed=self._seed + FRESH_SEED, radius_mm=self._given_mm, processes=self._processes,
         )  # fmt: skip
         return replace(plan, chance=chance_of(found))
@@ -175,7 +176,7 @@ class FunctionRating:
         signed = -np.inf if value is None else value if goal.larger_is_better else -value
         return lambda _batch, _draws, _factor: float(signed)
 
-    def stated(self, plan: Plan) -> Plan:
+    def stated(self, plan: Plan, most: int | None = None) -> Plan:
         """Return a plan with the value of its function."""
         if not self._goal.is_function:
             return plan

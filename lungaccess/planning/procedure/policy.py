@@ -437,8 +437,8 @@ class Policy:
 
     def from_needle(
         self, way: OnTheWay, lps_from_tip: Float, target: Float, curvature_share: float = 1.0
-    ) -> tuple[Float, float]:
-        """Return the arcs `(A, 3)` that are left for a needle on its way, and their chance.
+    ) -> tuple[Float, float, bool]:
+        """Return the arcs `(A, 3)` left for a needle on its way, their chance, and if any path is proved.
 
         Parameters
         ----------
@@ -470,7 +470,7 @@ class Policy:
             self._scene._replace(limits=left), known, np.array(lps_from_tip)[None], np.array([way.branch]),
             np.array(target)[None], ASIDES, found, chances, arcs,
         )  # fmt: skip
-        return arcs[0, : found[0, 1]], float(chances[0])
+        return arcs[0, : found[0, 1]], float(chances[0]), bool(found[0, 2])
 
     # One answer -----------------------------------------------------------------------------------
 
@@ -551,7 +551,7 @@ class Policy:
         rest, turned = rest_of(path.arcs, inserted)
         branch = int(chosen.found[0, 2])
         way = OnTheWay(rest, inserted, turned, path.lps_from_start[:3, 2], branch)
-        arcs, chance = self.from_needle(way, pose, target)
+        arcs, chance, _proved = self.from_needle(way, pose, target)
         same = arcs.shape == rest.shape and bool(_same(arcs[None], rest[None])[0])
         action = Action.GO_ON if same else Action.NEEDLE
         return Decision(

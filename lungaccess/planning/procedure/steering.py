@@ -14,7 +14,7 @@ WIDEST_MISS_MM = 10.0
 
 
 class PolicyReplanner(Replanner):
-    """Goes on by what the policy chooses; where that is not likely to succeed at all, it searches.
+    """Goes on by what the policy chooses; it searches where no path is proved, for one that ends nearer.
 
     Parameters
     ----------
@@ -35,10 +35,13 @@ class PolicyReplanner(Replanner):
         rest, turned = rest_of(self._followed, inserted_mm - self._begun_mm)
         asked, total = self._asked, self._turned + turned if turned_rad is None else turned_rad
         way = OnTheWay(rest, inserted_mm, total, asked.lps_from_start[:3, 2], asked.branch)
-        arcs, chance = self._policy.from_needle(way, lps_from_tip, target, self.curvature_share)
-        found = Replan(path=ArcPath(lps_from_start=lps_from_tip, arcs=arcs))
-        if chance < LEAST_CHANCE:
-            found = self._searched(way, lps_from_tip, target)
+        arcs, chance, proved = self._policy.from_needle(way, lps_from_tip, target, self.curvature_share)
+        path = ArcPath(lps_from_start=lps_from_tip, arcs=arcs)
+        found = Replan(path=path, miss_mm=float(np.linalg.norm(path.frames()[-1][:3, 3] - target)))
+        if chance < LEAST_CHANCE or not proved:
+            other = self._searched(way, lps_from_tip, target)
+            nearer = other.path is not None and other.miss_mm < found.miss_mm
+            found = other if chance < LEAST_CHANCE or nearer else found
         if found.path is not None:
             self._followed, self._begun_mm, self._turned = found.path.arcs, inserted_mm, total
         return found

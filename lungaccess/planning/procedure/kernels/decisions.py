@@ -565,7 +565,8 @@ def choose_needles(scene, sizes, tips, branches, targets, asides, found, chances
                 continue
             proved += 1
             chance = path_chance(scene, sizes, nowhere, nowhere, tip, path, count, target, rolls)
-            if chance > best - TIE:
+            # Beside the target nothing is gained where going on succeeds as often.
+            if chance > best + (TIE if attempt > 1 else -TIE):
                 best, found[n, 1] = chance, count
                 arcs[n] = 0.0
                 arcs[n, :count] = path[:count]

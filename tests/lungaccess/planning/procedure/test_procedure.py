@@ -91,8 +91,8 @@ def test_the_tip_of_the_tubes_is_corrected(plan: Plan, small_lung: Lung) -> None
     procedure = Procedure(tubes=TubesOut(measured=True))
     found = simulate_procedure(plan, small_lung, errors=model, procedure=procedure, samples=40, radius_mm=3.0)
     assert found.stages[0].corrected_mm > 0.3
-    # The needle ends in the centre, or where that cannot be reached at points 0.6 of the radius beside it.
-    assert found.miss_mm[0.95] < 0.6 * 3.0 + 1e-3
+    # The needle ends in the centre, or where that cannot be reached in the goal: as planned, or beside it.
+    assert found.miss_mm[0.5] < 1e-3 and found.miss_mm[0.95] < 3.0
 
 
 def test_imaging_finds_the_target_where_it_is(plan: Plan, small_lung: Lung) -> None:

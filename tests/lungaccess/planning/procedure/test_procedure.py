@@ -270,3 +270,20 @@ def test_the_command(
     said = capsys.readouterr().out
     assert "measured-tip" in said and "success" in said
     assert main([*command[:-1], "nonsense"]) == ExitCode.BAD_INPUT
+
+
+def test_replan_asks_the_policy(
+    plan: Plan, small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr("lungaccess.problem.patients.load_patient", lambda *_args, **_options: small_lung)
+    file, record = str(tmp_path / "plan.json"), str(tmp_path / "record.json")
+    plan.save(file)
+    asked = ["replan", "patient", "--plan", file, "--scope", file, "--errors", "gated-ct"]
+    command = [*asked, "--procedure", "measured-tip", "--radius", "5", "--record", record]
+    assert main([*command, "--json"]) == ExitCode.OK
+    first = json.loads(capsys.readouterr().out)
+    assert 0.0 < first["chance"] <= 1.0 and first["tube"] and first["needle"]
+    assert main([*command, "--tube", file]) == ExitCode.OK
+    assert "estimated chance of success" in capsys.readouterr().out
+    assert len(json.loads(Path(record).read_text())["steps"]) == 2
+    assert main(asked) == ExitCode.BAD_INPUT

@@ -89,7 +89,8 @@ def with_devices(task: Task, candidate: Candidate, model: Plan) -> Plan:
     What takes long to state is that of another plan: clearances, costs and the margin of the scope's motion.
     """
     frame, deployment = candidate.tip.lps_from_scope_tip, candidate.deployment
-    tube, needle = tube_part(task, frame, deployment), needle_part(candidate.path)
+    tube = tube_part(task, frame, deployment)
+    needle = None if task.system.needle is None else needle_part(candidate.path)
     exemption = replace(model.exemption, branch=deployment.branch, exit_point_lps=tube.exit.point_lps)
     scope = replace(model.scope, lps_from_scope_tip=frame)
     return replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption)

@@ -59,6 +59,7 @@ CONSTRAINTS = (
 )  # fmt: skip
 COMMANDS = ("plan", "alternatives")
 FEW = ratings.Rounds(pool=4, of_a_tip=2, draws=(32,), kept=(), fresh=32)
+FEWER = ratings.Rounds(pool=1, of_a_tip=1, draws=(4,), kept=(), fresh=4)
 """So few candidates and draws show whether a cell can be done."""
 
 
@@ -161,7 +162,7 @@ class Table:
         systems, words = self.asked(cell)
         ask: Callable[..., Any] = answer if cell.command == "plan" else answer_with_several
         few = mock.patch.multiple(
-            ratings, OPEN_LOOP=FEW, MEASURED=FEW, SCREENING=FEW, EXACT=replace(ratings.EXACT, pool=4)
+            ratings, OPEN_LOOP=FEW, MEASURED=FEWER, SCREENING=FEWER, EXACT=replace(ratings.EXACT, pool=4)
         )
         try:
             with few, mock.patch.object(finder, "BY_COST", 3000 if cell.constraint == "kuntz2015" else 5):

@@ -32,9 +32,10 @@ from lungaccess.planning.procedure.insertion import (
     insert_plan,
 )
 from lungaccess.plans.curves import needle_pieces
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import AngleError, CurvatureError, ErrorModel
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
-from lungaccess.uncertainty.risk import AngleError, CurvatureError, ErrorModel, load_errors
 from stages.needle.environment import needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, arc_transform

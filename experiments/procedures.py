@@ -16,10 +16,11 @@ import lungaccess as la
 from anatomy.lung import Lung
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.planning.procedure import ProcedureReport, load_procedure, procedure_names, simulate_procedure
+from lungaccess.planning.procedure import ProcedureReport, simulate_procedure
+from lungaccess.problem.error_files import error_preset_names, load_errors
 from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.procedures import load_procedure, procedure_names
 from lungaccess.problem.target import point_target
-from lungaccess.uncertainty.risk import error_preset_names, load_errors
 
 SIZES = {"quick": (2, 20), "full": (8, 100)}
 """Targets, and procedures for each target, error model and procedure."""

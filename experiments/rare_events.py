@@ -18,7 +18,8 @@ from anatomy.base.records import frozen_value
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.uncertainty.risk import RiskAssessor, load_errors, rare_touch
+from lungaccess.problem.error_files import load_errors
+from lungaccess.uncertainty.risk import RiskAssessor, rare_touch
 from lungaccess.uncertainty.risk.statistics import Share
 
 BATCH = 1_000_000

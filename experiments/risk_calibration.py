@@ -9,7 +9,8 @@ import argparse
 
 import lungaccess as la
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk import RiskAssessor, error_preset_names, load_errors
+from lungaccess.problem.error_files import error_preset_names, load_errors
+from lungaccess.uncertainty.risk import RiskAssessor
 
 PREDICTED, COUNTED = 10_000, 100_000
 SEED, FRESH_SEED = 0, 1_000_003

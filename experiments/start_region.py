@@ -25,10 +25,10 @@ import numpy as np
 import lungaccess as la
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from lungaccess.planning.procedure import load_procedure, simulate_procedure
+from lungaccess.planning.procedure import simulate_procedure
 from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.procedures import ScopePlacing
+from lungaccess.problem.procedures import ScopePlacing, load_procedure
 from lungaccess.uncertainty.risk import RiskAssessor
 from lungaccess.uncertainty.risk.deviations import deviated_pieces, deviated_starts
 from stages.needle import (

@@ -21,9 +21,10 @@ from anatomy.lung import Lung
 from experiments.procedures import ITERATIONS, plans_of
 from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.planning.procedure import Procedure, load_procedure
 from lungaccess.planning.success import estimate_success
-from lungaccess.uncertainty.risk import ErrorModel, error_preset_names, load_errors
+from lungaccess.problem.error_files import error_preset_names, load_errors
+from lungaccess.problem.errors import ErrorModel
+from lungaccess.problem.procedures import Procedure, load_procedure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -29,9 +29,7 @@ from lungaccess.planning.one_stage import safe_scope_region as safe_scope_region
 from lungaccess.planning.procedure import Decision as Decision
 from lungaccess.planning.procedure import Measurements as Measurements
 from lungaccess.planning.procedure import Policy as Policy
-from lungaccess.planning.procedure import Procedure as Procedure
 from lungaccess.planning.procedure import ProcedureRecord as ProcedureRecord
-from lungaccess.planning.procedure import load_procedure as load_procedure
 from lungaccess.planning.procedure import simulate_procedure as simulate_procedure
 from lungaccess.planning.reachability import UnreachableProof as UnreachableProof
 from lungaccess.planning.reachability import compare_reach as compare_reach
@@ -51,7 +49,11 @@ from lungaccess.problem import point_target as point_target
 from lungaccess.problem import preset_names as preset_names
 from lungaccess.problem import presets_by_invasiveness as presets_by_invasiveness
 from lungaccess.problem import resolve_target as resolve_target
+from lungaccess.problem.error_files import load_errors as load_errors
+from lungaccess.problem.errors import ErrorModel as ErrorModel
 from lungaccess.problem.goals import Goal as Goal
+from lungaccess.problem.procedures import Procedure as Procedure
+from lungaccess.problem.procedures import load_procedure as load_procedure
 from lungaccess.problem.request import Request as Request
 from lungaccess.problem.request import StatedPlace as StatedPlace
 from lungaccess.problem.request import register_goal as register_goal
@@ -60,9 +62,7 @@ from lungaccess.running.study import run_study as run_study
 from lungaccess.showing.report.html import plan_page as plan_page
 from lungaccess.showing.slicer import export_slicer as export_slicer
 from lungaccess.uncertainty.breathing.window import breathing_window as breathing_window
-from lungaccess.uncertainty.risk import ErrorModel as ErrorModel
 from lungaccess.uncertainty.risk import assess as assess
 from lungaccess.uncertainty.risk import find_tolerances as find_tolerances
-from lungaccess.uncertainty.risk import load_errors as load_errors
 from lungaccess.uncertainty.risk import safe_start_region as safe_start_region
 from stages.needle import Objective as Objective

@@ -20,9 +20,9 @@ from lungaccess.cli.app import app
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.usage import with_nodule_number
 from lungaccess.planning.one_stage import load_tubes
+from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.system import load_system
 from lungaccess.running.study import read_study
-from lungaccess.uncertainty.risk import load_errors
 from tests.pages import PAGES, ROOT, RUN, SHOWN, blocks, name_of
 
 LEAST_RUN_SHARE = 0.9

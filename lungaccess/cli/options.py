@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.organ import Organ
     from lungaccess.planning.coupled.atlas import Atlas
-    from lungaccess.planning.procedure import Procedure
+    from lungaccess.problem.errors import ErrorModel
+    from lungaccess.problem.procedures import Procedure
     from lungaccess.problem.system import System
     from lungaccess.problem.target import StatedTarget, Target
-    from lungaccess.uncertainty.risk import ErrorModel
 
     GoalText = str
     ObjectiveText = str
@@ -265,7 +265,8 @@ class ErrorOptions:
 
     def load(self) -> ErrorModel:
         """Return the error model, the default one if none is given."""
-        from lungaccess.uncertainty.risk import load_errors, with_known
+        from lungaccess.problem.error_files import load_errors
+        from lungaccess.problem.errors import with_known
 
         model = load_errors() if self.errors is None else load_errors(self.errors)
         for stated in self.known:
@@ -278,7 +279,7 @@ class ErrorOptions:
 
     def given_procedure(self) -> Procedure | None:
         """Return the procedure, None if none is given."""
-        from lungaccess.planning.procedure import load_procedure
+        from lungaccess.problem.procedures import load_procedure
 
         return None if self.procedure is None else load_procedure(self.procedure)
 

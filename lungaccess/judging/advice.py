@@ -15,14 +15,16 @@ from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.judging.checking import Checker
 from lungaccess.planning import run
 from lungaccess.planning.coupled import Atlas
-from lungaccess.planning.procedure import Procedure, load_procedure, procedure_names
 from lungaccess.planning.success import chance_of, estimate_success
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import UNITS, ErrorModel, with_known
+from lungaccess.problem.procedures import Procedure, load_procedure, procedure_names
 from lungaccess.problem.request import Limits, Request
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
-from lungaccess.uncertainty.risk import UNITS, ErrorModel, Share, load_errors, with_known
+from lungaccess.uncertainty.risk import Share
 
 GOOD = 0.9
 """A plan that succeeds so often is left without advice."""

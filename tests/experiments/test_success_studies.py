@@ -11,8 +11,11 @@ import pytest
 
 from experiments import procedures, success_planning
 from experiments.run_all import STUDIES
-from lungaccess.planning.procedure import Procedure, ProcedureReport, load_procedure, procedure_names
-from lungaccess.uncertainty.risk import ErrorModel, Share, error_preset_names, load_errors
+from lungaccess.planning.procedure import ProcedureReport
+from lungaccess.problem.error_files import error_preset_names, load_errors
+from lungaccess.problem.errors import ErrorModel
+from lungaccess.problem.procedures import Procedure, load_procedure, procedure_names
+from lungaccess.uncertainty.risk import Share
 
 COUNTS = {"a": 20, "b": 60, "c": 90}
 

@@ -50,10 +50,11 @@ def insert(
 ) -> ExitCode:
     """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees."""
     from lungaccess.judging.checking import check
-    from lungaccess.planning.procedure import NeedleSteering, insert_plan
+    from lungaccess.planning.procedure import insert_plan
     from lungaccess.plans.plan import Plan
+    from lungaccess.problem.error_files import load_errors
+    from lungaccess.problem.procedures import NeedleSteering
     from lungaccess.showing.report.insertion import insertion_webp, insertions_png
-    from lungaccess.uncertainty.risk import load_errors
 
     stored = Plan.load(plan)
     steering = NeedleSteering(

@@ -47,9 +47,10 @@ def risk(
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it."""
     from lungaccess.judging.appraisal import Headline
-    from lungaccess.planning.procedure import Procedure, simulate_procedure
+    from lungaccess.planning.procedure import simulate_procedure
     from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.plans.plan import Plan
+    from lungaccess.problem.procedures import Procedure
     from lungaccess.uncertainty.risk import assess, find_tolerances
     from lungaccess.uncertainty.risk.assessment import DEFAULT_SAMPLES
 

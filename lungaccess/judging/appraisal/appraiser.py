@@ -12,11 +12,13 @@ from anatomy.base.records import frozen_value
 from lungaccess.judging.appraisal.headline import Headline
 from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 from lungaccess.judging.checking import Checker, CheckReport
-from lungaccess.planning.procedure import DEFAULT_PROCEDURE, Procedure, load_procedure
 from lungaccess.planning.success import Estimate, chance_of, estimate_success
 from lungaccess.plans.costs import known_costs
 from lungaccess.plans.scope_steps import motion_record
-from lungaccess.uncertainty.risk import ErrorModel, Share, assess, load_errors
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
+from lungaccess.problem.procedures import DEFAULT_PROCEDURE, Procedure, load_procedure
+from lungaccess.uncertainty.risk import Share, assess
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -13,12 +13,5 @@ if TYPE_CHECKING:
     from lungaccess.planning.procedure.record import ProcedureRecord
     from lungaccess.planning.procedure.report import ProcedureReport, StageReport
     from lungaccess.planning.procedure.simulation import Simulator, simulate_procedure
-    from lungaccess.problem.procedures import (
-        DEFAULT_PROCEDURE,
-        NeedleSteering,
-        Procedure,
-        load_procedure,
-        procedure_names,
-    )
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

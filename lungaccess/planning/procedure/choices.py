@@ -17,9 +17,10 @@ from lungaccess.planning.procedure.kernels.decisions import Choices
 from lungaccess.planning.procedure.residuals import Residuals
 from lungaccess.planning.procedure.spread import Spread
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import Procedure
 from lungaccess.problem.system import System
-from lungaccess.uncertainty.risk import Deviations, ErrorModel
+from lungaccess.uncertainty.risk import Deviations
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_deviations, tubes_alone
 from stages.needle import needle_environment, workspace_lengths
 from stages.tube import Deployment, Deployments, DeploymentValidator, one_site_enumerator

@@ -24,8 +24,10 @@ from lungaccess.planning.procedure.truth import (
 )
 from lungaccess.plans import curves
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import NeedleSteering
-from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, Share, load_errors
+from lungaccess.uncertainty.risk import RiskAssessor, Share
 from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import Deviations
 from stages.needle import (

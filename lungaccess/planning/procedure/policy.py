@@ -47,12 +47,13 @@ from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.errors import BREATHING
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import BREATHING, ErrorModel
 from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, load_errors
+from lungaccess.uncertainty.risk import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import deviated_starts, judging
 from stages.needle import ArcPath, Limits, NeedleEnvironment, Objective, Obstacles, needle_environment

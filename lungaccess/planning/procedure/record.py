@@ -16,8 +16,8 @@ from lungaccess.planning.procedure.decision import Decision, Measurements
 from lungaccess.planning.procedure.policy import Policy
 from lungaccess.plans.file import to_json
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import Procedure
-from lungaccess.uncertainty.risk import ErrorModel
 
 
 class ProcedureRecord:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from anatomy.base.records import frozen_value
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import Procedure
-from lungaccess.uncertainty.risk import ErrorModel, Share
+from lungaccess.uncertainty.risk import Share
 
 NO_PATH = "no path left"
 """A procedure that ended because no path was found from a pose as measured."""

@@ -30,8 +30,10 @@ from lungaccess.planning.procedure.truth import (
     turned_about,
 )
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import Procedure, load_procedure
-from lungaccess.uncertainty.risk import MISSES, Deviations, ErrorModel, Share, load_errors
+from lungaccess.uncertainty.risk import MISSES, Deviations, Share
 from lungaccess.uncertainty.risk.assessment import MISS_QUANTILES
 from lungaccess.uncertainty.risk.deviations import deviated_starts
 from lungaccess.uncertainty.risk.kernels import deviation as kernel

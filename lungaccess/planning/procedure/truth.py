@@ -14,8 +14,8 @@ from lungaccess.planning.procedure.fusion import as_measured
 from lungaccess.planning.procedure.kernels.decisions import deviated_planar
 from lungaccess.planning.procedure.policy import Chosen
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import NeedleSteering
-from lungaccess.uncertainty.risk import ErrorModel
 from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, in_rows
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from anatomy.lung import Lung
-from lungaccess.planning.procedure import DEFAULT_PROCEDURE, Procedure, ProcedureReport, simulate_procedure
+from lungaccess.planning.procedure import ProcedureReport, simulate_procedure
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk import ErrorModel, RiskReport, assess
+from lungaccess.problem.errors import ErrorModel
+from lungaccess.problem.procedures import DEFAULT_PROCEDURE, Procedure
+from lungaccess.uncertainty.risk import RiskReport, assess
 
 FRESH_SEED = 1 << 20
 """Added to a search's seed for the draws that it never sees."""

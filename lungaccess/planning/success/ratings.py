@@ -12,13 +12,16 @@ import numpy as np
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
-from lungaccess.planning.procedure import Procedure, Simulator, load_procedure
+from lungaccess.planning.procedure import Simulator
 from lungaccess.planning.procedure.spread import Spread
 from lungaccess.planning.success.estimate import FRESH_SEED, MEASURED_PROCEDURE, chance_of, estimate_success
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.goals import SUCCESS, Goal
+from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.request import Request
-from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, goal_radius, load_errors
+from lungaccess.uncertainty.risk import RiskAssessor, goal_radius
 from lungaccess.uncertainty.risk.breathing import model_for
 
 BATCH_SEED = 1 << 24

@@ -15,15 +15,16 @@ from anatomy.base.records import frozen_value
 from anatomy.base.settings import to_mapping
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
-from lungaccess.planning.procedure import Procedure, load_procedure
 from lungaccess.plans.version import software_version
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.request import goal_of
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
 from lungaccess.running.study.patients import Patient, open_patient, patient_of
 from lungaccess.running.study.settings import Case, PlannerChoice, Study
-from lungaccess.uncertainty.risk import ErrorModel, load_errors
 
 OF_THEIR_OWN_CLASS = ("patient", "system", "errors", "procedure")
 """The fields of a problem that are not plain values."""

@@ -7,18 +7,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.problem.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
-    from lungaccess.problem.errors import (
-        CURVATURE,
-        UNITS,
-        AngleError,
-        BreathingError,
-        CurvatureError,
-        ErrorModel,
-        Place,
-        PositionError,
-        with_known,
-    )
     from lungaccess.uncertainty.risk.assessment import MISSES, RiskReport, assess, rare_touch, safest
     from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
     from lungaccess.uncertainty.risk.deviations import Deviations

@@ -20,9 +20,9 @@ from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning import read_lesions
 from lungaccess.planning.one_stage import load_tubes
-from lungaccess.planning.procedure import load_procedure
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.procedures import load_procedure
 from lungaccess.running.study import read_study
-from lungaccess.uncertainty.risk import load_errors
 from tests.lungaccess.cli.every_command import commands
 
 QUICK = ("presets", "template", "tubes", "shapes", "doctor", "completion")

@@ -18,8 +18,9 @@ from lungaccess.judging.appraisal import Appraiser
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
 from lungaccess.judging.appraisal.headline import Geometry, of_hundred
 from lungaccess.planning import with_front
-from lungaccess.planning.procedure import load_procedure, procedure_names
 from lungaccess.plans.chance import Chance
+from lungaccess.problem.error_files import error_preset_names, load_errors
+from lungaccess.problem.procedures import load_procedure, procedure_names
 from lungaccess.showing.report.html import breathing, phase, tables, words
 from lungaccess.showing.report.html.deployment import device_points, packed_plan
 from lungaccess.showing.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
@@ -27,15 +28,14 @@ from lungaccess.showing.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.showing.report.html.risk import risk_section
 from lungaccess.showing.report.html.trade_off import CAPTION, trade_off_svg
 from lungaccess.showing.report.html.volumes import image_words, page_image
-from lungaccess.uncertainty.risk import error_preset_names, load_errors
 
 if TYPE_CHECKING:
     from anatomy.grid import Volume
     from anatomy.lung import Lung
     from lungaccess.judging.appraisal import Appraisal, Headline, Limit
-    from lungaccess.planning.procedure import Procedure
     from lungaccess.plans.plan import Plan
-    from lungaccess.uncertainty.risk import ErrorModel
+    from lungaccess.problem.errors import ErrorModel
+    from lungaccess.problem.procedures import Procedure
     from stages.needle import StartRegion
 
 

@@ -22,8 +22,10 @@ from lungaccess.judging.appraisal.grade import FAIR_FROM, GOOD_FROM, grade_of_ch
 from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.judging.checking import Finding
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.showing.report.html import words
-from lungaccess.uncertainty.risk import ErrorModel, Share, load_errors
+from lungaccess.uncertainty.risk import Share
 from tests.lungaccess.appraisals import make_check, make_risk
 
 SYSTEM = la.load_system("ultrathin")

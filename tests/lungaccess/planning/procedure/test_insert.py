@@ -16,14 +16,9 @@ from anatomy.lung import Lung
 from lungaccess.cli import app as cli
 from lungaccess.planning.procedure.insertion import WATCHED, InsertionStudy, Outcome, insert_plan
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk import (
-    AngleError,
-    CurvatureError,
-    ErrorModel,
-    PositionError,
-    RiskAssessor,
-    load_errors,
-)
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import AngleError, CurvatureError, ErrorModel, PositionError
+from lungaccess.uncertainty.risk import RiskAssessor
 
 EXACT = {"position_mm": 0.0, "direction_deg": 0.0, "target_mm": 0.0}
 SLOW = replace(WATCHED, measure_every_mm=1.0)

@@ -17,15 +17,15 @@ from anatomy.base.errors import PlanFileError, SettingsError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.planning.one_stage import ScopeReplanner
-from lungaccess.planning.procedure import Procedure, Simulator, load_procedure
+from lungaccess.planning.procedure import Simulator
 from lungaccess.planning.procedure.fusion import as_measured, fused, fused_share, scope_moves, tip_moves
 from lungaccess.planning.procedure.residuals import Residuals, fused_size
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.procedures import ScopePlacing
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.procedures import Procedure, ScopePlacing, load_procedure
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from lungaccess.uncertainty.risk import load_errors
 from stages.needle import Objective
 from stages.tube import enumerate_deployments, one_site_enumerator
 

@@ -15,23 +15,25 @@ from anatomy.base.errors import FileError, SettingsError
 from anatomy.lung import Lung
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.planning.procedure import Procedure, load_procedure, procedure_names, simulate_procedure
+from lungaccess.planning.procedure import simulate_procedure
 from lungaccess.planning.procedure.choices import scope_frames
 from lungaccess.planning.procedure.policy import Policy
 from lungaccess.planning.procedure.report import NO_PATH
 from lungaccess.planning.procedure.simulation import ORDER, SUCCESS
 from lungaccess.planning.procedure.truth import ends_of, with_stop
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.procedures import Imaging, NeedleSteering, ScopePlacing, TubesOut
-from lungaccess.uncertainty.risk import (
-    MISSES,
-    AngleError,
-    CurvatureError,
-    ErrorModel,
-    PositionError,
-    assess,
-    load_errors,
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import AngleError, CurvatureError, ErrorModel, PositionError
+from lungaccess.problem.procedures import (
+    Imaging,
+    NeedleSteering,
+    Procedure,
+    ScopePlacing,
+    TubesOut,
+    load_procedure,
+    procedure_names,
 )
+from lungaccess.uncertainty.risk import MISSES, assess
 from lungaccess.uncertainty.risk.deviations import deviated_starts
 
 SCOPE_ONLY = ErrorModel(

@@ -13,10 +13,10 @@ from anatomy.lung import Lung
 from lungaccess.planning.success import finder, ratings
 from lungaccess.planning.success.ratings import ChanceRating, Rounds
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.goals import Goal
 from lungaccess.problem.request import Request
 from lungaccess.problem.target import Target
-from lungaccess.uncertainty.risk import load_errors
 from tests.lungaccess.planning.coupled.planning import KUNTZ_TARGET, SYSTEM, TARGET, same_run
 
 ERRORS = load_errors("gated-ct")

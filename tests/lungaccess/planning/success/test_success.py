@@ -12,14 +12,16 @@ import lungaccess as la
 from anatomy.base.typed import Int
 from anatomy.lung import Lung
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
-from lungaccess.planning.procedure import load_procedure
 from lungaccess.planning.procedure.spread import Spread
 from lungaccess.planning.success.ratings import OPEN_LOOP
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel
+from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from lungaccess.uncertainty.risk import ErrorModel, RiskAssessor, load_errors
+from lungaccess.uncertainty.risk import RiskAssessor
 from stages.needle import Objective
 
 SYSTEM = la.load_system("tight-inner", fissures_allowed=True)

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from anatomy.base.errors import FileError, SettingsError, TargetError
-from lungaccess.planning.procedure import load_procedure
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import peripheral
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.system import load_system
 from lungaccess.running.study import one_run, summarise
 from lungaccess.running.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
@@ -24,7 +25,6 @@ from lungaccess.running.study.patients import open_patient
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.runs import Run, runs_of
 from lungaccess.running.study.settings import PlannerChoice, study_of
-from lungaccess.uncertainty.risk import load_errors
 from tests.lungaccess.running.study.toys import NEAR, content
 
 

@@ -16,13 +16,15 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import Headline
 from lungaccess.planning import Alternative, with_front
-from lungaccess.planning.procedure import ProcedureReport, StageReport, load_procedure
+from lungaccess.planning.procedure import ProcedureReport, StageReport
 from lungaccess.planning.success import chance_of
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.procedures import load_procedure
 from lungaccess.showing.report.html import page_of_plan, trade_off_svg
 from lungaccess.showing.report.html.risk import risk_section
 from lungaccess.showing.slicer import export
-from lungaccess.uncertainty.risk import Share, load_errors
+from lungaccess.uncertainty.risk import Share
 from tests.lungaccess.appraisals import make_check, make_risk
 
 STATED = chance_of(make_risk(1200, reaches=1900, vessel=700))

@@ -19,8 +19,8 @@ from anatomy.base.settings import parse, to_mapping
 from anatomy.lung import Lung
 from anatomy.motion.population import share_of_motion
 from lungaccess.problem.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
-from lungaccess.problem.errors import BREATHING
-from lungaccess.uncertainty.risk import (
+from lungaccess.problem.errors import (
+    BREATHING,
     UNITS,
     AngleError,
     BreathingError,

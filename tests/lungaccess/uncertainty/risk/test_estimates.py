@@ -12,7 +12,9 @@ from scipy.stats import chi, chi2, norm
 import lungaccess as la
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk import ErrorModel, PositionError, assess, load_errors, rare_share, rare_touch
+from lungaccess.problem.error_files import load_errors
+from lungaccess.problem.errors import ErrorModel, PositionError
+from lungaccess.uncertainty.risk import assess, rare_share, rare_touch
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.rare import Luck
 from lungaccess.uncertainty.risk.sensitivity import sensitivities

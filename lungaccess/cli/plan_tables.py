@@ -14,7 +14,6 @@ from rich.text import Text
 
 from lungaccess.cli import terminal
 from lungaccess.judging.appraisal.grade import Grade
-from lungaccess.judging.appraisal.headline import of_hundred
 from stages.needle import Objective
 
 if TYPE_CHECKING:
@@ -126,6 +125,8 @@ def show_headline(headline: Headline) -> None:
 
 def show_advice(advice: Sequence[Advice], appraisal: Appraisal) -> None:
     """Print what lifts the chance of success most, as it was tried, each with its command."""
+    from lungaccess.judging.appraisal.headline import of_hundred
+
     success = appraisal.headline.success
     if not advice or success is None:
         return

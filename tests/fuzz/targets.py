@@ -124,7 +124,7 @@ def _read_centerlines(name: str) -> Callable[[Path], Any]:
 
 
 def _template(name: str) -> Callable[[Path], None]:
-    text = (resources.files("lungaccess.problem") / "cli" / "templates" / name).read_bytes()
+    text = (resources.files("lungaccess") / "cli" / "templates" / name).read_bytes()
     return lambda folder: (folder / name).write_bytes(text) and None
 
 

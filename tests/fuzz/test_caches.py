@@ -21,7 +21,7 @@ from anatomy.patient import PatientImages
 from anatomy.store import open_lung
 from lungaccess.planning.coupled import atlas_store
 from lungaccess.planning.coupled.atlas_store import open_atlas
-from stages.tube import ShapeGrid, ShapeLimits, open_shapes, shape_store
+from stages.tube import ShapeGrid, ShapeLimits, design_shapes, open_shapes
 from tests.anatomy.stored_toy import SOURCES, require_same
 from tests.anatomy.toys import toy
 from tests.fuzz.caches import tamper
@@ -91,9 +91,9 @@ def shapes(monkeypatch: pytest.MonkeyPatch) -> Cache:
     made: list[str] = []
     tubes = (SYSTEM.tubes.inner, SYSTEM.tubes.outer)
     fine, coarse = ShapeGrid(stop_mm=10.0, rotations=4), ShapeGrid(stop_mm=20.0, rotations=4)
-    enumerated = {grid: shape_store.tube_shapes(tubes, ShapeLimits(), grid) for grid in (fine, coarse)}
+    enumerated = {grid: design_shapes.tube_shapes(tubes, ShapeLimits(), grid) for grid in (fine, coarse)}
     monkeypatch.setattr(
-        shape_store, "tube_shapes", lambda *design: made.append("shapes") or enumerated[design[-1]]
+        design_shapes, "tube_shapes", lambda *design: made.append("shapes") or enumerated[design[-1]]
     )
 
     def opened(cache: Path, grid: ShapeGrid = fine) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 from experiments.support.needle.queries import Validator, environment_of, hard_queries, load_obstacles
 from lungaccess.running.benchmark import UncObstacles
 from stages.needle import query as needle_query
-from stages.needle.search.planners import PLANNERS
+from stages.needle.search.planners import searches
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES
 from tests.scenarios.runs import Answer
 
@@ -29,7 +29,7 @@ class SharedQueries:
         for query in self._queries:
             environment = environment_of(self._obstacles[query.patient], query)
             asked = needle_query.Query(lps_from_start=query.lps_from_start, target=query.target_lps)
-            search = PLANNERS[planner](environment, asked, 0)
+            search = searches()[planner](environment, asked, 0)
             search.advance(NEEDLE_ITERATIONS)
             path = search.path
             if path is None:

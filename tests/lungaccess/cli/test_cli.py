@@ -58,6 +58,7 @@ def toy_commands(monkeypatch: pytest.MonkeyPatch, toy_lung: Any, toy_plan: Plan)
         ]
     }
     seen.update(accepted=True, risk=make_risk(60))
+    monkeypatch.setattr("lungaccess.judging.advice.advise", lambda *_, **__: ())
 
     def search(request: Request, **options: Any) -> Iterator[Plan]:
         seen.update(system=request.system, target=request.target, goal=request.goal, limits=request.limits)

@@ -99,8 +99,7 @@ def test_a_plan_as_json_says_what_the_check_says(
     for name in ("overview_png", "tree_png", "cost_over_time_png"):
         monkeypatch.setattr(f"lungaccess.showing.report.{name}", lambda *_: None)
     appraise_as_told(monkeypatch, {"accepted": True, "risk": make_risk(1900)})
-    found = plan_search.Found(plan=toy_plan, cost=toy_plan.cost)
-    monkeypatch.setattr(plan_search, "run_search", lambda *_: (found, []))
+    monkeypatch.setattr(plan_search, "run_search", lambda *_: (toy_plan, []))
     words = ["plan", "toy", "--nodule", "--json", "--out", str(tmp_path)]
     assert cli.main(words) == ExitCode.OK
     said = json.loads(capsys.readouterr().out)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from anatomy.margins import Margins
-from stages.needle import OMPL_PLANNERS, OUR_PLANNERS, PLANNERS, first_path, needle_environment, violation
+from stages.needle import OMPL_PLANNERS, OUR_PLANNERS, first_path, needle_environment, searches, violation
 from stages.needle.device import Needle
 from tests.stages.needle.ompl.problems import NEAR, query, scene
 
@@ -40,9 +40,9 @@ def test_ours_serve_as_they_are_and_give_the_same_through_ompl(name: str) -> Non
         scene(), Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 30), Margins(), with_fissures=False
     )
     for asked in (query(), query(NEAR)):
-        alone = first_path(PLANNERS[name](environment, asked, 5), 3000)
+        alone = first_path(searches()[name](environment, asked, 5), 3000)
         assert alone is not None and not violation(environment, asked, alone)
-        assert first_path(PLANNERS[name](environment, asked, 5), 3000, 0.5 * alone.length_mm) is None
+        assert first_path(searches()[name](environment, asked, 5), 3000, 0.5 * alone.length_mm) is None
         try:
             from stages.needle.ompl import NeedleProblem
         except ImportError:

@@ -37,6 +37,7 @@ KEYS = {
     "fissures_unknown",
     "success",
     "stated_by_plan",
+    "without_measuring",
     "most_frequent_failure",
     "failures",
     "draws",

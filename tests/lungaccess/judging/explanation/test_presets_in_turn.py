@@ -65,7 +65,7 @@ def explained(small_lung: Lung, clock: FakeTime, monkeypatch: pytest.MonkeyPatch
     for name in OTHER_PARTS:
         monkeypatch.setattr(explain.Explainer, name, lambda _self: None)
     monkeypatch.setattr(explain, "direct_candidates", lambda *_: None)
-    monkeypatch.setattr(explain, "plan", lambda *_, **__: iter(()))
+    monkeypatch.setattr(explain, "run", lambda *_, **__: iter(()))
     accepted: Any = SimpleNamespace(accepted=True)
 
     def explained_with(

@@ -305,7 +305,7 @@ def test_no_deployment_costs_less_than_the_bound(
 ) -> None:
     """Rotations and insertions beside those of the atlas, each with a single arc."""
     task = Task(lung=small_lung, system=SYSTEM, target=target, objective=Objective.of(objective))
-    *_, best = plans_of(small_lung, target, atlas, iterations=20, objective=objective)
+    *_, best = plans_of(small_lung, target, atlas, iterations=20, goal=objective)
     bound = CostBound(task, atlas)
     values = [bound.improve(2.0 * best.cost, 5000) for _ in range(4)]
     assert values == sorted(values)

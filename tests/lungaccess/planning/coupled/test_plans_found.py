@@ -38,7 +38,8 @@ class TestPlans:
     def test_each_objective_is_served_best_by_its_own_search(
         self, by_objective: dict[str, list[Plan]]
     ) -> None:
-        for name in KEYS:
+        # A plan states the cost of all in tissue under that objective alone.
+        for name in set(KEYS) - {"tissue"}:
             best = {other: plans[-1].costs[name] for other, plans in by_objective.items()}
             # A short random search comes this near to the best, no nearer.
             assert best[name] <= 1.02 * min(best.values())

@@ -67,7 +67,7 @@ def test_a_file_is_read_with_its_folder(tmp_path: Path) -> None:
         ({"planner": [{"name": "a", "needle_planner": "control.RTT"}]}, "control.RRT"),
         (
             {"planner": [{"name": "a", "kind": "needle", "method": "rrt", "needle_planner": "rrt"}]},
-            "of the kind plan",
+            "none, for a planner of the needle",
         ),
         ({"planner": [{"name": "a", "kind": "needle", "method": "rrt"}]}, "start poses in every case"),
         ({"planner": [{"name": "a"}, {"name": "a"}]}, "each only once"),

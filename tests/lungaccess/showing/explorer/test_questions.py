@@ -30,7 +30,7 @@ PLAN = {"ask": "plan", "id": 3, "target": "nodule 1"}
 
 def test_a_question_is_read() -> None:
     name, question = read_message(json.dumps(PLAN | {"what_if": {"system": "ultrathin", "margin_mm": 1.0}}))
-    assert (name, question.id, question.what_if.margin_mm, question.iterations) == ("plan", 3, 1.0, 1000)
+    assert (name, question.id, question.what_if.margin_mm, question.iterations) == ("plan", 3, 1.0, 20)
     assert read_message('{"ask": "cancel", "id": 7}') == (CANCEL, 7)
 
 

@@ -14,7 +14,7 @@ from anatomy.base.errors import FileError, SettingsError
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.ompl import NeedlePlanner, NeedleProblem, benchmark, read_state
 from stages.needle.search.base import RestartingRRT
-from stages.needle.search.planners import PLANNERS
+from stages.needle.search.planners import searches
 from tests.stages.needle.ompl.problems import (
     GOAL,
     LONG_S,
@@ -34,13 +34,13 @@ def test_the_benchmark_of_ompl_takes_all_planners(problem: NeedleProblem, tmp_pa
     results = benchmark(
         problem, query(NEAR), time_s=LONG_S, runs=2, goal_tolerance_mm=4.0, file=log, seed=3
     )  # fmt: skip
-    assert list(results) == [*PLANNERS, *OMPL_PLANNERS]
+    assert list(results) == [*searches(), *OMPL_PLANNERS]
     for name, result in results.items():
         assert result.runs == 2 and result.name == name
         assert result.solved_share + len(result.refusals) / 2 == 1.0
         assert all(0.0 < time < LONG_S for time in result.times_s)
         assert all(20.0 < length < 100.0 for length in result.lengths_mm)
-    assert all(results[name].solved_share == 1.0 for name in PLANNERS)
+    assert all(results[name].solved_share == 1.0 for name in searches())
     assert list(tmp_path.iterdir()) == [log]
     text = log.read_text(encoding="utf-8")
     assert text.startswith("OMPL version") and "control_KPIECE1" in text

@@ -107,7 +107,7 @@ def drawn_line(rng: np.random.Generator, count: int = 40) -> tuple[Volume, np.nd
     nodes = np.stack((rho * np.cos(angle), rho * np.sin(angle), z), axis=1) @ turn.T
     edges = np.stack((np.arange(count - 1), np.arange(1, count)), axis=1)
     grid = Grid(shape=mask.grid.shape, lps_from_ijk=matrix)
-    return Volume(grid=grid, array=mask.array), *centreline._refined(nodes, edges, 0.75)
+    return Volume(grid=grid, array=mask.array), *centreline._refined(nodes, edges)
 
 
 def clamped(nodes: np.ndarray, edges: np.ndarray, walls: centreline._Walls) -> Centreline:

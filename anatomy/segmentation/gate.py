@@ -13,7 +13,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.segmentation.lungs import Lungs
-from anatomy.segmentation.missing_lung import missing_lung, solid_tissue
+from anatomy.segmentation.missing_lung import missing_lung, sampled, solid_tissue
 
 CHECKS: Mapping[str, str] = MappingProxyType(
     {
@@ -241,7 +241,7 @@ def landmarks(tree: AirwayTree, left: Mask, right: Mask, grid: Grid) -> Landmark
     Each direction is told by signs that do not depend on each other.  Only a header that is wrong, or organs
     that are mirrored, turn all signs of a direction around.
     """
-    lungs = [_points(mask, grid) for mask in (left, right)]
+    lungs = [sampled(mask, grid, SAMPLE_MM) for mask in (left, right)]
     top, carina = tree.points_lps[0], tree.carina_lps
     along = top - carina
     length = float(np.linalg.norm(along))
@@ -270,12 +270,6 @@ def _left(tree: AirwayTree, lungs: list[Float], carina: Float) -> tuple[int, ...
 
 def _sign(value: float, least: float) -> int:
     return 0 if abs(value) < least else int(np.sign(value))
-
-
-def _points(mask: Mask, grid: Grid) -> Float:
-    """Return voxels of a mask in steps of some millimetres, `(N, 3)` LPS mm."""
-    step = np.maximum(1, np.rint(SAMPLE_MM / grid.spacing_mm)).astype(np.int64)
-    return np.asarray(grid.lps(np.argwhere(mask[tuple(slice(None, None, int(s)) for s in step)]) * step))
 
 
 def _whole(mask: Mask) -> bool:

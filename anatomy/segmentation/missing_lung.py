@@ -45,7 +45,7 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
         In the order of voxels of `canonical`.
     carina_lps : (3,) float64
     """
-    points = _sampled(left | right, grid)
+    points = sampled(left | right, grid, SAMPLE_MM)
     chest, first = _on_cubes(untilted(points, carina_lps))
     zones = tuple(
         f"About {lost_ml / 1000.0:.2f} l of lung are missing in the {name}: only {100 * share:.0f} % of "
@@ -60,7 +60,7 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
 
 def _short(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> Iterator[str]:
     """Yield warnings of lungs that end too early at the back or at the base."""
-    sides = {"right": _sampled(right, grid), "left": _sampled(left, grid)}
+    sides = {"right": sampled(right, grid, SAMPLE_MM), "left": sampled(left, grid, SAMPLE_MM)}
     width = float(np.subtract(*np.percentile(np.concatenate([*sides.values()])[:, 0], [98.0, 2.0])))
     for name, points in sides.items():
         lower = points[points[:, 2] < carina_lps[2]]
@@ -113,9 +113,9 @@ def _zones(chest: Mask, first: Float, carina_lps: Float) -> Iterator[tuple[str, 
                 yield f"{part} of the {name} lung", float(lung / whole), float(lost_ml)
 
 
-def _sampled(mask: Mask, grid: Grid) -> Float:
-    """Return about one point of a mask in each cube of `SAMPLE_MM`, LPS mm `(N, 3)`."""
-    step = np.maximum(1, np.rint(SAMPLE_MM / grid.spacing_mm)).astype(np.int64)
+def sampled(mask: Mask, grid: Grid, cube_mm: float) -> Float:
+    """Return about one point of a mask in each cube of `cube_mm`, LPS mm `(N, 3)`."""
+    step = np.maximum(1, np.rint(cube_mm / grid.spacing_mm)).astype(np.int64)
     return np.asarray(grid.lps(np.argwhere(mask[tuple(slice(None, None, int(s)) for s in step)]) * step))
 
 

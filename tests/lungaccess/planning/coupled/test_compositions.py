@@ -285,7 +285,7 @@ def test_a_bound_for_a_window_holds_where_the_masks_show_one_of_its_phases(
         with pytest.raises(SettingsError, match="the masks show"):
             beside_in_window_mm(task, (0.0, 0.1) if shown > 0.5 else (0.9, 1.0))
         phases = max(shown - 0.2, 0.0), min(shown + 0.2, 1.0)
-        plans = la.plan_for_window(lung, system, goal, phases, atlas=atlas, iterations=6)
+        plans = la.plan(lung, system, goal, goal="default", phases=phases, atlas=atlas, iterations=6)
         costs = [each.cost for each in plans]
         bound = cost_bound(task, atlas, beside_in_window_mm(task, phases))
         for _ in range(10):

@@ -7,12 +7,11 @@ The picture shows tubes and needles of the set from the front, over the airway t
 import matplotlib.pyplot as plt
 
 import lungaccess as la
-from lungaccess.planning import alternatives
 
 lung = la.load_patient("phantom-3")
 system = la.load_system("ultrathin")
 target = la.resolve_target(lung, nodule=1)
-found = alternatives(lung, system, target, count=8, separation_mm=5.0)
+found = la.alternatives(lung, system, target, goal="default", count=8, separation_mm=5.0)
 figure, ax = plt.subplots(figsize=(9, 5))
 x, _y, z = lung.tree.points_lps.T
 ax.plot(x, z, ".", color="0.8", markersize=2)

@@ -25,7 +25,7 @@ from experiments.support.kuntz2015.rrt_time import LONG_S, PAPER_S, PAPER_SHARE,
 from experiments.support.kuntz2015.workspace_rejection import PAPER_PATHS
 from experiments.support.kuntz2015.workspace_rejection import PAPER_S as PAPER_PATHS_S
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.planning import Alternative, alternatives
+from lungaccess.planning import Alternative
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
@@ -60,11 +60,11 @@ def diverse_sets(atlas: Atlas, points: Float, count: int) -> list[tuple[float, t
     for point in points:
         target = point_target(atlas.lung, point)
         try:
-            alternatives(atlas.lung, atlas.system, target, atlas=atlas)
+            la.alternatives(atlas.lung, atlas.system, target, goal="default", atlas=atlas)
         except la.NoPlan:
             continue
         began = time.process_time()
-        plans = alternatives(atlas.lung, atlas.system, target, atlas=atlas)
+        plans = la.alternatives(atlas.lung, atlas.system, target, goal="default", atlas=atlas)
         found.append((time.process_time() - began, plans))
         if len(found) == count:
             break

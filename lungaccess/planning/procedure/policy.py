@@ -137,12 +137,8 @@ class Chosen:
 
     def only(self, chosen: Int) -> Chosen:
         """Return some of the procedures, by their numbers."""
-        arrays = {
-            each.name: getattr(self, each.name)[chosen]
-            for each in fields(self)
-            if each.name not in ("tubes", "deployed")
-        }
-        arrays["tubes"] = self.tubes[chosen] if len(self.tubes) else self.tubes
+        arrays = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "deployed"}
+        arrays = {name: each[chosen] if len(each) else each for name, each in arrays.items()}
         kept = tuple(self.deployed[n] for n in chosen.tolist()) if self.deployed else ()
         return Chosen(**arrays, deployed=kept)
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import lungaccess as la
 from anatomy import poses
-from anatomy.base.errors import PlanFileError, SettingsError
+from anatomy.base.errors import LungaccessError, PlanFileError, SettingsError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.planning.one_stage import ScopeReplanner
@@ -28,6 +28,7 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle import Objective
 from stages.tube import enumerate_deployments, one_site_enumerator
+from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 SYSTEM = la.load_system("ultrathin")
 ERRORS = load_errors("gated-ct")
@@ -224,3 +225,33 @@ def test_a_record_is_played_again(policy: la.Policy, plan: Plan, small_lung: Lun
     path.write_text("{}")
     with pytest.raises(PlanFileError, match="no record"):
         la.ProcedureRecord.load(path, plan, small_lung)
+
+
+# Other systems -----------------------------------------------------------------------------------
+
+
+def thin_tubes_only() -> la.System:
+    loaded = la.load_system("tubes-only", fissures_allowed=True)
+    return replace(loaded, name="thin", scope=replace(loaded.scope, outer_diameter_mm=2.0))
+
+
+@pytest.mark.parametrize("system", [two_curved_tubes(), thin_tubes_only()], ids=["twisted", "tubes only"])
+def test_twisted_tubes_and_none_behind_them(system: la.System, small_lung: Lung) -> None:
+    """Measured procedures of any system succeed at least as often as open loop, up to the error of draws."""
+    atlas = la.build_atlas(small_lung, system, **COARSE)
+    entries, beyond_mm = atlas.deployments, 0.0 if system.needle is None else 14.0
+    for entry in np.random.default_rng(0).permutation(entries.count):
+        try:
+            point = entries.positions[entry] + beyond_mm * entries.tangents[entry]
+            plan = next(iter(la.plan(small_lung, system, la.point_target(small_lung, point), atlas=atlas)))
+        except LungaccessError:
+            continue
+        break
+    options = {"errors": ERRORS, "samples": 40, "radius_mm": 5.0}
+    procedure = load_procedure("measured-tip")
+    blind = la.simulate_procedure(plan, small_lung, **options)
+    seen = la.simulate_procedure(plan, small_lung, procedure=procedure, **options)
+    assert seen.succeeds.count >= blind.succeeds.count - 2.0 * math.sqrt(40 * 0.25)
+    policy = la.Policy(plan, small_lung, ERRORS, procedure, radius_mm=5.0)
+    decision = policy.decide(la.Measurements.of(scope=[plan.scope.lps_from_scope_tip]))
+    assert decision.tube is not None and (decision.needle is None) == (system.needle is None)

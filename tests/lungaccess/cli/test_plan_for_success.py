@@ -17,7 +17,7 @@ from lungaccess.plans.plan import Plan
     ("words", "said"),
     [
         (["--goal", "sucess"], "Did you mean 'success'"),
-        (["--goal", "success", "--gap", "0.1"], "nothing bounds chance of success"),
+        (["--goal", "success", "--gap", "0.1"], "no bound of the best possible"),
         (["--goal", "length", "--gap", "0.1", "--phases", "0:0.3"], "breathes is not known"),
         (["--goal", "success", "--procedure", "measured-top"], "measured-tip"),
         (["--goal", "window"], "breathes is not known"),

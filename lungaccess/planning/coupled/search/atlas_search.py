@@ -9,6 +9,7 @@ from itertools import count, islice
 
 import numpy as np
 
+from anatomy.base.typed import Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.search.base import DirectSearch, SearchInParts, Step, evaluated_step
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
@@ -99,17 +100,28 @@ class AtlasSearch(SearchInParts):
             yield from rounds.halve(newcomers)
 
     def _starts(self, local_search: LocalSearch) -> Iterator[LocalSearchRun]:
-        """Yield local searches from clear direct arcs, different ones by their cost, then any of them."""
+        """Yield local searches from clear direct arcs, different ones by their cost, then any of them.
+
+        Tubes that the validation refuses although the atlas has them, on the edge of a limit, are not tried
+        again, so that the search ends where no others are left.
+        """
         number, parts = self.share
         clear = self.direct.clear
-        for entry in different(self.atlas.deployments, clear)[number::parts].tolist():
+        refused: set[int] = set()
+        for entry in self._entries(clear, different(self.atlas.deployments, clear)[number::parts], refused):
             run = local_search.begin(self.arcs.candidate(entry))
             if run is not None:
                 yield run
-        while len(clear):
-            run = local_search.begin(self.arcs.candidate(int(self._rng.choice(clear))))
-            if run is not None:
-                yield run
+            else:
+                refused.add(entry)
+
+    def _entries(self, clear: Int, first: Int, refused: set[int]) -> Iterator[int]:
+        """Yield deployments of the atlas: the first ones, then any that are clear until all are refused."""
+        yield from first.tolist()
+        while len(refused) < len(clear):
+            entry = int(self._rng.choice(clear))
+            if entry not in refused:
+                yield entry
 
     def _sampled(self, local_search: LocalSearch) -> Iterator[tuple[Step, Candidate | None]]:
         """Sample deployments near those of the atlas whose needle reaches the target, or nearly does."""

@@ -110,6 +110,16 @@ class TestBudget:
         plans.close()  # type: ignore[attr-defined]
         assert costs[0] > costs[1] > costs[2]
 
+    def test_tubes_that_are_all_refused_do_not_hold_up_the_search(
+        self, small_lung: Lung, target: Target, atlas: la.Atlas, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The atlas has tubes on the edge of a limit that the validation refuses."""
+        tried: list[int] = []
+        monkeypatch.setattr(DirectArcs, "candidate", lambda _self, entry: tried.append(entry))
+        with pytest.raises(la.NoPlan, match="after 0 iterations"):
+            plans_of(small_lung, target, atlas, iterations=0)
+        assert len(tried) > len(set(tried)) > 1
+
     @pytest.mark.slow
     def test_a_futile_search_without_budget_ends(self, small_lung: Lung, atlas: la.Atlas) -> None:
         far = la.resolve_target(small_lung, FAR_TARGET)

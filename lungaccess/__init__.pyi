@@ -57,6 +57,8 @@ from lungaccess.problem.procedures import load_procedure as load_procedure
 from lungaccess.problem.request import Request as Request
 from lungaccess.problem.request import StatedPlace as StatedPlace
 from lungaccess.problem.request import register_goal as register_goal
+from lungaccess.running.design import read_design as read_design
+from lungaccess.running.design import run_design as run_design
 from lungaccess.running.study import read_study as read_study
 from lungaccess.running.study import run_study as run_study
 from lungaccess.showing.report.html import plan_page as plan_page

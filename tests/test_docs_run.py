@@ -106,7 +106,7 @@ def run_command(words: list[str]) -> None:
     if words[0] != "lungaccess" or words[1] in SERVES:
         return
     stated = at_hand(words[1:])
-    if stated[0] == "study" or stated[:3:2] == ["benchmark", "run"]:  # they start processes
+    if stated[0] in ("design", "study") or stated[:3:2] == ["benchmark", "run"]:  # they start processes
         code = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         done = subprocess.run([sys.executable, "-c", code, *stated], env=os.environ | {"PYTHONPATH": path})

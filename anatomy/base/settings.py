@@ -164,7 +164,8 @@ def override(values: T, changes: Mapping[str, object], where: str = "overrides")
     values : settings
         What to start from.
     changes : mapping of str to object
-        New values by dotted key path, e.g. ``{"needle.diameter_mm": 0.8}``.
+        New values by dotted key path, e.g. ``{"needle.diameter_mm": 0.8}``; entries of arrays by their number
+        from 0.
     where : str, optional
         Where the changes come from, for the message.
 
@@ -180,14 +181,16 @@ def override(values: T, changes: Mapping[str, object], where: str = "overrides")
     mapping = to_mapping(values)
     for path, value in changes.items():
         *parents, key = path.split(".")
-        inner = mapping
+        inner: Any = mapping
         for parent in parents:
-            step = inner.setdefault(parent, {})
-            if not isinstance(step, dict):
-                raise SettingsError(
-                    f"{where}: {path} is not a setting", remedy=_REMEDY, expected="a key of the file"
-                )
-            inner = step
+            if isinstance(inner, list):
+                inner = inner[int(parent)] if parent.isdigit() and int(parent) < len(inner) else None
+            else:
+                inner = inner.setdefault(parent, {}) if isinstance(inner, dict) else None
+        if not isinstance(inner, dict):
+            raise SettingsError(
+                f"{where}: {path} is not a setting", remedy=_REMEDY, expected="a key of the file"
+            )
         inner[key] = value
     return parse(type(values), mapping, where)
 

@@ -26,6 +26,7 @@ from lungaccess.cli.commands.cache import cache
 from lungaccess.cli.commands.certify import certify
 from lungaccess.cli.commands.check import check
 from lungaccess.cli.commands.demo import demo
+from lungaccess.cli.commands.design import design
 from lungaccess.cli.commands.doctor import doctor
 from lungaccess.cli.commands.export import export
 from lungaccess.cli.commands.info import info, presets
@@ -97,7 +98,7 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
 for _command in (
     plan, needle, replan, stream, certify, check, info, presets, template, phantom, demo, advise,
     alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report,
-    view, export, insert, doctor, selftest, completion,
+    view, export, insert, design, doctor, selftest, completion,
 ):  # fmt: skip
     app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 app.command(study)

@@ -34,6 +34,7 @@ EXAMPLES = MappingProxyType(
         "shapes": "lungaccess shapes --system ultrathin --out shapes.csv",
         "reach": "lungaccess reach PATIENT --spacing 10 --out reach",
         "segment": "lungaccess segment PATIENT/ct.nii.gz --out SEGMENTED",
+        "design": "lungaccess design --out design",
         "study run": "lungaccess study run study.toml --out results.db",
         "study show": "lungaccess study show results.db",
         "study export": "lungaccess study export results.db --csv tables",

@@ -140,6 +140,7 @@ def _text_targets() -> dict[str, Target]:
     from lungaccess.problem.error_files import load_errors
     from lungaccess.problem.procedures import load_procedure
     from lungaccess.problem.system import load_system
+    from lungaccess.running.design.settings import read_design
     from lungaccess.running.study.settings import read_study
     from tests.lungaccess.conftest import make_plan
 
@@ -169,6 +170,7 @@ def _text_targets() -> dict[str, Target]:
             "procedure.toml", _template("procedure.toml"), lambda f: load_procedure(f / "procedure.toml")
         ),
         "study": Target("study.toml", _template("study.toml"), lambda f: read_study(f / "study.toml")),
+        "design": Target("design.toml", _template("design.toml"), lambda f: read_design(f / "design.toml")),
         "tubes": Target("tubes.toml", _template("tubes.toml"), lambda f: load_tubes(f / "tubes.toml")),
         "pose": Target("pose.txt", _template("pose.txt"), lambda f: read_pose(f / "pose.txt", "ras")),
         "points": Target("points.txt", points, lambda f: read_points(f / "points.txt", "lps")),

@@ -10,12 +10,13 @@ from anatomy.base.files import write_text
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 
-Kind = Literal["patient", "errors", "procedure", "study", "tubes", "lesions", "pose", "contours"]
+Kind = Literal["patient", "errors", "procedure", "study", "design", "tubes", "lesions", "pose", "contours"]
 FILES = {
     "patient": "patient.toml",
     "errors": "errors.toml",
     "procedure": "procedure.toml",
     "study": "study.toml",
+    "design": "design.toml",
     "tubes": "tubes.toml",
     "lesions": "lesions.txt",
     "pose": "pose.txt",
@@ -29,8 +30,9 @@ def template(
         Kind,
         Parameter(
             help="patient: a folder of own masks; errors: sizes of errors for `risk`; procedure: what is "
-            "measured on the way, for `risk`; study: many plans; tubes: two tubes alone; lesions: points for "
-            "`tour`; pose: a start for `needle`; contours: an outlined nodule for `segment`."
+            "measured on the way, for `risk`; study: many plans; design: a search over devices; tubes: two "
+            "tubes alone; lesions: points for `tour`; pose: a start for `needle`; contours: an outlined "
+            "nodule for `segment`."
         ),
     ],
     /,
@@ -41,10 +43,15 @@ def template(
 
     Devices have templates of their own: `lungaccess presets --show NAME`.
     """
-    text = (resources.files("lungaccess") / "cli" / "templates" / FILES[kind]).read_text(encoding="utf-8")
+    text = template_text(kind)
     if out is None:
         terminal.console.file.write(text)
         return ExitCode.OK
     write_text(out, text)
     terminal.say(f"Written to {out}")
     return ExitCode.OK
+
+
+def template_text(kind: Kind) -> str:
+    """Return the example of a file."""
+    return (resources.files("lungaccess") / "cli" / "templates" / FILES[kind]).read_text(encoding="utf-8")

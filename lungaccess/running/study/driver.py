@@ -1,28 +1,27 @@
-"""Run a study on a cluster of dask.distributed; only this process writes the results file."""
+"""Make the runs of a study on many processes; only this one writes the results file."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import time
-from collections.abc import Callable, Iterator
-from itertools import islice
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from anatomy.base.errors import SettingsError
+from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
 from lungaccess.plans.version import software_kernels
 from lungaccess.running.study.answers import CRASH, UNKNOWN, Answer
-from lungaccess.running.study.cluster import Backlog, connect, interruptions_noted, require_dask
+from lungaccess.running.study.cluster import Workers, connect, dask_is_installed, interruptions_noted
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.runs import Problem, Run, runs_of
 from lungaccess.running.study.settings import Study, StudyError
 from stages.needle import require_planner
 
-if TYPE_CHECKING:
-    from distributed import Client
-
-RETRIES = 2
-"""How often a run that could not be made is tried again at once: workers and disks may fail for a moment."""
+KILLED = "KilledWorker"
+"""What dask raises for a run in which its workers died several times."""
 Progress = Callable[[str, float | None], None]
 
 
@@ -79,17 +78,45 @@ def run_study(
     LungaccessError
         If a patient, a system or a target of the study cannot be read.
     """
+    began = time.perf_counter()
+    say = progress or (lambda _words, _share: None)
+    with open_results(path, scheduler=scheduler, workers=workers, cache=cache) as maker:
+        runs = list(runs_of(study, cache=cache, progress=lambda words: say(words, None)))
+        return replace(maker.make(runs, say), wall_s=time.perf_counter() - began)
+
+
+@contextlib.contextmanager
+def open_results(
+    path: Path, *, scheduler: str | None, workers: int | None, cache: Path | None
+) -> Iterator[RunMaker]:
+    """Open a results file, for runs that are added to it; parameters and errors are those of `run_study`."""
     if workers is not None and scheduler is not None:
         raise SettingsError(
             f"--workers is {workers} and --scheduler is {scheduler}",
             expected="one of them: a scheduler has workers of its own",
             remedy="Leave out --workers",
         )
-    began = time.perf_counter()
-    say = progress or (lambda _words, _share: None)
-    require_dask()
-    with ResultsFile(path, create=True) as results:
-        runs = list(runs_of(study, cache=cache, progress=lambda words: say(words, None)))
+    if scheduler is not None and not dask_is_installed():
+        raise StudyError(
+            "A scheduler needs a library that is not installed",
+            expected="dask.distributed",
+            remedy="pip install 'lungaccess[study]', or leave out --scheduler",
+        )
+    with ResultsFile(path, create=True) as results, contextlib.ExitStack() as stack:
+        yield RunMaker(results, cache, lambda: stack.enter_context(connect(scheduler, workers)))
+
+
+class RunMaker:
+    """Makes the runs that a results file does not have; workers start with the first that is missing."""
+
+    def __init__(self, results: ResultsFile, cache: Path | None, start: Callable[[], Workers]) -> None:
+        self.results, self._cache, self._workers = results, cache, functools.cache(start)
+
+    def make(self, runs: Sequence[Run], say: Progress) -> StudyDone:
+        """Make those of the runs that are missing, and store them one by one."""
+        from lungaccess.running.study.one_run import answer
+
+        began, results = time.perf_counter(), self.results
         stored = results.finished_keys()
         missing = [run for run in runs if run.key not in stored]
         there = {run.key for run in runs} & stored
@@ -99,95 +126,55 @@ def run_study(
         added = failed = 0
         if missing:
             say("starting workers", None)
-            with connect(scheduler, workers) as client, interruptions_noted() as stop_if_interrupted:
-                _prepare(client, missing, cache, say)
-                for done, (run, answer) in enumerate(_answers(client, missing, cache), start=1):
-                    new = results.add(run, answer)
+            workers = self._workers()
+            with interruptions_noted() as stop_if_interrupted:
+                _prepare(workers, missing, self._cache, say)
+                for done, (run, found) in enumerate(workers.each(answer, missing, self._cache), start=1):
+                    made = found if isinstance(found, Answer) else _failed(run, found)
+                    new = results.add(run, made)
                     added += new
-                    failed += new and answer.failed
+                    failed += new and made.failed
                     say(f"{done} of {len(missing)} runs, {run.problem.case}", done / len(missing))
                     stop_if_interrupted()
-    return StudyDone(
-        runs=len(runs),
-        stored_before=len(runs) - len(missing),
-        other_kernels=others,
-        added=added,
-        failed=failed,
-        wall_s=time.perf_counter() - began,
-    )
+        return StudyDone(
+            runs=len(runs),
+            stored_before=len(runs) - len(missing),
+            other_kernels=others,
+            added=added,
+            failed=failed,
+            wall_s=time.perf_counter() - began,
+        )
 
 
-def _prepare(client: Client, runs: list[Run], cache: Path | None, say: Progress) -> None:
-    """Let one worker for each patient and system make the atlas, before all of them need it."""
-    problems: dict[Any, Problem] = {}
-    for run in runs:
-        if run.planner.kind == "plan":
-            problems.setdefault((run.problem.patient, run.problem.system), run.problem)
-    from concurrent.futures import CancelledError
-
-    from distributed import KilledWorker
-
+def _prepare(workers: Workers, runs: Sequence[Run], cache: Path | None, say: Progress) -> None:
+    """Let one worker for each patient, scope and tubes make the atlas, before all of them need it."""
     from lungaccess.running.study.one_run import prepare
 
-    for problem in problems.values():
-        if not client.nthreads():
-            say("waiting for a worker", None)
-            client.wait_for_workers(1)
-        say(f"enumerating what scope and tubes can do: {problem.case}", None)
-        try:
-            client.submit(prepare, problem, cache, pure=False, retries=RETRIES).result()
-        except (KilledWorker, CancelledError) as error:
+    problems: dict[Any, Problem] = {}
+    for problem in (run.problem for run in runs if run.planner.kind == "plan"):
+        system = problem.system
+        devices = (system.scope, system.tubes, system.margins, system.fissures_allowed)
+        problems.setdefault((problem.patient, devices), problem)
+    what = "enumerating what scope and tubes can do"
+    say(what, None)
+    for done, (problem, error) in enumerate(workers.each(prepare, [*problems.values()], cache), start=1):
+        if isinstance(error, LungaccessError):
+            raise error
+        if error is not None:
             raise StudyError(
                 f"The atlas of {problem.case} could not be made ({error})",
                 expected="workers with about 6 GiB of free memory",
                 remedy="Start fewer workers with --workers",
             ) from error
+        say(f"{what}: {done} of {len(problems)} done, {problem.case}", done / len(problems))
 
 
-def _answers(client: Client, runs: list[Run], cache: Path | None) -> Iterator[tuple[Run, Answer]]:
-    """Yield each run's answer as it comes; only a few runs wait at the scheduler at any time."""
-    from distributed import as_completed
-
-    from lungaccess.running.study.one_run import answer
-
-    waiting, under_way = iter(runs), dict[str, Run]()
-    finished = as_completed(with_results=True, raise_errors=False)
-    backlog = Backlog(client)
-    while True:
-        for run in islice(waiting, max(0, backlog.limit() - len(under_way))):
-            key = task_key(run)
-            future = client.submit(answer, run, cache, key=key, pure=False, retries=RETRIES)
-            under_way[key] = run
-            finished.add(future)
-        if not under_way:
-            return
-        future, result = next(finished)
-        run = under_way.pop(future.key)
-        if future.status in ("cancelled", "lost"):
-            raise StudyError(
-                "The dask scheduler was lost",
-                remedy="Start the study again, it goes on from what is stored",
-                expected="a scheduler that runs until the study ends",
-            )
-        yield run, result if future.status == "finished" else _failed(run, result)
-        future.release()
-
-
-def task_key(run: Run) -> str:
-    """Return what dask calls a run; it keeps statistics by the word before the dash, one for all runs."""
-    return f"run-{run.key}"
-
-
-def _failed(run: Run, raised: Any) -> Answer:
-    """Return what is stored of a run that could not be made; dask hands over what `sys.exc_info` returns."""
-    from distributed import KilledWorker
-
-    error = raised[1] if isinstance(raised, tuple) else raised
-    crashed = isinstance(error, KilledWorker)
+def _failed(run: Run, error: BaseException) -> Answer:
+    """Return what is stored of a run that could not be made."""
     return Answer(
         key=run.key,
         outcome=type(error).__name__,
-        status=CRASH if crashed else UNKNOWN,
+        status=CRASH if type(error).__name__ == KILLED else UNKNOWN,
         failed=True,
         message=f"{error}",
     )

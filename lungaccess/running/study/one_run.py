@@ -3,6 +3,7 @@
 That command reads a run as JSON on standard input and writes its answer as JSON on standard output.
 """
 
+import contextlib
 import hashlib
 import json
 import subprocess
@@ -16,7 +17,6 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-import psutil
 
 from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
@@ -77,7 +77,7 @@ def answer(run: Run, cache: Path | None = None) -> answers.Answer:
 
 
 def prepare(problem: Problem, cache: Path | None = None) -> None:
-    """Make sure that the cache has the patient and the atlas of a problem.
+    """Make sure that the cache has the patient and the atlas of a problem, unless its device allows none.
 
     Raises
     ------
@@ -86,7 +86,9 @@ def prepare(problem: Problem, cache: Path | None = None) -> None:
     """
     with _one_at_a_time:
         numba.set_num_threads(1)
-        _atlas_of(problem, cache)
+        _opened(problem.patient, cache)
+        with contextlib.suppress(*ANSWERS):
+            _atlas_of(problem, cache)
 
 
 def _here(run: Run, cache: Path | None) -> answers.Answer:
@@ -97,9 +99,10 @@ def _here(run: Run, cache: Path | None) -> answers.Answer:
 
 def _measured(run: Run, cache: Path | None) -> answers.Answer:
     opened = _opened(run.problem.patient, cache)
-    atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
     began, cpu_began = time.perf_counter(), time.process_time()
     try:
+        atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
+        began, cpu_began = time.perf_counter(), time.process_time()
         made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
     except NoPlan as failure:
         made = _no_plan(run, failure)
@@ -110,8 +113,17 @@ def _measured(run: Run, cache: Path | None) -> answers.Answer:
         made,
         time_s=time.perf_counter() - began,
         cpu_s=time.process_time() - cpu_began,
-        memory_mb=psutil.Process().memory_info().rss / MIB,
+        memory_mb=_memory_mb(),
     )
+
+
+def _memory_mb() -> float:
+    """Return the resident memory of this process, MiB; 0 where the library that measures it is missing."""
+    try:
+        import psutil
+    except ImportError:
+        return 0.0
+    return float(psutil.Process().memory_info().rss / MIB)
 
 
 def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:

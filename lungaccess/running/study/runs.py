@@ -173,12 +173,12 @@ def runs_of(
         (progress or (lambda _words: None))(f"targets of {case.name}")
         folder = Path(study.folder)
         patient = patient_of(case, folder, cache)
-        system = load_system(_beside(case.system, folder), fissures_allowed=case.fissures_allowed)
+        system = load_system(beside(case.system, folder), fissures_allowed=case.fissures_allowed)
         counted: dict[str, Any] = {}
         if case.errors:
             counted = {
-                "errors": load_errors(_beside(case.errors, folder)),
-                "procedure": load_procedure(_beside(case.procedure, folder)),
+                "errors": load_errors(beside(case.errors, folder)),
+                "procedure": load_procedure(beside(case.procedure, folder)),
             }
         for planner in study.planner:
             if planner.needs_a_needle:
@@ -209,8 +209,8 @@ def runs_of(
 Point = tuple[float, float, float]
 
 
-def _beside(name: str, folder: Path) -> str:
-    """Return the name of a preset as it is, and that of a file as it lies beside the study's."""
+def beside(name: str, folder: Path) -> str:
+    """Return the name of a preset as it is, and that of a file as it lies in the study's folder."""
     return str(folder / name) if name.endswith(".toml") else name
 
 

@@ -6,6 +6,7 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.showing.report.clock import window_png
+    from lungaccess.showing.report.front import front_png
     from lungaccess.showing.report.motion import motion_png
     from lungaccess.showing.report.needle import needle_png
     from lungaccess.showing.report.no_plan import no_plan_png

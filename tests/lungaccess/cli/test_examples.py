@@ -22,6 +22,7 @@ from lungaccess.planning import read_lesions
 from lungaccess.planning.one_stage import load_tubes
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
+from lungaccess.running.design import read_design
 from lungaccess.running.study import read_study
 from tests.lungaccess.cli.every_command import commands
 
@@ -95,6 +96,7 @@ def test_every_template_can_be_read(templates: Path) -> None:
         load_procedure("closed-loop"), name="procedure.toml", description=""
     )
     assert read_study(templates / "study.toml").case
+    assert read_design(templates / "design.toml").vary
     assert load_tubes(templates / "tubes.toml").name == "curved pair"
     assert read_lesions(templates / "lesions.txt").shape == (2, 3)
     assert read_pose(templates / "pose.txt", "lps")[2, 3] == 60.0

@@ -1,0 +1,143 @@
+"""What a search over devices is: a study's cases, and ranges of the numbers of their system."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from anatomy.base.errors import SettingsError
+from anatomy.base.files import read_toml
+from anatomy.base.settings import impossible, parse, settings, text
+from anatomy.base.words import did_you_mean
+from lungaccess.running.design.criteria import CRITERIA
+from lungaccess.running.study.settings import Study, study_of
+
+_REMEDY = "`lungaccess template design` prints a complete file to start from"
+_OF_ONE_NUMBER = frozenset({"range", "one_of", "also"})
+"""The keys of a table that says what a number may be; any other table holds numbers."""
+
+
+@settings
+class Number:
+    """A number, or another value, of the device that may change.
+
+    Parameters
+    ----------
+    key : str
+        Dotted path in the system's file; entries of arrays by their number from 0, such as
+        "tubes.inner.slotted_segments.0.stiffness_factor".
+    one_of : tuple
+        The values to choose from, instead of a range: numbers, texts, arrays or whole tables.
+    also : tuple of str
+        Further keys that always have the same value.
+    """
+
+    key: Annotated[str, text("key of the system's file")]
+    range: Annotated[tuple[float, float] | None, Field(description="least and largest value")] = None
+    one_of: Annotated[tuple[Any, ...], Field(description="values to choose from")] = ()
+    also: Annotated[tuple[str, ...], Field(description="keys with the same value")] = ()
+
+    def __post_init__(self) -> None:
+        low, high = self.range or (0.0, 1.0)
+        if (self.range is None) == (not self.one_of) or low >= high:
+            raise impossible(self.key, self.range, "a range [least, larger], or else one_of = [...]")
+
+
+@settings
+class Design:
+    """A search over devices.
+
+    Parameters
+    ----------
+    study : Study
+        The cohort: cases with one system, one planner, one seed, and a budget of iterations.
+    make_large : tuple of str
+        One or two of `CRITERIA`: the best device has most of the first, and of two the front is searched.
+    designs : int
+        How many devices a round begins with.
+    rounds : int
+        The first covers the ranges evenly; each further one lies closer around the best so far.
+    reduction : int
+        One of so many devices goes on to so many times the targets, until all are counted.
+    seed : int
+        Seed of the devices and of the order of the targets.
+    """
+
+    study: Study
+    vary: Annotated[tuple[Number, ...], Field(min_length=1, description="at least one number")]
+    make_large: Annotated[tuple[str, ...], Field(min_length=1, max_length=2, description="one or two")]
+    designs: Annotated[int, Field(strict=True, ge=1, description="devices a round")] = 16
+    rounds: Annotated[int, Field(strict=True, ge=1, description="rounds")] = 3
+    reduction: Annotated[int, Field(strict=True, ge=2, description="one of so many goes on")] = 3
+    seed: Annotated[int, Field(strict=True, ge=0, description="seed of the devices")] = 0
+
+    def __post_init__(self) -> None:
+        study = self.study
+        for name in self.make_large:
+            if name not in CRITERIA:
+                guess = did_you_mean(name, CRITERIA).rstrip("?")
+                raise impossible("make_large", name, f"one of {', '.join(CRITERIA)}. {guess}".rstrip(". "))
+            if CRITERIA[name].needs_errors and not all(case.errors for case in study.case):
+                raise impossible("case.errors", "", f"errors in every case, for {name}")
+        for key, found in (
+            ("case.system", {case.system for case in study.case}),
+            ("planner", [each.name for each in study.planner if each.kind == "plan"]),
+            ("seeds", study.seeds),
+        ):
+            if len(found) != 1:
+                raise impossible(key, sorted(found), "one alone, for plans of all stages")
+        if study.budget.time_s is not None:
+            raise impossible(
+                "budget.time_s", study.budget.time_s, "iterations, which can be repeated exactly"
+            )
+
+
+def read_design(path: str | os.PathLike[str]) -> Design:
+    """Read a search over devices from a TOML file.
+
+    Raises
+    ------
+    SettingsError
+        If the file is not TOML, or a key is unknown, missing or wrong.
+    FileError
+        If the file cannot be read.
+    """
+    path = Path(path)
+    return design_of(read_toml(path, remedy=_REMEDY), path.name, str(path.parent))
+
+
+def design_of(content: Mapping[str, Any], where: str = "design", folder: str = ".") -> Design:
+    """Return the search that plain values describe: those of a study, and a table `design`.
+
+    Raises
+    ------
+    SettingsError
+        If a key is unknown, missing or wrong.
+    """
+    values = {"planner": [{"name": "atlas"}], **content}
+    own = values.pop("design", None)
+    if not isinstance(own, Mapping) or not isinstance(own.get("vary"), Mapping):
+        raise SettingsError(
+            f"{where} has no [design.vary]", expected="numbers that may change", remedy=_REMEDY
+        )
+    study = study_of(values, where, folder)
+    # What else would reach a target is the search's own answer.
+    planners = tuple(replace(each, without_counterfactuals=True) for each in study.planner)
+    numbers = tuple(parse(Number, each, f"{where}, design.vary") for each in _numbers(own["vary"]))
+    return parse(Design, {**own, "vary": numbers, "study": replace(study, planner=planners)}, where, _REMEDY)
+
+
+def _numbers(table: Mapping[str, Any], before: str = "") -> Iterator[dict[str, Any]]:
+    """Yield what each number of nested tables may be: a dotted key may be quoted or not."""
+    for name, value in table.items():
+        if not isinstance(value, Mapping):
+            yield {"key": before + name, "range": value}
+        elif value.keys() <= _OF_ONE_NUMBER:
+            yield {"key": before + name, **value}
+        else:
+            yield from _numbers(value, f"{before}{name}.")

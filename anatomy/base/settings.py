@@ -248,7 +248,9 @@ def _allowed(cls: type, loc: Sequence[int | str]) -> str:
         if isinstance(item, kind)
     ]
     meaning = f" ({field.description})" if field.description else ""
-    return f"{_NOUNS.get(field.annotation, 'a table')} {' and '.join(bounds)}".strip() + meaning
+    kind = _without_none(field.annotation)
+    noun = _NOUNS.get(kind) or ("a list" if typing.get_origin(kind) is tuple else "a table")
+    return f"{noun} {' and '.join(bounds)}".strip() + meaning
 
 
 _BOUND_WORDS: tuple[tuple[type, str, str], ...] = (
@@ -261,9 +263,11 @@ _BOUND_WORDS: tuple[tuple[type, str, str], ...] = (
 
 _NOUNS: dict[object, str] = {
     float: "a finite number",
+    int: "a whole number",
     str: "a text that is not empty",
     bool: "true or false",
     tuple[str, ...]: "a list of texts",
+    tuple[float, float]: "a list of two finite numbers",
 }
 
 

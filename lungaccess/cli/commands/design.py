@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -68,18 +68,23 @@ def _show(title: str, found: DesignFound) -> None:
     """Print the first device and the front, and how many others were tried or refused."""
     devices = found.record()["devices"]
     first = found.counted[0].system.name
-    names = dict.fromkeys([first, *(each.system.name for each in found.front)])
+    numbers = {each.system.name: f"{n}" for n, each in enumerate(found.front, start=1)}
     keys = [number.key for number in found.design.vary]
     rows = [
         (
+            numbers.get(name, ""),
             name,
-            *(str(devices[name]["numbers"][key]) for key in keys),
+            *(_shown(devices[name]["numbers"][key]) for key in keys),
             "{reached} of {targets}".format(**devices[name]),
-            *(f"{value:.4g}" for value in devices[name]["values"].values()),
+            *map(_shown, devices[name]["values"].values()),
         )
-        for name in names
+        for name in dict.fromkeys([first, *numbers])
     ]
-    terminal.show_wide([terminal.table(title, ("device", *keys, "reached", *found.criteria), rows)])
+    terminal.show_wide([terminal.table(title, ("front", "device", *keys, "reached", *found.criteria), rows)])
     terminal.say(f"{found.tried} devices were tried, {len(found.counted) - 1} of them on all targets.")
     for count, words in found.refused.values():
         terminal.say(f"The validator of devices refused {count}, as here: {words}")
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else f"{value}"

@@ -59,7 +59,7 @@ class DesignFound:
 
     def record(self) -> dict[str, Any]:
         """Return it as plain values."""
-        keys = [key for number in self.design.vary for key in (number.key, *number.also)]
+        keys = [key for number in self.design.vary for key in number.keys]
         plain = {
             each.system.name: {
                 "numbers": {key: value_at(each.system, key) for key in keys},
@@ -90,6 +90,8 @@ def run_design(
 ) -> DesignFound:
     """Search a device; write `design.json`, the best as `device.toml`, and the front into a folder.
 
+    The files of the front are numbered in its order, from the best.
+
     Every run is kept in the folder's `results.db`: a search that was stopped goes on from there.  The same
     search finds the same, whatever ended it on the way and however many workers it has.  Parameters and
     errors are those of `lungaccess.running.study.run_study`, and moreover:
@@ -109,8 +111,10 @@ def run_design(
         found = _Search(design, runs, maker, say).run()
     write_json(front.parent / "design.json", found.record())
     write_text(front.parent / "device.toml", settings_toml(found.front[0].system))
-    for each in found.front:
-        write_text(front / f"{each.system.name}.toml", settings_toml(each.system))
+    for old in front.glob("[0-9]*.toml"):
+        old.unlink()  # An edited search may have a shorter front.
+    for number, each in enumerate(found.front, start=1):
+        write_text(front / f"{number}.toml", settings_toml(each.system))
     return found
 
 
@@ -126,11 +130,17 @@ class _Search:
         self._base = load_system(beside(design.study.case[0].system, Path(design.study.folder)))
         self._even = Sobol(len(design.vary), seed=design.seed)
         self._known, self._refused = set[str](), dict[str, tuple[int, str]]()
+        # A criterion that the device does not have is refused before any run.
+        self._values(Contender(system=self._base, reached=(False,), chances=(0.0,)))
 
     def run(self) -> DesignFound:
-        counted = self._counted([Contender(system=self._base)], len(self._cohort), "the device as it is")
+        counted = list[Contender]()
         for number in range(self._design.rounds):
+            # Wrong keys and ranges show when devices are drawn, before anything is counted.
             drawn = self._drawn(number, counted)
+            if not counted:
+                base = Contender(system=self._base)
+                counted = self._counted([base], len(self._cohort), "the device as it is")
             counted += self._halved(drawn, f"round {number + 1}") if drawn else []
         best = sorted(front_of(counted), key=lambda each: each.values, reverse=True)
         return DesignFound(
@@ -195,10 +205,10 @@ class _Search:
                 "for the kernels here, name another folder",
             )
         made = [self._outcomes(each, own) for each, own in zip(devices, runs, strict=True)]
-        return [
-            replace(each, values=tuple(CRITERIA[name].value(each) for name in self._design.make_large))
-            for each in made
-        ]
+        return [replace(each, values=self._values(each)) for each in made]
+
+    def _values(self, contender: Contender) -> tuple[float, ...]:
+        return tuple(CRITERIA[name].value(contender) for name in self._design.make_large)
 
     def _outcomes(self, contender: Contender, runs: Sequence[Run]) -> Contender:
         rows = [next(self._maker.results.rows(_OUTCOME, (run.key,))) for run in runs]
@@ -224,6 +234,8 @@ def chosen(found: Sequence[Contender], number: int) -> list[Contender]:
 
     The weights lead evenly from the first criterion alone to the second alone (Chebyshev's scalarisation).
     """
+    if not found:
+        return []
     values = np.array([each.values for each in found])
     span = np.ptp(values, axis=0)
     short = (values.max(axis=0) - values) / np.where(span > 0.0, span, 1.0)

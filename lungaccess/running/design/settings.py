@@ -13,7 +13,6 @@ from pydantic import Field
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import read_toml
 from anatomy.base.settings import impossible, parse, settings, text
-from anatomy.base.words import did_you_mean
 from lungaccess.running.design.criteria import CRITERIA
 from lungaccess.running.study.settings import Study, study_of
 
@@ -41,6 +40,11 @@ class Number:
     range: Annotated[tuple[float, float] | None, Field(description="least and largest value")] = None
     one_of: Annotated[tuple[Any, ...], Field(description="values to choose from")] = ()
     also: Annotated[tuple[str, ...], Field(description="keys with the same value")] = ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """All keys that have the value."""
+        return (self.key, *self.also)
 
     def __post_init__(self) -> None:
         low, high = self.range or (0.0, 1.0)
@@ -78,10 +82,13 @@ class Design:
 
     def __post_init__(self) -> None:
         study = self.study
+        keys = [key for number in self.vary for key in number.keys]
+        for key, names in (("make_large", self.make_large), ("vary", keys)):
+            if len(set(names)) < len(names):
+                raise impossible(key, names, "each only once")
         for name in self.make_large:
             if name not in CRITERIA:
-                guess = did_you_mean(name, CRITERIA).rstrip("?")
-                raise impossible("make_large", name, f"one of {', '.join(CRITERIA)}. {guess}".rstrip(". "))
+                raise impossible("make_large", name, f"one of {', '.join(CRITERIA)}")
             if CRITERIA[name].needs_errors and not all(case.errors for case in study.case):
                 raise impossible("case.errors", "", f"errors in every case, for {name}")
         for key, found in (
@@ -128,7 +135,9 @@ def design_of(content: Mapping[str, Any], where: str = "design", folder: str = "
     study = study_of(values, where, folder)
     # What else would reach a target is the search's own answer.
     planners = tuple(replace(each, without_counterfactuals=True) for each in study.planner)
-    numbers = tuple(parse(Number, each, f"{where}, design.vary") for each in _numbers(own["vary"]))
+    numbers = tuple(
+        parse(Number, each, f"{where}, design.vary.{each['key']}", _REMEDY) for each in _numbers(own["vary"])
+    )
     return parse(Design, {**own, "vary": numbers, "study": replace(study, planner=planners)}, where, _REMEDY)
 
 

@@ -50,7 +50,7 @@ def device(base: System, numbers: Sequence[Number], point: Sequence[float]) -> S
         else:
             low, high = number.range
             value = min(max(float(f"{low + x * (high - low):.{DIGITS}g}"), low), high)
-        changes |= dict.fromkeys((number.key, *number.also), value)
+        changes |= dict.fromkeys(number.keys, value)
     changed = override(base, changes, "the device")
     found = [
         f"{key} = {json.dumps(value)}: assumption, found by `lungaccess design`; `{base.name}` has "

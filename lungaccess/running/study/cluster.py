@@ -1,22 +1,17 @@
-"""Who makes the runs of a study: a cluster of dask, or without dask processes of this machine."""
+"""The dask cluster of a study: a scheduler that runs somewhere, or processes on this machine."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import math
-import multiprocessing
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from anatomy.base.child_process import end_with_parent
 from lungaccess.running.study.settings import StudyError
 
 if TYPE_CHECKING:
@@ -46,107 +41,21 @@ DASK_CONFIG = {
 }
 
 
-class DaskWorkers:
-    """The workers of a dask scheduler, where only a few pieces of work wait at any time."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-        self._asked_s, self._limit = -math.inf, LEAST_RUNS
-
-    def each(self, work: Callable[..., Any], asked: Sequence[T], *more: Any) -> Iterator[tuple[T, Any]]:
-        """Yield each piece with what the work returned for it, or the error, in the order in which they end.
-
-        Raises
-        ------
-        StudyError
-            If the scheduler is lost.
-        """
-        import distributed
-
-        waiting, under_way = iter(asked), dict[str, T]()
-        finished = distributed.as_completed(with_results=True, raise_errors=False)
-        while True:
-            for piece in islice(waiting, max(0, self._most() - len(under_way))):
-                future = self._client.submit(work, piece, *more, pure=False, retries=RETRIES)
-                under_way[future.key] = piece
-                finished.add(future)
-            if not under_way:
-                return
-            future, result = next(finished)
-            if future.status in ("cancelled", "lost"):
-                raise StudyError(
-                    "The dask scheduler was lost",
-                    remedy="Start the study again, it goes on from what is stored",
-                    expected="a scheduler that runs until the study ends",
-                )
-            # Of an error dask hands over what `sys.exc_info` returns.
-            yield under_way.pop(future.key), result[1] if isinstance(result, tuple) else result
-            future.release()
-
-    def _most(self) -> int:
-        """Return the largest number of pieces that may be under way."""
-        if time.monotonic() - self._asked_s > COUNT_WORKERS_EVERY_S:
-            self._limit = max(LEAST_RUNS, RUNS_A_WORKER * len(self._client.nthreads()))
-            self._asked_s = time.monotonic()
-        return self._limit
-
-
-class PoolWorkers:
-    """Processes of this machine that need no library."""
-
-    def __init__(self, pool: ProcessPoolExecutor) -> None:
-        self._pool = pool
-
-    def each(self, work: Callable[..., Any], asked: Sequence[T], *more: Any) -> Iterator[tuple[T, Any]]:
-        """Yield each piece as `DaskWorkers.each` does.
-
-        Raises
-        ------
-        StudyError
-            If a process is lost.
-        """
-        under_way = {self._pool.submit(work, piece, *more): piece for piece in asked}
-        for future in as_completed(under_way):
-            error = future.exception()
-            if isinstance(error, BrokenProcessPool):
-                raise StudyError(
-                    f"A process of the study was lost ({error})",
-                    expected="processes that nothing ends, with enough memory",
-                    remedy="Start it again with fewer --workers: it goes on from what is stored",
-                ) from error
-            yield under_way.pop(future), error or future.result()
-
-
-Workers = DaskWorkers | PoolWorkers
-"""Who makes the runs."""
-
-
-def dask_is_installed() -> bool:
-    """Tell whether the library of clusters is there."""
-    return importlib.util.find_spec("distributed") is not None
+def require_dask() -> None:
+    """Raise StudyError unless the libraries of studies are installed."""
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise StudyError(
+            f"Studies need a library that is not installed ({error})",
+            expected="dask.distributed",
+            remedy="pip install 'lungaccess[study]'",
+        ) from error
 
 
 @contextlib.contextmanager
-def connect(scheduler: str | None, workers: int | None) -> Iterator[Workers]:
+def connect(scheduler: str | None, workers: int | None) -> Iterator[Client]:
     """Connect to a scheduler, or start processes on this machine and stop them afterwards."""
-    number = workers or os.cpu_count() or 1
-    if scheduler is not None or dask_is_installed():
-        with connect_dask(scheduler, number) as client:
-            yield DaskWorkers(client)
-        return
-    others, spawn = multiprocessing.active_children(), multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(number, mp_context=spawn, initializer=end_with_parent) as pool:
-        try:
-            yield PoolWorkers(pool)
-        except BaseException:
-            for each in set(multiprocessing.active_children()) - set(others):
-                each.terminate()
-            raise
-
-
-@contextlib.contextmanager
-def connect_dask(scheduler: str | None, workers: int) -> Iterator[Client]:
-    """Connect to a scheduler of dask, or start one with processes on this machine."""
     import dask
     from distributed import Client, LocalCluster
 
@@ -157,7 +66,7 @@ def connect_dask(scheduler: str | None, workers: int) -> Iterator[Client]:
                 # Patients are mapped from files: dask would take that memory for a leak and stop a worker.
                 with _interruptions_ignored():
                     cluster = LocalCluster(
-                        n_workers=workers,
+                        n_workers=workers or os.cpu_count() or 1,
                         threads_per_worker=1,
                         processes=True,
                         memory_limit=0,
@@ -218,3 +127,65 @@ def interruptions_noted() -> Iterator[Callable[[], None]]:
     finally:
         for each in ours:
             signal.signal(each, signal.default_int_handler)
+
+
+def each_done(
+    client: Client, work: Callable[..., Any], asked: Sequence[T], *more: Any
+) -> Iterator[tuple[T, Any]]:
+    """Yield each piece of work with what became of it, in the order in which they end.
+
+    Only a few pieces wait at the scheduler at any time.
+
+    Parameters
+    ----------
+    work : callable
+        Receives a piece and `more`, on a worker.
+
+    Yields
+    ------
+    tuple
+        The piece with what `work` returned for it, or the error that it raised at every try.
+
+    Raises
+    ------
+    StudyError
+        If the scheduler is lost.
+    """
+    from distributed import as_completed
+
+    waiting, under_way = iter(asked), dict[str, T]()
+    finished = as_completed(with_results=True, raise_errors=False)
+    backlog = Backlog(client)
+    while True:
+        for piece in islice(waiting, max(0, backlog.limit() - len(under_way))):
+            future = client.submit(work, piece, *more, pure=False, retries=RETRIES)
+            under_way[future.key] = piece
+            finished.add(future)
+        if not under_way:
+            return
+        future, result = next(finished)
+        if future.status in ("cancelled", "lost"):
+            raise StudyError(
+                "The dask scheduler was lost",
+                remedy="Start the study again, it goes on from what is stored",
+                expected="a scheduler that runs until the study ends",
+            )
+        # Dask hands over an error as `sys.exc_info` returns it.
+        yield under_way.pop(future.key), result if future.status == "finished" else result[1]
+        future.release()
+
+
+class Backlog:
+    """The largest number of runs that the scheduler may hold, by the number of its workers."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._asked_s = -math.inf
+        self._limit = LEAST_RUNS
+
+    def limit(self) -> int:
+        """Return the largest number of runs that may be under way."""
+        if time.monotonic() - self._asked_s > COUNT_WORKERS_EVERY_S:
+            self._limit = max(LEAST_RUNS, RUNS_A_WORKER * len(self._client.nthreads()))
+            self._asked_s = time.monotonic()
+        return self._limit

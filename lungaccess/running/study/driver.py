@@ -1,4 +1,4 @@
-"""Make the runs of a study on many processes; only this one writes the results file."""
+"""Run a study on a cluster of dask.distributed; only this process writes the results file."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import contextlib
 import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
 from lungaccess.plans.version import software_kernels
 from lungaccess.running.study.answers import CRASH, UNKNOWN, Answer
-from lungaccess.running.study.cluster import Workers, connect, dask_is_installed, interruptions_noted
+from lungaccess.running.study.cluster import connect, each_done, interruptions_noted, require_dask
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.runs import Problem, Run, runs_of
 from lungaccess.running.study.settings import Study, StudyError
 from stages.needle import require_planner
 
-KILLED = "KilledWorker"
-"""What dask raises for a run in which its workers died several times."""
+if TYPE_CHECKING:
+    from distributed import Client
+
 Progress = Callable[[str, float | None], None]
 
 
@@ -78,11 +78,9 @@ def run_study(
     LungaccessError
         If a patient, a system or a target of the study cannot be read.
     """
-    began = time.perf_counter()
     say = progress or (lambda _words, _share: None)
     with open_results(path, scheduler=scheduler, workers=workers, cache=cache) as maker:
-        runs = list(runs_of(study, cache=cache, progress=lambda words: say(words, None)))
-        return replace(maker.make(runs, say), wall_s=time.perf_counter() - began)
+        return maker.make(list(runs_of(study, cache=cache, progress=lambda words: say(words, None))), say)
 
 
 @contextlib.contextmanager
@@ -96,12 +94,7 @@ def open_results(
             expected="one of them: a scheduler has workers of its own",
             remedy="Leave out --workers",
         )
-    if scheduler is not None and not dask_is_installed():
-        raise StudyError(
-            "A scheduler needs a library that is not installed",
-            expected="dask.distributed",
-            remedy="pip install 'lungaccess[study]', or leave out --scheduler",
-        )
+    require_dask()
     with ResultsFile(path, create=True) as results, contextlib.ExitStack() as stack:
         yield RunMaker(results, cache, lambda: stack.enter_context(connect(scheduler, workers)))
 
@@ -109,14 +102,15 @@ def open_results(
 class RunMaker:
     """Makes the runs that a results file does not have; workers start with the first that is missing."""
 
-    def __init__(self, results: ResultsFile, cache: Path | None, start: Callable[[], Workers]) -> None:
-        self.results, self._cache, self._workers = results, cache, functools.cache(start)
+    def __init__(self, results: ResultsFile, cache: Path | None, start: Callable[[], Client]) -> None:
+        self.results, self._cache, self._client = results, cache, functools.cache(start)
+        self._began = time.perf_counter()
 
     def make(self, runs: Sequence[Run], say: Progress) -> StudyDone:
         """Make those of the runs that are missing, and store them one by one."""
         from lungaccess.running.study.one_run import answer
 
-        began, results = time.perf_counter(), self.results
+        results = self.results
         stored = results.finished_keys()
         missing = [run for run in runs if run.key not in stored]
         there = {run.key for run in runs} & stored
@@ -126,10 +120,10 @@ class RunMaker:
         added = failed = 0
         if missing:
             say("starting workers", None)
-            workers = self._workers()
+            client = self._client()
             with interruptions_noted() as stop_if_interrupted:
-                _prepare(workers, missing, self._cache, say)
-                for done, (run, found) in enumerate(workers.each(answer, missing, self._cache), start=1):
+                _prepare(client, missing, self._cache, say)
+                for done, (run, found) in enumerate(each_done(client, answer, missing, self._cache), start=1):
                     made = found if isinstance(found, Answer) else _failed(run, found)
                     new = results.add(run, made)
                     added += new
@@ -142,11 +136,11 @@ class RunMaker:
             other_kernels=others,
             added=added,
             failed=failed,
-            wall_s=time.perf_counter() - began,
+            wall_s=time.perf_counter() - self._began,
         )
 
 
-def _prepare(workers: Workers, runs: Sequence[Run], cache: Path | None, say: Progress) -> None:
+def _prepare(client: Client, runs: Sequence[Run], cache: Path | None, say: Progress) -> None:
     """Let one worker for each patient, scope and tubes make the atlas, before all of them need it."""
     from lungaccess.running.study.one_run import prepare
 
@@ -155,9 +149,12 @@ def _prepare(workers: Workers, runs: Sequence[Run], cache: Path | None, say: Pro
         system = problem.system
         devices = (system.scope, system.tubes, system.margins, system.fissures_allowed)
         problems.setdefault((problem.patient, devices), problem)
+    if not client.nthreads():
+        say("waiting for a worker", None)
+        client.wait_for_workers(1)
     what = "enumerating what scope and tubes can do"
     say(what, None)
-    for done, (problem, error) in enumerate(workers.each(prepare, [*problems.values()], cache), start=1):
+    for done, (problem, error) in enumerate(each_done(client, prepare, [*problems.values()], cache), start=1):
         if isinstance(error, LungaccessError):
             raise error
         if error is not None:
@@ -166,15 +163,17 @@ def _prepare(workers: Workers, runs: Sequence[Run], cache: Path | None, say: Pro
                 expected="workers with about 6 GiB of free memory",
                 remedy="Start fewer workers with --workers",
             ) from error
-        say(f"{what}: {done} of {len(problems)} done, {problem.case}", done / len(problems))
+        say(f"{what}: {done} of {len(problems)}, {problem.case}", None)
 
 
 def _failed(run: Run, error: BaseException) -> Answer:
     """Return what is stored of a run that could not be made."""
+    from distributed import KilledWorker
+
     return Answer(
         key=run.key,
         outcome=type(error).__name__,
-        status=CRASH if type(error).__name__ == KILLED else UNKNOWN,
+        status=CRASH if isinstance(error, KilledWorker) else UNKNOWN,
         failed=True,
         message=f"{error}",
     )

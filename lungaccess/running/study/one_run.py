@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+import psutil
 
 from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
@@ -102,6 +103,7 @@ def _measured(run: Run, cache: Path | None) -> answers.Answer:
     began, cpu_began = time.perf_counter(), time.process_time()
     try:
         atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
+        # The atlas belongs to the device and the patient, and its time to no run.
         began, cpu_began = time.perf_counter(), time.process_time()
         made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
     except NoPlan as failure:
@@ -113,17 +115,8 @@ def _measured(run: Run, cache: Path | None) -> answers.Answer:
         made,
         time_s=time.perf_counter() - began,
         cpu_s=time.process_time() - cpu_began,
-        memory_mb=_memory_mb(),
+        memory_mb=psutil.Process().memory_info().rss / MIB,
     )
-
-
-def _memory_mb() -> float:
-    """Return the resident memory of this process, MiB; 0 where the library that measures it is missing."""
-    try:
-        import psutil
-    except ImportError:
-        return 0.0
-    return float(psutil.Process().memory_info().rss / MIB)
 
 
 def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:

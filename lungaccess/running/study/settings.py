@@ -243,12 +243,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
         If the file cannot be read.
     """
     path = Path(path)
-    content = read_toml(path, remedy=_REMEDY)
-    if "folder" in content:
-        raise SettingsError(
-            f"{path}: folder is not a setting", remedy=_REMEDY, expected="the keys of a study"
-        )
-    return study_of(content, path.name, str(path.parent))
+    return study_of(read_toml(path, remedy=_REMEDY), path.name, str(path.parent))
 
 
 def study_of(content: Mapping[str, Any], where: str = "study", folder: str = ".") -> Study:
@@ -260,6 +255,10 @@ def study_of(content: Mapping[str, Any], where: str = "study", folder: str = "."
         If a key is unknown, missing or wrong.
     """
     values = dict(content)
+    if "folder" in values:
+        raise SettingsError(
+            f"{where}: folder is not a setting", remedy=_REMEDY, expected="the keys of a study"
+        )
     try:
         for key, cls in (("case", Case), ("planner", PlannerChoice)):
             if key in values:

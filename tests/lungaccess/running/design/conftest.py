@@ -73,7 +73,12 @@ class ToyWorkers:
     def __init__(self) -> None:
         self.asked: list[str] = []
 
-    def each(self, work: Any, asked: Sequence[Any], cache: Any) -> Iterator[tuple[Any, Any]]:
+    def nthreads(self) -> dict[str, int]:
+        return {"here": 1}
+
+    def each_done(
+        self, client: Any, work: Any, asked: Sequence[Any], cache: Any
+    ) -> Iterator[tuple[Any, Any]]:
         for piece in reversed(asked):
             if isinstance(piece, Run):
                 self.asked.append(piece.key)
@@ -86,5 +91,6 @@ class ToyWorkers:
 def workers(monkeypatch: pytest.MonkeyPatch) -> ToyWorkers:
     made = ToyWorkers()
     monkeypatch.setattr(driver, "connect", lambda *_where: contextlib.nullcontext(made))
+    monkeypatch.setattr(driver, "each_done", made.each_done)
     monkeypatch.setattr(search, "runs_of", toy_runs)
     return made

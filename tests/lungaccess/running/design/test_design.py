@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from anatomy.base.errors import SettingsError
+from anatomy.base.files import require_writable_folder, write_text
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.problem.system import load_system
@@ -91,11 +92,11 @@ def test_the_chance_counts_targets_without_a_plan_as_failures(tmp_path: Path, wo
 def test_what_is_written_is_the_device_that_was_counted(
     tmp_path: Path, design: Design, workers: ToyWorkers
 ) -> None:
+    write_text(require_writable_folder(tmp_path / "front") / "99.toml", "of an earlier search")
     found = run_design(design, tmp_path)
     assert load_system(tmp_path / "device.toml") == found.front[0].system
-    assert {path.stem for path in (tmp_path / "front").iterdir()} == {
-        each.system.name for each in found.front
-    }
+    files = {path.stem: load_system(path) for path in (tmp_path / "front").iterdir()}
+    assert files == {str(n): each.system for n, each in enumerate(found.front, start=1)}
     first, second, *rest = found.front[0].system.sources
     assert (
         first.startswith(f"{BENT} = {value_at(found.front[0].system, BENT)}: assumption") and "0.025" in first
@@ -132,7 +133,7 @@ def test_ranges_without_any_device_are_an_error(
 ) -> None:
     with pytest.raises(SettingsError, match="No device within the ranges") as error:
         run_design(design_of(design_content(design={"vary": vary})), tmp_path)
-    assert said in str(error.value)
+    assert said in str(error.value) and not workers.asked
 
 
 @pytest.mark.parametrize(
@@ -142,8 +143,13 @@ def test_ranges_without_any_device_are_an_error(
         ({"design": {"vary": {TURN: [0.02, 0.01]}}}, "[least, larger]"),
         ({"design": {"vary": {TURN: {"range": [0.01, 0.02], "one_of": [1]}}}}, "or else one_of"),
         ({"design": {"vary": {TURN: {"one_of": [0.01], "allso": []}}}}, "design.vary"),
-        ({"design": {"make_large": ["raech"]}}, "Did you mean 'reach'"),
+        ({"design": {"make_large": ["raech"]}}, "one of reach, chance"),
         ({"design": {"make_large": ["chance"]}}, "errors in every case"),
+        ({"design": {"make_large": ["reach", "reach"]}}, "each only once"),
+        ({"design": {"vary": {TURN: {"range": [0.01, 0.02], "also": [TURN]}}}}, "each only once"),
+        ({"design": {"vary": {TURN: 0.01}}}, f"{TURN}: range = 0.01. Expected: range: a list of two finite"),
+        ({"design": {"designs": 0.5}}, "a whole number at least 1"),
+        ({"folder": "elsewhere"}, "folder is not a setting"),
         ({"seeds": [0, 1]}, "one alone"),
         ({"planner": [{"name": "a"}, {"name": "b"}]}, "one alone"),
         ({"budget": {"iterations": 2, "time_s": 1.0}}, "repeated exactly"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import signal
 import sqlite3
@@ -124,7 +123,7 @@ def threads():
     return numba.config.NUMBA_NUM_THREADS
 
 if __name__ == "__main__":
-    with cluster.connect_dask(None, 1) as client:
+    with cluster.connect(None, 1) as client:
         print(client.submit(threads).result())
 """
 
@@ -216,37 +215,13 @@ def test_a_full_disk_ends_the_study_and_keeps_what_is_stored(
     assert done.stored_before + done.added == 400
 
 
-def test_a_scheduler_without_dask_says_what_to_install(
+def test_without_dask_the_error_says_what_to_install(
     tmp_path: Path, study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(StudyError, match=r"pip install 'lungaccess\[study\]'"):
-        run_study(study, tmp_path / "r.db", scheduler="tcp://127.0.0.1:1")
+        run_study(study, tmp_path / "r.db")
     assert not (tmp_path / "r.db").exists()
-
-
-@pytest.fixture
-def without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-
-
-def test_processes_of_this_machine_stand_in_for_dask(without_dask: None) -> None:
-    with cluster_of_study.connect(None, 1) as workers:
-        found = dict(workers.each(math.sqrt, [4.0, 9.0, -1.0]))
-        assert (found[4.0], found[9.0]) == (2.0, 3.0) and isinstance(found[-1.0], ValueError)
-        with pytest.raises(StudyError, match="was lost"):
-            list(workers.each(os._exit, [1]))
-
-
-@pytest.mark.slow
-def test_a_study_without_dask_gives_the_same(
-    tmp_path: Path, cache: Path, without_dask: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    study, plain, by_dask = study_of(content()), tmp_path / "plain.db", tmp_path / "dask.db"
-    assert run_study(study, plain, workers=1, cache=cache).added == 4
-    monkeypatch.undo()
-    assert run_study(study, by_dask, workers=1, cache=cache).added == 4
-    assert differences(plain, by_dask) == []
 
 
 def test_no_scheduler(tmp_path: Path, study: Study, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

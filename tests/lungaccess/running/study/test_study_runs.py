@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.base.errors import FileError, SettingsError, TargetError
+from anatomy.base.errors import AnatomyError, FileError, SettingsError, TargetError
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import peripheral
 from lungaccess.problem.error_files import load_errors
@@ -143,6 +143,22 @@ def test_other_files_than_those_of_the_study_are_refused(runs: list[Run], tmp_pa
     patient = replace(runs[0].problem.patient, sources=(("labels", "0" * 64),))
     with pytest.raises(FileError, match="differ from those the study began with"):
         open_patient(patient, tmp_path)
+
+
+def test_a_device_without_an_atlas_is_an_answer(
+    runs: list[Run], cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of many devices is too wide for a patient's airways: the study goes on."""
+
+    def refuse(*_asked: object, **_more: object) -> None:
+        raise AnatomyError("No motion brings this bronchoscope to a place from which tubes leave the airway")
+
+    monkeypatch.setattr(one_run, "open_atlas", refuse)
+    wide = replace(runs[0].problem, system=replace(runs[0].problem.system, name="wide"))
+    one_run.prepare(wide, cache)
+    found = answer(replace(runs[0], problem=wide), cache)
+    assert (found.outcome, found.failed) == ("AnatomyError", False)
+    assert "No motion brings this bronchoscope" in found.message
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from lungaccess.cli.usage import with_nodule_number
 from lungaccess.planning.one_stage import load_tubes
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.system import load_system
+from lungaccess.running.design import read_design
 from lungaccess.running.study import read_study
 from tests.pages import PAGES, ROOT, RUN, SHOWN, blocks, name_of
 
@@ -30,6 +31,7 @@ LEAST_RUN_SHARE = 0.9
 READERS = {
     "errors.toml": load_errors,
     "my-device.toml": load_system,
+    "my-design.toml": read_design,
     "network.toml": lambda path: parse(NetworkSettings, tomllib.loads(path.read_text()), path.name),
     "study.toml": read_study,
     "success.toml": read_study,

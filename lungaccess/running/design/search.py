@@ -13,7 +13,7 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder, write_json, write_text
 from anatomy.base.records import frozen_value
-from anatomy.base.settings import settings_toml
+from anatomy.base.settings import override, settings_toml
 from lungaccess.problem.system import System, load_system, with_fissure_rule
 from lungaccess.running.design.criteria import CRITERIA, Contender
 from lungaccess.running.design.settings import Design
@@ -130,13 +130,15 @@ class _Search:
         self._base = load_system(beside(design.study.case[0].system, Path(design.study.folder)))
         self._even = Sobol(len(design.vary), seed=design.seed)
         self._known, self._refused = set[str](), dict[str, tuple[int, str]]()
-        # A criterion that the device does not have is refused before any run.
+        # Keys and criteria that the device does not have are refused before any run.
+        there = {key: value_at(self._base, key) for number in design.vary for key in number.keys}
+        override(self._base, there, "design.vary")
         self._values(Contender(system=self._base, reached=(False,), chances=(0.0,)))
 
     def run(self) -> DesignFound:
         counted = list[Contender]()
         for number in range(self._design.rounds):
-            # Wrong keys and ranges show when devices are drawn, before anything is counted.
+            # Impossible ranges show when devices are drawn, before anything is counted.
             drawn = self._drawn(number, counted)
             if not counted:
                 base = Contender(system=self._base)

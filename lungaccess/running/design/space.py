@@ -72,7 +72,7 @@ def value_at(system: System, path: str) -> Any:
     values: Any = to_mapping(system)
     for part in path.split("."):
         if isinstance(values, list):
-            values = values[int(part)] if int(part) < len(values) else None
+            values = values[int(part)] if part.isdigit() and int(part) < len(values) else None
         else:
             values = values.get(part) if isinstance(values, Mapping) else None
     return values

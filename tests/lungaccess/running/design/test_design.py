@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from anatomy.base.errors import SettingsError
+from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.files import require_writable_folder, write_text
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
@@ -25,7 +26,7 @@ from lungaccess.running.design.search import chosen, front_of
 from lungaccess.running.design.settings import Number
 from lungaccess.running.design.space import device, near, value_at
 from lungaccess.running.study.results import ResultsFile
-from tests.lungaccess.cli.killing import require_gone
+from tests.lungaccess.cli.killing import START, require_gone, started
 from tests.lungaccess.running.design.conftest import BENT, TARGETS, TURN, ToyWorkers, design_content
 
 
@@ -231,39 +232,26 @@ def test_killed_and_started_again(tmp_path: Path) -> None:
     """A search on a coarse synthetic patient ends the same after every process was killed at once."""
     file = tmp_path / "design.toml"
     file.write_text(DESIGN)
-    code = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
-    words = [
-        sys.executable,
-        "-c",
-        code,
-        "design",
-        str(file),
-        "--workers",
-        "1",
-        "--cache",
-        str(tmp_path / "c"),
-    ]
+    words = ["design", str(file), "--workers", "1", "--cache", str(tmp_path / "c"), "--out"]
 
     def stored(folder: Path) -> int:
-        if not (folder / "results.db").is_file():
-            return 0
-        try:
-            with ResultsFile(folder / "results.db") as results:
-                return len(results.finished_keys())
-        except Exception:
-            return 0
+        with contextlib.suppress(LungaccessError), ResultsFile(folder / "results.db") as results:
+            return len(results.finished_keys())
+        return 0
 
     killed, quiet = tmp_path / "killed", tmp_path / "quiet"
-    with subprocess.Popen([*words, "--out", str(killed)], start_new_session=True) as process:
+    with started([*words, str(killed)]) as process:
         while process.poll() is None and stored(killed) < 4:
             time.sleep(0.05)
         assert process.poll() is None
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
         require_gone(process.pid)
+    left = stored(killed)
     for folder in (killed, quiet):
-        subprocess.run([*words, "--out", str(folder)], check=True)
+        subprocess.run([sys.executable, "-c", START, *words, str(folder)], check=True)
     assert (killed / "design.json").read_bytes() == (quiet / "design.json").read_bytes()
+    assert 4 <= left < stored(killed) == stored(quiet)
     record = json.loads((quiet / "design.json").read_text())
     assert record["devices"][record["best"]]["reached"] >= 1
 
@@ -281,6 +269,7 @@ fissures_allowed = true
 targets = ["lps:-81.25,51,-33.5"]
 peripheral = {per_lung = 1}
 [design]
+make_large = ["reach"]
 designs = 3
 rounds = 1
 vary.tubes.inner.precurvature_per_mm = [0.02, 0.06]

@@ -62,16 +62,12 @@ def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
 
 def steps_table(plan: Plan, lung: Lung) -> Table:
     """Return step by step what hands do with the bronchoscope."""
-    from lungaccess.plans.insertion import scope_motion
-    from lungaccess.plans.scope_steps import handle_words, scope_steps
+    from lungaccess.plans.scope_steps import STEPS_NOTE, handle_words, scope_steps
 
-    steps = scope_steps(scope_motion(plan), lung.tree)
+    steps = scope_steps(plan, lung)
     rows = [(str(number), one.text) for number, one in enumerate(steps, start=1)]
     made = terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows)
-    made.caption = (
-        f"{handle_words(plan)} Up, down and o'clock are those of the picture; twist 0 is as the scope enters "
-        "the trachea, and inserted lengths count from there."
-    )
+    made.caption = f"{handle_words(plan)} {STEPS_NOTE}"
     made.caption_justify = "left"
     return made
 

@@ -22,6 +22,7 @@ from lungaccess.planning.one_system import run
 from lungaccess.planning.searches import plan_of, search_of
 from lungaccess.planning.success.ratings import Rating, rating_of
 from lungaccess.plans.chance import Chance
+from lungaccess.plans.insertion import with_simplest_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.goals import SUCCESS
 from lungaccess.problem.request import Limits, Request
@@ -128,6 +129,7 @@ def alternatives(
     for each in _others(request, place_part(request, atlas), count, separation_mm):
         if len(plans) < count and are_separated(best, each, separation_mm):
             plans.append(each)
+    plans[1:] = [with_simplest_motion(plan, request.lung) for plan in plans[1:]]
     made = [with_window(plan, request.lung) if plan.window is None else plan for plan in plans]
     return with_front(made, [each.chance for each in made] if request.goal is SUCCESS else None)
 

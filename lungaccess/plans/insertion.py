@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
 from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.plans.plan import Plan
-from stages.scope import ScopeMotion
+from lungaccess.problem.channel import bends_with_tubes_rad
+from stages.scope import ScopeMotion, prover_of
 
 PASSING_STEP_MM = 0.25
 """Spacing of the points of a body that are taken as a polyline to find where it passes a place."""
@@ -53,6 +57,31 @@ def scope_motion(plan: Plan) -> ScopeMotion:
         states=plan.scope.states,
         bending_length_mm=plan.system.scope.bending_length_mm,
     )
+
+
+def with_simplest_motion(plan: Plan, lung: Lung) -> Plan:
+    """Return a plan whose scope comes to the same tip by fewer changes and twists, where they are found.
+
+    The tip's frame, tubes, needle and costs stay; what the plan states of the motion is that of the new one.
+    """
+    prover, system = prover_of(lung, plan.system.scope), plan.system
+    motion = prover.simplest(
+        scope_motion(plan),
+        max_curvature_per_mm=system.tubes.channel_curvature_per_mm,
+        end_bends_rad=bends_with_tubes_rad(system),
+    )
+    margin_mm = prover.prove(motion)
+    if isinstance(margin_mm, str) or np.array_equal(motion.states, plan.scope.states):
+        return plan
+    scope = replace(
+        plan.scope,
+        states=motion.states,
+        length_mm=motion.length_mm,
+        length_from_carina_mm=motion.length_mm - _passes_mm(motion, lung.tree.carina_lps),
+        min_lumen_margin_mm=margin_mm + system.scope.lumen_margin_mm,
+        max_curvature_per_mm=motion.max_curvature_per_mm,
+    )
+    return replace(plan, scope=scope)
 
 
 def shown_motion(plan: Plan) -> ScopeMotion:

@@ -1,4 +1,4 @@
-"""What hands do with the bronchoscope of a plan: its states merged into steps that a person can follow."""
+"""What hands do with the bronchoscope of a plan: the steps from each proved state to the next, in words."""
 
 from __future__ import annotations
 
@@ -7,80 +7,104 @@ from dataclasses import asdict
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_value
-from anatomy.base.typed import Float, Int
+from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.clock_face import STRAIGHT_AHEAD, clock_hour
 from lungaccess.plans.insertion import scope_motion, shown_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
-from stages.scope import ScopeMotion
+from stages.scope import DECIMALS, prover_of
 
-MERGED_RAD = math.radians(8.0)
-"""States are merged while an even motion is so near to them: hands are not steadier [assumption]."""
 AHEAD_MM = 12.0
 """Where the way goes on is told by the place of the tip after so much more advance: about a branch on."""
-ROUNDED_MM, ROUNDED_DEG = 0.5, 0.5
-"""What is smaller is written as 0."""
-STILL = np.linspace(0.0, 1.0, 33)
-"""Shares of an even turn in place at which it is compared with the states between."""
+TOLERANCE_DECIMALS = 1
+"""Tolerances are written with so many; the numbers of a step are what a motion is proved for as written."""
+UNLIMITED_MM, UNLIMITED_DEG = 10.0, 90.0
+"""Larger tolerances are not looked for."""
+
+STEPS_NOTE = (
+    "Each step is the proved way from one state of the plan to the next, and its errors are those for which it "
+    "is still proved, one at a time. Up, down and o'clock are those of the scope's picture; twist 0 is as the "
+    "scope enters the trachea, and inserted lengths count from there."
+)
+"""What there is to know of the steps wherever they are shown."""
 
 
 @frozen_value
 class ScopeStep:
-    """One step of a scope's insertion; all that changes changes evenly over its advance.
+    """One step of a scope's insertion: the proved way from one state of the motion to the next.
+
+    It advances, turns the scope, or bends the tip; where both of the last change, they change evenly together.
 
     Parameters
     ----------
     advance_mm, inserted_mm : float
         Advance in this step, and the whole advance at its end; 0 mm is where the motion begins.
-    twist_deg : float
-        Change of the twist; positive is clockwise seen from behind, as the picture sees it.
+    twist_deg, to_twist_deg : float
+        Change of the twist and its value at the end; positive is clockwise seen from behind, as the picture
+        sees it.
     from_bend_deg, to_bend_deg : float
         Bend at begin and end; positive is towards the top of the picture, and negative is down.
+    advance_tolerance_mm, twist_tolerance_deg, bend_tolerance_deg : float
+        By how much the advance at the end, or twist or bend anywhere in the step, may err, all else being
+        as stated, with the scope and its gap still proved to be in the lumen; see
+        `stages.scope.MotionProver.tolerances`.
     goes_on : str
         Where in the picture the airway goes on as the step begins.
     branch, generation : int
         Of the airway in which the tip is at the end; branches go by their numbers, as in the whole plan.
-    first_state, last_state : int
-        The states of the plan that it merges.
+    state : int
+        The state of the plan in which it ends.
     """
 
     advance_mm: float
     inserted_mm: float
     twist_deg: float
+    to_twist_deg: float
     from_bend_deg: float
     to_bend_deg: float
+    advance_tolerance_mm: float
+    twist_tolerance_deg: float
+    bend_tolerance_deg: float
     goes_on: str
     branch: int
     generation: int
-    first_state: int
-    last_state: int
+    state: int
 
     @property
     def text(self) -> str:
-        """The step as a sentence."""
-        turns = " and ".join(words for words in (self._twist_words, self._bend_words) if words)
-        if self.advance_mm < ROUNDED_MM:
-            do = f"stand still and {turns}" if turns else "stand still"
-        elif turns:
-            do = f"advance {self.advance_mm:.0f} mm and on the way {turns}"
-        else:
-            do = f"advance {self.advance_mm:.0f} mm with the tip {bend_words(self.to_bend_deg)}"
-        return f"The airway goes on {self.goes_on}: {do}. Inserted: {self.inserted_mm:.0f} mm."
+        """The step as a sentence, and its tolerance as another."""
+        return f"The airway goes on {self.goes_on}: {self.action}. {self.tolerance_words}."
+
+    @property
+    def action(self) -> str:
+        """What hands do."""
+        if self.advance_mm > 0.0:
+            return f"advance {_number(self.advance_mm)} mm, until {_number(self.inserted_mm)} mm are inserted"
+        return " and evenly with it ".join(words for words in (self._twist_words, self._bend_words) if words)
+
+    @property
+    def tolerance_words(self) -> str:
+        """By how much the step may err."""
+        mm = _tolerance(self.advance_tolerance_mm, UNLIMITED_MM, " mm")
+        twist = _tolerance(self.twist_tolerance_deg, UNLIMITED_DEG, "°")
+        bend = _tolerance(self.bend_tolerance_deg, UNLIMITED_DEG, "°")
+        return f"There is room for an error of {mm}, {twist} of twist or {bend} of bend"
 
     @property
     def _twist_words(self) -> str:
-        if abs(self.twist_deg) < ROUNDED_DEG:
+        if self.twist_deg == 0.0:
             return ""
-        way = "clockwise" if self.twist_deg > 0.0 else "counterclockwise"
-        return f"turn the scope {abs(self.twist_deg):.0f}° {way} (seen from behind)"
+        return (
+            f"turn the scope {_number(abs(self.twist_deg))}° {_way(self.twist_deg)} (seen from behind), to "
+            f"{twist_words(self.to_twist_deg)}"
+        )
 
     @property
     def _bend_words(self) -> str:
-        if abs(self.to_bend_deg - self.from_bend_deg) < ROUNDED_DEG:
+        if self.to_bend_deg == self.from_bend_deg:
             return ""
         return f"bring the tip from {bend_words(self.from_bend_deg)} to {bend_words(self.to_bend_deg)}"
 
@@ -89,34 +113,58 @@ class ScopeStep:
         return {**asdict(self), "text": self.text}
 
 
+def _number(value: float) -> str:
+    """Return a number with at most so many decimals as are written."""
+    return f"{round(value, DECIMALS) + 0.0:g}"
+
+
+def _tolerance(value: float, most: float, unit: str) -> str:
+    """Return a tolerance, rounded down."""
+    if value >= most:
+        return f"{most:g}{unit} and more"
+    return f"{math.floor(value * 10**TOLERANCE_DECIMALS) / 10**TOLERANCE_DECIMALS:g}{unit}"
+
+
+def _way(twist_deg: float) -> str:
+    return "clockwise" if twist_deg > 0.0 else "counterclockwise"
+
+
+def twist_words(twist_deg: float) -> str:
+    """Return a twist in words, such as "20° clockwise"."""
+    number = _number(abs(twist_deg))
+    return "0°" if number == "0" else f"{number}° {_way(twist_deg)}"
+
+
 def bend_words(bend_deg: float) -> str:
     """Return a bend in words, such as "20° up"."""
-    if abs(bend_deg) < ROUNDED_DEG:
-        return "straight"
-    return f"{abs(bend_deg):.0f}° {'up' if bend_deg > 0.0 else 'down'}"
+    number = _number(abs(bend_deg))
+    return "straight" if number == "0" else f"{number}° {'up' if bend_deg > 0.0 else 'down'}"
 
 
-def scope_steps(motion: ScopeMotion, tree: AirwayTree) -> tuple[ScopeStep, ...]:
-    """Return a motion as steps."""
-    tips, states = motion.tips, motion.states
-    ends = merged_states(states)
-    places = np.linalg.norm(tips[ends, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
+def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
+    """Return the motion of a plan's bronchoscope as steps, each from one proved state to the next."""
+    motion, tree = scope_motion(plan), lung.tree
+    tips, advance, angles = motion.tips, motion.states[:, 0], np.degrees(motion.states[:, 1:])
+    places = np.linalg.norm(tips[:, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
     branches = tree.branch_of_point[places]
-    angles = np.degrees(states)
+    allowed = prover_of(lung, plan.system.scope).tolerances(motion)
     return tuple(
         ScopeStep(
-            advance_mm=float(states[last, 0] - states[first, 0]),
-            inserted_mm=float(states[last, 0]),
-            twist_deg=float(angles[last, 1] - angles[first, 1]),
-            from_bend_deg=float(angles[first, 2]),
-            to_bend_deg=float(angles[last, 2]),
-            goes_on=_goes_on(tips, states[:, 0], first),
-            branch=int(branch),
-            generation=int(tree.generation[branch]),
-            first_state=int(first),
-            last_state=int(last),
+            advance_mm=float(advance[end] - advance[end - 1]),
+            inserted_mm=float(advance[end]),
+            twist_deg=float(angles[end, 0] - angles[end - 1, 0]),
+            to_twist_deg=float(angles[end, 0]),
+            from_bend_deg=float(angles[end - 1, 1]),
+            to_bend_deg=float(angles[end, 1]),
+            advance_tolerance_mm=float(allowed[end - 1, 0]),
+            twist_tolerance_deg=float(np.degrees(allowed[end - 1, 1])),
+            bend_tolerance_deg=float(np.degrees(allowed[end - 1, 2])),
+            goes_on=_goes_on(tips, advance, end - 1),
+            branch=int(branches[end]),
+            generation=int(tree.generation[branches[end]]),
+            state=end,
         )
-        for first, last, branch in zip(ends[:-1], ends[1:], branches[1:], strict=True)
+        for end in range(1, len(tips))
     )
 
 
@@ -128,7 +176,7 @@ def handle_factor(plan: Plan) -> float:
 def handle_words(plan: Plan) -> str:
     """Say how the handle is set while the tubes go in, which straighten the section."""
     bend_deg, factor = float(np.degrees(plan.scope.states[-1, 2])), handle_factor(plan)
-    if abs(bend_deg) < ROUNDED_DEG:
+    if bend_words(bend_deg) == bend_words(0.0):
         return "The tip is straight, and tubes in the channel leave it so."
     return (
         f"Tubes in the channel straighten the tip: as they go in, set the handle up to {factor:.2f} times as "
@@ -138,12 +186,12 @@ def handle_words(plan: Plan) -> str:
 
 
 def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
-    """Return a plan's motion of the bronchoscope as plain values: steps for hands, all states for motors."""
+    """Return a plan's motion of the bronchoscope as plain values: steps for hands, states for motors."""
     advance, (twist, bend) = plan.scope.states[:, 0], np.degrees(plan.scope.states[:, 1:]).T
     return {
         "steps": [
             one.as_json() | {"branch_in_words": lung.branch_words(one.branch)}
-            for one in scope_steps(scope_motion(plan), lung.tree)
+            for one in scope_steps(plan, lung)
         ],
         "bifurcations": [
             one.as_json() for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)
@@ -156,28 +204,6 @@ def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
         "bending_length_mm": plan.system.scope.bending_length_mm,
         "handle_factor_with_tubes": handle_factor(plan),
     }
-
-
-def merged_states(states: Float) -> Int:
-    """Return the states `(K,)` between which all others lie near an even motion, with the first and last."""
-    ends = [0]
-    while ends[-1] < len(states) - 1:
-        last = ends[-1] + 1
-        while last + 1 < len(states) and _is_even(states[ends[-1] : last + 2]):
-            last += 1
-        ends.append(last)
-    return np.array(ends)
-
-
-def _is_even(states: Float) -> bool:
-    """Tell whether all states are near those of an even motion from the first to the last."""
-    advance = states[:, 0] - states[0, 0]
-    still = advance[-1] <= 0.0
-    share = STILL if still else advance / advance[-1]
-    twist, bend = (states[0, 1:] + share[:, None] * (states[-1, 1:] - states[0, 1:])).T
-    true, even = states[:, 2] * np.exp(1j * states[:, 1]), bend * np.exp(1j * twist)
-    away = np.abs(true[:, None] - even).min(axis=1) if still else np.abs(true - even)
-    return bool(away.max() <= MERGED_RAD)
 
 
 def _goes_on(tips: Float, advance: Float, state: int) -> str:

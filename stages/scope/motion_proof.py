@@ -18,13 +18,17 @@ from stages.scope.device import SHORTEST_MM, Bronchoscope
 from stages.scope.kernels.body import MOST_TWIST_RAD, Walls, motion_room
 from stages.scope.kernels.growth import Device
 from stages.scope.kernels.shifting import shifted_tips
+from stages.scope.kernels.tolerances import step_tolerances
 from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
 from stages.scope.shifting import TipRow, as_shifts
+from stages.scope.simplifying import Simplifier, frame_columns
 
 PROOF_STEP_MM = 0.1
 """Longest step of the proof along the body; at most half of it is lost, far less than a voxel."""
 PROOF_TURN_MM = 0.2
 """A change in place is cut until the tip moves by less than this from piece to piece; a quarter is lost."""
+SIMPLER_ROOM_MM, KEPT_ROOM = 0.1, 0.5
+"""A simpler motion keeps at least so much room, or this share of that of the motion before if that is less."""
 ROUNDING = 1e-9
 """Limits are kept up to this share of them: states were computed with rounding."""
 
@@ -71,7 +75,7 @@ class MotionProver:
         wrong = broken_limit(self._scope, motion)
         if wrong:
             return wrong
-        entry = _entry(motion)
+        entry = frame_columns(motion.lps_from_entry)
         where = np.zeros(1, dtype=np.int64)
         room = motion_room(
             self._walls,
@@ -87,6 +91,49 @@ class MotionProver:
             return f"the scope is not proved to be free of the wall from state {int(where[0])} on"
         return float(room)
 
+    def tolerances(self, motion: ScopeMotion) -> Float:
+        """Return by how much advance in mm, twist and bend in rad may err in each step `(M - 1, 3)`.
+
+        If one of the three errs by no more than this anywhere in a step, and all else is as stated, the scope
+        with its gap stays in the lumen during the step.  Larger values may be possible, smaller ones are.
+
+        Parameters
+        ----------
+        motion : ScopeMotion
+            A proved one of M states.
+        """
+        out = np.zeros((len(motion.states) - 1, 3))
+        section_mm = self._scope.bending_length_mm
+        entry = frame_columns(motion.lps_from_entry)
+        step_tolerances(
+            self._walls, self._device.radius, section_mm, entry, motion.states, PROOF_TURN_MM, out
+        )
+        return out
+
+    def simplest(
+        self, motion: ScopeMotion, *, max_curvature_per_mm: float, end_bends_rad: tuple[float, float]
+    ) -> ScopeMotion:
+        """Return a proved motion of fewer changes and twists to the same tip, the given one if none is found.
+
+        Parameters
+        ----------
+        motion : ScopeMotion
+            A proved one.
+        max_curvature_per_mm : float
+            Largest curvature of the body that the tubes in its channel can stand.
+        end_bends_rad : (float, float)
+            Bends farthest down and up of the section at the tip, where tubes in it take some.
+        """
+        room = self.prove(motion)
+        if isinstance(room, str):
+            return motion
+        device = kernel_device(self._scope, max_curvature_per_mm)
+        tightest = max_curvature_per_mm * device.length
+        ends = max(end_bends_rad[0], -tightest), min(end_bends_rad[1], tightest)
+        least = min(KEPT_ROOM * room, SIMPLER_ROOM_MM)
+        found = Simplifier(self._walls, device, motion, end_bends_rad=ends, least_mm=least).best()
+        return motion if isinstance(self.prove(found), str) else found
+
     def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> TipRow:
         """Return tips along the motion to one of them, and which of them may be tips of a plan.
 
@@ -101,15 +148,18 @@ class MotionProver:
         """
         shifts = as_shifts(shifts_mm)
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
-        shifted_tips(self._walls, self._device, _entry(motion), motion.states, shifts, tips, rooms)
+        shifted_tips(
+            self._walls,
+            self._device,
+            frame_columns(motion.lps_from_entry),
+            motion.states,
+            shifts,
+            tips,
+            rooms,
+        )
         _nearest, inside = in_tip_region(self._tree, tips)
         proved = (rooms >= 0.0) & inside
         return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=proved | (shifts == 0.0))
-
-
-def _entry(motion: ScopeMotion) -> Float:
-    frame = motion.lps_from_entry
-    return np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
 
 
 def broken_limit(scope: Bronchoscope, motion: ScopeMotion) -> str:

@@ -15,6 +15,7 @@ from scipy import ndimage
 
 import lungaccess as la
 from anatomy.airway_tree import AirwayTree
+from anatomy.fields import distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.motion.prepare import prepare_motion
@@ -79,6 +80,12 @@ def small_plan(breathing_atlas: la.Atlas) -> Plan:
     return best
 
 
+class _Toy(SimpleNamespace):
+    """What is read of a Lung; provers are kept by lungs."""
+
+    __hash__ = object.__hash__
+
+
 def _segment(points: np.ndarray, a: list[float], b: list[float], radius: float) -> np.ndarray:
     start, axis = np.array(a), np.array(b) - np.array(a)
     t = np.clip(((points - start) @ axis) / (axis @ axis), 0, 1)
@@ -119,7 +126,7 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         name: _Field(grid, masks[key])
         for name, key in {"airway": "airway", "vessel": "vessel", "pleura": "outside"}.items()
     }
-    return SimpleNamespace(
+    return _Toy(
         name="Toy",
         kind="toy",
         key="0" * 64,
@@ -129,6 +136,7 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         cost=None,
         has_fissures=fissures,
         fields=fields,
+        lumen_depth=distance_field("lumen_depth", ~lumen, grid),
         nodules=Volume(grid=grid, array=ball) if nodule else None,
         mask=lambda name: Volume(grid=grid, array=masks[name]),
         tree=_tree(trunk),

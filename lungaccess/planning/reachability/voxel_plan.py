@@ -15,6 +15,7 @@ from lungaccess.planning.reachability.layers import voxel_seeds
 from lungaccess.planning.reachability.reach_map import ReachMap
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.insertion import with_simplest_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
@@ -66,7 +67,7 @@ def plan_to_voxel(reach: ReachMap, atlas: Atlas, ijk: Int) -> Plan:
             f"Deployment {entry} of the atlas does not lead to voxel {list(voxel)}",
             expected="the atlas with which the map was made",
         )
-    return assemble(task, candidate, iteration=0, timing={})
+    return with_simplest_motion(assemble(task, candidate, iteration=0, timing={}), atlas.lung)
 
 
 def _searched(arcs: DirectArcs, entry: int, trees: int, seed: int) -> Candidate | None:

@@ -164,20 +164,14 @@ def key_section(plan: Plan, lung: Lung) -> str:
 def instructions_section(plan: Plan, lung: Lung) -> str:
     """Return step by step how hands bring the scope to where the plan has its tip."""
     from lungaccess.plans.bifurcations import route_bifurcations
-    from lungaccess.plans.insertion import scope_motion, shown_motion
-    from lungaccess.plans.scope_steps import handle_words, scope_steps
+    from lungaccess.plans.insertion import shown_motion
+    from lungaccess.plans.scope_steps import STEPS_NOTE, handle_words, scope_steps
 
-    steps = scope_steps(scope_motion(plan), lung.tree)
-    note = (
-        f"These steps merge the {plural(len(plan.scope.states), 'state')} of the plan, which are proved; "
-        "within a step all changes evenly. Up, down and o'clock are those of the scope's picture; twist 0 "
-        "is as the scope enters the trachea, and inserted lengths count from there."
-    )
-    texts = [*(one.text for one in steps), handle_words(plan)]
+    texts = [*(one.text for one in scope_steps(plan, lung)), handle_words(plan)]
     ways = [one.text for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)]
     return (
         f"<h3>Which way at each bifurcation</h3>{words.steps(ways)}"
-        f"<h3>With the hands</h3>{words.steps(texts)}<p class='note'>{words.text(note)}</p>"
+        f"<h3>With the hands</h3>{words.steps(texts)}<p class='note'>{words.text(STEPS_NOTE)}</p>"
     )
 
 

@@ -15,18 +15,20 @@ from lungaccess.plans.clock_face import STRAIGHT_AHEAD, clock_hour
 from lungaccess.plans.insertion import scope_motion, shown_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
-from stages.scope import DECIMALS, prover_of
+from stages.scope import ScopeMotion, prover_of
 
 AHEAD_MM = 12.0
 """Where the way goes on is told by the place of the tip after so much more advance: about a branch on."""
-TOLERANCE_DECIMALS = 1
-"""Tolerances are written with so many; the numbers of a step are what a motion is proved for as written."""
+MOST_DECIMALS = 6
+"""Steps are written with as many decimals as their proof takes, at most so many: far below a hand's errors."""
+NEAR_MM, NEAR_RAD = 0.1, math.radians(0.1)
+"""The tip of the steps as they are written is so near to that of the plan: less than any hand can tell."""
 UNLIMITED_MM, UNLIMITED_DEG = 10.0, 90.0
 """Larger tolerances are not looked for."""
 
 STEPS_NOTE = (
-    "Each step is the proved way from one state of the plan to the next, and its errors are those for which it "
-    "is still proved, one at a time. Up, down and o'clock are those of the scope's picture; twist 0 is as the "
+    "Each step is the proved way from one state of the plan to the next, as it is written here, and its errors "
+    "are those for which it is still proved, one at a time. Up, down and o'clock are those of the scope's picture; twist 0 is as the "
     "scope enters the trachea, and inserted lengths count from there."
 )
 """What there is to know of the steps wherever they are shown."""
@@ -114,15 +116,16 @@ class ScopeStep:
 
 
 def _number(value: float) -> str:
-    """Return a number with at most so many decimals as are written."""
-    return f"{round(value, DECIMALS) + 0.0:g}"
+    """Return a number without zeros at its end."""
+    return f"{value + 0.0:.{MOST_DECIMALS}f}".rstrip("0").rstrip(".")
 
 
 def _tolerance(value: float, most: float, unit: str) -> str:
     """Return a tolerance, rounded down."""
     if value >= most:
         return f"{most:g}{unit} and more"
-    return f"{math.floor(value * 10**TOLERANCE_DECIMALS) / 10**TOLERANCE_DECIMALS:g}{unit}"
+    tenths = math.floor(10.0 * value)
+    return f"{0.1 * tenths:.1f}{unit}" if tenths else f"less than 0.1{unit}"
 
 
 def _way(twist_deg: float) -> str:
@@ -141,10 +144,28 @@ def bend_words(bend_deg: float) -> str:
     return "straight" if number == "0" else f"{number}° {'up' if bend_deg > 0.0 else 'down'}"
 
 
+def written_motion(plan: Plan, lung: Lung) -> ScopeMotion:
+    """Return the motion of a plan's bronchoscope as it is written: proved, with as few decimals as that takes.
+
+    Where not even the plan's own motion is proved, it has the most decimals.
+    """
+    motion, prover = scope_motion(plan), prover_of(lung, plan.system.scope)
+    for decimals in range(1, MOST_DECIMALS + 1):
+        written = motion.written(decimals)
+        apart = written.lps_from_tip - motion.lps_from_tip
+        # The nine cosines of two frames differ by sqrt(2) times the turn between them, if it is small.
+        turned_rad = np.linalg.norm(apart[:3, :3]) / math.sqrt(2.0)
+        near = np.linalg.norm(apart[:3, 3]) <= NEAR_MM and turned_rad <= NEAR_RAD
+        if near and not isinstance(prover.prove(written), str):
+            break
+    return written
+
+
 def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
     """Return the motion of a plan's bronchoscope as steps, each from one proved state to the next."""
-    motion, tree = scope_motion(plan), lung.tree
-    tips, advance, angles = motion.tips, motion.states[:, 0], np.degrees(motion.states[:, 1:])
+    motion, tree = written_motion(plan, lung), lung.tree
+    tips, advance = motion.tips, np.round(motion.states[:, 0], MOST_DECIMALS)
+    angles = np.round(np.degrees(motion.states[:, 1:]), MOST_DECIMALS)
     places = np.linalg.norm(tips[:, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
     branches = tree.branch_of_point[places]
     allowed = prover_of(lung, plan.system.scope).tolerances(motion)
@@ -165,6 +186,7 @@ def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
             state=end,
         )
         for end in range(1, len(tips))
+        if advance[end] > advance[end - 1] or (angles[end] != angles[end - 1]).any()
     )
 
 
@@ -176,12 +198,13 @@ def handle_factor(plan: Plan) -> float:
 def handle_words(plan: Plan) -> str:
     """Say how the handle is set while the tubes go in, which straighten the section."""
     bend_deg, factor = float(np.degrees(plan.scope.states[-1, 2])), handle_factor(plan)
-    if bend_words(bend_deg) == bend_words(0.0):
+    with_tubes, without = (bend_words(round(each, 1)) for each in (bend_deg, bend_deg * factor))
+    if with_tubes == bend_words(0.0):
         return "The tip is straight, and tubes in the channel leave it so."
     return (
         f"Tubes in the channel straighten the tip: as they go in, set the handle up to {factor:.2f} times as "
-        f"far, as for {bend_words(bend_deg * factor)} without them, so that the picture stays and the tip "
-        f"keeps {bend_words(bend_deg)}."
+        f"far, as for {without} without them, so that the picture stays and the tip "
+        f"keeps {with_tubes}."
     )
 
 

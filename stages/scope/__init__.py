@@ -18,6 +18,5 @@ if TYPE_CHECKING:
     from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
     from stages.scope.passages import Passages, find_passages
     from stages.scope.shifting import TipRow, evenly, shifted
-    from stages.scope.simplifying import DECIMALS
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -20,6 +20,8 @@ from stages.scope.device import laid_pieces
 
 ADVANCE, TWIST, BEND = range(3)
 """Columns of a motion's states: advance in mm, twist and bend in rad."""
+NEARLY_WHOLE = 1e-6
+"""A number that misses a whole one by less is whole: it went through radians."""
 
 
 @frozen_record
@@ -106,3 +108,14 @@ class ScopeMotion:
         for before, after, most in zip(self.states[:-1], self.states[1:], shares.max(axis=1), strict=True):
             states.append(np.linspace(before, after, max(1, int(np.ceil(most - 1e-9))) + 1)[1:])
         return replace(self, states=np.concatenate(states))
+
+    def written(self, decimals: int) -> ScopeMotion:
+        """Return the motion that is made by who reads its states in mm and degrees with so many decimals.
+
+        Bends are cut off rather than rounded, so that they stay within the limits of the device.
+        """
+        scale = 10.0**decimals
+        advance, (twist, bend) = self.states[:, ADVANCE], np.degrees(self.states[:, 1:]).T
+        cut = np.sign(bend) * np.floor(np.abs(bend) * scale + NEARLY_WHOLE) / scale
+        angles = np.radians(np.stack([np.round(twist, decimals), cut], axis=1))
+        return replace(self, states=np.column_stack([np.round(advance, decimals), angles]))

@@ -27,11 +27,8 @@ TURN_MM, STEP_MM = 0.2, 0.1
 """Longest parts of changes in place and longest steps along the body in which room is measured."""
 STEPS, GAIN = 40, 0.005
 """A fit ends after so many steps, or where a step gains less than this share."""
-DECIMALS = 2
-"""Degrees and mm are written with so many decimals."""
 GRIDS = (1.0, 0.1)
-"""Twists, bends and advances become multiples of so many degrees and mm, of the first of these that is
-proved, also as it is written."""
+"""Twists, bends and advances become multiples of so many degrees and mm, of the first that is proved."""
 FREE = (2, 4, 3)
 """So many of the last twists, bends and advances stay as they are: the six numbers of a pose need some."""
 MOST_TRIES = 60
@@ -73,13 +70,6 @@ class Legs:
         """Twist, bend and advance of each leg and the end, `(K + 1, 3)`."""
         bends = self.bends[np.minimum(np.arange(self.count + 1), len(self.bends) - 1)]
         return np.column_stack([self.twists[self.group], bends, np.append(self.advances, 0.0)])
-
-    @property
-    def written(self) -> Legs:
-        """The legs that somebody makes who reads twists, bends and inserted lengths as they are written."""
-        angles = [np.radians(np.round(np.degrees(each), DECIMALS)) for each in (self.twists, self.bends)]
-        inserted = np.round(np.cumsum(self.advances), DECIMALS)
-        return Legs(self.group, *angles, np.diff(inserted, prepend=0.0))
 
     @property
     def unknowns(self) -> Float:
@@ -186,7 +176,7 @@ class Simplifier:
                 begin += count
             bounds[fixed] = x[fixed, None]
             found = self._fitted(legs.changed(np.where(fixed, x, legs.unknowns)), bounds)
-            if found is not None and self._orders(found.written) is not None:
+            if found is not None:
                 return found
         return legs
 

@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
@@ -20,25 +21,25 @@ from stages.scope import ScopeMotion, prover_of
 AHEAD_MM = 12.0
 """Where the way goes on is told by the place of the tip after so much more advance: about a branch on."""
 MOST_DECIMALS = 6
-"""Steps are written with as many decimals as their proof takes, at most so many: far below a hand's errors."""
+"""Steps are written with as many decimals as their proof takes, at most so many: no motor is finer."""
 NEAR_MM, NEAR_RAD = 0.1, math.radians(0.1)
 """The tip of the steps as they are written is so near to that of the plan: less than any hand can tell."""
 UNLIMITED_MM, UNLIMITED_DEG = 10.0, 90.0
 """Larger tolerances are not looked for."""
 
 STEPS_NOTE = (
-    "Each step is the proved way from one state of the plan to the next, as it is written here, and its errors "
-    "are those for which it is still proved, one at a time. Up, down and o'clock are those of the scope's picture; twist 0 is as the "
-    "scope enters the trachea, and inserted lengths count from there."
+    "Each step is the proved way from one state of the plan to the next, as it is written here, and its "
+    "errors are those for which it is still proved, one at a time. Up, down and o'clock are those of the "
+    "scope's picture; twist 0 is as the scope enters the trachea, and inserted lengths count from there."
 )
 """What there is to know of the steps wherever they are shown."""
 
 
 @frozen_value
 class ScopeStep:
-    """One step of a scope's insertion: the proved way from one state of the motion to the next.
+    """One step of a scope's insertion: the proved way from one state of the motion to the next, as written.
 
-    It advances, turns the scope, or bends the tip; where both of the last change, they change evenly together.
+    It advances, turns the scope, or bends the tip; where both of the last change, they change evenly.
 
     Parameters
     ----------
@@ -145,9 +146,9 @@ def bend_words(bend_deg: float) -> str:
 
 
 def written_motion(plan: Plan, lung: Lung) -> ScopeMotion:
-    """Return the motion of a plan's bronchoscope as it is written: proved, with as few decimals as that takes.
+    """Return the motion of a plan's bronchoscope as steps write it, with as few decimals as its proof takes.
 
-    Where not even the plan's own motion is proved, it has the most decimals.
+    It has the most decimals where not even the motion of the plan is proved.
     """
     motion, prover = scope_motion(plan), prover_of(lung, plan.system.scope)
     for decimals in range(1, MOST_DECIMALS + 1):
@@ -163,12 +164,24 @@ def written_motion(plan: Plan, lung: Lung) -> ScopeMotion:
 
 def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
     """Return the motion of a plan's bronchoscope as steps, each from one proved state to the next."""
-    motion, tree = written_motion(plan, lung), lung.tree
+    motion = written_motion(plan, lung)
+    return steps_of(motion, lung.tree, prover_of(lung, plan.system.scope).tolerances(motion))
+
+
+def steps_of(motion: ScopeMotion, tree: AirwayTree, allowed: Float) -> tuple[ScopeStep, ...]:
+    """Return a motion as steps; where nothing changes there is none.
+
+    Parameters
+    ----------
+    motion : ScopeMotion
+        As it is written, M states.
+    allowed : (M - 1, 3) float64
+        Its tolerances, see `stages.scope.MotionProver.tolerances`.
+    """
     tips, advance = motion.tips, np.round(motion.states[:, 0], MOST_DECIMALS)
     angles = np.round(np.degrees(motion.states[:, 1:]), MOST_DECIMALS)
     places = np.linalg.norm(tips[:, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
     branches = tree.branch_of_point[places]
-    allowed = prover_of(lung, plan.system.scope).tolerances(motion)
     return tuple(
         ScopeStep(
             advance_mm=float(advance[end] - advance[end - 1]),

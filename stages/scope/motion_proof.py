@@ -28,7 +28,7 @@ PROOF_STEP_MM = 0.1
 PROOF_TURN_MM = 0.2
 """A change in place is cut until the tip moves by less than this from piece to piece; a quarter is lost."""
 SIMPLER_ROOM_MM, KEPT_ROOM = 0.1, 0.5
-"""A simpler motion keeps at least so much room, or this share of that of the motion before if that is less."""
+"""A simpler motion keeps at least so much room, or this share of that of the given one if that is less."""
 ROUNDING = 1e-9
 """Limits are kept up to this share of them: states were computed with rounding."""
 

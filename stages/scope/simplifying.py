@@ -285,12 +285,12 @@ class Simplifier:
     def _orders(self, legs: Legs) -> Int | None:
         """Return in which orders legs change twist and bend, None if they are not proved."""
         orders = np.zeros(legs.count + 1, dtype=np.int64)
+        walls, device, rows = self._walls, self._device, legs.rows
         # Long steps tell soon what is blocked, short ones how much room there is.
         for turn_mm, step_mm, least_mm in ((math.inf, math.inf, 0.0), (TURN_MM, STEP_MM, self._least_mm)):
             room = kernel.prove_legs(
-                self._walls, self._device.radius, self._device.length, self._entry, legs.rows, turn_mm, step_mm,
-                least_mm, orders,
-            )  # fmt: skip
+                walls, device.radius, device.length, self._entry, rows, turn_mm, step_mm, least_mm, orders
+            )
             if room < least_mm:
                 return None
         return orders
@@ -321,8 +321,8 @@ class Simplifier:
                 for one in options
             ]
         _, way = min(ways, key=lambda each: each[0] + abs(each[1][0][0]))
-        twists, turns = np.array([at for at, _ in way]), np.array([turn for _, turn in way])
-        bends = legs.bends * (-1.0) ** turns[legs.group[: len(legs.bends)]]
+        twists, signs = np.array([at for at, _ in way]), np.array([(-1.0) ** turns for _, turns in way])
+        bends = legs.bends * signs[legs.group[: len(legs.bends)]]
         return replace(legs, twists=twists, bends=bends)
 
     def _states(self, legs: Legs) -> Float:

@@ -231,7 +231,7 @@ def fit_legs(walls, section, entry, target, group, counts, x, bounds, steps, gai
     for k in range(legs + 1):
         total += counts[k]
     n = x.shape[0]
-    scale = np.empty(n)
+    scale = np.zeros(n)
     scale[:groups] = TWIST_SCALE_RAD
     scale[groups:advances] = BEND_SCALE_RAD
     scale[advances:] = ADVANCE_SCALE_MM

@@ -92,19 +92,17 @@ def test_twist_and_bend_that_change_together_are_one_step() -> None:
 
 
 def test_room_for_less_than_is_written_is_said() -> None:
-    allowed = np.array([[0.09, 0.001, 1.0]])
-    (only,) = steps_of(motion([[0, 0, 0], [5, 0, 0]]), TREE, allowed)
-    assert only.tolerance_words.startswith(
-        "There is room for an error of less than 0.1 mm, less than 0.1° of"
-    )
+    (only,) = steps_of(motion([[0, 0, 0], [5, 0, 0]]), TREE, np.array([[0.09, 0.001, 1.0]]))
+    assert "an error of less than 0.1 mm, less than 0.1° of twist or 57.2° of bend" in only.text
 
 
 class TestCarriedOut:
     """What is written, carried out word for word by the check's own kinematics, is the motion of the plan."""
 
+    @staticmethod
     @pytest.fixture(scope="class")
-    def plans(self, small_plan: Plan, breathing_lung: Lung) -> list[Plan]:
-        """A plan, the same with the motion that was found, and others with motions as found and made simple."""
+    def plans(small_plan: Plan, breathing_lung: Lung) -> list[Plan]:
+        """A plan, and the same with motions to other tips as they are found and as they are made simple."""
         motions = find_motions(breathing_lung, small_plan.system.scope, reach_mm=60.0)
         order = np.argsort(motions.states.advance_mm[motions.state], kind="stable")
         found = [small_plan]
@@ -145,8 +143,8 @@ class TestCarriedOut:
             assert np.array_equal(states_of_texts(texts), said)
 
     def test_a_simple_motion_keeps_all_else_of_a_plan(self, plans: list[Plan], breathing_lung: Lung) -> None:
-        before, after = plans[1:3]
-        assert len(after.scope.states) < len(before.scope.states)
+        before, after = plans[-2:]
+        assert len(after.scope.states) < 0.7 * len(before.scope.states)
         assert replace(after, scope=before.scope) == before
         assert np.array_equal(after.scope.lps_from_scope_tip, before.scope.lps_from_scope_tip)
         np.testing.assert_allclose(

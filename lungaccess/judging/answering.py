@@ -143,6 +143,8 @@ def plan(
 ) -> Iterator[Plan]:
     """Plan all stages; yield each plan that is better than the one before.
 
+    At the end comes the best one again, with fewer motions of the scope to the same tip where they are found.
+
     The goal is the chance of success if none is stated: under the errors of the preset `breath-hold`, and a
     procedure that measures the tip of the tubes and plans again.  The first clear plan comes at once, without
     its chance.

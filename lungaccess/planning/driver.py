@@ -9,6 +9,7 @@ from typing import Protocol
 from anatomy.base.kernel_clock import working_cpu_s, working_s
 from anatomy.base.records import frozen_record, frozen_value
 from lungaccess.planning.constraints import holds
+from lungaccess.plans.insertion import with_simplest_motion
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request
@@ -86,7 +87,10 @@ def atlas_event(share: float) -> ProgressEvent:
 
 
 def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None]) -> Iterator[Plan]:
-    """Drive a finder within the limits of a request; yield the plans that keep its constraints."""
+    """Drive a finder within the limits of a request; yield the plans that keep its constraints.
+
+    The last one is the best, whose scope comes to its tip by the simplest motion that is found.
+    """
     clock, limits = Clock(), request.limits
     best: Plan | None = None
     loss: float | None = None
@@ -116,9 +120,10 @@ def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None
             )  # fmt: skip
     if best is None:
         raise no_plan_beside(request) if beside else finder.no_plan(iteration)
-    last = finder.last(best, iteration, clock.elapsed_s)
-    if last is not None:
-        yield last
+    last = finder.last(best, iteration, clock.elapsed_s) or best
+    simplest = with_simplest_motion(last, request.lung)
+    if simplest is not best:
+        yield simplest
 
 
 def no_plan_beside(request: Request) -> NoPlan:

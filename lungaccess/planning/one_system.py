@@ -23,6 +23,8 @@ def run(
 ) -> Iterator[Plan]:
     """Answer a request for one system; yield each plan that is better than the one before.
 
+    At the end comes the best one again, with fewer motions of the scope to the same tip where they are found.
+
     Parameters
     ----------
     atlas : Atlas, optional

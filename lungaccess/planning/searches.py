@@ -26,7 +26,6 @@ from lungaccess.planning.coupled.window_explanation import explain_window
 from lungaccess.planning.driver import Turn
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
-from lungaccess.plans.insertion import with_simplest_motion
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim
@@ -137,12 +136,11 @@ class CostFinder:
         return self._gap is not None and iteration > 0 and self._gap.is_met(best.cost)
 
     def last(self, best: Plan, iteration: int, elapsed_s: float) -> Plan | None:
-        """Return the best plan with its simplest motion, and with its bound where a gap was asked for."""
-        simplest = with_simplest_motion(best, self._request.lung)
+        """Return the best plan with its bound, where a gap was asked for."""
         if self._gap is None:
-            return None if simplest is best else simplest
+            return None
         timing = dict(best.timing) | {"planning_s": elapsed_s}
-        return replace(simplest, cost_bound=self._gap.bound.value, iterations=iteration, timing=timing)
+        return replace(best, cost_bound=self._gap.bound.value, iterations=iteration, timing=timing)
 
     def no_plan(self, iteration: int) -> NoPlan:
         """Return why there is no plan."""

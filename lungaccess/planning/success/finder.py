@@ -35,7 +35,6 @@ from lungaccess.planning.success.ratings import (
 from lungaccess.plans.assemble import with_devices
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
-from lungaccess.plans.insertion import with_simplest_motion
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request
@@ -296,16 +295,11 @@ class ContestFinder:
         return False
 
     def last(self, best: Plan, iteration: int, elapsed_s: float) -> Plan | None:
-        """Return the best plan, or the leader where the search ended before that was shown.
-
-        Its scope comes to the tip by the simplest motion that is found.
-        """
-        made = best
-        if self._shown is None and self._leader is not None:
-            # Where the time is over, no more is counted than the contest did.
-            made = self._stated(self._leader, iteration, elapsed_s, max(self._leader.draws, LEAST_STATED))
-        simplest = with_simplest_motion(made, self._request.lung)
-        return None if simplest is best else simplest
+        """Return the leader with what it states, where the search ended before that was shown."""
+        if self._shown is not None or self._leader is None:
+            return None
+        # Where the time is over, no more is counted than the contest did.
+        return self._stated(self._leader, iteration, elapsed_s, max(self._leader.draws, LEAST_STATED))
 
     def no_plan(self, iteration: int) -> NoPlan:
         """Return why there is no plan."""

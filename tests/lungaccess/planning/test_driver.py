@@ -172,9 +172,12 @@ class TestWholeSearches:
     def test_processor_time_that_is_over_leaves_the_first_arc(
         self, small_lung: Lung, small_atlas: la.Atlas, target: Target
     ) -> None:
-        (only,) = la.plan(small_lung, SYSTEM, target, goal="default", atlas=small_atlas, cpu_s=0.0)
+        only, simple = la.plan(small_lung, SYSTEM, target, goal="default", atlas=small_atlas, cpu_s=0.0)
         first = next(la.plan(small_lung, SYSTEM, target, goal="default", atlas=small_atlas))
         assert only.digest == first.digest and only.iterations == 0
+        assert replace(simple, scope=only.scope) == only
+        assert len(simple.scope.states) < len(only.scope.states)
+        assert la.check(simple, small_lung, SYSTEM).accepted
 
     @pytest.mark.parametrize("kind", ["exit", "scope tip"])
     def test_all_plans_go_through_the_place_and_repeat(

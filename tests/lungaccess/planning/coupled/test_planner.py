@@ -65,7 +65,7 @@ class TestRepeatability:
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
         short, long = (plans_of(small_lung, target, atlas, iterations=n) for n in (40, 160))
-        assert same_run(long)[: len(short)] == same_run(short)
+        assert same_run(long)[: len(short) - 1] == same_run(short)[:-1], "the last has a simple motion"
         assert long[-1].costs["inverse_clearance"] <= short[-1].costs["inverse_clearance"]
         assert all(plan.iterations <= 40 for plan in short)
 
@@ -90,7 +90,7 @@ class TestBudget:
     def test_no_time_still_gives_the_first_direct_arc(
         self, small_lung: Lung, target: Target, atlas: la.Atlas
     ) -> None:
-        (plan,) = la.plan(small_lung, SYSTEM, target, atlas=atlas, time_s=0.0, goal="default")
+        plan, _simple = la.plan(small_lung, SYSTEM, target, atlas=atlas, time_s=0.0, goal="default")
         assert plan.iterations == 0
         assert plan.digest == plans_of(small_lung, target, atlas, iterations=0)[0].digest
 

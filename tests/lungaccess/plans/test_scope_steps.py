@@ -145,7 +145,7 @@ class TestCarriedOut:
     def test_a_simple_motion_keeps_all_else_of_a_plan(self, plans: list[Plan], breathing_lung: Lung) -> None:
         before, after = plans[-2:]
         assert len(after.scope.states) < 0.7 * len(before.scope.states)
-        assert replace(after, scope=before.scope) == before
+        assert replace(after, scope=before.scope).digest == before.digest
         assert np.array_equal(after.scope.lps_from_scope_tip, before.scope.lps_from_scope_tip)
         np.testing.assert_allclose(
             scope_motion(after).lps_from_tip, before.scope.lps_from_scope_tip, atol=1e-9
@@ -172,7 +172,6 @@ def test_programs_get_every_state(toy_plan: Plan, toy_lung: Any) -> None:
     assert np.allclose(np.array(states) * [1.0, np.pi / 180.0, np.pi / 180.0], toy_plan.scope.states)
     assert record["steps"][-1]["branch"] == toy_plan.scope.branches[-1]
     assert record["steps"][-1]["inserted_mm"] == pytest.approx(toy_plan.scope.states[-1, 0], abs=0.1)
-    assert record["steps"][-1]["state"] == len(states) - 1
     taken = [each["openings"][0]["branch"] for each in record["bifurcations"]]
     assert taken == toy_plan.scope.branches[1:].tolist()
     assert "take the one " in record["bifurcations"][0]["text"]

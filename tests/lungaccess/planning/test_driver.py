@@ -74,7 +74,10 @@ def target(small_lung: Lung) -> Target:
 
 
 @pytest.fixture
-def asked(toy_lung: Lung) -> Callable[..., Request]:
+def asked(toy_lung: Lung, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Request]:
+    """Searches whose best plan has the simplest motion from the start."""
+    monkeypatch.setattr(driver, "with_simplest_motion", lambda plan, _lung: plan)
+
     def of(**options: Any) -> Request:
         target = Target(lps_mm=np.zeros(3), origin="point")
         return Request.of(toy_lung, SYSTEM, target, **{"goal": "inverse-clearance", **options})

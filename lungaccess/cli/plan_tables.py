@@ -62,12 +62,12 @@ def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
 
 def steps_table(plan: Plan, lung: Lung) -> Table:
     """Return step by step what hands do with the bronchoscope."""
-    from lungaccess.plans.scope_steps import STEPS_NOTE, handle_words, scope_steps
+    from lungaccess.plans.scope_steps import handle_words, scope_steps, steps_note
 
     steps = scope_steps(plan, lung)
     rows = [(str(number), one.text) for number, one in enumerate(steps, start=1)]
     made = terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows)
-    made.caption = f"{handle_words(plan)} {STEPS_NOTE}"
+    made.caption = f"{handle_words(plan)} {steps_note(plan, lung)}"
     made.caption_justify = "left"
     return made
 

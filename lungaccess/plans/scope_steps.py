@@ -27,12 +27,16 @@ NEAR_MM, NEAR_RAD = 0.1, math.radians(0.1)
 UNLIMITED_MM, UNLIMITED_DEG = 10.0, 90.0
 """Larger tolerances are not looked for."""
 
-STEPS_NOTE = (
+PROVED = (
     "Each step is the proved way from one state of the plan to the next, as it is written here, and its "
-    "errors are those for which it is still proved, one at a time. Up, down and o'clock are those of the "
-    "scope's picture; twist 0 is as the scope enters the trachea, and inserted lengths count from there."
+    "errors are those for which it is still proved, one at a time."
 )
-"""What there is to know of the steps wherever they are shown."""
+"""What is said of steps that are proved."""
+DIRECTIONS = (
+    "Up, down and o'clock are those of the scope's picture; twist 0 is as the scope enters the trachea, and "
+    "inserted lengths count from there."
+)
+"""What is said of all steps."""
 
 
 @frozen_value
@@ -168,6 +172,13 @@ def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
     return steps_of(motion, lung.tree, prover_of(lung, plan.system.scope).tolerances(motion))
 
 
+def steps_note(plan: Plan, lung: Lung) -> str:
+    """Say what there is to know of the steps wherever they are shown, above all if they are not proved."""
+    proved = prover_of(lung, plan.system.scope).prove(written_motion(plan, lung))
+    said = f"These steps are not proved: {proved}." if isinstance(proved, str) else PROVED
+    return f"{said} {DIRECTIONS}"
+
+
 def steps_of(motion: ScopeMotion, tree: AirwayTree, allowed: Float) -> tuple[ScopeStep, ...]:
     """Return a motion as steps; where nothing changes there is none.
 
@@ -178,18 +189,19 @@ def steps_of(motion: ScopeMotion, tree: AirwayTree, allowed: Float) -> tuple[Sco
     allowed : (M - 1, 3) float64
         Its tolerances, see `stages.scope.MotionProver.tolerances`.
     """
-    tips, advance = motion.tips, np.round(motion.states[:, 0], MOST_DECIMALS)
-    angles = np.round(np.degrees(motion.states[:, 1:]), MOST_DECIMALS)
+    tips, advance = motion.tips, motion.states[:, 0]
+    written = np.round(np.column_stack([advance, np.degrees(motion.states[:, 1:])]), MOST_DECIMALS)
+    moved = np.round(np.diff(written, axis=0), MOST_DECIMALS)
     places = np.linalg.norm(tips[:, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
     branches = tree.branch_of_point[places]
     return tuple(
         ScopeStep(
-            advance_mm=float(advance[end] - advance[end - 1]),
-            inserted_mm=float(advance[end]),
-            twist_deg=float(angles[end, 0] - angles[end - 1, 0]),
-            to_twist_deg=float(angles[end, 0]),
-            from_bend_deg=float(angles[end - 1, 1]),
-            to_bend_deg=float(angles[end, 1]),
+            advance_mm=float(moved[end - 1, 0]),
+            inserted_mm=float(written[end, 0]),
+            twist_deg=float(moved[end - 1, 1]),
+            to_twist_deg=float(written[end, 1]),
+            from_bend_deg=float(written[end - 1, 2]),
+            to_bend_deg=float(written[end, 2]),
             advance_tolerance_mm=float(allowed[end - 1, 0]),
             twist_tolerance_deg=float(np.degrees(allowed[end - 1, 1])),
             bend_tolerance_deg=float(np.degrees(allowed[end - 1, 2])),
@@ -199,7 +211,7 @@ def steps_of(motion: ScopeMotion, tree: AirwayTree, allowed: Float) -> tuple[Sco
             state=end,
         )
         for end in range(1, len(tips))
-        if advance[end] > advance[end - 1] or (angles[end] != angles[end - 1]).any()
+        if moved[end - 1].any()
     )
 
 
@@ -236,6 +248,7 @@ def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
             {"advance_mm": float(a), "twist_deg": float(t), "bend_deg": float(b)}
             for a, t, b in zip(advance, twist, bend, strict=True)
         ],
+        "note": steps_note(plan, lung),
         "lps_from_entry": plan.scope.lps_from_entry.tolist(),
         "bending_length_mm": plan.system.scope.bending_length_mm,
         "handle_factor_with_tubes": handle_factor(plan),

@@ -165,13 +165,13 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     """Return step by step how hands bring the scope to where the plan has its tip."""
     from lungaccess.plans.bifurcations import route_bifurcations
     from lungaccess.plans.insertion import shown_motion
-    from lungaccess.plans.scope_steps import STEPS_NOTE, handle_words, scope_steps
+    from lungaccess.plans.scope_steps import handle_words, scope_steps, steps_note
 
     texts = [*(one.text for one in scope_steps(plan, lung)), handle_words(plan)]
     ways = [one.text for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)]
     return (
         f"<h3>Which way at each bifurcation</h3>{words.steps(ways)}"
-        f"<h3>With the hands</h3>{words.steps(texts)}<p class='note'>{words.text(STEPS_NOTE)}</p>"
+        f"<h3>With the hands</h3>{words.steps(texts)}<p class='note'>{words.text(steps_note(plan, lung))}</p>"
     )
 
 

@@ -18,7 +18,7 @@ from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.space import not_lumen
 from lungaccess.plans.insertion import scope_insertion, scope_motion, with_simplest_motion
 from lungaccess.plans.plan import Plan
-from lungaccess.plans.scope_steps import handle_factor, handle_words, motion_record, steps_of
+from lungaccess.plans.scope_steps import handle_factor, handle_words, motion_record, steps_note, steps_of
 from lungaccess.showing.report.html.tables import instructions_section
 from stages.scope import ScopeMotion, find_motions, prover_of
 from tests.lungaccess.literal_steps import carried_out, least_room_mm, off, states_of_json, states_of_texts
@@ -129,6 +129,13 @@ class TestCarriedOut:
             needed = plan.system.scope.radius_mm + plan.system.scope.lumen_margin_mm
             boxes = environment.boxes(not_lumen, needed + 1.0)
             assert least_room_mm(carried, boxes, needed) >= 0.0
+
+    def test_steps_that_are_not_proved_say_so(self, plans: list[Plan], breathing_lung: Lung) -> None:
+        assert "not proved" not in steps_note(plans[0], breathing_lung)
+        straight = plans[0].scope.states * [1.0, 1.0, 0.0]
+        edited = replace(plans[0], scope=replace(plans[0].scope, states=straight))
+        note = steps_note(edited, breathing_lung)
+        assert note.startswith("These steps are not proved: the scope is not proved to be free of the wall")
 
     def test_terminal_and_page_say_the_same(
         self, plans: list[Plan], breathing_lung: Lung, wide_terminal: None

@@ -96,25 +96,25 @@ def test_room_for_less_than_is_written_is_said() -> None:
     assert "an error of less than 0.1 mm, less than 0.1° of twist or 57.2° of bend" in only.text
 
 
+@pytest.fixture(scope="module")
+def plans(small_plan: Plan, breathing_lung: Lung) -> list[Plan]:
+    """A plan, and the same with motions to other tips as they are found and as they are made simple."""
+    motions = find_motions(breathing_lung, small_plan.system.scope, reach_mm=60.0)
+    order = np.argsort(motions.states.advance_mm[motions.state], kind="stable")
+    found = [small_plan]
+    for tip in order[[-1, len(order) // 2, len(order) // 3]].tolist():
+        moving = motions.motion(tip)
+        margin_mm = prover_of(breathing_lung, small_plan.system.scope).prove(moving)
+        assert isinstance(margin_mm, float)
+        nearest = int(breathing_lung.tree.nearest_point_index.query(moving.lps_from_tip[:3, 3])[1])
+        scope = scope_insertion(moving, breathing_lung.tree, nearest, margin_mm)
+        found.append(replace(small_plan, scope=scope))
+        found.append(with_simplest_motion(found[-1], breathing_lung))
+    return found
+
+
 class TestCarriedOut:
     """What is written, carried out word for word by the check's own kinematics, is the motion of the plan."""
-
-    @staticmethod
-    @pytest.fixture(scope="class")
-    def plans(small_plan: Plan, breathing_lung: Lung) -> list[Plan]:
-        """A plan, and the same with motions to other tips as they are found and as they are made simple."""
-        motions = find_motions(breathing_lung, small_plan.system.scope, reach_mm=60.0)
-        order = np.argsort(motions.states.advance_mm[motions.state], kind="stable")
-        found = [small_plan]
-        for tip in order[[-1, len(order) // 2, len(order) // 3]].tolist():
-            moving = motions.motion(tip)
-            margin_mm = prover_of(breathing_lung, small_plan.system.scope).prove(moving)
-            assert isinstance(margin_mm, float)
-            nearest = int(breathing_lung.tree.nearest_point_index.query(moving.lps_from_tip[:3, 3])[1])
-            scope = scope_insertion(moving, breathing_lung.tree, nearest, margin_mm)
-            found.append(replace(small_plan, scope=scope))
-            found.append(with_simplest_motion(found[-1], breathing_lung))
-        return found
 
     def test_in_words_and_numbers(self, plans: list[Plan], breathing_lung: Lung) -> None:
         environment = Environment(breathing_lung)

@@ -18,7 +18,7 @@ from anatomy.margins import Margins
 from lungaccess.problem.preset_files import PresetFiles
 from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope
-from stages.tube.device import ConcentricTubes
+from stages.tube.device import ConcentricTubes, Tube
 
 FISSURE_RULES = {True: " (fissures may be crossed)", False: " (fissures are obstacles)"}
 """How the name of a preset ends that was loaded with another rule for fissures than its own."""
@@ -99,21 +99,45 @@ class System:
         # Tubes that share a bend are bent by no more than the most bent of them is at rest.
         at_rest = [tube.max_precurvature_per_mm for tube in self.tubes.nested]
         bent = max(self.tubes.channel_curvature_per_mm, *at_rest)
-        most = needle.most_bent_per_mm
+        most = needle.most_bent_per_mm(self.needle_passing_mm)
         if bent > most:
             raise impossible(
                 "needle.diameter_mm",
                 needle.diameter_mm,
                 f"at most {needle.diameter_mm * most / bent:.3g}: channel and tubes bend the needle by "
                 f"{bent:.4g} / mm, so that its strain exceeds needle.max_strain = "
-                f"{needle.max_strain:g}. A smaller needle.strain_factor (slots) or "
-                "tubes.max_channel_curvature_per_mm allows more",
+                f"{needle.max_strain:g}. Slots (needle.slotted_segments) or a smaller "
+                "tubes.max_channel_curvature_per_mm allow more",
             )
 
     @property
     def stages(self) -> tuple[str, ...]:
         """The devices that go one through the other, the first to move first."""
         return ("scope", "tube") if self.needle is None else ("scope", "tube", "needle")
+
+    @property
+    def needle_passing_mm(self) -> float:
+        """Length of needle, from its tip, that passes bends when it is inserted farthest."""
+        return self.tubes.passing_mm + (0.0 if self.needle is None else self.needle.max_length_mm)
+
+    @property
+    def needle_tube(self) -> Tube | None:
+        """The needle's shaft as one more, straight tube; None without one or if its stiffness is neglected.
+
+        It is as long as it has to be to come out of the inner tube by its `max_length_mm`.
+        """
+        needle = self.needle
+        if needle is None or needle.youngs_modulus_gpa == 0.0:
+            return None
+        ends = (segment.to_mm for segment in needle.slotted_segments)
+        return Tube(
+            outer_diameter_mm=needle.diameter_mm,
+            inner_diameter_mm=needle.inner_diameter_mm,
+            length_mm=max(self.tubes.inner.length_mm + needle.max_length_mm, *ends, 0.0),
+            slotted_segments=needle.slotted_segments,
+            youngs_modulus_gpa=needle.youngs_modulus_gpa,
+            poisson_ratio=needle.poisson_ratio,
+        )
 
     @property
     def track_radius_mm(self) -> float:

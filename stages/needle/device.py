@@ -2,7 +2,10 @@
 
 from typing import Annotated
 
-from anatomy.base.settings import quantity, settings
+from pydantic import Field
+
+from anatomy.base.settings import impossible, quantity, settings
+from anatomy.shafts import SlottedSegment, check_segments
 
 
 @settings
@@ -11,6 +14,15 @@ class Needle:
 
     Its angle to the start is limited as in [Kuntz2015].  The wall that its first length may lie in is that of
     the branch which the tube pierced.
+
+    Its shaft is a tube like any other, which stiffens the tubes that aim it.  Without further keys it is a
+    solid wire of superelastic NiTi, the stiffest that such a needle can be; `youngs_modulus_gpa = 0` says that
+    its stiffness is to be neglected.
+
+    Raises
+    ------
+    SettingsError
+        If a value is not finite or absurd, the bore is as wide as the needle, or slotted segments overlap.
     """
 
     diameter_mm: Annotated[float, quantity("outer diameter of the needle", above=0.0, at_most=5.0)]
@@ -33,14 +45,36 @@ class Needle:
     max_strain: Annotated[
         float, quantity("largest strain of the needle's shaft in a bend", above=0.0, at_most=0.2)
     ] = 0.08
-    strain_factor: Annotated[
-        float, quantity("strain as a share of a plain shaft's: slots lower it", above=0.0, at_most=2.0)
-    ] = 1.0
+    inner_diameter_mm: Annotated[
+        float, quantity("bore of the needle, 0 of a solid one", at_least=0.0, at_most=5.0)
+    ] = 0.0
+    slotted_segments: Annotated[
+        tuple[SlottedSegment, ...], Field(description="stretches with slots, the foremost first")
+    ] = ()
+    youngs_modulus_gpa: Annotated[
+        float, quantity("Young's modulus, 0 to neglect the stiffness", at_least=0.0, at_most=1000.0)
+    ] = 60.0
+    poisson_ratio: Annotated[float, quantity("Poisson's ratio", at_least=0.0, below=0.5)] = 0.3
 
-    @property
-    def most_bent_per_mm(self) -> float:
-        """How bent a channel may be that the needle passes, 1/mm."""
-        return self.max_strain / (self.radius_mm * self.strain_factor)
+    def __post_init__(self) -> None:
+        if self.inner_diameter_mm >= self.diameter_mm:
+            raise impossible(
+                "inner_diameter_mm", self.inner_diameter_mm, f"less than diameter_mm = {self.diameter_mm:g}"
+            )
+        check_segments(self.slotted_segments)
+
+    def strain_factor(self, passing_mm: float) -> float:
+        """Return the largest strain as a share of a plain shaft's, from the tip to `passing_mm` behind it."""
+        at, factor = 0.0, 0.0
+        for segment in self.slotted_segments:
+            if segment.from_tip_mm < passing_mm:
+                plain = segment.from_tip_mm > at
+                factor, at = max(factor, segment.strain_factor, float(plain)), segment.to_mm
+        return max(factor, 1.0) if at < passing_mm else factor
+
+    def most_bent_per_mm(self, passing_mm: float) -> float:
+        """Return how bent a channel may be that the first `passing_mm` of the needle pass, 1/mm."""
+        return self.max_strain / (self.radius_mm * self.strain_factor(passing_mm))
 
     @property
     def radius_mm(self) -> float:

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from anatomy.shafts import SlottedSegment
     from stages.tube.arcs import TubeShape, pieces_of_arcs, points_on_arcs
     from stages.tube.casadi_model import CasadiTubes
     from stages.tube.casadi_shape import DerivedShape, derive_shape
+    from stages.tube.casadi_statics import LoadedShape, derive_loaded
     from stages.tube.deployments import (
         DEFAULT_STOP_MM,
         Deployments,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from stages.tube.exits import exit_points
     from stages.tube.following import DeployedSequence, SnapError, deploy
     from stages.tube.kernels import DesignArrays, ManyShapes, ShapeArrays, TubeEnvironment
+    from stages.tube.loading import NeedleArrivals, needle_arrivals
     from stages.tube.mechanics import Batch, TubeMechanics
     from stages.tube.nearby import NearbyShape, Neighbourhood
     from stages.tube.nesting import check_nesting
@@ -43,7 +46,6 @@ if TYPE_CHECKING:
         shape_of_arrays,
         with_any_sweep,
     )
-    from stages.tube.parts import SlottedSegment
     from stages.tube.placing import PlacedShapes, place_shapes
     from stages.tube.proposals import (
         DesignProposal,
@@ -56,7 +58,8 @@ if TYPE_CHECKING:
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
-    from stages.tube.strain import straightening
+    from stages.tube.strain import bending_section, straightening
+    from stages.tube.tissue import LUNG_N_MM2, HeldShape, held_shape
     from stages.tube.validation import REASONS, Deployment, DeploymentValidator, centreline
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -27,6 +27,7 @@ from stages.tube.casadi_rates import (
     POSITION,
     ROTATION,
     about_z,
+    bending_n_mm2,
     determinant_function,
     landmarks_mm,
     pose_derivative,
@@ -235,7 +236,7 @@ class OrderedTubes:
         state, length = casadi.SX.sym("state", FIRST_ANGLE + 2 * len(self._tubes)), casadi.SX.sym("step_mm")
         bending, rest = [], []
         for tube, marks, count in zip(self._tubes, self._marks, passed, strict=True):
-            bending.append(tube.bending_stiffness_n_mm2 if count else 0.0)
+            bending.append(bending_n_mm2(tube, marks, len(marks) - count))
             rest.append(rest_curvature_per_mm(tube, marks, len(marks) - count))
         twisting = [tube.torsional_stiffness_n_mm2 for tube in self._tubes]
         rate = casadi.Function("rate", [state], [state_rates(state, bending, twisting, rest)])

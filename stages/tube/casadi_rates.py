@@ -4,6 +4,7 @@ The state is the position and the quaternion of the innermost tube's frame, its 
 others relative to it, and the torsional moments in N mm.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,18 +22,44 @@ SAME_MM = 1e-9
 
 
 def landmarks_mm(tube: Tube) -> list[float]:
-    """Return the ascending arc lengths from the base at which the precurvature changes, and the end."""
+    """Return the ascending arc lengths from the base at which precurvature or slots change, and the end."""
     ends = {end for bend in tube.bends for end in (bend.from_mm, bend.to_mm)}
-    return [*sorted(end for end in ends if 0.0 < end < tube.length_mm - SAME_MM), tube.length_mm]
+    for segment in tube.slotted_segments:
+        ends |= {
+            tube.length_mm - segment.from_tip_mm,
+            tube.length_mm - segment.from_tip_mm - segment.length_mm,
+        }
+    return [*sorted(end for end in ends if SAME_MM < end < tube.length_mm - SAME_MM), tube.length_mm]
+
+
+def _middle(marks: Sequence[float], index: int) -> float:
+    """Return the middle of the part of a tube that ends at a landmark; none is beyond the last."""
+    if index >= len(marks):
+        return math.inf
+    return 0.5 * ((marks[index - 1] if index > 0 else 0.0) + marks[index])
 
 
 def rest_curvature_per_mm(tube: Tube, marks: Sequence[float], index: int) -> Any:
     """Return the precurvature vector (2,) of the part of a tube that ends at a landmark."""
-    before = marks[index - 1] if index > 0 else 0.0
+    middle = _middle(marks, index)
     for start, end, curvature, direction in tube.bends:
-        if index < len(marks) and start <= 0.5 * (before + marks[index]) < end:
+        if start <= middle < end:
             return curvature * np.array([np.cos(direction), np.sin(direction)])
     return np.zeros(2)
+
+
+def bending_n_mm2(tube: Tube, marks: Sequence[float], index: int) -> float:
+    """Return the bending stiffness of the part of a tube that ends at a landmark, 0 beyond its end."""
+    from_tip = tube.length_mm - _middle(marks, index)
+    if from_tip < 0.0:
+        return 0.0
+    shares = (
+        segment.stiffness_factor
+        for segment in tube.slotted_segments
+        if 0.0 <= from_tip - segment.from_tip_mm < segment.length_mm
+    )
+    area = math.pi / 64.0 * (tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4)
+    return 1e3 * tube.youngs_modulus_gpa * area * next(shares, 1.0)
 
 
 def state_rates(

@@ -14,7 +14,8 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings
 from anatomy.base.typed import Float
-from stages.tube.parts import Bend, SlottedSegment, TubeParts, tube_parts
+from anatomy.shafts import SlottedSegment, check_segments, second_moment_mm4
+from stages.tube.parts import Bend, TubeParts, tube_parts
 
 ROUNDING = 1e-9
 """Share of a limit by which a value may seem to break it that was computed from it."""
@@ -49,7 +50,9 @@ class Tube:
     """
 
     outer_diameter_mm: Annotated[float, quantity("outer diameter of the tube", above=0.0, at_most=10.0)]
-    inner_diameter_mm: Annotated[float, quantity("inner diameter of the tube", above=0.0, at_most=10.0)]
+    inner_diameter_mm: Annotated[
+        float, quantity("inner diameter of the tube, 0 of a wire", at_least=0.0, at_most=10.0)
+    ]
     length_mm: Annotated[float, quantity("whole length of the tube", above=0.0, at_most=2000.0)]
     curved_length_mm: Annotated[
         float, quantity("length of the precurved distal part, 0 if straight", at_least=0.0, at_most=500.0)
@@ -92,20 +95,7 @@ class Tube:
                 f"curved_length_mm = {self.curved_length_mm:g}",
             )
 
-        self._check_slots()
-
-    def _check_slots(self) -> None:
-        at = 0.0
-        for n, segment in enumerate(self.slotted_segments):
-            end = segment.from_tip_mm + segment.length_mm
-            if segment.from_tip_mm < at or end > self.length_mm:
-                raise impossible(
-                    f"slotted_segments[{n}].from_tip_mm",
-                    segment.from_tip_mm,
-                    f"at least {at:g}, where the segment before ends, and such that the segment ends within "
-                    f"length_mm = {self.length_mm:g}",
-                )
-            at = end
+        check_segments(self.slotted_segments, self.length_mm)
 
     @cached_property
     def parts(self) -> TubeParts:
@@ -131,7 +121,7 @@ class Tube:
     @property
     def second_moment_mm4(self) -> float:
         """Second moment of area of the cross-section, mm^4."""
-        return math.pi / 64.0 * (self.outer_diameter_mm**4 - self.inner_diameter_mm**4)
+        return second_moment_mm4(self.outer_diameter_mm, self.inner_diameter_mm)
 
     @property
     def bending_stiffness_n_mm2(self) -> float:

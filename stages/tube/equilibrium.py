@@ -28,16 +28,22 @@ class Equilibrium:
         Rotation of each tube's material at its end against the Bishop frame, not wrapped.
     beta_mm : (n,) float64
         Where the rear ends are: 0 at the front plate, negative behind it.
+    needle_mm : float
+        How far the needle's tip is from the front plate, if there is a needle.
     """
 
-    def __init__(self, mechanics: NestedTubes, tip_angles_rad: Float, beta_mm: Float) -> None:
+    def __init__(
+        self, mechanics: NestedTubes, tip_angles_rad: Float, beta_mm: Float, needle_mm: float
+    ) -> None:
         n = mechanics.count
         self.mechanics = mechanics
         self.tip_angles_rad = read_only(tip_angles_rad.copy())
         self.beta_mm = read_only(beta_mm.copy())
         # As the kernels of the search have it: for a read-only array they would be compiled once more.
         self._beta_mm = beta_mm.copy()
-        self._cutting, n_steps = mechanics.cut(beta_mm)
+        self._cutting, n_steps = mechanics.cut(
+            mechanics.rear_ends(beta_mm[None], np.array([needle_mm]))[0].copy()
+        )
         self._nodes, self._steps = torsion_scratch(n_steps, n, 2 * n)
         owners = np.concatenate([-1 - np.arange(n), np.arange(n)])
         torsion.twist(mechanics.design, self._cutting, tip_angles_rad, owners, self._nodes, self._steps)

@@ -49,6 +49,9 @@ class TubeMechanics(NestedTubes):
     ----------
     tubes : sequence of Tube
         One or more, the innermost first.
+    needle : Tube, optional
+        A straight needle or wire in the innermost tube, of which only the bending stiffness matters.  It may
+        end anywhere; what is of it beyond the tubes is no part of their shape.
     step_rad : float
         Steps span at most this angle of the fastest torsional oscillation: a half of it makes errors 16
         times smaller.
@@ -59,11 +62,13 @@ class TubeMechanics(NestedTubes):
     Raises
     ------
     SettingsError
-        If there is no tube, a tube does not fit into the next one or is shorter than it, or the step is not
-        between 0 and 1.
+        If there is no tube, a tube or needle does not fit into the next one or is shorter than it, the
+        needle is bent, or the step is not between 0 and 1.
     """
 
-    def given_tip_angles(self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike) -> Equilibrium:
+    def given_tip_angles(
+        self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: float = 0.0
+    ) -> Equilibrium:
         """Return the equilibrium with given rotations of the tubes' own ends: it always exists.
 
         Parameters
@@ -72,6 +77,8 @@ class TubeMechanics(NestedTubes):
             Rotation of each tube's material at its end against the Bishop frame, not wrapped.
         beta_mm : (n,) float64
             Where the rear ends are: 0 at the front plate, negative behind it.
+        needle_mm : float
+            Where the needle's tip is: at 0 or behind it changes nothing.
 
         Raises
         ------
@@ -79,10 +86,16 @@ class TubeMechanics(NestedTubes):
             If numbers are missing or not finite, a rear end is ahead of the front plate or of that of the
             next tube, or a tube ends behind the front plate or ahead of one that it encloses.
         """
-        return Equilibrium(self, self._joints(tip_angles_rad, "tip angles"), self._shifts(beta_mm))
+        tips, beta = self._joints(tip_angles_rad, "tip angles"), self._shifts(beta_mm)
+        return Equilibrium(self, tips, beta, self._needle(needle_mm, 1)[0])
 
     def given_base_angles(
-        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, guess_rad: ArrayLike | None = None
+        self,
+        base_angles_rad: ArrayLike,
+        beta_mm: ArrayLike,
+        *,
+        needle_mm: float = 0.0,
+        guess_rad: ArrayLike | None = None,
     ) -> Equilibrium:
         """Return an equilibrium with given rotations of the rear ends.
 
@@ -95,6 +108,7 @@ class TubeMechanics(NestedTubes):
         base_angles_rad : (n,) float64
             Not wrapped: a full turn between tubes is another state.
         beta_mm : (n,) float64
+        needle_mm : float
             See `given_tip_angles`.
         guess_rad : (n,) float64, optional
             Tip angles to start from, such as those of a configuration nearby; by default the base angles.
@@ -109,8 +123,9 @@ class TubeMechanics(NestedTubes):
         base, beta = self._joints(base_angles_rad, "base angles"), self._shifts(beta_mm)
         tip = base.copy() if guess_rad is None else self._joints(guess_rad, "guess")
         results = np.zeros((1, equilibrium.RESULT_COLUMNS))
-        tips = tip[None].copy()
-        equilibrium.settle_many(self.design, base[None], beta[None], self.step_rad, True, tips, results)
+        tips, needle = tip[None].copy(), self._needle(needle_mm, 1)
+        rear = self.rear_ends(beta[None], needle)
+        equilibrium.settle_many(self.design, base[None], rear, self.step_rad, True, tips, results)
         if not results[0, equilibrium.CONVERGED]:
             raise ConvergenceError(
                 f"No equilibrium was found for base angles {np.round(base, 4).tolist()} rad and rear ends at "
@@ -118,14 +133,15 @@ class TubeMechanics(NestedTubes):
                 expected="an equilibrium; one exists, but Newton's method did not come near it",
                 remedy="give tip angles of a configuration nearby as a guess",
             )
-        return Equilibrium(self, tips[0], beta)
+        return Equilibrium(self, tips[0], beta, needle[0])
 
-    def batch(self, base_angles_rad: ArrayLike, beta_mm: ArrayLike) -> Batch:
+    def batch(self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: ArrayLike = 0.0) -> Batch:
         """Return the equilibria of many configurations; see `given_base_angles`.
 
         Parameters
         ----------
         base_angles_rad, beta_mm : (M, n) float64
+        needle_mm : float or (M,) float64
 
         Raises
         ------
@@ -143,7 +159,8 @@ class TubeMechanics(NestedTubes):
                 )
         self.check_shifts(beta)
         results = np.zeros((len(base), equilibrium.RESULT_COLUMNS))
-        equilibrium.settle_many(self.design, base, beta, self.step_rad, True, tips, results)
+        rear = self.rear_ends(beta, self._needle(needle_mm, len(base)))
+        equilibrium.settle_many(self.design, base, rear, self.step_rad, True, tips, results)
         return Batch(
             tip_angles_rad=read_only(tips),
             base_from_tip=read_only(matrices(results[:, equilibrium.TIP :])),
@@ -158,6 +175,17 @@ class TubeMechanics(NestedTubes):
         if found.shape != (self.count,) or not np.isfinite(found).all():
             raise SettingsError(
                 f"The {name} are {found.tolist()}", expected=f"{self.count} finite numbers, one for each tube"
+            )
+        return found
+
+    def _needle(self, needle_mm: ArrayLike, count: int) -> Float:
+        """Return where the needle's tip is in each of so many configurations."""
+        found = np.array(np.broadcast_to(np.asarray(needle_mm, dtype=np.float64), (count,)))
+        farthest = 0.0 if self.needle is None else self.needle.length_mm
+        if not np.isfinite(found).all() or (found > farthest).any():
+            raise SettingsError(
+                f"The needle's tip is at {found.max(initial=-np.inf):g} mm",
+                expected=f"a finite number of at most {farthest:g} mm, the needle's length",
             )
         return found
 

@@ -1,32 +1,12 @@
 """The parts of a tube: where it is curved at rest, and where a laser has cut slots into it."""
 
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.base.settings import quantity, settings
 from anatomy.base.typed import Float
-
-
-@settings
-class SlottedSegment:
-    """A stretch of a tube that a laser has patterned with slots, so that it bends more easily.
-
-    Both factors compare it with the plain tube at the same curvature: the bending stiffness, and the largest
-    strain of the material.
-    """
-
-    from_tip_mm: Annotated[
-        float, quantity("place of its front end, counted from the tube's tip", at_least=0.0, at_most=2000.0)
-    ] = 0.0
-    length_mm: Annotated[float, quantity("length of the segment", above=0.0, at_most=2000.0)]
-    stiffness_factor: Annotated[
-        float, quantity("bending stiffness as a share of the plain tube's", above=0.0, at_most=1.0)
-    ]
-    strain_factor: Annotated[
-        float, quantity("strain as a share of the plain tube's at the same curvature", above=0.0, at_most=2.0)
-    ]
+from anatomy.shafts import SlottedSegment
 
 
 class TubeParts(NamedTuple):
@@ -36,8 +16,8 @@ class TubeParts(NamedTuple):
     ----------
     begin_mm, end_mm : (K,) float64
         Places along the tube, counted from its tip.
-    curvature_per_mm : (K,) float64
-        Precurvature.
+    curvature_per_mm, direction_rad : (K,) float64
+        Precurvature, and its direction about the axis, 0 where it is straight.
     stiffness_n_mm2 : (K,) float64
         Bending stiffness.
     strained_radius_mm : (K,) float64
@@ -47,6 +27,7 @@ class TubeParts(NamedTuple):
     begin_mm: Float
     end_mm: Float
     curvature_per_mm: Float
+    direction_rad: Float
     stiffness_n_mm2: Float
     strained_radius_mm: Float
 
@@ -68,14 +49,16 @@ def tube_parts(
     radius_mm: float,
 ) -> TubeParts:
     """Cut a tube, of which stiffness and radius are given where it is plain, into its parts."""
-    curved = [(length_mm - bend.to_mm, length_mm - bend.from_mm, bend.curvature_per_mm) for bend in bends]
-    slotted = [(each.from_tip_mm, each.from_tip_mm + each.length_mm, each) for each in slots]
+    curved = [(length_mm - bend.to_mm, length_mm - bend.from_mm, bend) for bend in bends]
+    slotted = [(each.from_tip_mm, each.to_mm, each) for each in slots]
     edges = {0.0, length_mm, *(edge for begin, end, _ in (*curved, *slotted) for edge in (begin, end))}
     ends = np.array(sorted(edges))
     middle = 0.5 * (ends[:-1] + ends[1:])
-    curvature, stiffness, strain = np.zeros(len(middle)), np.ones(len(middle)), np.ones(len(middle))
-    for begin, end, kappa in curved:
-        curvature[(middle > begin) & (middle < end)] = kappa
+    curvature, direction = np.zeros(len(middle)), np.zeros(len(middle))
+    stiffness, strain = np.ones(len(middle)), np.ones(len(middle))
+    for begin, end, bend in curved:
+        within = (middle > begin) & (middle < end)
+        curvature[within], direction[within] = bend.curvature_per_mm, bend.direction_rad
     for begin, end, each in slotted:
         within = (middle > begin) & (middle < end)
         stiffness[within], strain[within] = each.stiffness_factor, each.strain_factor
@@ -83,6 +66,7 @@ def tube_parts(
         begin_mm=ends[:-1],
         end_mm=ends[1:],
         curvature_per_mm=curvature,
+        direction_rad=direction,
         stiffness_n_mm2=stiffness_n_mm2 * stiffness,
         strained_radius_mm=radius_mm * strain,
     )

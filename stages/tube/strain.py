@@ -1,24 +1,35 @@
-"""How much tubes straighten a scope's bent tip."""
+"""How much tubes and needle straighten a scope's bent tip."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.tube.device import ConcentricTubes
+from anatomy.shafts import second_moment_mm4
+from stages.tube.device import ConcentricTubes, Tube
 
 
 def straightening(
-    tubes: ConcentricTubes, insertions_mm: ArrayLike, bending_length_mm: float, section_stiffness_n_mm2: float
+    tubes: ConcentricTubes,
+    insertions_mm: ArrayLike,
+    bending_length_mm: float,
+    section_stiffness_n_mm2: float,
+    *,
+    needle: Tube | None = None,
+    needle_out_mm: float = 0.0,
 ) -> float:
-    """Return the bending stiffness of the tubes in a scope's bending section, as a share of the section's.
+    """Return the bending stiffness of what lies in a scope's bending section, as a share of the section's.
 
     Beam in beam: the section's own bending moment, which the handle sets, also bends what is inside.  With
     the share q the handle must be set to 1 + q times the bend that is wanted [Rucker2010, for tubes].
-    Where the tubes are not equally stiff all along the section, their stiffest part there counts.
+    Where the tubes are not equally stiff all along the section, their stiffest part there counts, and of the
+    needle the stiffest that passes the section on the whole of its way.
 
     Parameters
     ----------
     insertions_mm : (n,) float64
         Of the tubes beyond the scope's tip, the outermost first; the last are those of the tubes there are.
+    needle : Tube, optional
+    needle_out_mm : float
+        How far the needle goes beyond the tip of the inner tube.
     """
     total = 0.0
     inserted = np.asarray(insertions_mm, dtype=np.float64)[-len(tubes.nested) :]
@@ -26,4 +37,36 @@ def straightening(
         parts = tube.parts
         inside = (parts.end_mm > out_mm) & (parts.begin_mm < out_mm + bending_length_mm)
         total += float(parts.stiffness_n_mm2[inside].max(initial=0.0))
+    if needle is not None:
+        passing_mm = float(inserted[-1]) + needle_out_mm + bending_length_mm
+        total += float(needle.parts.stiffness_n_mm2[needle.parts.begin_mm < passing_mm].max())
     return total / section_stiffness_n_mm2
+
+
+def bending_section(
+    outer_diameter_mm: float,
+    channel_diameter_mm: float,
+    length_mm: float,
+    stiffness_n_mm2: float,
+    curvature_per_mm: float,
+) -> Tube:
+    """Return a scope's bending section as the outermost of nested tubes, whose rear end is the front plate.
+
+    Its precurvature is what the handle gives it while it is empty.  So section, tubes and needle are one
+    equilibrium.  In torsion it is as soft as in bending: no measurement is known, and real ones are stiffer.
+
+    Raises
+    ------
+    SettingsError
+        If it is no tube.
+    """
+    area = second_moment_mm4(outer_diameter_mm, channel_diameter_mm)
+    return Tube(
+        outer_diameter_mm=outer_diameter_mm,
+        inner_diameter_mm=channel_diameter_mm,
+        length_mm=length_mm,
+        curved_length_mm=length_mm if curvature_per_mm > 0.0 else 0.0,
+        precurvature_per_mm=curvature_per_mm,
+        youngs_modulus_gpa=1e-3 * stiffness_n_mm2 / area,
+        poisson_ratio=0.0,
+    )

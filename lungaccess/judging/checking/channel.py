@@ -10,7 +10,8 @@ from anatomy.base.typed import Float
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.scope_motion import motion_of
 from lungaccess.plans.plan import Plan
-from stages.tube.device import Tube
+from lungaccess.problem.system import System
+from stages.tube.device import AIRWAY_MM, Tube
 
 STEP_MM = 0.5
 """Spacing of the places of channel and tube that are looked at; what is between two is counted with both."""
@@ -36,7 +37,7 @@ def check_channel(plan: Plan, found: Findings) -> None:
     if needle is not None:
         # Tubes that share a bend are bent by no more than the most bent of them is at rest.
         at_rest = max(curvature for tube in tubes.nested for _begin, _end, curvature in bent_at_rest(tube))
-        strain = 0.5 * needle.diameter_mm * needle.strain_factor * max(tightest, at_rest)
+        strain = 0.5 * needle.diameter_mm * _largest_factor(plan.system) * max(tightest, at_rest)
         detail = "largest strain of the needle on its way through channel and tubes"
         found.at_most("needle.strain", strain, needle.max_strain, "", detail, 1e-9)
     _check_handle(plan, inserted, found)
@@ -76,6 +77,16 @@ def _slots(tube: Tube, from_tip_mm: float) -> tuple[float, float]:
         if segment.from_tip_mm <= from_tip_mm <= segment.from_tip_mm + segment.length_mm:
             return segment.stiffness_factor, segment.strain_factor
     return 1.0, 1.0
+
+
+def _largest_factor(system: System) -> float:
+    """Return the largest factor of strain along all of the needle that can come to a bend."""
+    needle = system.require_needle("The strain of a needle")
+    segments = needle.slotted_segments
+    passing_mm = AIRWAY_MM + system.tubes.max_extension_mm + needle.max_length_mm
+    covered = sum(max(min(segment.to_mm, passing_mm) - segment.from_tip_mm, 0.0) for segment in segments)
+    factors = [segment.strain_factor for segment in segments if segment.from_tip_mm < passing_mm]
+    return max([*factors, 1.0] if covered < passing_mm - 1e-9 else factors)
 
 
 def _check_handle(plan: Plan, inserted_mm: tuple[float, ...], found: Findings) -> None:

@@ -1,9 +1,14 @@
 """Where nested tubes begin, end and bend: the pieces in which their mechanics is smooth.
 
-Units mm, N, rad.  A `design` is the tuple of `stiffness` (n, 2) float64, bending and torsional stiffness in
-N mm^2 of each tube, innermost first; `lengths` (n,) float64; and `bends` (m, 5) float64: tube, begin and end
-by arc length from the tube's rear end, precurvature in 1/mm, its direction in rad.  `beta` (n,) float64 is
-where the tubes' rear ends are, 0 or less; the front plate is at 0.
+Units mm, N, rad.  A `design` is the tuple of `stiffness` (b, 2) float64, bending and torsional stiffness in
+N mm^2 of each body where it is plain; `lengths` (b,) float64; and `bends` (m, 6) float64, the stretches that
+are not straight and plain: body, begin and end by arc length from the body's rear end, precurvature in 1/mm,
+its direction in rad, and bending stiffness as a share of the plain one.  `beta` (b,) float64 is where the
+rear ends are, 0 or less; the front plate is at 0.
+
+The first n bodies are the tubes, innermost first, each with an angle.  Bodies after them are straight, such
+as a needle in the tubes: they add bending stiffness where they lie, and as turning them changes nothing they
+have no angle.
 """
 
 import math
@@ -15,8 +20,9 @@ from anatomy.kernels.compiling import kernel, merged_kernel
 SHORTEST_PIECE_MM = 1e-9
 """Shorter pieces are rounding and are left out."""
 
-# Columns of `pieces`: arc lengths of both ends; the tubes whose shift moves them (-1: none); 1 / the sum of
-# bending stiffnesses; how many tubes are bent here; the only one if it is one; number of steps.
+# Columns of `pieces`: arc lengths of both ends; the bodies whose shift moves them (-1: none); 1 / the sum of
+# bending stiffnesses; how many tubes are bent here; the only one if it is one; number of steps.  After them
+# follows the bending stiffness of each body here, 0 where it is not.
 NEAR, FAR, NEAR_OWNER, FAR_OWNER, SOFTNESS, BENT, BENT_TUBE, STEPS, PIECE_COLUMNS = range(9)
 
 
@@ -53,21 +59,22 @@ def _breakpoints(lengths, bends, beta, found):
 def cut(design, beta, step, pieces, moments, directions):
     """Cut the tubes ahead of the front plate into pieces; return their number and that of all steps.
 
+    The last piece ends where the last tube does, even if a straight body goes on.
+
     Parameters
     ----------
     design, beta
         See the module.
     step : float
         Largest angle, in rad of the fastest torsional oscillation of a piece, that one step may span.
-    pieces : (1 + n + 2 m, PIECE_COLUMNS) float64
+    pieces : (1 + b + 2 m, PIECE_COLUMNS + b) float64
         Is filled, the nearest piece first.
-    moments, directions : (1 + n + 2 m, n) float64
+    moments, directions : (1 + b + 2 m, n) float64
         Are filled: bending stiffness times precurvature in N mm of each tube in each piece, 0 where it is
         straight or not there, and the direction of the precurvature in rad.
     """
     stiffness, lengths, bends = design
-    n = lengths.shape[0]
-    found = np.zeros((1 + n + 2 * bends.shape[0], 2))
+    found = np.zeros((1 + lengths.shape[0] + 2 * bends.shape[0], 2))
     n_found = _breakpoints(lengths, bends, beta, found)
     count = 0
     last = 0
@@ -79,22 +86,37 @@ def cut(design, beta, step, pieces, moments, directions):
         piece[FAR], piece[FAR_OWNER] = found[m, 0], found[m, 1]
         last = m
         middle = 0.5 * (piece[NEAR] + piece[FAR])
-        total = 0.0
-        for i in range(n):
-            moments[count, i] = directions[count, i] = 0.0
-            if beta[i] + lengths[i] > middle:
-                total += stiffness[i, 0]
-        if total == 0.0:
+        if not _fill(design, beta, middle, piece[PIECE_COLUMNS:], moments[count], directions[count]):
             break
-        for b in range(bends.shape[0]):
-            i = int(bends[b, 0])
-            if beta[i] + bends[b, 1] < middle < beta[i] + bends[b, 2]:
-                moments[count, i] = stiffness[i, 0] * bends[b, 3]
-                directions[count, i] = bends[b, 4]
+        total = 0.0
+        for i in range(lengths.shape[0]):
+            total += piece[PIECE_COLUMNS + i]
         piece[SOFTNESS] = 1.0 / total
         count += 1
     steps = _count_steps(stiffness, pieces, moments, count, step)
     return count, steps
+
+
+@merged_kernel
+def _fill(design, beta, middle, bending, moments, directions):
+    """Fill what bends the bodies at the arc length `middle`; return whether any tube is there."""
+    stiffness, lengths, bends = design
+    n = moments.shape[0]
+    any_tube = False
+    for i in range(lengths.shape[0]):
+        there = beta[i] + lengths[i] > middle
+        bending[i] = stiffness[i, 0] if there else 0.0
+        if i < n:
+            moments[i] = directions[i] = 0.0
+            any_tube = any_tube or there
+    for b in range(bends.shape[0]):
+        i = int(bends[b, 0])
+        if beta[i] + bends[b, 1] < middle < beta[i] + bends[b, 2]:
+            bending[i] *= bends[b, 5]
+            if i < n:
+                moments[i] = bending[i] * bends[b, 3]
+                directions[i] = bends[b, 4]
+    return any_tube
 
 
 @merged_kernel

@@ -104,7 +104,7 @@ def _least_behind(dpsi, drate, beta, matrix, right):
     Between two rear ends it is a polynomial in s of a degree less than the number of tubes: linear for two
     of them, a parabola for three, of which the vertex is looked at.
     """
-    n = beta.shape[0]
+    n = dpsi.shape[2]
     least = determinant_at(dpsi, drate, _FIRST_NODE, beta, 0.0, matrix, right)
     for i in range(n):
         near = 0.0
@@ -162,7 +162,7 @@ def _turns_back(dpsi, drate, beta, at, matrix, before, right):
 def least_determinant(nodes, beta):
     """Return the least determinant along the tubes; -inf where two directions turn unstable at once."""
     _s, _psi, _rate, dpsi, drate = nodes
-    last = beta.shape[0] - 1
+    last = dpsi.shape[2] - 1
     matrix, before, right = np.zeros((last, last)), np.zeros((last, last)), np.zeros(last)
     least = 1.0
     if last == 0:
@@ -178,18 +178,17 @@ def least_determinant(nodes, beta):
 def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
     """Move the tip angles towards the wanted base angles; return the largest error before, rad."""
     _s, psi, rate, dpsi, drate = nodes
-    last = beta.shape[0] - 1
+    last = tip_angles.shape[0] - 1
     worst = 0.0
     for i in range(last + 1):
         worst = max(worst, abs(base_angles[i] - psi[0, i] - beta[i] * rate[0, i]))
     if worst < TOLERANCE:
         return worst
     error = base_angles[last] - psi[0, last] - beta[last] * rate[0, last]
-    rearmost = beta.min()
     if last > 0:
         for i in range(last):
             right[i] = base_angles[i] - psi[0, i] - beta[i] * rate[0, i] - error
-        _relative(dpsi, drate, _FIRST_NODE, beta, rearmost, matrix)
+        _relative(dpsi, drate, _FIRST_NODE, beta, beta[: last + 1].min(), matrix)
         _solve(matrix, right)
         size = np.abs(right).max()
         if not size < LARGEST_TURN:
@@ -283,7 +282,7 @@ def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stab
     precurvature is raised from nothing, and then angles all round are tried.  Returns the largest error of a
     base angle and the least determinant.
     """
-    last = beta.shape[0] - 1
+    last = tip_angles.shape[0] - 1
     matrix, right = np.zeros((last, last)), np.zeros(last)
     worst = newton(
         design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, TOLERANCE
@@ -307,6 +306,14 @@ def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stab
     return first_worst, least_determinant(nodes, beta)
 
 
+@kernel()
+def cutting_scratch(design, n):
+    """Return arrays for `assembly.cut` of n tubes: pieces, moments and directions."""
+    bodies = design[1].shape[0]
+    most = 1 + bodies + 2 * design[2].shape[0]
+    return np.zeros((most, PIECE_COLUMNS + bodies)), np.zeros((most, n)), np.zeros((most, n))
+
+
 @inner_kernel
 def scratch_for(n_steps, n, columns):
     """Return `nodes` and `steps` as `torsion.twist` fills them."""
@@ -324,8 +331,10 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
     ----------
     design : tuple
         See `assembly`.
-    base_angles, beta : (M, n) float64
-        rad, mm.
+    base_angles : (M, n) float64
+        rad.
+    beta : (M, b) float64
+        mm, of the tubes and then of straight bodies in them.
     step : float
         See `assembly.cut`.
     prefer_stable : bool
@@ -333,9 +342,8 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
     results : (M, RESULT_COLUMNS) float64
         Is filled: see the columns; the tip frame is that of the first tube's material.
     """
-    n = beta.shape[1]
-    most = 1 + n + 2 * design[2].shape[0]
-    pieces, moments, directions = np.zeros((most, PIECE_COLUMNS)), np.zeros((most, n)), np.zeros((most, n))
+    n = base_angles.shape[1]
+    pieces, moments, directions = cutting_scratch(design, n)
     owners = -1 - np.arange(n - 1)
     allocated = 0
     nodes, steps = scratch_for(allocated, n, n - 1)

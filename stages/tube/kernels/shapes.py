@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, FAR, NEAR, PIECE_COLUMNS, cut
-from stages.tube.kernels.equilibrium import TOLERANCE, least_determinant, newton, scratch_for
+from stages.tube.kernels.equilibrium import TOLERANCE, cutting_scratch, least_determinant, newton, scratch_for
 from stages.tube.kernels.pose import GAUSS, curvature, frames_at, lay
 from stages.tube.kernels.sweep import sweep_of
 
@@ -39,10 +39,9 @@ LEAST, STRAIN, SWEEP, LEADER, ERROR, EXTENSION, TIP, SHAPE_COLUMNS = 0, 1, 2, 3,
 @inner_kernel
 def _settled(design, base_angles, beta, step, tip_angles):
     """Solve from a guess; return the error of the base angles, the cutting, nodes and steps."""
-    n = beta.shape[0]
+    n = base_angles.shape[0]
     last = n - 1
-    most = 1 + n + 2 * design[2].shape[0]
-    pieces, moments, directions = np.zeros((most, PIECE_COLUMNS)), np.zeros((most, n)), np.zeros((most, n))
+    pieces, moments, directions = cutting_scratch(design, n)
     count, n_steps = cut(design, beta, step, pieces, moments, directions)
     cutting = (pieces, moments, directions, count)
     nodes, steps = scratch_for(n_steps, n, last)
@@ -100,8 +99,8 @@ def reach(design, base, turn, begin, end, step, tip_angles):
 
 
 @inner_kernel
-def largest_strain(design, strained, beta, cutting, nodes, steps):
-    """Return the largest strain of bending ahead of the scope tip."""
+def largest_strain(design, strained, beta, cutting, nodes, steps, first=0):
+    """Return the largest strain of bending ahead of the scope tip, of all bodies from the first named on."""
     pieces, moments, directions, _count = cutting
     psi, rate = nodes[1], nodes[2]
     worst = 0.0
@@ -110,12 +109,14 @@ def largest_strain(design, strained, beta, cutting, nodes, steps):
         middle = 0.5 * (pieces[k, NEAR] + pieces[k, FAR])
         for end in range(2):
             x, y = curvature(cutting, k, float(end), steps[0][at], psi, rate, at)
-            for i in range(strained.shape[0]):
+            for i in range(first, strained.shape[0]):
                 if beta[i] + design[1][i] < middle:
                     continue
-                own = moments[k, i] / design[0][i, 0]
-                angle = psi[at + end, i] + directions[k, i]
-                off = math.hypot(x - own * math.cos(angle), y - own * math.sin(angle))
+                off = math.hypot(x, y)
+                if i < psi.shape[1]:
+                    own = moments[k, i] / pieces[k, PIECE_COLUMNS + i]
+                    angle = psi[at + end, i] + directions[k, i]
+                    off = math.hypot(x - own * math.cos(angle), y - own * math.sin(angle))
                 worst = max(worst, strained[i] * off)
     return worst
 

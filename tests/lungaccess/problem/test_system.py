@@ -148,6 +148,25 @@ def test_fingerprint_depends_on_every_number_and_nothing_else() -> None:
     assert len({system_fingerprint(other) for other in (system, *changed)}) == 4
 
 
+def test_a_needle_without_further_keys_is_a_solid_wire_of_nitinol() -> None:
+    system = load_system("tight-inner")
+    assert system.needle_tube.bending_stiffness_n_mm2 == pytest.approx(60e3 * math.pi / 64.0 * 0.8**4)
+    assert system.needle_tube.length_mm == system.tubes.inner.length_mm + system.needle.max_length_mm
+    assert not system.needle_tube.bends
+
+
+def test_a_needle_states_its_shaft_as_tubes_do_and_may_be_neglected() -> None:
+    slots = {"length_mm": 900.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
+    changes = {"needle.inner_diameter_mm": 0.6, "needle.slotted_segments": [slots]}
+    shaft = override(load_system("tight-inner"), {"name": "other", **changes}).needle_tube
+    plain = 60e3 * math.pi / 64.0 * (0.8**4 - 0.6**4)
+    assert shaft.parts.stiffness_n_mm2 == pytest.approx([0.04 * plain])
+    assert shaft.length_mm == 900.0
+    changes = {"name": "other", "needle.youngs_modulus_gpa": 0.0}
+    assert override(load_system("tight-inner"), changes).needle_tube is None
+    assert load_system("tubes-only").needle_tube is None
+
+
 def test_example_of_the_documentation_works(tmp_path: Path) -> None:
     page = (DOCS / "how_to" / "devices.md").read_text(encoding="utf-8")
     example = page.split("```toml\n")[1].split("```")[0]

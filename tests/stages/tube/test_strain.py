@@ -68,3 +68,12 @@ def test_tubes_straighten_a_section_by_their_share_of_the_stiffness() -> None:
     # With 56 mm inserted, a millimetre of plain inner tube lies in the section.
     stiff = INNER.bending_stiffness_n_mm2 + 0.04 * OUTER.bending_stiffness_n_mm2
     assert straightening(short, (0.0, 56.0), 15.0, 1000.0) == pytest.approx(stiff / 1000.0)
+
+
+def test_the_stiffest_part_of_the_needle_that_passes_the_section_counts() -> None:
+    soft = SlottedSegment(length_mm=100.0, stiffness_factor=0.1, strain_factor=1.0)
+    needle = Tube(outer_diameter_mm=0.8, inner_diameter_mm=0.0, length_mm=800.0, slotted_segments=(soft,))
+    alone = straightening(PLAIN, (0.0, 30.0), 15.0, 1000.0)
+    for out, share in ((50.0, 0.1), (60.0, 1.0)):
+        found = straightening(PLAIN, (0.0, 30.0), 15.0, 1000.0, needle=needle, needle_out_mm=out)
+        assert found - alone == pytest.approx(1e-3 * share * needle.bending_stiffness_n_mm2)

@@ -10,6 +10,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.words import plural
 from anatomy.lobes import FISSURES_UNKNOWN
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+from lungaccess.judging.checking.needle_load import FINDING as NEEDLE_LOAD
 from lungaccess.planning.procedure.report import NO_PATH
 from lungaccess.planning.success.estimate import Estimate, chance_of
 from lungaccess.plans.chance import Chance
@@ -57,6 +58,8 @@ class Headline:
         The estimate of success, or what the plan states of one; None if there is none, as for a refused plan.
     fissures_unknown : bool
         Whether fissures must not be crossed, and the patient has no mask of them.
+    needle_load : str
+        What the needle does to the tubes that aim it, where the plan does not count it; empty where nothing.
     without_measuring : Share or None
         How often the plan succeeds in open loop, where the estimate is of a procedure that measures.
     has_aim : bool
@@ -67,6 +70,7 @@ class Headline:
     refusals: int = 0
     estimate: Estimate | None = None
     fissures_unknown: bool = False
+    needle_load: str = ""
     without_measuring: Share | None = None
     has_aim: bool = False
 
@@ -78,13 +82,14 @@ class Headline:
         if report is None:
             return cls(geometry=Geometry.UNCHECKED, estimate=estimate)
         geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
-        unknown = any(each.name == "patient.fissures" for each in report.unchecked)
+        unchecked = {each.name: each.detail for each in report.unchecked}
         has_aim = any(each.name == "target.aim" for each in report.findings)
         return cls(
             geometry=geometry,
             refusals=len(report.refusals),
             estimate=estimate,
-            fissures_unknown=unknown,
+            fissures_unknown="patient.fissures" in unchecked,
+            needle_load=unchecked.get(NEEDLE_LOAD, ""),
             without_measuring=without_measuring,
             has_aim=has_aim,
         )
@@ -103,12 +108,22 @@ class Headline:
     @property
     def grade(self) -> Grade:
         """The worse of geometry and chance of success: accepted geometry alone is never good."""
-        of_geometry = {
-            Geometry.PROVED: Grade.UNKNOWN if self.fissures_unknown else Grade.GOOD,
+        return max(self.geometry_grade, grade_of_chance(self.success))
+
+    @property
+    def geometry_grade(self) -> Grade:
+        """The grade of the geometry: it is not known where something that decides it is not counted."""
+        return {
+            Geometry.PROVED: Grade.UNKNOWN if self.not_counted else Grade.GOOD,
             Geometry.UNCHECKED: Grade.UNKNOWN,
             Geometry.REFUSED: Grade.POOR,
         }[self.geometry]
-        return max(of_geometry, grade_of_chance(self.success))
+
+    @property
+    def not_counted(self) -> tuple[str, ...]:
+        """What the geometry leaves out, in words: fissures that are not known, the load of the needle."""
+        missing = (("fissures", self.fissures_unknown), ("needle's load", self.needle_load))
+        return tuple(name for name, is_missing in missing if is_missing)
 
     @property
     def verdict(self) -> str:
@@ -161,9 +176,10 @@ class Headline:
 
     @property
     def geometry_words(self) -> str:
-        """What is known of the geometry, and that fissures are not checked where they are not known."""
+        """What is known of the geometry, and what is not checked."""
         missing = f", fissures not checked: {FISSURES_UNKNOWN}" if self.fissures_unknown else ""
-        return f"geometry {self.geometry}{missing}"
+        load = f", needle's load not counted: {self.needle_load}" if self.needle_load else ""
+        return f"geometry {self.geometry}{missing}{load}"
 
     @property
     def chance_text(self) -> str:
@@ -229,6 +245,7 @@ class Headline:
             "verdict": self.verdict,
             "geometry": str(self.geometry),
             "fissures_unknown": self.fissures_unknown,
+            "needle_load": self.needle_load or None,
             "success": None if self.success is None else plain_share(self.success),
             "without_measuring": None if open_loop is None else plain_share(open_loop),
             "stated_by_plan": self.is_stated,

@@ -12,6 +12,7 @@ from lungaccess.judging.checking.deployment import check_deployment
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.findings import CheckReport, Findings
 from lungaccess.judging.checking.functions import check_functions
+from lungaccess.judging.checking.needle_load import check_needle_load
 from lungaccess.judging.checking.outcome import check_tubes_at_target
 from lungaccess.judging.checking.record import check_record
 from lungaccess.judging.checking.scope import check_scope
@@ -45,6 +46,7 @@ class Checker:
         if check_record(plan, self._environment.lung, found, system, target):
             check_scope(plan.scope, plan.system, self._environment, found)
             tube_tip = check_deployment(plan, self._environment, found)
+            check_needle_load(plan, found)
             needle, device = plan.needle, plan.system.needle
             if needle is None or device is None:
                 check_tubes_at_target(plan, self._environment, tube_tip, found)

@@ -300,15 +300,11 @@ def _failures(said: Headline) -> list[str]:
 
 
 def _geometry(said: Headline) -> str:
-    grade = {
-        Geometry.PROVED: Grade.UNKNOWN if said.fissures_unknown else Grade.GOOD,
-        Geometry.UNCHECKED: Grade.UNKNOWN,
-        Geometry.REFUSED: Grade.POOR,
-    }[said.geometry]
-    note = "fissures not checked" if said.fissures_unknown else "by the planner and by an independent check"
+    missing = " and ".join(said.not_counted)
+    note = f"without {missing}" if missing else "by the planner and by an independent check"
     if said.geometry is not Geometry.PROVED:
         note = "by the independent check" if said.geometry is Geometry.REFUSED else ""
-    return _tile("Geometry", grade, str(said.geometry), note)
+    return _tile("Geometry", said.geometry_grade, str(said.geometry), note)
 
 
 def _limit(limit: Limit) -> str:

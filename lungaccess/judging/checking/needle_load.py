@@ -1,0 +1,52 @@
+"""Own look at what the needle's stiffness does to the tubes that aim it, which plans do not count."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from anatomy.base.errors import LungaccessError
+from lungaccess.judging.checking.findings import Findings
+from lungaccess.judging.checking.poses import angle_between
+from lungaccess.plans.plan import Plan
+
+FINDING = "tube.needle_load"
+"""What no plan counts has this name among the findings."""
+STILL_MM = 1e-3
+"""A tip that moves less is where the plan states it."""
+BEYOND_MM = 1e-6
+"""So far ahead of the tubes' tip the needle's is, lest rounding put it behind."""
+
+
+def check_needle_load(plan: Plan, found: Findings) -> None:
+    """Record how far the tubes' tip moves and turns when the needle arrives, if no tissue holds the tubes.
+
+    With its tip ahead of theirs, the needle is one more tube, the innermost and straight: the CasADi model of
+    nested tubes takes it as it is.
+    """
+    shaft, tubes = plan.system.needle_tube, plan.system.tubes
+    if plan.needle is None or shaft is None:
+        return
+    from stages.tube.casadi_model import CasadiTubes
+
+    nested, out_mm = tubes.nested, plan.tube.insertions_mm(tubes)[::-1]
+    base = np.array(plan.tube.rotations_rad(tubes)[::-1])
+    beta = np.array(out_mm) - [tube.length_mm for tube in nested]
+    rear = out_mm[0] + BEYOND_MM - shaft.length_mm
+    try:
+        before = CasadiTubes(nested).solve(base, beta).base_from_tip
+        arrived = CasadiTubes((shaft, *nested)).solve([0.0, *base], [rear, *beta]).base_from_tip
+    except LungaccessError as error:
+        found.unchecked(FINDING, f"no shape was found with the needle in the tubes: {error}")
+        return
+    shift_mm = float(np.linalg.norm(arrived[:3, 3] - before[:3, 3]))
+    turn_rad = float(angle_between(arrived[:3, 2], before[:3, 2]))
+    detail = (
+        f"when the needle arrives, its stiffness moves the tip of the tubes by {shift_mm:.1f} mm and turns it by "
+        f"{math.degrees(turn_rad):.0f}° if no tissue holds them; the plan is proved without that"
+    )
+    if shift_mm > STILL_MM:
+        found.unchecked(FINDING, detail)
+    else:
+        found.measured(FINDING, shift_mm, "mm", "motion of the tubes' tip when the needle arrives")

@@ -1,0 +1,89 @@
+"""What the needle does to the tubes that aim it: how stiff it is beside them, and what it bends."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from anatomy.base.records import frozen_value
+
+if TYPE_CHECKING:
+    from lungaccess.problem.system import System
+
+
+@frozen_value
+class NeedleLoad:
+    """What the needle does to tubes, in the air, when its tip arrives at theirs.
+
+    Parameters
+    ----------
+    ratio : float
+        See `stiffness_ratio`.
+    out_mm : float
+        How far the inner tube is inserted beyond the scope, the others not at all: its whole curve is out, or as
+        much of it as its limits allow.
+    shift_mm, turn_deg : float
+        By how much the tip of the inner tube moves, and its direction turns.
+    """
+
+    ratio: float
+    out_mm: float
+    shift_mm: float
+    turn_deg: float
+
+    @property
+    def words(self) -> str:
+        """The load in one sentence."""
+        return (
+            f"The needle is {self.ratio:.2g} times as stiff as the inner tube: when it arrives, the tip of the "
+            f"inner tube, inserted by {self.out_mm:.0f} mm, moves by {self.shift_mm:.1f} mm and turns by "
+            f"{self.turn_deg:.0f}°. No plan counts that."
+        )
+
+
+def stiffness_ratio(system: System) -> float:
+    """Return how many times as stiff in bending the needle is as the tube that aims it, 0 if it is neglected.
+
+    Of the needle the stiffest part counts that comes to lie in tubes beyond the scope, on its whole way; of
+    the inner tube the softest part that comes out of the scope.
+    """
+    shaft, tubes = system.needle_tube, system.tubes
+    if shaft is None:
+        return 0.0
+    passing_mm = tubes.max_extension_mm + system.require_needle("Its stiffness").max_length_mm
+    needle = shaft.parts.stiffness_n_mm2[shaft.parts.begin_mm < passing_mm].max()
+    parts = tubes.inner.parts
+    return float(needle / parts.stiffness_n_mm2[parts.begin_mm < tubes.max_extension_mm].min())
+
+
+def needle_load(system: System) -> NeedleLoad | None:
+    """Return what the needle of a system does to its tubes; None without one, or if its stiffness is neglected.
+
+    Section and tissue do not give way or hold here: see `stages.tube.bending_section`, `stages.tube.held_shape`.
+    """
+    from stages.tube import TubeMechanics
+
+    shaft, tubes = system.needle_tube, system.tubes
+    if shaft is None:
+        return None
+    bent_mm = max((tubes.inner.length_mm - bend.from_mm for bend in tubes.inner.bends), default=0.0)
+    ahead_mm = tubes.max_extension_mm
+    if tubes.outer is not None:
+        ahead_mm = min(ahead_mm, tubes.inner.length_mm - tubes.nested[1].length_mm)
+    out_mm = min(bent_mm, ahead_mm) or ahead_mm
+    mechanics = TubeMechanics(tubes.nested, needle=shaft)
+    beta = -mechanics.lengths_mm
+    beta[0] += out_mm
+    before, arrived = (
+        mechanics.given_base_angles(np.zeros(mechanics.count), beta, needle_mm=at).base_from_tip
+        for at in (0.0, out_mm)
+    )
+    ahead, was = arrived[:3, 2], before[:3, 2]
+    return NeedleLoad(
+        ratio=stiffness_ratio(system),
+        out_mm=out_mm,
+        shift_mm=float(np.linalg.norm(arrived[:3, 3] - before[:3, 3])),
+        turn_deg=math.degrees(math.atan2(float(np.linalg.norm(np.cross(ahead, was))), float(ahead @ was))),
+    )

@@ -22,8 +22,8 @@ class NeedleLoad:
     ratio : float
         See `stiffness_ratio`.
     out_mm : float
-        How far the inner tube is inserted beyond the scope, the others not at all: its whole curve is out, or as
-        much of it as its limits allow.
+        How far the inner tube is inserted beyond the scope, the others not at all: its whole curve is out, or
+        as much of it as its limits allow.
     shift_mm, turn_deg : float
         By how much the tip of the inner tube moves, and its direction turns.
     """
@@ -37,8 +37,8 @@ class NeedleLoad:
     def words(self) -> str:
         """The load in one sentence."""
         return (
-            f"The needle is {self.ratio:.2g} times as stiff as the inner tube: when it arrives, the tip of the "
-            f"inner tube, inserted by {self.out_mm:.0f} mm, moves by {self.shift_mm:.1f} mm and turns by "
+            f"The needle is {self.ratio:.2g} times as stiff as the inner tube: when it arrives, the tip of "
+            f"the inner tube, inserted by {self.out_mm:.0f} mm, moves by {self.shift_mm:.1f} mm and turns by "
             f"{self.turn_deg:.0f}°. No plan counts that."
         )
 
@@ -59,9 +59,10 @@ def stiffness_ratio(system: System) -> float:
 
 
 def needle_load(system: System) -> NeedleLoad | None:
-    """Return what the needle of a system does to its tubes; None without one, or if its stiffness is neglected.
+    """Return what a system's needle does to its tubes; None without one, or if its stiffness is neglected.
 
-    Section and tissue do not give way or hold here: see `stages.tube.bending_section`, `stages.tube.held_shape`.
+    The section does not give way here, and no tissue holds: see `stages.tube.bending_section` and
+    `stages.tube.held_shape`.
     """
     from stages.tube import TubeMechanics
 

@@ -23,7 +23,7 @@ from stages.tube.device import ConcentricTubes, Tube
 FISSURE_RULES = {True: " (fissures may be crossed)", False: " (fissures are obstacles)"}
 """How the name of a preset ends that was loaded with another rule for fissures than its own."""
 NOTED_MM = 0.1
-"""A needle that moves the tubes' tip by less is no warning worth: clearances are stated to a tenth of a mm."""
+"""A needle that moves the tubes' tip by less is not worth a warning: a tenth of a mm is far below errors."""
 _PRESETS = "presets"
 _NEEDLES = "presets/needles"
 _TUBES = "presets/tubes"

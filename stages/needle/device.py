@@ -16,8 +16,8 @@ class Needle:
     the branch which the tube pierced.
 
     Its shaft is a tube like any other, which stiffens the tubes that aim it.  Without further keys it is a
-    solid wire of superelastic NiTi, the stiffest that such a needle can be; `youngs_modulus_gpa = 0` says that
-    its stiffness is to be neglected.
+    solid wire of superelastic NiTi, the stiffest of its diameter and material; `youngs_modulus_gpa = 0` says
+    that its stiffness is to be neglected.
 
     Raises
     ------

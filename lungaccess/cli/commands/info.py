@@ -81,7 +81,8 @@ def presets(
         terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
     else:
         terminal.console.print(_preset_table(systems))
-        terminal.show_warnings(f"{name}: {each}" for name, system in systems.items() for each in system.warnings)
+        warned = ((name, each) for name, system in systems.items() for each in system.warnings)
+        terminal.show_warnings(f"{name}: {each}" for name, each in warned)
     return ExitCode.OK
 
 

@@ -1,110 +1,20 @@
-"""Nested tubes and a needle beside PyElastica: Cosserat rods, tied at their nodes, free to turn, at rest.
-
-The library knows neither concentric tubes nor their torsional equation: each rod has its stiffness and its
-curvature at rest, springs keep the nodes of all together, and damping takes the energy out.  What it finds
-differs by its discretisation, whose error falls with the square of the spacing of its nodes.
-"""
+"""Nested tubes and a needle beside PyElastica: Cosserat rods, tied at their nodes, free to turn, at rest."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pytest
 
-from anatomy.shafts import SlottedSegment
 from stages.tube.device import Tube
 from stages.tube.mechanics import TubeMechanics
 
-elastica: Any = pytest.importorskip("elastica", reason="PyElastica (the extra 'test') is not installed")
+pytest.importorskip("elastica", reason="PyElastica (the extra 'test') is not installed")
+from experiments.support import rods as rods_of
 
 pytestmark = pytest.mark.slow
 
-MODULUS = 55e3
-"""In N/mm^2: with it as the density a wave runs a mm in a unit of time; the shape at rest is the same."""
-DAMPING = 1.2e-3
-SYSTEMS = 50
-DURATION = 10_000.0
-"""The slowest motion of a tube of 32 mm has died away by then."""
-
-
-class Nodes(elastica.FreeJoint.__base__):  # type: ignore[misc]
-    """A connection of PyElastica that ties the nodes of two rods, as many as the shorter has."""
-
-    def __init__(self, stiffness: float, damping: float) -> None:
-        self.stiffness, self.damping = stiffness, damping
-
-    def apply_forces(
-        self, system_one: Any, index_one: Any, system_two: Any, index_two: Any, time: Any = 0.0
-    ) -> None:
-        n = min(system_one.n_elems, system_two.n_elems) + 1
-        force = self.stiffness * (system_two.position_collection - system_one.position_collection[:, :n])
-        force += self.damping * (system_two.velocity_collection - system_one.velocity_collection[:, :n])
-        system_one.external_forces[:, :n] += force
-        system_two.external_forces -= force
-
-    def apply_torques(
-        self, system_one: Any, index_one: Any, system_two: Any, index_two: Any, time: Any = 0.0
-    ) -> None:
-        return
-
-
-def rod_of(tube: Tube, end_mm: float, angle: float, spacing: float) -> Any:
-    """Return a straight rod with what a tube has ahead of the front plate, held by its first element.
-
-    It has a node in the middle of each stretch of the spacing, and half an element more at either end.
-    """
-    count = round(end_mm / spacing)
-    rod = elastica.CosseratRod.straight_rod(
-        n_elements=count + 1,
-        start=np.array([0.0, 0.0, -0.5 * spacing]),
-        direction=np.array([0.0, 0.0, 1.0]),
-        normal=np.array([np.cos(angle), np.sin(angle), 0.0]),
-        base_length=(count + 1) * spacing,
-        base_radius=0.5,
-        density=MODULUS,
-        youngs_modulus=MODULUS,
-    )
-    parts = tube.parts
-    part = np.searchsorted(parts.end_mm, end_mm - spacing * (np.arange(count) + 0.5))
-    rod.bend_matrix[:] = 0.0
-    rod.bend_matrix[0, 0] = rod.bend_matrix[1, 1] = parts.stiffness_n_mm2[part]
-    rod.bend_matrix[2, 2] = tube.torsional_stiffness_n_mm2
-    rod.mass_second_moment_of_inertia *= 10.0  # No stiffness, so that steps may be longer.
-    rod.inv_mass_second_moment_of_inertia /= 10.0
-    rod.rest_kappa[0] = parts.curvature_per_mm[part]
-    return rod
-
-
-def at_rest(
-    bodies: Sequence[Tube], ends_mm: Sequence[float], angles: Sequence[float], spacing: float, duration: float
-) -> list[Any]:
-    """Return the rods of bodies, the longest first, that end at multiples of the spacing, at rest."""
-    parts = (elastica.BaseSystemCollection, elastica.Constraints, elastica.Connections, elastica.Damping)
-    world: Any = type("World", parts, {})()
-    step = 0.4 * spacing
-    rods = [rod_of(*body, spacing) for body in zip(bodies, ends_mm, angles, strict=True)]
-    for rod in rods:
-        world.append(rod)
-        world.constrain(rod).using(
-            elastica.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
-        )
-        world.dampen(rod).using(
-            elastica.AnalyticalLinearDamper, uniform_damping_constant=DAMPING, time_step=step
-        )
-    mass = float(rods[0].mass.mean())
-    for rod in rods[1:]:
-        world.connect(rods[0], rod).using(Nodes, 0.02 * mass / spacing**2, 0.02 * mass / spacing)
-    world.finalize()
-    elastica.integrate(elastica.PositionVerlet(), world, duration, int(duration / step), progress_bar=False)
-    assert max(float(np.abs(rod.velocity_collection).max()) for rod in rods) < 2e-6  # At rest.
-    return rods
-
-
-def tip_of(rod: Any) -> tuple[Any, Any]:
-    """Return point and direction of a rod half an element before its end."""
-    return rod.position_collection[:, -2:].mean(axis=1), rod.director_collection[2, :, -1]
+SYSTEMS = 3
+"""So many of the random systems; `experiments.needle_rods` takes 50."""
 
 
 @pytest.mark.parametrize("degrees", [0.0, 60.0, 120.0])
@@ -117,7 +27,7 @@ def test_two_rods_come_to_rest_in_the_shape_of_the_tubes(degrees: float) -> None
             length_mm=length,
             curved_length_mm=length,
             precurvature_per_mm=curvature,
-            youngs_modulus_gpa=1e-3 * MODULUS,
+            youngs_modulus_gpa=1e-3 * rods_of.MODULUS,
         )
         for size, curvature in ((0, 0.02), (1, 0.012))
     ]
@@ -126,8 +36,8 @@ def test_two_rods_come_to_rest_in_the_shape_of_the_tubes(degrees: float) -> None
     twisted = float(wanted.tip_angles_rad[1] - wanted.tip_angles_rad[0])
     apart_mm = []
     for spacing in (3.0, 1.5):
-        rods = at_rest(tubes, [length, length], angles, spacing, 40_000.0)
-        apart_mm.append(float(np.linalg.norm(tip_of(rods[0])[0] - wanted.base_from_tip[:3, 3])))
+        rods = rods_of.at_rest(tubes, [length, length], angles, spacing, 40_000.0)
+        apart_mm.append(float(np.linalg.norm(rods_of.tip_of(rods[0])[0] - wanted.base_from_tip[:3, 3])))
         inner, outer = (rod.director_collection[..., -1] for rod in rods)
         turn = outer @ inner.T
         turned = float(np.arctan2(turn[0, 1] - turn[1, 0], turn[0, 0] + turn[1, 1]))
@@ -135,60 +45,9 @@ def test_two_rods_come_to_rest_in_the_shape_of_the_tubes(degrees: float) -> None
     assert apart_mm[1] < 0.05
 
 
-def random_system(number: int) -> tuple[list[Tube], list[float], list[float], Tube, float]:
-    """Return two tubes, their ends and angles, and a needle with a soft end, all borders between nodes."""
-    rng = np.random.default_rng(number)
-    modulus = 1e-3 * MODULUS
-    out = [int(rng.integers(10, 17)), 0]
-    out[1] = int(rng.integers(4, out[0] + 1))
-    tubes = []
-    for size, end in enumerate(out):
-        curved = int(rng.integers(3, end + 1))
-        diameter = 1.1 + 0.4 * size
-        tubes.append(
-            Tube(
-                outer_diameter_mm=diameter,
-                inner_diameter_mm=diameter - rng.uniform(0.12, 0.25),
-                length_mm=SPACING * (end + 20 - 10 * size),
-                curved_length_mm=SPACING * curved,
-                precurvature_per_mm=float(rng.uniform(0.01, 0.04) / (1 + size)),
-                youngs_modulus_gpa=modulus,
-            )
-        )
-    soft = SlottedSegment(
-        length_mm=SPACING * int(rng.integers(2, 12)),
-        stiffness_factor=float(rng.uniform(0.05, 0.5)),
-        strain_factor=1.0,
-    )
-    needle = Tube(
-        outer_diameter_mm=float(rng.uniform(0.4, 0.8)),
-        inner_diameter_mm=0.3,
-        length_mm=SPACING * 100,
-        slotted_segments=(soft,),
-        youngs_modulus_gpa=modulus,
-    )
-    needle_mm = SPACING * int(rng.integers(3, out[0] + 1))
-    angles = [0.0, float(rng.uniform(-1.2, 1.2))]
-    return tubes, [SPACING * end for end in out], angles, needle, needle_mm
-
-
-SPACING = 2.0
-"""Spacing of nodes, mm: errors of tips are a few hundredths of a millimetre."""
-
-
 @pytest.mark.parametrize("number", range(SYSTEMS))
 def test_tips_under_a_needle_are_those_of_three_rods(number: int) -> None:
-    tubes, ends, angles, needle, needle_mm = random_system(number)
-    beta = np.array(ends) - [tube.length_mm for tube in tubes]
-    mechanics = TubeMechanics(tubes, needle=needle)
-    # The rods begin at the front plate, where the tubes are turned by less than at their rear ends.
-    wanted = mechanics.given_base_angles(angles, beta, needle_mm=needle_mm)
-    assert wanted.stable
-    at_plate = wanted.angles([0.0])[0].tolist()
-    rods = at_rest([*tubes, needle], [*ends, needle_mm], [*at_plate, 0.0], SPACING, DURATION)
-    point, ahead = tip_of(rods[0])
-    assert np.linalg.norm(point - wanted.base_from_tip[:3, 3]) < 0.1
-    turned = np.linalg.norm(np.cross(ahead, wanted.base_from_tip[:3, 2]))
-    assert np.degrees(turned) < 0.2
-    unloaded = mechanics.given_base_angles(angles, beta).base_from_tip
-    assert np.linalg.norm(unloaded[:3, 3] - wanted.base_from_tip[:3, 3]) > 0.1
+    found = rods_of.apart(number)
+    assert found.mm < 0.1
+    assert found.degrees < 0.2
+    assert found.moved_mm > 0.1

@@ -19,7 +19,7 @@ STOP_MM = 5.0
 """Motion of the needle between two looks at the tubes: shapes change smoothly, and what lies between two
 looks is bounded by second differences."""
 BEYOND_STOPS = 4
-"""Looks after the needle's arrival, beside those when the border of a flexible segment enters the tubes."""
+"""Looks after the arrival of a needle with flexible segments, beside those when a border enters the tubes."""
 
 
 @frozen_record
@@ -111,7 +111,9 @@ def needle_arrivals(
     bodies = (*mechanics.tubes, needle)
     strained = np.array([float(body.parts.strained_radius_mm.max()) for body in bodies])
     borders = {float(end) for end in needle.parts.end_mm if end < needle_out_mm}
-    beyond = np.array(sorted({*borders, *np.linspace(0.0, needle_out_mm, BEYOND_STOPS + 1)[1:]}))
+    # A shaft that is alike all along changes nothing once it has arrived.
+    between = np.linspace(0.0, needle_out_mm, BEYOND_STOPS + 1)[1:] if borders else [needle_out_mm]
+    beyond = np.array(sorted({*borders, *between}))
 
     def follow(some: slice) -> None:
         deployments = base[some], beta[some]

@@ -135,6 +135,7 @@ def test_presets_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["presets"]) == 0
     text = capsys.readouterr().out
     assert DEFAULT_SYSTEM in text and "121" in text
+    assert f"- {DEFAULT_SYSTEM}: The needle is 11 times as stiff" in text
 
 
 # Plans -------------------------------------------------------------------------------------------

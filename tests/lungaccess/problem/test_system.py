@@ -6,10 +6,12 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from anatomy.base.errors import FileError, SettingsError
 from anatomy.base.settings import override, parse, to_mapping
+from lungaccess.problem.needle_load import needle_load
 from lungaccess.problem.system import (
     System,
     load_system,
@@ -165,6 +167,23 @@ def test_a_needle_states_its_shaft_as_tubes_do_and_may_be_neglected() -> None:
     changes = {"name": "other", "needle.youngs_modulus_gpa": 0.0}
     assert override(load_system("tight-inner"), changes).needle_tube is None
     assert load_system("tubes-only").needle_tube is None
+
+
+def test_a_system_warns_of_a_needle_that_bends_its_tubes_away() -> None:
+    system = load_system("tight-inner")
+    load = needle_load(system)
+    inner, kappa = 0.04 * system.tubes.inner.bending_stiffness_n_mm2, system.tubes.inner.precurvature_per_mm
+    ratio = system.needle_tube.bending_stiffness_n_mm2 / inner
+    assert load.ratio == pytest.approx(ratio)
+    assert load.out_mm == 40.0
+    left = 40.0 * kappa / (1.0 + ratio)
+    assert math.radians(load.turn_deg) == pytest.approx(40.0 * kappa - left)
+    tips = [40.0 / turn * np.array([1.0 - math.cos(turn), math.sin(turn)]) for turn in (40.0 * kappa, left)]
+    assert load.shift_mm == pytest.approx(np.linalg.norm(tips[1] - tips[0]), abs=1e-5)
+    assert system.warnings == (load.words,)
+    for name in ("stylet-needle", "tubes-only"):
+        assert not load_system(name).warnings
+    assert not override(system, {"name": "other", "needle.youngs_modulus_gpa": 0.0}).warnings
 
 
 def test_example_of_the_documentation_works(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ KEYS = {
     "verdict",
     "geometry",
     "fissures_unknown",
+    "needle_load",
     "success",
     "stated_by_plan",
     "without_measuring",
@@ -114,6 +115,18 @@ def test_without_a_fissure_mask_a_plan_is_never_good_news() -> None:
     assert (headline.grade, headline.verdict) == (Grade.UNKNOWN, "not known to succeed")
     assert "fissures not checked: no fissure mask" in headline.text
     assert headline.to_mapping()["fissures_unknown"] is True
+
+
+def test_a_needle_that_bends_its_tubes_away_is_never_good_news() -> None:
+    check = make_check(True)
+    load = Finding(name="tube.needle_load", ok=None, detail="the tip moves by 9 mm")
+    headline = Headline.of(replace(check, findings=(*check.findings, load)), make_risk(1980))
+    assert (headline.grade, headline.verdict) == (Grade.UNKNOWN, "not known to succeed")
+    assert "geometry proved and checked, needle's load not counted: the tip moves by 9 mm" in (
+        headline.geometry_words
+    )
+    assert headline.not_counted == ("needle's load",)
+    assert headline.to_mapping()["needle_load"] == "the tip moves by 9 mm"
 
 
 def test_the_model_is_named_and_its_sizes_are_stated(tmp_path: Path) -> None:

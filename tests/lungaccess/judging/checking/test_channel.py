@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from experiments.support.mutants import channel
 from experiments.support.mutants.mutant import Case
 from lungaccess.judging.checking import check
+from lungaccess.judging.checking.findings import Findings
+from lungaccess.judging.checking.needle_load import check_needle_load
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion
@@ -49,6 +52,34 @@ def test_strain_and_handle_agree_with_the_planner_s(case: Case) -> None:
     factor = bend_factor(plan.system, *inserted)
     assert factor > 1.5, "tubes straighten the section"
     assert found["scope.handle"] == pytest.approx(factor * abs(plan.scope.states[-1, 2]))
+
+
+def test_what_the_needle_does_to_the_tubes_is_said_and_not_counted(case: Case) -> None:
+    """Both tubes are bent in one plane: the tip turns by the sum of all curvatures, which stiffness shares."""
+    plan, tubes = case.plan, case.plan.system.tubes
+    outer_mm, inner_mm = plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
+    inner, outer = (float(tube.parts.stiffness_n_mm2[0]) for tube in tubes.nested)
+    shaft = plan.system.needle_tube
+    assert shaft is not None
+    assert inner_mm <= tubes.inner.curved_length_mm
+    turns = [
+        tubes.inner.precurvature_per_mm
+        * inner
+        * (outer_mm / (inner + outer + needle) + (inner_mm - outer_mm) / (inner + needle))
+        for needle in (0.0, shaft.bending_stiffness_n_mm2)
+    ]
+    (said,) = [each.detail for each in case.report.unchecked if each.name == "tube.needle_load"]
+    assert f"turns it by {np.degrees(turns[0] - turns[1]):.0f}°" in said
+
+
+def test_a_needle_that_moves_no_tube_is_measured_and_a_neglected_one_is_not_named(case: Case) -> None:
+    system = case.plan.system
+    straight = replace(system.tubes.inner, curved_length_mm=0.0, precurvature_per_mm=0.0)
+    soft = replace(system.needle, youngs_modulus_gpa=0.0)
+    for changes, ok in (({"tubes": replace(system.tubes, inner=straight)}, [True]), ({"needle": soft}, [])):
+        found = Findings()
+        check_needle_load(replace(case.plan, system=replace(system, **changes)), found)
+        assert [each.ok for each in found.report().findings] == ok
 
 
 @pytest.mark.parametrize("mutation", channel.MUTATIONS, ids=lambda each: each.__name__)

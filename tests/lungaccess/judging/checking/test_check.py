@@ -135,7 +135,7 @@ def test_without_a_fissure_mask_fissures_are_not_checked_and_never_ok(
     free = tools.changed(plan, fissures_are_obstacles=False)
     stated = {stage: {k: v for k, v in d.items() if k != "fissure"} for stage, d in free.clearance_mm.items()}
     report = check(tools.changed(free, clearance_mm=stated), blind)
-    names = ["needle.clearance.fissure", "patient.fissures", "tube.clearance.fissure"]
+    names = ["needle.clearance.fissure", "patient.fissures", "tube.clearance.fissure", "tube.needle_load"]
     assert sorted(report.to_mapping()["not_checked"]) == names  # type: ignore[call-overload]
     # The plan's cost counts its distance from the fissure; nothing else is wrong without the mask.
     assert [each.name for each in report.refusals] == ["costs.inverse_clearance"]

@@ -18,10 +18,9 @@ COUNT = 50
 
 def main() -> None:
     """Print one line a system, then the largest of all."""
-    found = []
-    for number in range(int(sys.argv[1]) if len(sys.argv) > 1 else COUNT):
-        found.append(apart(number))
-        print(number, *(f"{each:.4f}" for each in found[-1]), flush=True)
+    found = apart(range(int(sys.argv[1]) if len(sys.argv) > 1 else COUNT))
+    for number, each in enumerate(found):
+        print(number, *(f"{value:.4f}" for value in each))
     most = np.max(found, axis=0)
     least = np.min(found, axis=0)
     print(f"{len(found)} systems: apart by {most[0]:.4f} mm and {most[1]:.4f} degrees at most")

@@ -55,7 +55,7 @@ def test_strain_and_handle_agree_with_the_planner_s(case: Case) -> None:
 
 
 def test_what_the_needle_does_to_the_tubes_is_said_and_not_counted(case: Case) -> None:
-    """Both tubes are bent in one plane: the tip turns by the sum of all curvatures, which stiffness shares."""
+    """The tubes bend in one plane: the tip turns by the sum of curvatures, in which stiffness shares."""
     plan, tubes = case.plan, case.plan.system.tubes
     outer_mm, inner_mm = plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
     inner, outer = (float(tube.parts.stiffness_n_mm2[0]) for tube in tubes.nested)

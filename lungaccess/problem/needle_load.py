@@ -12,6 +12,9 @@ from anatomy.base.records import frozen_value
 if TYPE_CHECKING:
     from lungaccess.problem.system import System
 
+NOTED_MM = 0.1
+"""A needle that moves the tubes' tip by less is not worth a warning: a tenth of a mm is far below errors."""
+
 
 @frozen_value
 class NeedleLoad:
@@ -88,3 +91,9 @@ def needle_load(system: System) -> NeedleLoad | None:
         shift_mm=float(np.linalg.norm(arrived[:3, 3] - before[:3, 3])),
         turn_deg=math.degrees(math.atan2(float(np.linalg.norm(np.cross(ahead, was))), float(ahead @ was))),
     )
+
+
+def system_warnings(system: System) -> tuple[str, ...]:
+    """Return what no plan with a system counts, in sentences with numbers."""
+    load = needle_load(system)
+    return () if load is None or load.shift_mm < NOTED_MM else (load.words,)

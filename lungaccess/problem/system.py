@@ -22,8 +22,6 @@ from stages.tube.device import ConcentricTubes, Tube
 
 FISSURE_RULES = {True: " (fissures may be crossed)", False: " (fissures are obstacles)"}
 """How the name of a preset ends that was loaded with another rule for fissures than its own."""
-NOTED_MM = 0.1
-"""A needle that moves the tubes' tip by less is not worth a warning: a tenth of a mm is far below errors."""
 _PRESETS = "presets"
 _NEEDLES = "presets/needles"
 _TUBES = "presets/tubes"
@@ -140,14 +138,6 @@ class System:
             youngs_modulus_gpa=needle.youngs_modulus_gpa,
             poisson_ratio=needle.poisson_ratio,
         )
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What plans with this system do not count, in sentences with numbers."""
-        from lungaccess.problem.needle_load import needle_load
-
-        load = needle_load(self)
-        return () if load is None or load.shift_mm < NOTED_MM else (load.words,)
 
     @property
     def track_radius_mm(self) -> float:

@@ -20,6 +20,8 @@ STEP_MM = 1.0
 """Largest motion between two steps."""
 LARGEST_TURN_RAD = 0.2
 """Largest turn of a tip in a step that is no jump: where the tubes are about to snap they turn faster."""
+BEYOND_MM = 1e-6
+"""So far ahead of the tubes' tip a needle's is that has arrived, lest rounding put it behind."""
 LEAST_SHARE = 1.0 / 64.0
 """Tips that still turn as far in this share of a step are said to jump."""
 
@@ -93,6 +95,29 @@ def derive_shape(tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm:
         least_determinant=least,
         way=tuple(read_only(each[:, :4].copy()) for each in way),
     )
+
+
+def derive_arrival(
+    tubes: Sequence[Tube], needle: Tube, rotations_rad: ArrayLike, insertions_mm: ArrayLike
+) -> tuple[Float, Float]:
+    """Return the frames `(4, 4)` of the tubes' tip without a needle, and of a needle's that has come to it.
+
+    With its tip at theirs a needle is one more tube, the innermost and straight.  No tissue holds the tubes.
+
+    Raises
+    ------
+    ConvergenceError
+        If no equilibrium is found.
+    SettingsError
+        If the insertions are impossible.
+    """
+    turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
+    out = np.asarray(insertions_mm, dtype=np.float64)
+    beta = out - [tube.length_mm for tube in tubes]
+    rear = out[0] + BEYOND_MM - needle.length_mm
+    before = CasadiTubes(tubes).solve(turned, beta)
+    arrived = CasadiTubes((needle, *tubes)).solve(np.append(0.0, turned), np.append(rear, beta))
+    return before.base_from_tip, arrived.base_from_tip
 
 
 def _stepped(model: CasadiTubes, base: Float, begin: Float, end: Float, tips: Float) -> tuple[Float, float]:

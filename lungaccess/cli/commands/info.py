@@ -68,6 +68,7 @@ def presets(
     Its JSON holds every setting.
     """
     from anatomy.base.settings import to_mapping
+    from lungaccess.problem.needle_load import system_warnings
     from lungaccess.problem.preset_order import presets_by_invasiveness
     from lungaccess.problem.system import load_system, needle_preset_names, preset_text, tube_preset_names
 
@@ -81,7 +82,7 @@ def presets(
         terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
     else:
         terminal.console.print(_preset_table(systems))
-        warned = ((name, each) for name, system in systems.items() for each in system.warnings)
+        warned = ((name, each) for name, system in systems.items() for each in system_warnings(system))
         terminal.show_warnings(f"{name}: {each}" for name, each in warned)
     return ExitCode.OK
 

@@ -15,28 +15,19 @@ FINDING = "tube.needle_load"
 """What no plan counts has this name among the findings."""
 STILL_MM = 1e-3
 """A tip that moves less is where the plan states it."""
-BEYOND_MM = 1e-6
-"""So far ahead of the tubes' tip the needle's is, lest rounding put it behind."""
 
 
 def check_needle_load(plan: Plan, found: Findings) -> None:
-    """Record how far the tubes' tip moves and turns when the needle arrives, if no tissue holds the tubes.
-
-    With its tip ahead of theirs, the needle is one more tube, the innermost and straight: the CasADi model of
-    nested tubes takes it as it is.
-    """
+    """Record how far the tubes' tip moves and turns when the needle arrives, if no tissue holds the tubes."""
     shaft, tubes = plan.system.needle_tube, plan.system.tubes
     if plan.needle is None or shaft is None:
         return
-    from stages.tube.casadi_model import CasadiTubes
+    from stages.tube.casadi_shape import derive_arrival
 
-    nested, out_mm = tubes.nested, plan.tube.insertions_mm(tubes)[::-1]
-    base = np.array(plan.tube.rotations_rad(tubes)[::-1])
-    beta = np.array(out_mm) - [tube.length_mm for tube in nested]
-    rear = out_mm[0] + BEYOND_MM - shaft.length_mm
     try:
-        before = CasadiTubes(nested).solve(base, beta).base_from_tip
-        arrived = CasadiTubes((shaft, *nested)).solve([0.0, *base], [rear, *beta]).base_from_tip
+        before, arrived = derive_arrival(
+            tubes.nested, shaft, plan.tube.rotations_rad(tubes)[::-1], plan.tube.insertions_mm(tubes)[::-1]
+        )
     except LungaccessError as error:
         found.unchecked(FINDING, f"no shape was found with the needle in the tubes: {error}")
         return

@@ -34,8 +34,8 @@ def check_needle_load(plan: Plan, found: Findings) -> None:
     shift_mm = float(np.linalg.norm(arrived[:3, 3] - before[:3, 3]))
     turn_rad = float(angle_between(arrived[:3, 2], before[:3, 2]))
     detail = (
-        f"when the needle arrives, its stiffness moves the tip of the tubes by {shift_mm:.1f} mm and turns "
-        f"it by {math.degrees(turn_rad):.0f}° if no tissue holds them; the plan is proved without that"
+        f"when the needle arrives, the tubes' tip moves by {shift_mm:.1f} mm and turns by "
+        f"{math.degrees(turn_rad):.0f}° in the air"
     )
     if shift_mm > STILL_MM:
         found.unchecked(FINDING, detail)

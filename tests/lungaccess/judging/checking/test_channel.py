@@ -69,7 +69,7 @@ def test_what_the_needle_does_to_the_tubes_is_said_and_not_counted(case: Case) -
         for needle in (0.0, shaft.bending_stiffness_n_mm2)
     ]
     (said,) = [each.detail for each in case.report.unchecked if each.name == "tube.needle_load"]
-    assert f"turns it by {np.degrees(turns[0] - turns[1]):.0f}°" in said
+    assert f"turns by {np.degrees(turns[0] - turns[1]):.0f}°" in said
 
 
 def test_a_needle_that_moves_no_tube_is_measured_and_a_neglected_one_is_not_named(case: Case) -> None:

@@ -22,7 +22,7 @@ MODULUS = 55e3
 """In N/mm^2: with it as the density a wave runs a mm in a unit of time; the shape at rest is the same."""
 DAMPING = 1.2e-3
 """Rate at which velocities fall, per unit of time."""
-DURATION = 10_000.0
+DURATION = 14_000.0
 """The slowest motion of a tube of 32 mm has died away by then."""
 AT_REST = 2e-5
 """Speed, mm in a unit of time, below which rods are at rest: the slowest turn by 1e-3 rad in it, and are then
@@ -105,7 +105,7 @@ def at_rest(
             )
         mass = float(first.mass.mean())
         for rod in others:
-            world.connect(first, rod).using(Nodes, 0.02 * mass / spacing**2, 0.02 * mass / spacing)
+            world.connect(first, rod).using(Nodes, 0.5 * mass / spacing**2, 0.02 * mass / spacing)
     world.finalize()
     elastica.integrate(elastica.PositionVerlet(), world, duration, int(duration / step), progress_bar=False)
     speed = max(float(np.abs(rod.velocity_collection).max()) for rods in made for rod in rods)
@@ -141,17 +141,17 @@ def random_system(number: int) -> tuple[list[Tube], list[float], list[float], Tu
         )
     soft = SlottedSegment(
         length_mm=SPACING * int(rng.integers(2, 12)),
-        stiffness_factor=float(rng.uniform(0.05, 0.5)),
+        stiffness_factor=float(rng.uniform(0.3, 0.8)),
         strain_factor=1.0,
     )
     needle = Tube(
-        outer_diameter_mm=float(rng.uniform(0.4, 0.8)),
+        outer_diameter_mm=float(rng.uniform(0.65, 0.84)),
         inner_diameter_mm=0.3,
         length_mm=SPACING * 100,
         slotted_segments=(soft,),
         youngs_modulus_gpa=modulus,
     )
-    needle_mm = SPACING * int(rng.integers(3, out[0] + 1))
+    needle_mm = SPACING * int(rng.integers(out[0] // 2, out[0] + 1))
     angles = [0.0, float(rng.uniform(-1.2, 1.2))]
     return tubes, [SPACING * end for end in out], angles, needle, needle_mm
 

@@ -22,7 +22,7 @@ MODULUS = 55e3
 """In N/mm^2: with it as the density a wave runs a mm in a unit of time; the shape at rest is the same."""
 DAMPING = 1.2e-3
 """Rate at which velocities fall, per unit of time."""
-DURATION = 14_000.0
+DURATION = 12_000.0
 """The slowest motion of a tube of 32 mm has died away by then."""
 AT_REST = 2e-5
 """Speed, mm in a unit of time, below which rods are at rest: the slowest turn by 1e-3 rad in it, and are then
@@ -105,7 +105,7 @@ def at_rest(
             )
         mass = float(first.mass.mean())
         for rod in others:
-            world.connect(first, rod).using(Nodes, 0.5 * mass / spacing**2, 0.02 * mass / spacing)
+            world.connect(first, rod).using(Nodes, mass / spacing**2, 0.02 * mass / spacing)
     world.finalize()
     elastica.integrate(elastica.PositionVerlet(), world, duration, int(duration / step), progress_bar=False)
     speed = max(float(np.abs(rod.velocity_collection).max()) for rods in made for rod in rods)

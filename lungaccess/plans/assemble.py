@@ -16,12 +16,12 @@ from lungaccess.plans.candidate import Candidate, parts_in_tissue, wall_in_path_
 from lungaccess.plans.costs import path_costs
 from lungaccess.plans.insertion import scope_insertion
 from lungaccess.plans.parts import (
+    DeployedShape,
     Exemption,
     NeedleArc,
     NeedlePath,
     ScopeInsertion,
     TubeDeployment,
-    TwistedShape,
     WallExit,
 )
 from lungaccess.plans.plan import Plan
@@ -30,7 +30,7 @@ from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, InTissue
 from stages.scope import ScopeTip, prove_motion
-from stages.tube import ConcentricTubes, Deployment, TubeShape
+from stages.tube import Deployment
 
 CLEARANCE_CAP_MM = 5.0
 """Clearances below this are stated exactly: larger ones never limit a plan."""
@@ -69,7 +69,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         needle=None if needle is None else needle_part(candidate.path),
         exemption=Exemption(
             branch=deployment.branch,
-            exit_point_lps=_exit_point(task, frame, deployment),
+            exit_point_lps=deployment.exit_point(frame),
             needle_length_mm=0.0 if needle is None else needle.exit_exemption_mm,
         ),
         required_clearance_mm=required_clearance_mm(system),
@@ -141,40 +141,20 @@ def tube_part(task: Task, lps_from_scope_tip: Float, deployment: Deployment) -> 
     return TubeDeployment(
         rotation_rad=deployment.rotation_rad,
         outer_insertion_mm=0.0 if tubes.outer is None else deployment.outer_mm,
-        middle_insertion_mm=0.0 if shape is None or tubes.middle is None else float(shape.insertions_mm[1]),
+        middle_insertion_mm=0.0 if tubes.middle is None else float(shape.insertions_mm[1]),
         inner_insertion_mm=deployment.inner_mm,
         lps_from_tip=deployment.lps_from_tip,
         exit=WallExit(
             branch=deployment.branch,
-            point_lps=_exit_point(task, lps_from_scope_tip, deployment),
+            point_lps=deployment.exit_point(lps_from_scope_tip),
             arc_length_mm=deployment.exit_mm,
             wall_angle_rad=deployment.wall_angle_rad,
             wall_run_mm=deployment.wall_run_mm,
         ),
         lateral_sweep_mm=deployment.lateral_sweep_mm,
-        follow_the_leader_error_mm=(
-            deployment.lateral_sweep_mm if shape is None else shape.follow_the_leader_error_mm
-        ),
-        shape=None if shape is None else _twisted_shape(tubes, shape),
+        follow_the_leader_error_mm=shape.follow_the_leader_error_mm,
+        shape=DeployedShape.of(tubes, shape),
     )
-
-
-def _twisted_shape(tubes: ConcentricTubes, shape: TubeShape) -> TwistedShape:
-    turned = zip(tubes.named, shape.rotations_rad[::-1].tolist(), strict=True)
-    return TwistedShape(
-        relative_rotations_rad={name: angle for (name, _tube), angle in turned},
-        arcs=shape.arcs,
-        arc_error_mm=shape.arc_error_mm,
-        least_determinant=shape.least_determinant,
-    )
-
-
-def _exit_point(task: Task, frame: Float, deployment: Deployment) -> Float:
-    return np.asarray(_tube_points(task, frame, deployment, np.array([deployment.exit_mm]))[0])
-
-
-def _tube_points(task: Task, frame: Float, deployment: Deployment, arc_lengths: Float) -> Float:
-    return deployment.points(task.system.tubes, frame, arc_lengths)
 
 
 def needle_part(path: ArcPath) -> NeedlePath:
@@ -196,7 +176,7 @@ def tube_clearance_mm(task: Task, lps_from_scope_tip: Float, deployment: Deploym
     """Return the smallest distance of the tube's axis from each structure, beyond the exit."""
     begin, end = deployment.exit_mm, deployment.inner_mm
     count = max(2, math.ceil((end - begin) / SAMPLE_MM) + 1)
-    points = _tube_points(task, lps_from_scope_tip, deployment, np.linspace(begin, end, count))
+    points = deployment.points(lps_from_scope_tip, np.linspace(begin, end, count))
     return {name: _least_clearance(task.lung, points, name, deployment.branch) for name in _structures(task)}
 
 

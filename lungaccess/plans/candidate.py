@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
-from lungaccess.plans.curves import SHORTEST_MM, deployed_pieces, pieces_beyond, radii_at
+from lungaccess.plans.curves import SHORTEST_MM, pieces_beyond, radii_at
 from lungaccess.problem.system import System
 from stages.needle import LENGTH, ArcPath, InTissue
 from stages.scope import ScopeTip
@@ -35,9 +33,9 @@ class Candidate:
     path: ArcPath
 
 
-def tubes_in_tissue(system: System, lps_from_scope_tip: Float, deployment: Deployment) -> ArcPath:
+def tubes_in_tissue(lps_from_scope_tip: Float, deployment: Deployment) -> ArcPath:
     """Return the tubes of a deployment, from where they leave the lumen to their tip, as a path."""
-    return _tubes_beyond(system, lps_from_scope_tip, deployment, deployment.exit_mm)
+    return _tubes_beyond(lps_from_scope_tip, deployment, deployment.exit_mm)
 
 
 def parts_in_tissue(
@@ -50,12 +48,10 @@ def parts_in_tissue(
     """
     begin_mm, parts = deployment.exit_mm + deployment.wall_run_mm, []
     if begin_mm < deployment.inner_mm - SHORTEST_MM:
-        tubes = _tubes_beyond(system, lps_from_scope_tip, deployment, begin_mm)
+        tubes = _tubes_beyond(lps_from_scope_tip, deployment, begin_mm)
         ends_mm = begin_mm + np.cumsum(tubes.arcs[:, LENGTH])
         middles_mm = ends_mm - 0.5 * tubes.arcs[:, LENGTH]
-        inserted: Sequence[float] = (deployment.outer_mm, deployment.inner_mm)[-len(system.tubes.named) :]
-        if deployment.shape is not None:
-            inserted = deployment.shape.insertions_mm[::-1].tolist()
+        inserted = deployment.shape.insertions_mm[::-1].tolist()
         radii = radii_at(system.tubes, inserted, middles_mm)
         for frame, arc, radius in zip(tubes.frames(), tubes.arcs, radii.tolist(), strict=False):
             parts.append(InTissue(ArcPath(lps_from_start=frame, arcs=arc), 2.0 * radius))
@@ -64,14 +60,8 @@ def parts_in_tissue(
     return parts
 
 
-def _tubes_beyond(
-    system: System, lps_from_scope_tip: Float, deployment: Deployment, begin_mm: float
-) -> ArcPath:
-    outer_mm, inner_mm, shape = deployment.outer_mm, deployment.inner_mm, deployment.shape
-    if shape is None:
-        pieces = deployed_pieces(system.tubes, deployment.rotation_rad, outer_mm, inner_mm)
-    else:
-        pieces = pieces_of_arcs(shape.arcs, deployment.rotation_rad)
+def _tubes_beyond(lps_from_scope_tip: Float, deployment: Deployment, begin_mm: float) -> ArcPath:
+    pieces = pieces_of_arcs(deployment.shape.arcs, deployment.rotation_rad)
     start, arcs = pieces_beyond(lps_from_scope_tip, pieces, begin_mm)
     return ArcPath(lps_from_start=start, arcs=arcs)
 

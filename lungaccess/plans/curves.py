@@ -85,7 +85,7 @@ def device_curves(
     tubes = system.tubes
     laid = laid_pieces(scope.states, system.scope.bending_length_mm)
     scope_poses, scope_mm = poses_on_pieces(scope.lps_from_entry, laid, SCOPE_STEP_MM)
-    tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube, tubes), step_mm)
+    tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube), step_mm)
     start = tube.lps_from_tip if needle is None else needle.lps_from_start
     needle_poses, needle_mm = poses_on_pieces(start, needle_pieces(needle), step_mm)
     needle_radius_mm = 0.0 if system.needle is None else system.needle.radius_mm
@@ -114,20 +114,9 @@ def device_curves(
     )
 
 
-def tube_pieces(tube: TubeDeployment, tubes: ConcentricTubes) -> Float:
+def tube_pieces(tube: TubeDeployment) -> Float:
     """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of each arc of the tubes."""
-    if tube.shape is not None:
-        return pieces_of_arcs(np.asarray(tube.shape.arcs), tube.rotation_rad)
-    return deployed_pieces(tubes, tube.rotation_rad, tube.outer_insertion_mm, tube.inner_insertion_mm)
-
-
-def deployed_pieces(tubes: ConcentricTubes, rotation_rad: float, outer_mm: float, inner_mm: float) -> Float:
-    """Return the same of planar tubes, from rotation and insertions."""
-    arcs = tubes.arcs(outer_mm, inner_mm)
-    pieces = np.stack([arcs.length_mm[0], np.zeros(4), arcs.curvature_per_mm], axis=1)
-    pieces = pieces[pieces[:, 0] > SHORTEST_ARC_MM]
-    pieces[:1, 1] = rotation_rad
-    return pieces
+    return pieces_of_arcs(np.asarray(tube.shape.arcs), tube.rotation_rad)
 
 
 def tube_radii(tube: TubeDeployment, tubes: ConcentricTubes, arc_mm: Float) -> Float:

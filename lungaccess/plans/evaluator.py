@@ -151,40 +151,27 @@ class CandidateEvaluator:
         beyond = path_beyond(path, wall_in_path_mm(self.task.system, deployment))
         return math.isfinite(map_integral(self.task.lung.cost, beyond))
 
-    def aimed(
-        self,
-        tip: ScopeTip,
-        rotation_rad: float,
-        outer_mm: float,
-        inner_mm: float,
-        shape: int | TubeShape = -1,
-    ) -> Candidate | None:
+    def aimed(self, tip: ScopeTip, rotation_rad: float, shape: int | TubeShape) -> Candidate | None:
         """Return a deployment that is to end at the target itself, None if it is refused; see `direct`."""
-        deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm, shape)
+        deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, shape)
         if isinstance(deployment, str):
             return None
-        path = tubes_in_tissue(self.task.system, tip.lps_from_scope_tip, deployment)
+        path = tubes_in_tissue(tip.lps_from_scope_tip, deployment)
         return Candidate(tip=tip, deployment=deployment, path=path)
 
     def direct(
-        self,
-        tip: ScopeTip,
-        rotation_rad: float,
-        outer_mm: float,
-        inner_mm: float,
-        shape: int | TubeShape = -1,
-        end: Float | None = None,
+        self, tip: ScopeTip, rotation_rad: float, shape: int | TubeShape, end: Float | None = None
     ) -> Candidate | None:
         """Return a deployment with a direct arc to the target, None if the deployment is refused.
 
         Parameters
         ----------
-        rotation_rad, outer_mm, inner_mm, shape
+        rotation_rad, shape
             As those of `DeploymentValidator.choose`.
         end : (3,) float64, optional
             Where the arc ends, LPS mm; at the aim if None.
         """
-        deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, outer_mm, inner_mm, shape)
+        deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, shape)
         if isinstance(deployment, str):
             return None
         aim = self.aim(tip.lps_from_scope_tip[:3, 3]) if end is None else end

@@ -24,8 +24,10 @@ from anatomy.base.settings import parse, to_mapping
 from lungaccess.plans.record import Record
 from lungaccess.problem.system import System
 
-SCHEMA = "lungaccess-plan-2"
-"""Name and version of the file format; a reader refuses any other."""
+SCHEMA = "lungaccess-plan-3"
+"""Name and version of the file format; a reader takes SHAPELESS, too, and refuses any other."""
+SHAPELESS = "lungaccess-plan-2"
+"""The format whose plans state no shape of tubes that bend in one plane: it follows from their insertions."""
 LINES = "lungaccess-plan-1"
 """The format whose plans state a line for the scope."""
 
@@ -74,8 +76,8 @@ def from_json(cls: type[P], text: str) -> P:
     _require_schema(content.get("schema"))
     stated = content.pop("digest", None)
     try:
-        plan = _decode(cls, content, "plan")
-        found = digest(plan)
+        plan = _decode(cls, _with_shape(content), "plan")
+        found = digest(plan) if content["schema"] == SCHEMA else _digest(content)
     except DAMAGE as error:
         raise PlanFileError(
             f"The plan holds values that no plan has ({reason(error)})",
@@ -92,13 +94,36 @@ def from_json(cls: type[P], text: str) -> P:
 
 
 def _require_schema(schema: object) -> None:
-    if schema == SCHEMA:
+    if schema in (SCHEMA, SHAPELESS):
         return
     found, remedy = f"The plan has the schema {schema!r}", _REMEDY
     if schema == LINES:
         found += ", in which the scope has a line but no motion: it does not say how the scope gets there"
         remedy += " for the same patient, target and system"
     raise PlanFileError(found, expected=SCHEMA, remedy=remedy)
+
+
+def _with_shape(content: dict[str, Any]) -> dict[str, Any]:
+    """Return a plan of either format as one of SCHEMA; plans of SHAPELESS were made with this closed form."""
+    tube = content["tube"]
+    if content["schema"] == SCHEMA or "shape" in tube:
+        return {**content, "schema": SCHEMA}
+    tubes = _system(content["system"], "plan.system").tubes
+    outer, inner = float(tube["outer_insertion_mm"]), float(tube["inner_insertion_mm"])
+    straight = max(inner - tubes.inner.curved_length_mm, 0.0)
+    ends = [min(straight, outer), outer, max(straight, outer), inner]
+    curvatures = [0.0, tubes.overlap_curvature_per_mm, 0.0, tubes.inner.precurvature_per_mm]
+    radii = [tubes.outermost.radius_mm] * 2 + [tubes.inner.radius_mm] * 2
+    lengths = np.diff(ends, prepend=0.0).tolist()
+    shape = {
+        "relative_rotations_rad": {name: 0.0 for name, _tube in tubes.named},
+        "arcs": [
+            [arc[0], 0.0, *arc[1:]] for arc in zip(lengths, curvatures, radii, strict=True) if arc[0] > 0
+        ],
+        "arc_error_mm": 0.0,
+        "least_determinant": 1.0,
+    }
+    return {**content, "schema": SCHEMA, "tube": {**tube, "shape": shape}}
 
 
 def plain(part: Record) -> Any:

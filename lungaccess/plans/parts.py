@@ -10,6 +10,7 @@ import numpy as np
 from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.base.typed import Float, Int
 from lungaccess.plans.record import Record, shaped
+from stages.tube.arcs import TubeShape
 from stages.tube.device import ConcentricTubes
 
 
@@ -76,8 +77,8 @@ class WallExit(Record):
 
 
 @frozen_record
-class TwistedShape(Record):
-    """The shape of tubes that are not planar, as the mechanics give it.
+class DeployedShape(Record):
+    """The shape of the tubes, as the mechanics give it.
 
     Parameters
     ----------
@@ -99,6 +100,17 @@ class TwistedShape(Record):
     arc_error_mm: float
     least_determinant: float
 
+    @classmethod
+    def of(cls, tubes: ConcentricTubes, shape: TubeShape) -> DeployedShape:
+        """Return a shape of the tubes as a plan states it."""
+        turned = zip(tubes.named, shape.rotations_rad[::-1].tolist(), strict=True)
+        return cls(
+            relative_rotations_rad={name: angle for (name, _tube), angle in turned},
+            arcs=shape.arcs,
+            arc_error_mm=shape.arc_error_mm,
+            least_determinant=shape.least_determinant,
+        )
+
 
 @frozen_record
 class TubeDeployment(Record):
@@ -107,16 +119,16 @@ class TubeDeployment(Record):
     Parameters
     ----------
     rotation_rad : float
-        All tubes are turned by this; planar ones bend towards local (cos, sin) of the scope tip.
+        All tubes are turned by this: a tube that is turned no farther bends towards local (cos, sin) of the
+        scope tip.
     outer_insertion_mm, inner_insertion_mm : float
         Lengths of outer and inner tube beyond the tip of the scope.
     middle_insertion_mm : float
         That of the middle tube, 0 where there is none.
     lps_from_tip : (4, 4) float64
-        Pose of the tip of the inner tube; +z is forward; +x is carried from the scope tip without turning, or
-        points towards the bend of planar tubes.
-    shape : TwistedShape or None
-        None for planar tubes, whose shape follows in closed form.
+        Pose of the tip of the inner tube; +z is forward; +x is carried from the scope tip, turned by
+        `rotation_rad`, without turning.
+    shape : DeployedShape
     lateral_sweep_mm : float
         Largest sideways motion of the tubes while they are deployed.
     follow_the_leader_error_mm : float
@@ -130,8 +142,8 @@ class TubeDeployment(Record):
     exit: WallExit
     lateral_sweep_mm: float
     follow_the_leader_error_mm: float
+    shape: DeployedShape
     middle_insertion_mm: float = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
-    shape: TwistedShape | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def insertions_mm(self, tubes: ConcentricTubes) -> tuple[float, ...]:
         """Return the insertions of the tubes that there are, the outermost first."""
@@ -144,13 +156,13 @@ class TubeDeployment(Record):
 
     def rotations_rad(self, tubes: ConcentricTubes) -> tuple[float, ...]:
         """Return the rotations of the rear ends of the tubes that there are, the outermost first."""
-        relative = {} if self.shape is None else self.shape.relative_rotations_rad
+        relative = self.shape.relative_rotations_rad
         return tuple(self.rotation_rad + relative.get(name, 0.0) for name, _tube in tubes.named)
 
     @property
     def clearance_loss_mm(self) -> float:
         """What has to be free around the tubes beside their radius and the margins."""
-        return self.lateral_sweep_mm + (0.0 if self.shape is None else self.shape.arc_error_mm)
+        return self.lateral_sweep_mm + self.shape.arc_error_mm
 
 
 @frozen_record

@@ -150,7 +150,7 @@ class Plan(Record):
     def rotations(self) -> str:
         """How far the tubes are turned about the tip of the scope, in words."""
         turned = [np.degrees(angle) for angle in self.tube.rotations_rad(self.system.tubes)]
-        if self.tube.shape is None:
+        if not any(self.tube.shape.relative_rotations_rad.values()):
             return f"turn to {turned[-1]:.1f}°"
         named = zip(self.system.tubes.named, turned, strict=True)
         return "turn " + ", ".join(
@@ -181,7 +181,7 @@ class Plan(Record):
         """
         if self.needle is not None:
             return poses_on_pieces(self.needle.lps_from_start, needle_pieces(self.needle), step_mm)
-        pieces = tube_pieces(self.tube, self.system.tubes)
+        pieces = tube_pieces(self.tube)
         start = pieces_beyond(self.scope.lps_from_scope_tip, pieces, self.tube.exit.arc_length_mm)
         return poses_on_pieces(*start, step_mm)
 

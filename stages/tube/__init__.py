@@ -14,19 +14,21 @@ if TYPE_CHECKING:
         DEFAULT_STOP_MM,
         Deployments,
         Enumerator,
+        SiteEnumerator,
         enumerate_deployments,
-        insertion_stops,
         join_deployments,
-        one_site_enumerator,
     )
-    from stages.tube.design_shapes import coarser_shapes, open_shapes, shapes_digest, shapes_format, shapes_of
+    from stages.tube.design_shapes import (
+        coarser_shapes,
+        longest_mm,
+        open_shapes,
+        shapes_at_hand,
+        shapes_digest,
+        shapes_format,
+        shapes_of,
+    )
     from stages.tube.device import BentPiece, ConcentricTubes, Tube
-    from stages.tube.environment import (
-        DEFAULT_ROTATIONS,
-        tracking_length_mm,
-        tube_constants,
-        tube_environment,
-    )
+    from stages.tube.environment import DEFAULT_ROTATIONS, tube_constants, tube_environment
     from stages.tube.equilibrium import Equilibrium
     from stages.tube.errors import ConvergenceError
     from stages.tube.exits import exit_points
@@ -37,16 +39,16 @@ if TYPE_CHECKING:
     from stages.tube.nearby import NearbyShape, Neighbourhood
     from stages.tube.nesting import check_nesting
     from stages.tube.one_shape import (
-        NO_SHAPES,
         copies,
         deployed,
         design_arrays,
         many_shapes,
         shape_arrays,
         shape_of_arrays,
+        shape_or_reason,
         with_any_sweep,
+        without_limits,
     )
-    from stages.tube.placing import PlacedShapes, place_shapes
     from stages.tube.proposals import (
         DesignProposal,
         MakerLimits,
@@ -60,6 +62,6 @@ if TYPE_CHECKING:
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
     from stages.tube.strain import bending_section, straightening
     from stages.tube.tissue import LUNG_N_MM2, HeldShape, held_shape
-    from stages.tube.validation import REASONS, Deployment, DeploymentValidator, centreline
+    from stages.tube.validation import REASONS, Deployment, DeploymentValidator
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,4 +1,4 @@
-"""The enumeration of all deployments from many scope poses."""
+"""The enumeration of all deployments from many scope poses: shapes of a design, placed in a lung."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,14 +20,10 @@ from anatomy.margins import Margins
 from stages.tube import kernels
 from stages.tube.design_shapes import coarser_shapes, shapes_of
 from stages.tube.device import ConcentricTubes
-from stages.tube.environment import (
-    DEFAULT_ROTATIONS,
-    THREADS,
-    tracking_length_mm,
-    tube_constants,
-    tube_environment,
-)
-from stages.tube.placing import place_shapes
+from stages.tube.environment import DEFAULT_ROTATIONS, THREADS, tube_constants, tube_environment
+from stages.tube.kernels import placing
+from stages.tube.shape_tree import ShapeTree
+from stages.tube.shapes import TubeShapes
 from stages.tube.validation import REASONS
 
 DEFAULT_STOP_MM = 2.0
@@ -46,7 +41,7 @@ class Deployments:
     rotation_rad, outer_mm, inner_mm : (E,) float64
         Rotation of all tubes together; insertions of the outermost and the innermost beyond the scope tip.
     shape : (E,) int64
-        Index in `shapes_of(tubes)`; -1 for planar tubes.
+        Index in `shapes_of(tubes)`.
     branch : (E,) int64
         Pierced branch.
     exit_mm, wall_angle_rad : (E,) float64
@@ -89,16 +84,9 @@ class Deployments:
         }
         return replace(self, **arrays)
 
-    def choice(self, entry: int) -> tuple[float, float, float, int]:
-        """Return rotation, insertions and shape of one, as `DeploymentValidator.choose` takes them."""
-        turned, outer, inner = self.rotation_rad[entry], self.outer_mm[entry], self.inner_mm[entry]
-        return float(turned), float(outer), float(inner), int(self.shape[entry])
-
-
-def insertion_stops(tubes: ConcentricTubes, spacing_mm: float = DEFAULT_STOP_MM) -> Float:
-    """Return insertions from 0 to `tracking_length_mm`, about `spacing_mm` apart."""
-    longest = tracking_length_mm(tubes)
-    return np.linspace(0.0, longest, max(1, round(longest / spacing_mm)) + 1)
+    def choice(self, entry: int) -> tuple[float, int]:
+        """Return rotation and shape of one, as `DeploymentValidator.choose` takes them."""
+        return float(self.rotation_rad[entry]), int(self.shape[entry])
 
 
 def enumerate_deployments(
@@ -112,11 +100,9 @@ def enumerate_deployments(
     stop_spacing_mm: float = DEFAULT_STOP_MM,
     worthwhile: Callable[[Float, Float], Bool] | None = None,
     progress: Callable[[float], None] | None = None,
+    enumerator: SiteEnumerator | None = None,
 ) -> Deployments:
-    """Enumerate what the tubes can do from many scope tips.
-
-    Of planar tubes only deployments without sideways sweep are enumerated: those whose tip stays within
-    `tracking_length_mm` of the scope tip.  Of any others, the shapes of the design at such stops are.
+    """Enumerate what the tubes can do from many scope tips: the shapes of the design that leave safely.
 
     Parameters
     ----------
@@ -125,69 +111,62 @@ def enumerate_deployments(
     with_fissures : bool
         Whether fissures are obstacles.
     rotations : int
-        Evenly spaced rotations of the tubes.  Between two of them a further one is looked at where not the
-        same insertions are accepted at both: there the tube or its exit is near a limit.
+        Evenly spaced rotations of the tubes.  Where no tube is turned against another, a further one is
+        looked at between two of them where not the same shapes are accepted at both: there the tube or its
+        exit is near a limit.
     stop_spacing_mm : float
-        Spacing of the insertions of both tubes.
+        Spacing of the insertions of all tubes.
     worthwhile : callable, optional
-        Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are of use; of
-        planar tubes no others are looked at, but those between two rotations always are.
+        Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are of use; no
+        others are looked at, but those between two rotations always are.
     progress : callable, optional
         Told the share of sites done.
+    enumerator : SiteEnumerator, optional
+        Made of the others if None.
     """
     tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 9)
-    if not tubes.planar:
-        return _enumerate_shapes(
-            lung, tubes, margins, tips, with_fissures, rotations, stop_spacing_mm, progress
-        )
-    enumerator = SiteEnumerator(
+    enumerator = enumerator or SiteEnumerator(
         lung, tubes, margins, with_fissures=with_fissures, rotations=rotations,
         stop_spacing_mm=stop_spacing_mm,
     )  # fmt: skip
     done = 0
 
-    def one_site(site: int) -> tuple[Float, Int, int]:
+    def one_site(tip: Float) -> Deployments:
         nonlocal done
-        found = enumerator.rows(tips[site], site, worthwhile)
+        found = enumerator.deployments(tip, worthwhile)
         done += 1
         if progress and done % 50 == 0:
             progress(done / len(tips))
         return found
 
     with ThreadPoolExecutor(THREADS) as pool:
-        parts = list(pool.map(one_site, range(len(tips))))
-    rows = np.concatenate([np.zeros((0, kernels.ENTRY_COLUMNS)), *(rows for rows, _, _ in parts)])
-    refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
-    for _, counts, _ in parts:
-        refused += counts
-    return _as_deployments(rows, enumerator.angles, refused, sum(candidates for *_, candidates in parts))
+        parts = list(pool.map(one_site, tips))
+    return _joined([enumerator.none, *parts], np.arange(-1, len(tips)))
 
 
 Enumerator = Callable[[Float, Callable[[Float, Float], Bool]], Deployments]
 """Returns the deployments from a scope tip `(9,)` that are of use; see `enumerate_deployments`."""
 
 
-def one_site_enumerator(
-    lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool, enough: int | None = None
-) -> Enumerator:
-    """Return what enumerates the deployments from one scope tip after another, prepared once for all.
-
-    Where more than `enough` are of use, fewer rotations of planar tubes are looked at.
-    """
-    if tubes.planar:
-        return SiteEnumerator(lung, tubes, margins, with_fissures=with_fissures, enough=enough).deployments
-    return lambda tip, worthwhile: enumerate_deployments(
-        lung, tubes, margins, tip[None], with_fissures=with_fissures, worthwhile=worthwhile
-    )
-
-
 class SiteEnumerator:
-    """Enumerates what planar tubes can do from one scope tip after another; see `enumerate_deployments`.
+    """Enumerates what tubes can do from one scope tip after another, prepared once for all.
+
+    A stretch that many shapes share is followed once; where it is refused, so are all of them.  What a shape
+    sweeps, and what its arcs and the sharing are off by, is added to its clearance.  The arc length at the
+    exit, the angle and the run there are those of the shape that shares the beginning, which is within the
+    tolerance of the tree.
+
+    Parameters
+    ----------
+    enough : int, optional
+        Where more deployments are of use, fewer rotations are looked at.
+    at_stops : tuple, optional
+        Numbers, set and tree of the shapes that are placed; `coarser_shapes` of the design's if None.
 
     Attributes
     ----------
     angles : (T,) float64
-        Rotations, rad: the even ones, then those between them.
+        Rotations, rad: the even ones, then those between them, if there are any.
     """
 
     def __init__(
@@ -200,170 +179,117 @@ class SiteEnumerator:
         rotations: int = DEFAULT_ROTATIONS,
         stop_spacing_mm: float = DEFAULT_STOP_MM,
         enough: int | None = None,
+        at_stops: tuple[Int, TubeShapes, ShapeTree] | None = None,
     ) -> None:
         self._enough = enough
-        self._rotations = rotations if tubes.inner.bends else 1
+        self._rotations = rotations if any(tube.bends for tube in tubes.nested) else 1
+        self._members, self._shapes, tree = at_stops or coarser_shapes(shapes_of(tubes), stop_spacing_mm)
+        self._tree, self._depth = tree.with_margin(margins.total_mm), int(tree.depth.max(initial=0))
         coarse: Float = np.arange(self._rotations, dtype=np.float64) * (2 * math.pi / self._rotations)
-        self.angles = np.concatenate([coarse, coarse + math.pi / self._rotations])
-        self._stops = insertion_stops(tubes, stop_spacing_mm)
+        self._between = not self._shapes.rotations_rad.any()
+        self.angles = (
+            np.concatenate([coarse, coarse + math.pi / self._rotations]) if self._between else coarse
+        )
+        self._turns = _about_z(self.angles)
         self._environment = tube_environment(lung, with_fissures=with_fissures)
         self._constants = tube_constants(tubes, margins)
-        self._outer, self._inner, self._ends = _ends_at_stops(tubes, stop_spacing_mm)
-        self._every = np.zeros((len(self.angles), len(self._stops), len(self._stops)), dtype=np.bool_)
-        self._every[:, self._outer, self._inner] = True
+        empty = np.zeros((0, placing.PLACED_COLUMNS)), np.zeros(0, dtype=np.int64)
+        self.none = self._as_deployments(np.eye(4), *empty, np.zeros(kernels.N_REASONS, dtype=np.int64), 0)
 
-    def deployments(self, tip: Float, worthwhile: Callable[[Float, Float], Bool]) -> Deployments:
-        """Return the deployments from one scope tip `(9,)` that are of use."""
-        rows, refused, candidates = self.rows(tip, 0, worthwhile)
-        return _as_deployments(rows, self.angles, refused, candidates)
-
-    def rows(
-        self, tip: Float, site: int, worthwhile: Callable[[Float, Float], Bool] | None
-    ) -> tuple[Float, Int, int]:
-        """Return entries as the kernel writes them, counts of the refused, and how many were looked at."""
+    def deployments(
+        self, tip: Float, worthwhile: Callable[[Float, Float], Bool] | None = None
+    ) -> Deployments:
+        """Return the deployments from one scope tip `(9,)`, those of use alone where that can be told."""
         frame = frames.pose(tip[:3], tip[3:6], tip[6:])
-        normals = frames.bending_directions(frame, self.angles)
         refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
-        work = np.zeros((2, kernels.N_TRACE))
-        wanted = self._every
+        traces = np.zeros((self._depth + 1, kernels.N_TRACE))
+        wanted = np.ones((len(self.angles), self._shapes.count), dtype=np.bool_)
         if worthwhile:
-            wanted = np.zeros_like(self._every)
-            at, towards = np.zeros((2, len(self.angles) * len(self._outer), 3))
-            kernels.turned_ends(self._ends, frame, normals, at, towards)
-            wanted[:, self._outer, self._inner] = worthwhile(at, towards).reshape(len(self.angles), -1)
-            if self._enough is not None:
-                self._thin(wanted, self._enough)
+            wanted = self._of_use(frame, worthwhile)
 
-        def rows_of(turns: Int) -> tuple[Float, int]:
-            chosen = wanted[turns]
-            most = int(np.count_nonzero(chosen))
-            rows = np.zeros((most, kernels.ENTRY_COLUMNS))
-            count = kernels.enumerate_site(
-                self._environment, self._constants, tip[:6], normals[turns], site, self._stops, chosen, rows,
-                refused, work,
+        def placed(turns: Int) -> tuple[Float, Int]:
+            rows = np.zeros((len(turns) * self._shapes.count, placing.PLACED_COLUMNS))
+            counts = np.zeros(len(turns), dtype=np.int64)
+            placing.place_tree(
+                self._environment, self._constants, frame @ self._turns[turns], self._tree, wanted[turns],
+                refused, traces, rows, counts,
             )  # fmt: skip
-            found = rows[:count].copy()
-            found[:, 1] = turns[found[:, 1].astype(np.int64)]
-            return found, most
+            return rows[: counts.sum()].copy(), np.repeat(turns, counts)
 
-        if worthwhile:
-            found, candidates = rows_of(np.arange(len(self.angles)))
-            return found, refused, candidates
-        found, candidates = rows_of(np.arange(self._rotations))
-        between = _between_unlike(found, self._rotations, self._stops)
-        if len(between):
-            further, more = rows_of(self._rotations + between)
-            found, candidates = np.concatenate([found, further]), candidates + more
-        return found, refused, candidates
+        turns = np.arange(len(self.angles) if worthwhile else self._rotations)
+        rows, turn_of = placed(turns)
+        if self._between and not worthwhile:
+            further = self._rotations + self._between_unlike(rows, turn_of)
+            more, of_more = placed(further)
+            rows, turn_of = np.concatenate([rows, more]), np.concatenate([turn_of, of_more])
+            turns = np.concatenate([turns, further])
+        candidates = int(np.count_nonzero(wanted[turns]))
+        return self._as_deployments(frame, rows, turn_of, refused, candidates)
 
-    def _thin(self, wanted: Bool, enough: int) -> None:
-        """Drop rotations evenly until no more than enough deployments are left: those between come last."""
-        counts = np.count_nonzero(wanted, axis=(1, 2))
-        turn = np.arange(len(self.angles)).reshape(-1, 2).T.ravel()
-        step = 1
-        while counts[turn % step == 0].sum() > enough and step < self._rotations:
+    def _of_use(self, frame: Float, worthwhile: Callable[[Float, Float], Bool]) -> Bool:
+        """Return which shapes `(T, S)` are of use, from few enough rotations: those between come last."""
+        tips = (frame @ self._turns)[:, None] @ self._shapes.scope_from_tip
+        at, towards = (np.ascontiguousarray(tips[..., :3, column].reshape(-1, 3)) for column in (3, 2))
+        wanted = worthwhile(at, towards).reshape(len(self.angles), -1)
+        counts, step = np.count_nonzero(wanted, axis=1), 1
+        turn = np.arange(len(self.angles)).reshape(-1, 1 + self._between).T.ravel()
+        while self._enough and counts[turn % step == 0].sum() > self._enough and step < self._rotations:
             step *= 2
         wanted[turn % step != 0] = False
+        return np.ascontiguousarray(wanted)
+
+    def _between_unlike(self, rows: Float, turn_of: Int) -> Int:
+        """Return the rotations between which and the next ones other shapes are accepted: a limit is near."""
+        accepted = np.zeros((self._rotations, self._shapes.count), dtype=bool)
+        accepted[turn_of, rows[:, placing.PLACED_SHAPE].astype(np.int64)] = True
+        return np.flatnonzero((accepted != np.roll(accepted, -1, axis=0)).any(axis=1))
+
+    def _as_deployments(
+        self, frame: Float, rows: Float, turn_of: Int, refused: Int, candidates: int
+    ) -> Deployments:
+        shape = rows[:, placing.PLACED_SHAPE].astype(np.int64)
+        lps = frame @ self._turns[turn_of] @ self._shapes.scope_from_tip[shape]
+        return Deployments(
+            site=read_only(np.zeros(len(rows), dtype=np.int64)),
+            rotation_rad=read_only(self.angles[turn_of]),
+            outer_mm=read_only(self._shapes.insertions_mm[shape, -1]),
+            inner_mm=read_only(self._shapes.insertions_mm[shape, 0]),
+            shape=read_only(self._members[shape]),
+            branch=read_only(rows[:, placing.PLACED_BRANCH].astype(np.int64)),
+            exit_mm=read_only(rows[:, placing.PLACED_EXIT].copy()),
+            wall_angle_rad=read_only(rows[:, placing.PLACED_ANGLE].copy()),
+            wall_run_mm=read_only(rows[:, placing.PLACED_RUN].copy()),
+            positions=read_only(lps[:, :3, 3].copy()),
+            tangents=read_only(lps[:, :3, 2].copy()),
+            candidates=candidates,
+            refused={REASONS[code]: int(refused[code]) for code in REASONS if refused[code]},
+        )
 
 
-@lru_cache(maxsize=8)
-def _ends_at_stops(tubes: ConcentricTubes, stop_spacing_mm: float) -> tuple[Int, Int, Float]:
-    """Return which stops `(K,)` outer and inner planar tube stand at, and where the tip then is `(K, 4)`.
-
-    Position and tangent of the tip are each aside and ahead, in the plane of the bend.  One tube has the same
-    shape wherever an outer one would end: its outer stops are its inner ones.
-    """
-    stops = insertion_stops(tubes, stop_spacing_mm)
-    outer, inner = (each[1:] for each in np.triu_indices(len(stops)))
-    if tubes.outer is None:
-        outer = inner = np.arange(1, len(stops))
-    base, normal = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
-    constants = tube_constants(tubes, Margins())
-    poses = [
-        kernels.tip_pose(constants, base, normal, *ends)
-        for ends in zip(stops[outer].tolist(), stops[inner].tolist(), strict=True)
-    ]
-    return outer, inner, np.array(poses).reshape(-1, 6)[:, [0, 2, 3, 5]]
-
-
-def _enumerate_shapes(
-    lung: Lung,
-    tubes: ConcentricTubes,
-    margins: Margins,
-    tips: Float,
-    with_fissures: bool,
-    rotations: int,
-    stop_spacing_mm: float,
-    progress: Callable[[float], None] | None,
-) -> Deployments:
-    """Place shapes of a design at scope tips."""
-    members, shapes, tree = coarser_shapes(shapes_of(tubes), stop_spacing_mm)
-    placed = place_shapes(
-        lung,
-        shapes,
-        margins,
-        [frames.pose(tip[:3], tip[3:6], tip[6:]) for tip in tips],
-        min_wall_angle_rad=math.radians(tubes.min_wall_angle_deg),
-        max_wall_run_mm=tubes.max_wall_run_mm,
-        with_fissures=with_fissures,
-        rotations=rotations if any(tube.bends for tube in tubes.nested) else 1,
-        tree=tree,
-        progress=progress,
-    )
-    return Deployments(
-        site=placed.site,
-        rotation_rad=placed.rotation_rad,
-        outer_mm=read_only(shapes.insertions_mm[placed.shape, -1]),
-        inner_mm=read_only(shapes.insertions_mm[placed.shape, 0]),
-        shape=read_only(members[placed.shape]),
-        branch=placed.branch,
-        exit_mm=placed.exit_mm,
-        wall_angle_rad=placed.wall_angle_rad,
-        wall_run_mm=placed.wall_run_mm,
-        positions=placed.positions,
-        tangents=placed.tangents,
-        candidates=placed.candidates,
-        refused=placed.refused,
-    )
-
-
-def _between_unlike(rows: Float, rotations: int, stops: Float) -> Int:
-    """Return the rotations between which and the next ones other insertions are accepted: a limit is near."""
-    accepted = np.zeros((rotations, len(stops), len(stops)), dtype=bool)
-    outer, inner = (np.rint(rows[:, column] / stops[1]).astype(np.int64) for column in (2, 3))
-    accepted[rows[:, 1].astype(np.int64), outer, inner] = True
-    unlike = (accepted != np.roll(accepted, -1, axis=0)).any(axis=(1, 2))
-    return np.flatnonzero(unlike)
+def _about_z(angles_rad: Float) -> Float:
+    """Return rotations about +z `(T, 4, 4)`."""
+    turned = np.zeros((len(angles_rad), 4, 4))
+    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angles_rad)
+    turned[:, 1, 0] = np.sin(angles_rad)
+    turned[:, 0, 1] = -turned[:, 1, 0]
+    turned[:, 2, 2] = turned[:, 3, 3] = 1.0
+    return turned
 
 
 def join_deployments(one: Deployments, other: Deployments, first_site: int) -> Deployments:
     """Return the deployments of two enumerations; the other's sites are counted from `first_site`."""
+    return _joined([one, other], np.array([0, first_site]))
+
+
+def _joined(parts: list[Deployments], first_site: Int) -> Deployments:
+    """Return the deployments of several enumerations, whose sites are counted from `first_site` (P,)."""
     arrays: dict[str, Any] = {
-        f.name: read_only(np.concatenate([getattr(one, f.name), getattr(other, f.name)]))
-        for f in fields(one)
-        if isinstance(getattr(one, f.name), np.ndarray)
+        f.name: read_only(np.concatenate([getattr(part, f.name) for part in parts]))
+        for f in fields(Deployments)
+        if isinstance(getattr(parts[0], f.name), np.ndarray)
     }
-    arrays["site"] = read_only(np.concatenate([one.site, other.site + first_site]))
-    refused = {
-        why: one.refused.get(why, 0) + other.refused.get(why, 0) for why in [*one.refused, *other.refused]
-    }
-    return Deployments(**arrays, candidates=one.candidates + other.candidates, refused=refused)
-
-
-def _as_deployments(rows: Float, angles: Float, refused: Int, candidates: int) -> Deployments:
-    tip = kernels.ENTRY_TIP
-    return Deployments(
-        site=read_only(rows[:, 0].astype(np.int64)),
-        rotation_rad=read_only(angles[rows[:, 1].astype(np.int64)]),
-        outer_mm=read_only(rows[:, 2].copy()),
-        inner_mm=read_only(rows[:, 3].copy()),
-        shape=read_only(np.full(len(rows), -1)),
-        branch=read_only(rows[:, 4].astype(np.int64)),
-        exit_mm=read_only(rows[:, 5].copy()),
-        wall_angle_rad=read_only(rows[:, 6].copy()),
-        wall_run_mm=read_only(rows[:, 7].copy()),
-        positions=read_only(rows[:, tip : tip + 3].copy()),
-        tangents=read_only(rows[:, tip + 3 : tip + 6].copy()),
-        candidates=candidates,
-        refused={REASONS[code]: int(refused[code]) for code in REASONS if refused[code]},
-    )
+    arrays["site"] = read_only(arrays["site"] + np.repeat(first_site, [part.count for part in parts]))
+    refused: dict[str, int] = {}
+    for why in dict.fromkeys(why for part in parts for why in part.refused):
+        refused[why] = sum(part.refused.get(why, 0) for part in parts)
+    return Deployments(**arrays, candidates=sum(part.candidates for part in parts), refused=refused)

@@ -11,10 +11,10 @@ import numpy as np
 
 from anatomy.base.settings import to_mapping
 from anatomy.base.typed import Int
-from anatomy.kept_records import kept_record
+from anatomy.kept_records import kept_record, record_path
 from anatomy.machine_code.sources import kernel_digest
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.shape_tree import ShapeTree, tree_of_shapes
+from stages.tube.shape_tree import STILL_MM, ShapeTree, tree_of_shapes
 from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
 
 KEPT = 4
@@ -25,13 +25,43 @@ atlas of a patient takes grow with them."""
 
 
 def shapes_of(tubes: ConcentricTubes) -> TubeShapes:
-    """Return all deployments of a design within its own limits, from the cache if they are there."""
-    limits = ShapeLimits(
+    """Return all deployments of a design within its own limits, from the cache if they are there.
+
+    Of planar tubes they are those that sweep nothing: few others keep the limit, and the tree of shapes would
+    be twice as large for them.
+    """
+    return _opened(tubes.nested, _limits(tubes), _grid(tubes.nested))
+
+
+def shapes_at_hand(tubes: ConcentricTubes) -> bool:
+    """Tell whether `shapes_of` a design takes no time: it is in the cache, or no tubes twist each other."""
+    nested = tubes.nested
+    if sum(bool(tube.bends) for tube in nested) <= 1:
+        return True
+    return record_path("shapes", shapes_format(), _design(nested, _limits(tubes), _grid(nested))).is_file()
+
+
+def _limits(tubes: ConcentricTubes) -> ShapeLimits:
+    sweep_mm = tubes.max_lateral_sweep_mm
+    return ShapeLimits(
         max_extension_mm=tubes.max_extension_mm,
-        max_lateral_sweep_mm=tubes.max_lateral_sweep_mm,
+        max_lateral_sweep_mm=min(sweep_mm, STILL_MM) if tubes.planar else sweep_mm,
         max_strain=tubes.max_strain,
     )
-    return _opened(tubes.nested, limits, _grid(tubes.nested))
+
+
+def _design(tubes: Sequence[Tube], limits: ShapeLimits, grid: ShapeGrid) -> dict[str, Any]:
+    """Return what the shapes of a design depend on."""
+    return {
+        "tubes": [to_mapping(tube) for tube in tubes],
+        "limits": to_mapping(limits),
+        "grid": to_mapping(grid),
+    }
+
+
+def longest_mm(tubes: ConcentricTubes) -> float:
+    """Return the greatest insertion of the shapes of a design, mm."""
+    return float(shapes_of(tubes).insertions_mm[:, 0].max(initial=0.0))
 
 
 def coarser_shapes(shapes: TubeShapes, stop_mm: float) -> tuple[Int, TubeShapes, ShapeTree]:
@@ -44,12 +74,10 @@ def coarser_shapes(shapes: TubeShapes, stop_mm: float) -> tuple[Int, TubeShapes,
 
 
 def shapes_digest(tubes: ConcentricTubes) -> str:
-    """Return a hash of the shapes of a design, "" for planar tubes, which have a closed form.
+    """Return a hash of the shapes of a design.
 
     Shapes near a limit may be in the set on one machine and not on another.
     """
-    if tubes.planar:
-        return ""
     shapes = shapes_of(tubes)
     parts = (shapes.insertions_mm, shapes.rotations_rad, shapes.arcs, shapes.first_arc)
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
@@ -69,8 +97,10 @@ def _opened(tubes: tuple[Tube, ...], limits: ShapeLimits, grid: ShapeGrid) -> Tu
 @lru_cache(maxsize=2 * KEPT)
 def _coarser(shapes: TubeShapes, stride: int) -> tuple[Int, TubeShapes, ShapeTree]:
     places = np.rint(shapes.insertions_mm / shapes.stop_mm).astype(np.int64)
+    # From the farthest stop back, so that the longest tubes are among them.
+    at_stops = ((places.max(initial=0) - places) % stride == 0) | (places == 0)
     turns = np.rint(shapes.rotations_rad / (2.0 * np.pi / shapes.grid.rotations)).astype(np.int64)
-    members = np.flatnonzero((places % stride == 0).all(axis=1) & (turns % stride == 0).all(axis=1))
+    members = np.flatnonzero(at_stops.all(axis=1) & (turns % stride == 0).all(axis=1))
     chosen = shapes if stride == 1 else shapes.subset(members)
     return members, chosen, tree_of_shapes(chosen)
 
@@ -102,15 +132,10 @@ def open_shapes(
         stored = {name: value for name, value in values.items() if name not in ("format", "name")}
         return TubeShapes(tubes=tuple(tubes), limits=limits, grid=grid, **stored)
 
-    design = {
-        "tubes": [to_mapping(tube) for tube in tubes],
-        "limits": to_mapping(limits),
-        "grid": to_mapping(grid),
-    }
     return kept_record(
         "shapes",
         shapes_format(),
-        design,
+        _design(tubes, limits, grid),
         make=lambda: tube_shapes(tubes, limits, grid),
         parts=_parts,
         rebuilt=rebuilt,

@@ -4,16 +4,14 @@ import math
 from dataclasses import field
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import Field
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings
-from anatomy.base.typed import Float
 from anatomy.shafts import SlottedSegment, check_segments, second_moment_mm4
 from stages.tube.parts import Bend, TubeParts, tube_parts
 
@@ -163,24 +161,6 @@ class Tube:
     def rest_strain(self) -> float:
         """Largest strain when the precurved part is held straight (dimensionless)."""
         return float((self.parts.curvature_per_mm * self.parts.strained_radius_mm).max())
-
-
-class TubeArcs(NamedTuple):
-    """The four arcs of N deployed pairs of tubes, in one plane, from the scope tip on.
-
-    They are straight in the outer tube, bent in the outer tube, straight beyond it and bent beyond it; a
-    deployment that lacks one of them has it with the length 0.
-
-    Parameters
-    ----------
-    length_mm : (N, 4) float64
-    curvature_per_mm, radius_mm : (4,) float64
-        The radius is that of the outermost tube.
-    """
-
-    length_mm: Float
-    curvature_per_mm: Float
-    radius_mm: Float
 
 
 @settings
@@ -359,18 +339,3 @@ class ConcentricTubes:
         stiffness = sum(tube.bending_stiffness_n_mm2 for tube in reversed(self.nested[1:]))
         inner = self.inner.bending_stiffness_n_mm2
         return self.inner.precurvature_per_mm * (inner / (inner + stiffness))
-
-    def arcs(self, outer_mm: ArrayLike, inner_mm: ArrayLike) -> TubeArcs:
-        """Return the arcs of planar tubes for insertions `(N,)` in mm, 0 <= outer <= inner.
-
-        [Kuntz2015, sec. IV-B].
-        """
-        outer, inner = (np.array(insertion, dtype=np.float64, ndmin=1) for insertion in (outer_mm, inner_mm))
-        straight = np.maximum(inner - self.inner.curved_length_mm, 0.0)
-        ends = np.stack([np.minimum(straight, outer), outer, np.maximum(straight, outer), inner], axis=1)
-        bent = (self.overlap_curvature_per_mm, self.inner.precurvature_per_mm)
-        return TubeArcs(
-            length_mm=np.diff(ends, axis=1, prepend=0.0),
-            curvature_per_mm=np.array([0.0, bent[0], 0.0, bent[1]]),
-            radius_mm=np.array([self.outermost.radius_mm] * 2 + [self.inner.radius_mm] * 2),
-        )

@@ -60,14 +60,3 @@ def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
     constants[kernels.MAX_PROTRUSION] = tubes.max_inner_protrusion_mm
     constants[kernels.MAX_WALL_RUN] = tubes.max_wall_run_mm
     return constants
-
-
-def tracking_length_mm(tubes: ConcentricTubes) -> float:
-    """Return the greatest insertion that is enumerated.
-
-    Planar tubes follow their own track exactly up to it: curved ones do so as long as the straight part of
-    the inner one stays in the scope.
-    """
-    if not tubes.planar or tubes.inner.precurvature_per_mm == 0.0:
-        return tubes.max_extension_mm
-    return min(tubes.inner.curved_length_mm, tubes.max_extension_mm)

@@ -3,14 +3,11 @@
 import numpy as np
 
 from anatomy.base.typed import Float, Int
-from anatomy.margins import Margins
 from anatomy.poses import pose
-from stages.tube import kernels
 from stages.tube.arcs import points_on_arcs
 from stages.tube.deployments import Deployments
 from stages.tube.design_shapes import shapes_of
 from stages.tube.device import ConcentricTubes
-from stages.tube.environment import tube_constants
 
 
 def exit_points(tubes: ConcentricTubes, scope_tips: Float, deployments: Deployments, chosen: Int) -> Float:
@@ -25,14 +22,6 @@ def exit_points(tubes: ConcentricTubes, scope_tips: Float, deployments: Deployme
     """
     tips, at_mm = scope_tips[deployments.site[chosen]], deployments.exit_mm[chosen]
     rotations = deployments.rotation_rad[chosen]
-    if tubes.planar:
-        planar = np.zeros((len(chosen), 2))
-        insertions = deployments.outer_mm[chosen], deployments.inner_mm[chosen]
-        kernels.planar_points_of_many(tube_constants(tubes, Margins()), *insertions, at_mm, planar)
-        forward, sideways = tips[:, 3:6], tips[:, 6:9]
-        bend = np.cos(rotations)[:, None] * sideways
-        bend += np.sin(rotations)[:, None] * np.cross(forward, sideways)
-        return np.asarray(tips[:, :3] + planar[:, :1] * bend + planar[:, 1:] * forward)
     shapes, points = shapes_of(tubes), np.zeros((len(chosen), 3))
     for row, (tip, shape) in enumerate(zip(tips, deployments.shape[chosen].tolist(), strict=True)):
         frame = pose(tip[:3], tip[3:6], tip[6:])

@@ -1,38 +1,36 @@
 """Single deployments of any joint values, proved by the way to them, and as arrays that a search changes."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.base.typed import Int
+from anatomy.base.typed import Float, Int
+from anatomy.margins import Margins
 from stages.tube.arcs import TubeShape
 from stages.tube.device import ConcentricTubes
+from stages.tube.environment import tube_constants
 from stages.tube.kernels import one_shape as kernel
 from stages.tube.kernels import shapes as columns
 from stages.tube.kernels.one_shape import DesignArrays, ManyShapes, ShapeArrays
 from stages.tube.mechanics import TubeMechanics
+from stages.tube.nesting import SAME_MM
 from stages.tube.sequences import BEND_RAD
-from stages.tube.shapes import TubeShapes, strained_radii
+from stages.tube.shapes import SNAPS, STRAINS, SWEEPS, TubeShapes, strained_radii
 
+TOO_LONG = "the tube would extend too far"
+PROTRUDES = "the inner tube is too short to protrude so far"
+STAYS = "the tube does not leave the airway"
+"""Why joint values are refused before their way is followed."""
+KEPT = 16
+"""Designs in memory: a system, and variants of it that are compared with it."""
 WAY_STEP_MM = 2.0
 """Insertion between two looks at the tubes on their way: as in the shapes of two tubes."""
 
-NO_SHAPES = ManyShapes(
-    joints=np.zeros((0, 0)),
-    tips=np.zeros((0, 0)),
-    results=np.zeros((0, columns.SHAPE_COLUMNS)),
-    arcs=np.zeros((0, columns.ARC_COLUMNS)),
-    first_arc=np.zeros(1, dtype=np.int64),
-)
-"""Planar tubes have a closed form instead."""
 
-
-def design_arrays(tubes: ConcentricTubes) -> DesignArrays | None:
-    """Return a design and its limits for the kernels; None for planar tubes, which have a closed form.
-
-    A kernel that takes None is compiled without the mechanics that only other tubes need.
-    """
-    if tubes.planar:
-        return None
+@lru_cache(maxsize=KEPT)
+def design_arrays(tubes: ConcentricTubes) -> DesignArrays:
+    """Return a design and its limits for the kernels."""
     mechanics = TubeMechanics(tubes.nested)
     limits = np.zeros(kernel.N_LIMITS)
     limits[kernel.STEP], limits[kernel.STOP] = mechanics.step_rad, WAY_STEP_MM
@@ -45,6 +43,7 @@ def design_arrays(tubes: ConcentricTubes) -> DesignArrays | None:
         strained=strained_radii(tubes.nested, tubes.max_extension_mm),
         turned=bent & (np.cumsum(bent) > 1),
         limits=limits,
+        planar=tube_constants(tubes, Margins()) if tubes.planar else np.zeros(0),
     )
 
 
@@ -55,10 +54,17 @@ def with_any_sweep(design: DesignArrays) -> DesignArrays:
     return design._replace(limits=limits)
 
 
-def shape_arrays(design: DesignArrays | None) -> ShapeArrays:
-    """Return arrays with room for any shape of a design; without room for planar tubes."""
-    n = 0 if design is None else len(design.lengths)
-    room = 0 if design is None else columns.MOST_ARCS * (1 + n + 2 * len(design.bends))
+def without_limits(design: DesignArrays) -> DesignArrays:
+    """Return a design of which any deployment is allowed that is possible and stable."""
+    limits = with_any_sweep(design).limits
+    limits[kernel.MAX_EXTENSION] = limits[kernel.MAX_STRAIN] = np.inf
+    return design._replace(limits=limits)
+
+
+def shape_arrays(design: DesignArrays) -> ShapeArrays:
+    """Return arrays with room for any shape of a design."""
+    n = len(design.lengths)
+    room = columns.MOST_ARCS * (1 + n + 2 * len(design.bends))
     return ShapeArrays(
         joints=np.zeros(2 * n),
         tips=np.zeros(n),
@@ -112,6 +118,24 @@ def deployed(design: DesignArrays, insertions_mm: ArrayLike, rotations_rad: Arra
     shape = shape_arrays(design)
     shape.joints[:] = np.concatenate([np.asarray(insertions_mm), np.asarray(rotations_rad)])
     return shape if kernel.whole_way(design, shape) else None
+
+
+def shape_or_reason(design: DesignArrays, insertions_mm: Float, rotations_rad: Float) -> TubeShape | str:
+    """Return the shape of joint values as `deployed` takes them, or which limit of the design is not kept."""
+    shape = shape_arrays(design)
+    shape.joints[:] = np.concatenate([insertions_mm, rotations_rad])
+    if kernel.whole_way(design, shape):
+        return shape_of_arrays(shape)
+    inserted, limits, result = insertions_mm, design.limits, shape.result
+    if inserted[0] > min(limits[kernel.MAX_EXTENSION], design.lengths[0]):
+        return TOO_LONG
+    if (-np.diff(inserted) > -np.diff(design.lengths) + SAME_MM).any():
+        return PROTRUDES
+    if inserted[0] == 0.0:
+        return STAYS
+    if result[columns.LEAST] <= 0.0:
+        return SNAPS
+    return STRAINS if result[columns.STRAIN] > limits[kernel.MAX_STRAIN] else SWEEPS
 
 
 def shape_of_arrays(shape: ShapeArrays) -> TubeShape:

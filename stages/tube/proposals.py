@@ -15,12 +15,12 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.settings import quantity, settings
 from anatomy.base.typed import Float, Int
-from anatomy.margins import Margins
-from stages.tube import kernels
+from anatomy.base.words import plural
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.environment import tube_constants
 from stages.tube.following import DeployedSequence, SnapError, deploy
+from stages.tube.kernels.shapes import SWEEP, TIP
 from stages.tube.mechanics import TubeMechanics
+from stages.tube.one_shape import deployed, design_arrays, without_limits
 from stages.tube.sequences import Sequence, alternating, inner_first, together
 
 INCREMENTS_MM = (2.0, 5.0, 10.0)
@@ -183,16 +183,15 @@ def propose_designs(
     Raises
     ------
     SettingsError
-        If there is one tube, the tubes are not planar, the insertions are impossible, the sweep is not
-        finite, or no outer tube fits into the channel.
+        If there are not two tubes, the insertions are impossible, the sweep is not finite, or no outer tube
+        fits into the channel.
     """
-    if tubes.outer is None:
+    if tubes.outer is None or tubes.middle is not None:
         raise SettingsError(
-            "The design has one tube",
+            f"The design has {plural(len(tubes.nested), 'tube')}",
             expected="an outer and an inner tube, whose sizes are varied",
-            remedy="Add [tubes.outer] to the device file",
+            remedy="Add [tubes.outer] to the device file, or leave out [tubes.middle]",
         )
-    tubes.require_planar("A comparison of designs")
     together(tubes.nested, 0.0, (inner_mm, outer_mm))
     if inner_mm == 0.0:
         raise SettingsError("The inner tube stays in the scope", expected="an insertion above 0")
@@ -235,24 +234,32 @@ def propose_designs(
 
 
 def evaluate_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:
-    """Return sweep and reach of a design in closed form.
+    """Return sweep and reach of a design, whose tubes are not turned against each other.
 
     Parameters
     ----------
     outer_mm, inner_mm : float
         Insertions of the deployment.
+
+    Raises
+    ------
+    SettingsError
+        If the tubes cannot be inserted so, or snap.
     """
-    numbers = tube_constants(tubes, Margins())
-    outer, inner = float(outer_mm), float(inner_mm)
-    aside, _ = kernels.planar_point(numbers, outer, inner, inner)
-    bent = min(tubes.inner.curved_length_mm, inner)
-    free = min(inner - outer, bent)
-    angle = numbers[kernels.INNER_CURVATURE] * free + numbers[kernels.OVERLAP_CURVATURE] * (bent - free)
+    inserted = np.array([inner_mm, outer_mm], dtype=np.float64)
+    made = deployed(without_limits(design_arrays(tubes)), inserted, np.zeros(2))
+    if made is None:
+        raise SettingsError(
+            f"The tubes cannot be inserted by {outer_mm:g} and {inner_mm:g} mm",
+            expected="insertions of outer and inner tube that are in order and snap nothing",
+        )
+    x, y, _z = made.result[TIP + 9 :]
+    ahead = made.result[TIP + np.array([2, 5, 8])]
     return DesignProposal(
         tubes=tubes,
-        lateral_sweep_mm=float(kernels.lateral_sweep(numbers, outer, inner)),
-        tip_offset_mm=float(aside),
-        tip_angle_rad=float(angle),
+        lateral_sweep_mm=float(made.result[SWEEP]),
+        tip_offset_mm=float(math.hypot(x, y)),
+        tip_angle_rad=float(math.atan2(math.hypot(ahead[0], ahead[1]), ahead[2])),
     )
 
 

@@ -10,6 +10,8 @@ from stages.tube.shapes import TubeShapes
 
 TOLERANCE_MM = 0.1
 """Shapes nearer to each other share a beginning: less than what tubes are off by anyway."""
+EXACT_MM = 1e-9
+"""The tolerance where nothing twists: shapes are few then, and those with one beginning have it exactly."""
 SWEEP_CLASSES = np.array([0.0, 0.125, 0.25, 0.5, 1.0])
 """Shares of the largest sweep, up to which sweeps are rounded where they enter the clearance."""
 STILL_MM = 1e-6
@@ -22,8 +24,8 @@ class ShapeTree:
 
     Parameters
     ----------
-    depth, skip, beneath : (M,) int64
-        Level from 1 on; the node to go on with where this one is refused; shapes that end in it or beyond.
+    depth, skip : (M,) int64
+        Level from 1 on; the node to go on with where this one is refused.
     first : (M + 1,) int64
         Where the `stretches` of each node begin.
     stretches : (R, 12) float64
@@ -36,7 +38,6 @@ class ShapeTree:
 
     depth: Int
     skip: Int
-    beneath: Int
     first: Int
     stretches: Float
     radius: Float
@@ -47,20 +48,23 @@ class ShapeTree:
     def with_margin(self, margin_mm: float) -> tuple[np.ndarray, ...]:
         """Return the tree as `placing.place_tree` takes it, every clearance larger by a margin."""
         return (
-            self.depth, self.skip, self.beneath, self.first, self.stretches, self.radius,
+            self.depth, self.skip, self.first, self.stretches, self.radius,
             self.clearance + margin_mm, self.first_shape, self.shapes,
         )  # fmt: skip
 
 
-def tree_of_shapes(shapes: TubeShapes, *, tolerance_mm: float = TOLERANCE_MM) -> ShapeTree:
+def tree_of_shapes(shapes: TubeShapes, *, tolerance_mm: float | None = None) -> ShapeTree:
     """Return the tree of shapes that share their beginnings within a tolerance.
 
     Parameters
     ----------
     shapes : TubeShapes
-    tolerance_mm : float
+    tolerance_mm : float, optional
         Largest distance between shapes that share a stretch; how far they really are enters clearances.
+        TOLERANCE_MM, or EXACT_MM where nothing twists, if None.
     """
+    if tolerance_mm is None:
+        tolerance_mm = TOLERANCE_MM if shapes.rotations_rad.any() else EXACT_MM
     stop = shapes.stop_mm
     places = np.rint(shapes.insertions_mm[:, 0] / stop).astype(np.int64)
     most = int(places.max(initial=0))
@@ -114,11 +118,10 @@ def _in_order(
     count = len(nodes)
     parents, places, firsts = nodes[:, 0], nodes[:, 1], nodes[:, 2]
     ending = np.bincount(leaf, minlength=count)
-    size, beneath = np.ones(count, dtype=np.int64), ending.copy()
+    size = np.ones(count, dtype=np.int64)
     for node in range(count - 1, -1, -1):  # children come after their parents
         if parents[node] >= 0:
             size[parents[node]] += size[node]
-            beneath[parents[node]] += beneath[node]
     rank, room = np.zeros(count, dtype=np.int64), np.zeros(count + 1, dtype=np.int64)
     for node in range(count):
         rank[node] = room[parents[node] + 1]
@@ -135,7 +138,6 @@ def _in_order(
     return ShapeTree(
         depth=read_only(places[order]),
         skip=read_only((rank + size)[order]),
-        beneath=read_only(beneath[order]),
         first=read_only(np.concatenate([[0], np.cumsum([len(rows) for rows in own])]).astype(np.int64)),
         stretches=read_only(np.concatenate([np.zeros((0, placing.STRETCH_COLUMNS)), *own])),
         radius=read_only(radii[firsts, places][order]),

@@ -28,6 +28,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 from stages.needle import arc_transform
 from tests.lungaccess.pursuit import pursued
+from tests.lungaccess.tube_shapes import stated_shape
 
 LEFT_LUNG_LPS = np.array([60.0, 0.0, 0.0])
 RIGHT_LUNG_LPS = np.array([-60.0, 0.0, 0.0])
@@ -248,6 +249,7 @@ def make_plan() -> Plan:
             ),
             lateral_sweep_mm=0.4,
             follow_the_leader_error_mm=0.1,
+            shape=stated_shape(system.tubes, 12.0, 24.0),
         ),
         needle=NeedlePath(
             lps_from_start=start,

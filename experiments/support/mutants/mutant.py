@@ -20,7 +20,7 @@ from lungaccess.judging.checking import CheckReport
 from lungaccess.plans.assemble import required_clearance_mm
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System, system_fingerprint
-from stages.tube import centreline, points_on_arcs
+from stages.tube import points_on_arcs
 
 
 @frozen_record
@@ -53,10 +53,7 @@ class Mutant:
 def tube_points(plan: Plan, arc_lengths_mm: Float) -> Float:
     """Return points `(N, 3)` LPS mm of a plan's tubes at arc lengths `(N,)` from the scope tip."""
     tube, pose = plan.tube, plan.scope.lps_from_scope_tip
-    if tube.shape is not None:
-        return points_on_arcs(tube.shape.arcs, pose, tube.rotation_rad, arc_lengths_mm)
-    insertions = tube.outer_insertion_mm, tube.inner_insertion_mm
-    return centreline(plan.system.tubes, pose, tube.rotation_rad, *insertions, arc_lengths_mm)
+    return points_on_arcs(tube.shape.arcs, pose, tube.rotation_rad, arc_lengths_mm)
 
 
 Mutation = Callable[[Case, Rng], Mutant | None]

@@ -1,4 +1,4 @@
-"""Tubes that are not planar, with joint values or a shape that do not belong together."""
+"""Tubes with joint values or a shape that do not belong together."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def rear_end_turned(case: Case, rng: Rng) -> Mutant | None:
     """One of several bent tubes is turned on, and the rest of the plan stays."""
     shape, tubes = case.plan.tube.shape, case.plan.system.tubes
     bent = [name for name, tube in tubes.named if tube.bends]
-    if shape is None or len(bent) < 2:
+    if len(bent) < 2:
         return None
     name, by = str(rng.choice(bent)), signed(rng, 0.02, 3.0)
     turned = {**shape.relative_rotations_rad, name: shape.relative_rotations_rad[name] + by}
@@ -29,8 +29,6 @@ def rear_end_turned(case: Case, rng: Rng) -> Mutant | None:
 def tube_moved(case: Case, rng: Rng) -> Mutant | None:
     """One tube is inserted farther or less far, and the rest of the plan stays."""
     tube = case.plan.tube
-    if tube.shape is None:
-        return None
     name = str(rng.choice([name for name, _tube in case.plan.system.tubes.named]))
     key = f"{name}_insertion_mm"
     inserted = getattr(tube, key) + signed(rng, 0.3, 8.0)
@@ -39,9 +37,7 @@ def tube_moved(case: Case, rng: Rng) -> Mutant | None:
 
 def shape_of_another_equilibrium(case: Case, rng: Rng) -> Mutant | None:
     """Arcs and tip are those of other rotations than are stated."""
-    tube, tubes, shape = case.plan.tube, case.plan.system.tubes, case.plan.tube.shape
-    if shape is None:
-        return None
+    tube, tubes = case.plan.tube, case.plan.system.tubes
     inserted = np.array(tube.insertions_mm(tubes))[::-1]
     turned = np.array(tube.rotations_rad(tubes))[::-1] - tube.rotation_rad
     other = Neighbourhood.of(tubes.nested, inserted, turned).at(
@@ -59,8 +55,6 @@ def shape_of_another_equilibrium(case: Case, rng: Rng) -> Mutant | None:
 def arcs_edited(case: Case, rng: Rng) -> Mutant | None:
     """An arc is longer, turned, more bent or thinner than it is."""
     shape = case.plan.tube.shape
-    if shape is None:
-        return None
     arcs = shape.arcs.copy()
     row, column = int(rng.integers(len(arcs))), int(rng.integers(4))
     if column == 1 and arcs[row, 0] * arcs[row, 2] < 0.1:
@@ -72,13 +66,11 @@ def arcs_edited(case: Case, rng: Rng) -> Mutant | None:
 
 
 def shape_left_out(case: Case, rng: Rng) -> Mutant | None:
-    """The shape of tubes that are not planar is missing, or its error or stability are prettier."""
+    """The shape of the tubes is missing, or its stability is prettier."""
     shape = case.plan.tube.shape
-    if shape is None:
-        return None
     if shape.least_determinant < 0.8 and rng.integers(2):
         return Mutant(plan=changed(case.plan, tube__shape__least_determinant=1.0))
-    return Mutant(plan=changed(case.plan, tube__shape=None))
+    return Mutant(plan=changed(case.plan, tube__shape__arcs=shape.arcs[:0]))
 
 
 def _moves(plan: Plan, mutant: Plan) -> bool:

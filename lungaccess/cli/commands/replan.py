@@ -208,7 +208,7 @@ def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
 
 def tube_rows(tube: TubeDeployment) -> list[tuple[str, str]]:
     """Return how tubes are to be turned and inserted."""
-    turned = {} if tube.shape is None else tube.shape.relative_rotations_rad
+    turned = tube.shape.relative_rotations_rad
     middle = [("middle tube", f"{tube.middle_insertion_mm:.1f} mm")] if tube.middle_insertion_mm else []
     return [
         ("turn the tubes, from +x of the scope", f"{math.degrees(tube.rotation_rad):.1f} deg"),

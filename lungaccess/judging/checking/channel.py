@@ -103,10 +103,3 @@ def _check_handle(plan: Plan, inserted_mm: tuple[float, ...], found: Findings) -
     detail = "bend that the handle sets so that section and tubes bend as planned"
     wanted = abs(bend) * stiffness / device.bending_stiffness_n_mm2
     found.at_most("scope.handle", wanted, float(limit), "rad", detail, 1e-6)
-
-
-def deployed_strain_factor(tube: Tube, inserted_mm: float) -> float:
-    """Return the largest factor of slots along what is inserted of a tube."""
-    return max(
-        _slots(tube, float(at))[1] for at in np.append(np.arange(0.0, inserted_mm, STEP_MM), inserted_mm)
-    )

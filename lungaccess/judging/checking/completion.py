@@ -1,11 +1,11 @@
 """A whole plan from bare motions: what it has to state is filled in by the arithmetic of the check.
 
 Who plans elsewhere says how the devices move, nothing else: the states of the scope, the insertions of the
-tubes, the arcs of the needle, and the poses between them.  A plan states more, such as where the tubes
-leave the lumen.  Filled in here, those statements are true by construction, so that the check of such a
-plan speaks of its motions alone; poses that were stated stay as they are.  The angle to the wall is known to
-`WALL_ANGLE_TOLERANCE_RAD` alone: where it may be the least one that is allowed, that is what is filled in, as
-a planner could have stated it.
+tubes with the shape that the mechanics make of them, the arcs of the needle, and the poses between them.  A
+plan states more, such as where the tubes leave the lumen.  Filled in here, those statements are true by
+construction, so that the check of such a plan speaks of its motions alone; poses that were stated stay as
+they are.  The angle to the wall is known to `WALL_ANGLE_TOLERANCE_RAD` alone: where it may be the least one
+that is allowed, that is what is filled in, as a planner could have stated it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from lungaccess.judging.checking import shapes
-from lungaccess.judging.checking.deployment import replayed_mm
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.outcome import recomputed_costs
 from lungaccess.judging.checking.record import wanted_clearance_mm
@@ -30,7 +29,15 @@ from lungaccess.judging.checking.wall_exit import (
     wall_angle_rad,
     wall_run_mm,
 )
-from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
+from lungaccess.plans.parts import (
+    DeployedShape,
+    Exemption,
+    NeedleArc,
+    NeedlePath,
+    ScopeInsertion,
+    TubeDeployment,
+    WallExit,
+)
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_version
 from lungaccess.problem.system import System, system_fingerprint
@@ -40,16 +47,16 @@ OBJECTIVE = "inverse_clearance"
 
 @frozen_record
 class Motions:
-    """How planar tubes and a needle are brought to a target: all that somebody else's planner has to say.
+    """How tubes and a needle are brought to a target: all that somebody else's planner has to say.
 
     Parameters
     ----------
     lps_from_entry, states, lps_from_scope_tip
         As in `lungaccess.plans.parts.ScopeInsertion`.
-    rotation_rad, outer_insertion_mm, inner_insertion_mm : float
-        As in `lungaccess.plans.parts.TubeDeployment`.
+    rotation_rad, outer_insertion_mm, inner_insertion_mm, shape, lateral_sweep_mm, follow_the_leader_error_mm
+        As in `lungaccess.plans.parts.TubeDeployment`: what the mechanics make of the insertions.
     lps_from_tube_tip : (4, 4) float64
-        Where the needle leaves the inner tube; +z is forward, +x points towards the bend of the tubes.
+        Where the needle leaves the inner tube; see `lungaccess.plans.parts.TubeDeployment`.
     arcs : tuple of NeedleArc
         At least one.
     """
@@ -60,6 +67,9 @@ class Motions:
     rotation_rad: float
     outer_insertion_mm: float
     inner_insertion_mm: float
+    shape: DeployedShape
+    lateral_sweep_mm: float
+    follow_the_leader_error_mm: float
     lps_from_tube_tip: Float
     arcs: tuple[NeedleArc, ...]
 
@@ -75,7 +85,7 @@ def completed_plan(
     Parameters
     ----------
     system : System
-        With planar tubes and a needle.
+        With a needle, and an outer and an inner tube or one tube.
     target_lps : (3,) float64, LPS mm
     method : str
         What the plan says it was made by.
@@ -90,8 +100,9 @@ def completed_plan(
         exit=WallExit(
             branch=0, point_lps=np.zeros(3), arc_length_mm=0.0, wall_angle_rad=0.0, wall_run_mm=0.0
         ),
-        lateral_sweep_mm=0.0,
-        follow_the_leader_error_mm=0.0,
+        lateral_sweep_mm=motions.lateral_sweep_mm,
+        follow_the_leader_error_mm=motions.follow_the_leader_error_mm,
+        shape=motions.shape,
     )
     pieces = _needle_pieces(motions.arcs)
     curve = shapes.integrate(motions.lps_from_tube_tip, shapes.cut_at(pieces, needle.exit_exemption_mm))
@@ -142,11 +153,10 @@ def _scope(motions: Motions, environment: Environment, system: System) -> ScopeI
 
 
 def _with_exit(plan: Plan, environment: Environment) -> Plan:
-    """Return a plan that states where its tubes leave the lumen, and how far they get beside their shape."""
+    """Return a plan that states where its tubes leave the lumen."""
     lung, tube = environment.lung, plan.tube
     if not 0.0 <= tube.outer_insertion_mm <= tube.inner_insertion_mm or tube.inner_insertion_mm <= 0.0:
         return plan
-    sweep, leader, _steps = replayed_mm(plan)
     pieces = shapes.tube_pieces(plan)
     curve = shapes.integrate(plan.scope.lps_from_scope_tip, pieces)
     derived = derived_exit(lung, curve)
@@ -165,7 +175,7 @@ def _with_exit(plan: Plan, environment: Environment) -> Plan:
         wall_angle_rad=max(angle, min(least, angle + WALL_ANGLE_TOLERANCE_RAD)),
         wall_run_mm=run,
     )
-    whole = replace(tube, exit=stated, lateral_sweep_mm=sweep, follow_the_leader_error_mm=leader)
+    whole = replace(tube, exit=stated)
     exemption = replace(plan.exemption, branch=way_out.branch, exit_point_lps=point)
     return replace(plan, tube=whole, exemption=exemption)
 

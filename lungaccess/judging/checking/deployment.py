@@ -11,7 +11,7 @@ from anatomy import structures
 from anatomy.base.typed import Float, Labels
 from lungaccess.judging.checking import shapes
 from lungaccess.judging.checking.boxes import PathDistances
-from lungaccess.judging.checking.channel import check_channel, deployed_strain_factor
+from lungaccess.judging.checking.channel import check_channel
 from lungaccess.judging.checking.clearances import (
     REACH_MM,
     check_clear,
@@ -23,8 +23,7 @@ from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.poses import check_rigid, check_same_pose
 from lungaccess.judging.checking.shapes import Curve
 from lungaccess.judging.checking.space import Select, airway_except, branch_of, has, labels_at
-from lungaccess.judging.checking.sweep import check_sweep
-from lungaccess.judging.checking.twisted import check_twisted
+from lungaccess.judging.checking.tube_shape import check_shape
 from lungaccess.judging.checking.wall_exit import Exit, check_exit, check_wall_run
 from lungaccess.plans.plan import Plan
 
@@ -38,10 +37,6 @@ OUT_OF_LUMEN_MM = 0.02
 
 RIM_POINTS = 24
 """Points around the tube, every 15 degrees: less than half a voxel apart on usual tubes."""
-SWEEP_STEP_MM = 1.0
-"""Insertion between two replayed steps; the sweep changes slowly with it."""
-SWEEP_POINT_MM = 0.5
-"""Spacing of the points of the body that are compared with the final shape."""
 ROUNDING_MM = 1e-12
 """Of an arc length: behind the end of a tube the next one begins."""
 _PROTRUSION = {"middle": "tube.protrusion.middle", "inner": "tube.protrusion"}
@@ -49,12 +44,8 @@ _PROTRUSION = {"middle": "tube.protrusion.middle", "inner": "tube.protrusion"}
 
 def check_deployment(plan: Plan, environment: Environment, found: Findings) -> Float | None:
     """Record everything about the tubes; return their re-integrated tip `(4, 4)` if they can be followed."""
-    tube, tubes, lung = plan.tube, plan.system.tubes, environment.lung
+    tube, lung = plan.tube, environment.lung
     if not (check_rigid("tube.tip", tube.lps_from_tip, found) and _is_pose(plan.scope.lps_from_scope_tip)):
-        return None
-    if not found.true(
-        "tube.shape", (tube.shape is None) == tubes.planar, "arcs of tubes that are not planar"
-    ):
         return None
     pieces = shapes.tube_pieces(plan)
     curve = shapes.integrate(plan.scope.lps_from_scope_tip, pieces)
@@ -62,14 +53,9 @@ def check_deployment(plan: Plan, environment: Environment, found: Findings) -> F
     check_same_pose("tube.tip", tube.lps_from_tip, tip, found)
     _check_lengths(plan, found)
     check_channel(plan, found)
-    if tube.shape is None:
-        _check_strain(plan, found)
-        beside_mm = _replay(plan, found)
-    else:
-        derived = check_twisted(plan, curve, found)
-        if derived is None:
-            return None
-        beside_mm = derived
+    beside_mm = check_shape(plan, curve, found)
+    if beside_mm is None:
+        return None
     way_out = check_exit(plan, lung, curve, found)
     if way_out is not None:
         curve = shapes.integrate(plan.scope.lps_from_scope_tip, shapes.cut_at(pieces, way_out.arc_mm))
@@ -108,40 +94,6 @@ def _check_lengths(plan: Plan, found: Findings) -> None:
             detail = f"{name} beyond the tube around it"
             found.at_most(_PROTRUSION[name], inserted - around[0], ahead, "mm", detail)
         around = inserted, length
-
-
-def _check_strain(plan: Plan, found: Findings) -> None:
-    """Strains of planar tubes beyond the scope are within what the tubes allow."""
-    tube, tubes = plan.tube, plan.system.tubes
-    outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
-    bend = shapes.bend_of(tubes, outer, inner)
-    # Straightened in the scope the inner tube is bent by its whole precurvature; the outer one bends with it.
-    factors = [
-        deployed_strain_factor(tube, length)
-        for tube, length in ((tubes.outermost, outer), (tubes.inner, inner))
-    ]
-    strains = [factors[1] * tubes.inner.precurvature_per_mm * tubes.inner.outer_diameter_mm / 2]
-    in_overlap = [k for k, end in zip(bend.per_mm, bend.edges_mm[1:], strict=True) if end <= outer]
-    strains += [factors[0] * k * tubes.outermost.outer_diameter_mm / 2 for k in in_overlap]
-    found.at_most("tube.strain", max(strains), tubes.max_strain, "", "largest strain of the tube material")
-
-
-def _replay(plan: Plan, found: Findings) -> float:
-    """Replay the deployment and return how far the tubes get from their final shape."""
-    return check_sweep(plan, *replayed_mm(plan), found)
-
-
-def replayed_mm(plan: Plan) -> tuple[float, float, int]:
-    """Return how far planar tubes and their tip get from the final shape, mm, and the steps replayed."""
-    tube, tubes = plan.tube, plan.system.tubes
-    outer, inner = tube.outer_insertion_mm, tube.inner_insertion_mm
-    final = shapes.planar_shape(shapes.bend_of(tubes, outer, inner), SWEEP_POINT_MM)
-    sweep = leader = 0.0
-    bends = shapes.deployment_bends(tubes, outer, inner, SWEEP_STEP_MM)
-    for bend in bends:
-        distances = shapes.distance_to_polyline(shapes.planar_shape(bend, SWEEP_POINT_MM), final)
-        sweep, leader = max(sweep, float(distances.max())), max(leader, float(distances[-1]))
-    return sweep, leader, len(bends)
 
 
 def _check_containment(plan: Plan, curve: Curve, labels: Labels, way_out: Exit, found: Findings) -> None:
@@ -185,7 +137,7 @@ def _check_clearance(
 ) -> None:
     """From its first contact with the wall on, each tube keeps radius, margins and more from obstacles.
 
-    More are the sweep and, of tubes that are not planar, how far the derived shape is from the curve.
+    More are the sweep, and how far the derived shape is from the curve.
     """
     contact = _first_contact(environment.lung, curve, way_out, plan)
     margin = plan.system.margins.total_mm + beside_mm

@@ -164,10 +164,9 @@ def _check_lengths(plan: Plan, found: Findings) -> bool:
     usable &= 0.0 <= tube.outer_insertion_mm <= tube.inner_insertion_mm
     if plan.system.tubes.middle is not None:
         usable &= tube.outer_insertion_mm <= tube.middle_insertion_mm <= tube.inner_insertion_mm
-    if tube.shape is not None:
-        bent = np.abs(tube.shape.arcs[:, 2]).max(initial=0.0)
-        usable &= len(tube.shape.arcs) > 0 and float(bent) <= MAX_CURVATURE_PER_MM
-        usable &= bool((tube.shape.arcs[:, 0] >= 0.0).all()) and tube.shape.arcs[:, 0].sum() <= MAX_TOTAL_MM
+    bent = np.abs(tube.shape.arcs[:, 2]).max(initial=0.0)
+    usable &= len(tube.shape.arcs) > 0 and float(bent) <= MAX_CURVATURE_PER_MM
+    usable &= bool((tube.shape.arcs[:, 0] >= 0.0).all()) and tube.shape.arcs[:, 0].sum() <= MAX_TOTAL_MM
     states = plan.scope.states
     usable &= 0 < len(states) <= MAX_STATES and float(np.abs(states[:, 1:]).max()) <= MAX_ANGLE_RAD
     usable &= float(np.abs(states[:, 0]).max()) <= MAX_TOTAL_MM

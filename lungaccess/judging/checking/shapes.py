@@ -10,7 +10,6 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from lungaccess.plans.plan import Plan
-from stages.tube.device import ConcentricTubes
 
 TINY_MM = 1e-9
 """A piece shorter than this is rounding, and is not cut off."""
@@ -145,45 +144,9 @@ def up_to(curve: Curve, end_mm: float) -> Curve:
     )
 
 
-@frozen_record
-class Bend:
-    """Curvature of the deployed tubes along their length from the scope tip: `per_mm` between `edges_mm`."""
-
-    edges_mm: tuple[float, ...]
-    per_mm: tuple[float, ...]
-
-
-def bend_of(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> Bend:
-    """Return the curvature of the tubes inserted by `outer_mm` and `inner_mm` (inner >= outer).
-
-    The inner tube is curved over its last `curved_length_mm`.  Where it lies in the straight outer tube the
-    bending moments balance: the curvature is that of the inner tube times its share of the bending
-    stiffness.  The outer tube never bends alone.
-    """
-    inner, outer = tubes.inner, tubes.outer
-    stiffness_outer = 0.0
-    stiffness_inner = inner.youngs_modulus_gpa * (inner.outer_diameter_mm**4 - inner.inner_diameter_mm**4)
-    if outer is not None:
-        stiffness_outer = outer.youngs_modulus_gpa * (outer.outer_diameter_mm**4 - outer.inner_diameter_mm**4)
-    share = stiffness_inner / (stiffness_inner + stiffness_outer)
-    curved_from = max(0.0, inner_mm - inner.curved_length_mm)
-    edges = sorted({0.0, min(curved_from, inner_mm), outer_mm, inner_mm})
-    values = []
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
-        middle = 0.5 * (start + stop)
-        if middle < curved_from:
-            values.append(0.0)
-        else:
-            values.append(inner.precurvature_per_mm * (share if middle < outer_mm else 1.0))
-    return Bend(edges_mm=tuple(edges), per_mm=tuple(values))
-
-
 def tube_pieces(plan: Plan) -> list[Piece]:
-    """Return the tubes of a plan as pieces: planar ones from their insertions, others as their arcs say."""
+    """Return the tubes of a plan as pieces, as their arcs say."""
     tube = plan.tube
-    if tube.shape is None:
-        bend = bend_of(plan.system.tubes, tube.outer_insertion_mm, tube.inner_insertion_mm)
-        return planar_pieces(tube.rotation_rad, bend)
     pieces, turned = [], -tube.rotation_rad
     for length, direction, curvature, _radius in tube.shape.arcs.tolist():
         if length > TINY_MM:
@@ -192,20 +155,9 @@ def tube_pieces(plan: Plan) -> list[Piece]:
     return pieces
 
 
-def planar_pieces(rotation_rad: float, bend: Bend) -> list[Piece]:
-    """Return planar tubes, turned by an angle, as pieces."""
-    rolls = [rotation_rad] + [0.0] * len(bend.per_mm)
-    lengths = np.diff(bend.edges_mm)
-    return [
-        Piece(length_mm=float(length), roll_rad=roll, curvature_per_mm=curvature)
-        for length, roll, curvature in zip(lengths, rolls, bend.per_mm, strict=False)
-    ]
-
-
 def tube_tip(plan: Plan, curve: Curve) -> Float:
     """Return the frame that a plan has to state where its tubes end, from the end of their curve."""
-    arcs = () if plan.tube.shape is None else plan.tube.shape.arcs
-    directions = [float(arc[1]) for arc in arcs if arc[0] > TINY_MM]
+    directions = [float(arc[1]) for arc in plan.tube.shape.arcs if arc[0] > TINY_MM]
     return np.asarray(curve.end @ turn(-directions[-1])) if directions else curve.end
 
 
@@ -217,31 +169,6 @@ def radius_at(plan: Plan, arc_mm: Float) -> Float:
         here = (arc_mm <= end_mm) | (radius == 0.0)
         radius = np.where(here, 0.5 * tube.outer_diameter_mm, radius)
     return radius
-
-
-def planar_shape(bend: Bend, step_mm: float) -> Float:
-    """Return points `(n, 2)` (sideways, forward) of the bent tubes by quadrature, `step_mm` apart or less.
-
-    The heading is the integral of the curvature, exact for pieces; the position is its integral by
-    Simpson's rule.
-    """
-    edges = np.asarray(bend.edges_mm)
-    count = max(int(np.ceil(edges[-1] / step_mm)), 1)
-    arc = np.linspace(0.0, edges[-1], 2 * count + 1)
-    turned = np.concatenate([[0.0], np.cumsum(np.diff(edges) * np.asarray(bend.per_mm))])
-    heading = np.interp(arc, edges, turned)
-    speed = np.stack([np.sin(heading), np.cos(heading)], axis=1)
-    width = arc[2] - arc[0]
-    steps = width / 6.0 * (speed[:-2:2] + 4.0 * speed[1::2] + speed[2::2])
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-
-
-def deployment_bends(tubes: ConcentricTubes, outer_mm: float, inner_mm: float, step_mm: float) -> list[Bend]:
-    """Return the shapes of a deployment [Kuntz2015]: both flush to `outer_mm`, then the inner one."""
-    flush = np.linspace(0.0, outer_mm, max(int(np.ceil(outer_mm / step_mm)), 1) + 1)[1:]
-    alone = np.linspace(outer_mm, inner_mm, max(int(np.ceil((inner_mm - outer_mm) / step_mm)), 1) + 1)
-    together = [bend_of(tubes, float(e), float(e)) for e in flush if e > 0.0]
-    return together + [bend_of(tubes, outer_mm, float(e)) for e in alone if e > 0.0]
 
 
 def distance_to_polyline(points: Float, line: Float) -> Float:

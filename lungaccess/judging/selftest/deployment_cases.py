@@ -21,7 +21,7 @@ from lungaccess.planning.reachability.kernels import unreachable
 from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment
 from stages.needle import ArcPath, Needle, NeedleEnvironment, backward_reach, environment_of_labels
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
-from stages.tube import kernels, tube_environment
+from stages.tube import deployed, kernels, tube_environment
 from stages.tube.kernels import TubeEnvironment
 
 NEEDLE = Needle(
@@ -37,6 +37,15 @@ for _column, _value in {
     kernels.MAX_WALL_RUN: 6.0,
 }.items():  # fmt: skip
     TUBES[_column] = _value
+DESIGN = kernels.DesignArrays(
+    stiffness=np.array([[0.6, 0.6], [0.4, 0.4]]), lengths=np.array([20.0, 10.0]),
+    bends=np.array([[0.0, 12.0, 20.0, 0.1, 0.0, 1.0]]), radii=np.array([0.3, 0.4]), strained=np.zeros(2),
+    turned=np.zeros(2, dtype=np.bool_), limits=np.array([0.075, 2.0, 0.5 * math.pi, 10.0, 1.0, 1.0]),
+    planar=TUBES,
+)  # fmt: skip
+"""The same tubes as the mechanics take them: the outer one is stiff enough to leave 0.6 of the curvature."""
+REFUSED = kernels.N_REASONS
+"""Stands for a reason where the tubes would sweep too far."""
 FRAME = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 """X, Y and the axis of the airway, which leads down from the origin."""
 WEIGHTS = 1.0, 0.1
@@ -89,8 +98,11 @@ def drawn_tubes(rng: scenes.Random, environment: TubeEnvironment) -> tuple[Float
     base = np.concatenate([place @ FRAME, turned @ FRAME[2], turned @ FRAME[0]])
     normal = math.cos(values[2]) * base[6:] + math.sin(values[2]) * (turned @ FRAME[1])
     trace, tip = np.zeros(kernels.N_TRACE), np.zeros(9)
-    outer, inner = float(values[3]), float(values[4])
-    reason = kernels.validate_deployment(environment, TUBES, base[:6], normal, outer, inner, trace, tip)
+    shape = deployed(DESIGN, values[4:2:-1], np.zeros(2))
+    reason = REFUSED
+    if shape is not None:
+        arcs, beside = shape.arcs[: shape.number[0]], float(shape.result[kernels.SWEEP])
+        reason = kernels.validate_arcs(environment, TUBES, base[:6], normal, arcs, beside, trace, tip)
     return values, base, int(reason), trace, np.concatenate([tip, normal])
 
 

@@ -23,7 +23,7 @@ from stages.tube import (
     Deployments,
     enumerate_deployments,
     join_deployments,
-    tracking_length_mm,
+    longest_mm,
 )
 
 TIP_SPACING_MM = 1.0
@@ -92,7 +92,7 @@ def motions_of(lung: Lung, system: System, spacing_mm: float = TIP_SPACING_MM) -
     return find_motions(
         lung,
         system.scope,
-        reach_mm=tracking_length_mm(system.tubes),
+        reach_mm=longest_mm(system.tubes),
         max_curvature_per_mm=system.tubes.channel_curvature_per_mm,
         tip_bends_rad=bends_with_tubes_rad(system),
         spacing_mm=spacing_mm,

@@ -6,7 +6,7 @@ import numpy as np
 
 from anatomy.base.typed import Float
 from lungaccess.planning.coupled.atlas import Atlas
-from stages.tube import TubeMechanics, shapes_of
+from stages.tube import shapes_of
 
 
 def tip_clearances_mm(atlas: Atlas) -> Float:
@@ -28,12 +28,4 @@ def tube_stability(atlas: Atlas) -> Float:
 
     1 is that of tubes which do not wind each other up; see `stages.tube.mechanics.Equilibrium`.
     """
-    entries, tubes = atlas.deployments, atlas.system.tubes
-    if not tubes.planar:
-        return np.asarray(shapes_of(tubes).least_determinant[entries.shape])
-    insertions, which = np.unique(
-        np.stack([entries.inner_mm, entries.outer_mm], axis=1), axis=0, return_inverse=True
-    )
-    rear_ends = insertions[:, : len(tubes.nested)] - np.array([tube.length_mm for tube in tubes.nested])
-    solved = TubeMechanics(tubes.nested).batch(np.zeros_like(rear_ends), rear_ends)
-    return np.asarray(np.where(solved.converged, solved.least_determinant, -np.inf)[which.ravel()])
+    return np.asarray(shapes_of(atlas.system.tubes).least_determinant[atlas.deployments.shape])

@@ -16,9 +16,9 @@ from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
 from stages.needle import StartIndex
 from stages.scope import ScopeMotions, prover_of
-from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, shapes_digest
+from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, shapes_at_hand, shapes_digest
 
-FORMAT = 9
+FORMAT = 10
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 
 
@@ -94,9 +94,9 @@ def atlas_is_kept(
 ) -> bool:
     """Tell whether `open_atlas` finds an atlas in the cache; the file is not read, so it may be damaged.
 
-    Tubes that are not planar count as not kept: their file is named by shapes that take long to compute.
+    Where the shapes of its tubes are not at hand it counts as not kept: its file is named by them.
     """
-    if not system.tubes.planar:
+    if not shapes_at_hand(system.tubes):
         return False
     depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
     return record_path("atlas", atlas_format(), depends_on, cache).is_file()

@@ -29,7 +29,7 @@ from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import Step, evaluated_step
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
-from stages.tube import tube_constants, tube_environment
+from stages.tube import deployed, design_arrays, shape_of_arrays, tube_constants, tube_environment
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
 
 BOXES_A_STEP = 500
@@ -247,12 +247,17 @@ def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Ite
     Each of those becomes the search's best candidate, which it then improves.  Who takes the steps improves
     the bound, which may go on while the search takes its next step.
     """
+    design = design_arrays(search.atlas.system.tubes)
     for step in steps:
         yield step
         if bound.settled or search.incumbent.step is None:
             continue
         for tip, rotation, outer, inner in bound.lowest:
-            candidate = search.evaluator.direct(search.atlas.motions.tip(tip), rotation, outer, inner)
+            made = deployed(design, [inner, outer][: len(design.lengths)], np.zeros(len(design.lengths)))
+            if made is None:
+                continue
+            scope_tip = search.atlas.motions.tip(tip)
+            candidate = search.evaluator.direct(scope_tip, rotation, shape_of_arrays(made))
             found = evaluated_step(search.evaluator, "lower bound", candidate, step.iteration)
             if found.cost < search.incumbent.cost:
                 yield search.incumbent.improved(found)

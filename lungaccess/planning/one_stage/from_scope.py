@@ -17,7 +17,7 @@ from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, OptimalSearch, workspace_lengths
-from stages.tube import Deployment, Enumerator, design_arrays, one_site_enumerator
+from stages.tube import Deployment, Enumerator, SiteEnumerator, design_arrays
 
 SEARCHED = 30
 """So many deployments get a search of the needle where no direct arc is clear: some ten milliseconds."""
@@ -42,9 +42,9 @@ class ScopeReplanner:
         self._tries, self._searches = tries, searches
         self._enumerate: Enumerator | None = None
         if task.system.needle is not None:
-            self._enumerate = one_site_enumerator(
+            self._enumerate = SiteEnumerator(
                 task.lung, task.system.tubes, task.system.margins, with_fissures=task.with_fissures
-            )
+            ).deployments
 
     def replan(self, lps_from_scope_tip: Float) -> RestOfPlan:
         """Return the rest from a rigid pose `(4, 4)`; NoPlan if there is none."""

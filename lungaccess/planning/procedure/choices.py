@@ -23,7 +23,7 @@ from lungaccess.problem.system import System
 from lungaccess.uncertainty.risk import Deviations
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_deviations, tubes_alone
 from stages.needle import needle_environment, workspace_lengths
-from stages.tube import Deployment, Deployments, DeploymentValidator, one_site_enumerator
+from stages.tube import Deployment, Deployments, DeploymentValidator, SiteEnumerator
 
 ENOUGH = 512
 """Deployments towards the target that are looked at from a scope's tip: several times what is ranked, since
@@ -46,12 +46,12 @@ class Offer:
     ----------
     choices : Choices
         As the kernels take them.
-    deployed : tuple of (float, float, float, int)
-        Rotation, insertions and shape of each but the planned one, see `DeploymentValidator.choose`.
+    deployed : tuple of (float, int)
+        Rotation and shape of each but the planned one, see `DeploymentValidator.choose`.
     """
 
     choices: Choices
-    deployed: tuple[tuple[float, float, float, int], ...]
+    deployed: tuple[tuple[float, int], ...]
 
 
 def scope_frames(starts: Float) -> Float:
@@ -80,11 +80,9 @@ def planned_choice(plan: Plan, left: Residuals) -> Choices:
     """Return the planned deployment alone."""
     tube, frame = plan.tube, np.array(plan.scope.lps_from_scope_tip)
     tubes = np.zeros((0, 11))
-    shapes, counts = np.zeros((1, 0, 4)), np.zeros(1, dtype=np.int64)
-    if tube.shape is None:
+    if plan.system.tubes.planar:
         tubes = DeviatedPlan(plan).kernel_inputs(_none(plan))[0].tubes[None]
-    else:
-        shapes, counts = np.array(tube.shape.arcs)[None], np.array([len(tube.shape.arcs)])
+    shapes, counts = np.array(tube.shape.arcs)[None], np.array([len(tube.shape.arcs)])
     return Choices(
         scope_from_tip=np.asarray(np.linalg.inv(frame) @ np.asarray(tube.lps_from_tip))[None],
         rotations=np.array([tube.rotation_rad]), exits=np.array([tube.exit.arc_length_mm]),
@@ -98,19 +96,18 @@ def with_choices(planned: Choices, system: System, made: list[Deployment], frame
     if not made:
         return planned
     tips = [np.linalg.inv(frame) @ each.lps_from_tip for frame, each in zip(frames, made, strict=True)]
+    tubes = planned.tubes
     if system.tubes.planar:
         own = [
             tubes_alone(system.tubes, frame, (each.rotation_rad, each.outer_mm, each.inner_mm)).tubes
             for frame, each in zip(frames, made, strict=True)
         ]
-        tubes, shapes = np.concatenate([planned.tubes, own]), np.zeros((1 + len(made), 0, 4))
-        counts = np.zeros(1 + len(made), dtype=np.int64)
-    else:
-        arcs = [planned.shapes[0], *(np.asarray(each.shape.arcs) for each in made if each.shape is not None)]
-        tubes, counts = planned.tubes, np.array([len(each) for each in arcs])
-        shapes = np.zeros((len(arcs), counts.max(), arcs[0].shape[1]))
-        for number, each in enumerate(arcs):
-            shapes[number, : len(each)] = each
+        tubes = np.concatenate([planned.tubes, own])
+    arcs = [planned.shapes[0], *(np.asarray(each.shape.arcs) for each in made)]
+    counts = np.array([len(each) for each in arcs])
+    shapes = np.zeros((len(arcs), counts.max(), arcs[0].shape[1]))
+    for number, each in enumerate(arcs):
+        shapes[number, : len(each)] = each
     return planned._replace(
         scope_from_tip=np.concatenate([planned.scope_from_tip, tips]),
         rotations=np.append(planned.rotations, [each.rotation_rad for each in made]),
@@ -119,7 +116,7 @@ def with_choices(planned: Choices, system: System, made: list[Deployment], frame
         n_arcs=counts,
         beside=np.append(
             planned.beside,
-            [0.0 if each.shape is None else each.shape.required_beside_mm for each in made],
+            [each.shape.required_beside_mm for each in made],
         ),
     )  # fmt: skip
 
@@ -137,14 +134,14 @@ def offered(
     needle = system.require_needle("A choice of deployments")
     environment = needle_environment(lung, needle, system.margins, with_fissures=fissures)
     validator = DeploymentValidator(lung, system.tubes, system.margins, with_fissures=fissures)
-    enumerate_from = one_site_enumerator(
+    enumerate_from = SiteEnumerator(
         lung, system.tubes, system.margins, with_fissures=fissures, enough=ENOUGH
-    )
+    ).deployments
 
     def worthwhile(positions: Float, tangents: Float) -> Bool:
         return np.isfinite(workspace_lengths(environment, positions, tangents, target))
 
-    found: dict[tuple[float, float, float, int], tuple[Deployment, Float]] = {}
+    found: dict[tuple[float, int], tuple[Deployment, Float]] = {}
     for frame in frames:
         row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
         entries = _some(enumerate_from(row, worthwhile), worthwhile)
@@ -168,5 +165,5 @@ def _some(entries: Deployments, worthwhile: Callable[[Float, Float], Bool]) -> D
 
 def _none(plan: Plan) -> Deviations:
     n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
-    twisted = 0 if plan.tube.shape is None else len(plan.system.tubes.nested)
+    twisted = 0 if plan.system.tubes.planar else len(plan.system.tubes.nested)
     return Deviations(**no_deviations(1, n_arcs, twisted))

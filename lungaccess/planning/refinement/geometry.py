@@ -1,7 +1,8 @@
-"""The curve of tubes and needle as symbols, in closed form.
+"""The curve of tubes and needle as symbols.
 
-Every piece is an arc of constant curvature.  Sine and cosine are power series of the squared angle, so
-that a straight arc is nothing special and all derivatives exist there.
+The tubes are polynomials, see `shape_model`.  Every piece of the needle is an arc of constant curvature.
+Sine and cosine are power series of the squared angle, so that a straight arc is nothing special and all
+derivatives exist there.
 """
 
 from __future__ import annotations
@@ -86,9 +87,9 @@ class Geometry:
         kappa = self._value("max_curvature_per_mm")
         self.bends = [(x[at["bend_x"]][a], x[at["bend_y"]][a]) for a in range(layout.arcs)]
         self._kappa = kappa
-        self.features: Any = self._features(x) if layout.tubes else None
+        self.features: Any = self._features(x)
         self.middle = x[at["middle"]]
-        self.tip = self._tube_tip()
+        self.tip = self._tip()
         self.frames = self._needle_frames()
 
     def _value(self, name: str) -> Any:
@@ -108,7 +109,7 @@ class Geometry:
         return Frame(x=c * x + s * y, y=c * y - s * x, z=z, point=rows[0])
 
     def _features(self, x: Any) -> Any:
-        """Return the features of tubes that are not planar; see `shape_model`."""
+        """Return the features of the tubes; see `shape_model`."""
         moved = x[self._layout.joints] - self._value("model_centre")
         pairs = [moved[a] * moved[b] for a in range(moved.shape[0]) for b in range(a, moved.shape[0])]
         matrix = casadi.reshape(self._value("model"), self._layout.model_terms, N_FEATURES).T
@@ -116,10 +117,10 @@ class Geometry:
 
     @property
     def beside(self) -> Any:
-        """What has to be free beside tubes that are not planar, mm."""
+        """What has to be free beside the tubes, mm."""
         return self.features[-1]
 
-    def _modelled_tip(self) -> Frame:
+    def _tip(self) -> Frame:
         scope, rows = self.scope_tip(), self.features[-10:-1]
         point, z, x = (
             rows[3 * m] * scope.x + rows[3 * m + 1] * scope.y + rows[3 * m + 2] * scope.z for m in range(3)
@@ -129,8 +130,8 @@ class Geometry:
         x = x / casadi.norm_2(x)
         return Frame(x=x, y=casadi.cross(z, x), z=z, point=scope.point + point)
 
-    def _modelled_point(self, s: Any) -> Any:
-        """Return the point at arc length `s` by Clenshaw's sum of the Chebyshev polynomials."""
+    def tube_point(self, s: Any) -> Any:
+        """Return the point of the tubes at arc length `s` by Clenshaw's sum of the Chebyshev polynomials."""
         scope, at = self.scope_tip(), 2.0 * s / self.inner - 1.0
         rows: Any = casadi.reshape(self.features[: 3 * (CURVE_DEGREE + 1)], 3, CURVE_DEGREE + 1)
         one: Any = 0.0
@@ -139,33 +140,6 @@ class Geometry:
             one, two = rows[:, k] + 2.0 * at * one - two, one
         local = rows[:, 0] + at * one - two
         return scope.point + local[0] * scope.x + local[1] * scope.y + local[2] * scope.z
-
-    @property
-    def straight(self) -> Any:
-        """Length of the inner tube's straight part ahead of the scope."""
-        return self._value("straight_out") * (self.inner - self._value("curved_length_mm"))
-
-    def _tube_pieces(self, s: Any) -> tuple[Any, Any, Any]:
-        """Return how much of the straight, shared and free pieces lies before arc length `s`."""
-        straight = casadi.fmin(self.straight, s)
-        shared = casadi.fmin(self.outer - self.straight, s - straight)
-        return straight, shared, s - straight - shared
-
-    def _tube_tip(self) -> Frame:
-        if self._layout.tubes:
-            return self._modelled_tip()
-        frame = self.scope_tip().along(0.0, 0.0, self.straight)
-        frame = frame.along(self._value("shared_curvature_per_mm"), 0.0, self.outer - self.straight)
-        return frame.along(self._value("inner_curvature_per_mm"), 0.0, self.inner - self.outer)
-
-    def tube_point(self, s: Any) -> Any:
-        """Return the point of the tubes at arc length `s`."""
-        if self._layout.tubes:
-            return self._modelled_point(s)
-        straight, shared, free = self._tube_pieces(s)
-        frame = self.scope_tip().along(0.0, 0.0, straight)
-        frame = frame.along(self._value("shared_curvature_per_mm"), 0.0, shared)
-        return frame.point_at(self._value("inner_curvature_per_mm"), 0.0, free)
 
     def outside(self) -> tuple[list[Any], list[Any]]:
         """Return points of the tubes from the exit to the tip, and by how much they are thicker there.

@@ -23,10 +23,10 @@ WALL_CONTACT_MM = 6.0
 SLOPE_MM = 0.5
 """Step over which the share of lumen is compared at the exit."""
 CURVE_DEGREE = 12
-"""Of the polynomial of a shape that is not planar: it is then right to a hundredth of a millimetre, though
-curvature jumps where a tube ends."""
+"""Of the polynomial of a shape: it is then right to a hundredth of a millimetre, though curvature jumps where
+a tube ends."""
 N_FEATURES = 3 * (CURVE_DEGREE + 1) + 10
-"""Of such a shape: coefficients of its curve, the tip's point, direction and +x, and the space beside it."""
+"""Of a shape: coefficients of its curve, the tip's point, direction and +x, and the space beside it."""
 
 
 @frozen_value
@@ -40,7 +40,7 @@ class Layout:
     with_map : bool
         Whether the objective looks at a cost map.
     tubes, turned : int
-        Of tubes that are not planar how many there are, and how many of them are turned against the others.
+        How many tubes there are, and how many of them are turned against the others.
     weighs_tubes : bool
         Whether the objective looks at the tubes, too.
     zone_points, tube_points, wall_points : int
@@ -49,8 +49,8 @@ class Layout:
 
     arcs: int
     with_map: bool
-    tubes: int = 0
-    turned: int = 0
+    tubes: int
+    turned: int
     weighs_tubes: bool = False
     zone_points: int = ZONE_POINTS
     tube_points: int = TUBE_POINTS
@@ -75,7 +75,7 @@ class Layout:
 
     @property
     def joints(self) -> list[int]:
-        """Places of the joints of tubes that are not planar; see `ShapeModel`."""
+        """Places of the joints of the tubes; see `ShapeModel`."""
         at = self.variables
         inserted = [at["outer"], *range(at["middle"].start, at["middle"].stop), at["inner"]]
         return [*inserted[-self.tubes :], *range(at["turned"].start, at["turned"].stop)]
@@ -87,7 +87,7 @@ class Layout:
 
     @property
     def model_terms(self) -> int:
-        """Number of terms of the polynomials of tubes that are not planar."""
+        """Number of terms of the polynomials of the tubes."""
         m = self.tubes + self.turned
         return (m + 1) * (m + 2) // 2
 
@@ -110,11 +110,10 @@ class Layout:
             "sideways": 3,
             "target": 3,
             "max_curvature_per_mm": 1,
-            "shared_curvature_per_mm": 1,
-            "inner_curvature_per_mm": 1,
-            "curved_length_mm": 1,
-            "straight_out": 1,
             "outer_radius_step_mm": 1,
+            "middle_radius_step_mm": 1,
+            "model_centre": self.tubes + self.turned,
+            "model": N_FEATURES * self.model_terms,
             "exempt_mm": 1,
             "weigh_clear": 1,
             "weigh_length": 1,
@@ -122,12 +121,6 @@ class Layout:
         }
         if self.weighs_tubes:
             sizes |= {"weigh_tubes": 1, "inner_width_mm": 1, "wall_mm": 1}
-        if self.tubes:
-            sizes |= {
-                "middle_radius_step_mm": 1,
-                "model_centre": self.tubes + self.turned,
-                "model": N_FEATURES * self.model_terms,
-            }
         for n in range(self.boxes):
             sizes[f"affine{n}"] = 12
             sizes[f"shape{n}"] = 3
@@ -153,7 +146,6 @@ class Layout:
             "turn": 1,
             "cosine": 2 * self.arcs,
             "order": 1,
-            "overlap": 1,
             "in_tissue": 1,
             "exit": 1,
             "slope": 1,
@@ -161,9 +153,9 @@ class Layout:
             "needle": self.arcs * self.arc_points,
             "tube": self.tube_points + 1,
             "wall": self.wall_points,
+            "beside": 1,
+            "middle": 2 * self.middle,
         }
-        if self.tubes:
-            sizes |= {"beside": 1, "middle": 2 * self.middle}
         return _in_a_row(sizes)
 
     @property

@@ -20,7 +20,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from stages.scope import ScopeTip
-from stages.tube import TubeShape, design_arrays, tracking_length_mm, tube_constants
+from stages.tube import TubeShape, design_arrays, longest_mm
 from stages.tube import kernels as index
 
 ARC_COUNTS = (3, 5, 8)
@@ -116,16 +116,15 @@ class Problem:
             arcs=arcs,
             with_map=weights.mapped > 0.0,
             weighs_tubes=weights.tubes > 0.0,
-            tubes=0 if design is None else len(design.lengths),
-            turned=0 if design is None else int(design.turned.sum()),
+            tubes=len(design.lengths),
+            turned=int(design.turned.sum()),
         )
         self.axis = LocalAxis(evaluator.tip_rows, candidate.tip)
         tubes = [deployment.rotation_rad, deployment.outer_mm, deployment.inner_mm, deployment.exit_mm]
         bends = rows[:, 1:].T / needle.max_curvature_per_mm
         further = np.zeros(self.layout.n_variables - 5 - 3 * arcs)
         self.start = np.concatenate([[0.0], tubes, rows[:, 0], *bends, further])
-        if self.model is not None:
-            self.start[self.layout.joints] = self.model.centre
+        self.start[self.layout.joints] = self.model.centre
         self.boxes = self._cut_boxes()
         lower, upper = self._variable_bounds()
         least, most = self._constraint_bounds()
@@ -148,30 +147,22 @@ class Problem:
             least[place] = np.minimum(least[place], values[place] - EASE)
         return replace(self.numbers, least=least)
 
-    def for_needle(self, x: Float, tip: ScopeTip, shape: TubeShape | None) -> Numbers:
-        """Return the numbers for the needle alone, from the tubes of `x` and a tip that stay as they are.
-
-        Parameters
-        ----------
-        shape : TubeShape or None
-            That of tubes which are not planar.
-        """
+    def for_needle(self, x: Float, tip: ScopeTip, shape: TubeShape) -> Numbers:
+        """Return the numbers for the needle alone, from the tubes of `x` and a tip that stay as they are."""
         rows, numbers = self.layout.constraints, self.numbers
         lower, upper = numbers.lower.copy(), numbers.upper.copy()
         least, most = numbers.least.copy(), numbers.most.copy()
         tubes = np.r_[: self.layout.variables["lengths"].start, self.layout.joints]
         lower[tubes] = upper[tubes] = x[tubes]
-        for name in ("order", "overlap", "in_tissue", "exit", "slope", "tube", "wall", "beside", "middle"):
+        for name in ("order", "in_tissue", "exit", "slope", "tube", "wall", "beside", "middle"):
             if name in rows:
                 least[rows[name]], most[rows[name]] = -np.inf, np.inf
         parameters = self._parameters(*one_tip(tip), self._model(shape, constant=True))
         return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
 
-    def _model(self, shape: TubeShape | None, *, constant: bool = False) -> ShapeModel | None:
-        """Return the model of tubes around a shape; None for planar tubes, which have a closed form."""
-        if shape is None or self.design is None:
-            return None
-        return ShapeModel(self.design, shape, constant=constant)
+    def _model(self, shape: TubeShape, *, constant: bool = False) -> ShapeModel:
+        """Return the model of tubes around a shape."""
+        return ShapeModel(self.design, shape, self.longest_mm, constant=constant)
 
     @property
     def sideways(self) -> Float:
@@ -179,14 +170,9 @@ class Problem:
         return np.asarray(self._candidate.tip.lps_from_scope_tip[:3, 0])
 
     @property
-    def _straight_out(self) -> bool:
-        """Whether the straight part of the inner tube reaches out of the scope."""
-        return 0.0 < self.task.system.tubes.inner.curved_length_mm < self._candidate.deployment.inner_mm
-
-    @property
     def longest_mm(self) -> float:
-        """The greatest insertion: where the tubes follow their own track, or that of the candidate."""
-        return max(tracking_length_mm(self.task.system.tubes), self._candidate.deployment.inner_mm)
+        """The greatest insertion of the shapes of the design, or that of the candidate."""
+        return max(longest_mm(self.task.system.tubes), self._candidate.deployment.inner_mm)
 
     def _cut_boxes(self) -> tuple[fields.FieldBox, ...]:
         lung, fissures = self.task.lung, self.task.with_fissures
@@ -209,8 +195,7 @@ class Problem:
         return tuple(boxes)
 
     def _tube_points(self, arc_lengths: Float) -> Float:
-        scope, tubes = self._candidate.tip.lps_from_scope_tip, self.task.system.tubes
-        return self._candidate.deployment.points(tubes, scope, arc_lengths)
+        return self._candidate.deployment.points(self._candidate.tip.lps_from_scope_tip, arc_lengths)
 
     def _lumen_at_exit(self) -> tuple[float, float]:
         """Return the share of lumen at the exit, and its greatest slope there, per mm."""
@@ -222,10 +207,12 @@ class Problem:
         share = ndimage.map_coordinates(values, lattice.T, order=3, prefilter=False, mode="nearest")
         return float(share[0]), float(np.linalg.norm(share[1:4] - share[4:]) / (2.0 * SLOPE_MM))
 
-    def _parameters(self, points: Float, tangents: Float, model: ShapeModel | None) -> Float:
+    def _parameters(self, points: Float, tangents: Float, model: ShapeModel) -> Float:
         """Return the parameters for an axis of the scope's tip given by coefficients and a model."""
         tubes = self.task.system.tubes
-        constants = tube_constants(tubes, self.task.system.margins)
+        steps = -np.diff(
+            [each.radius_mm for each in (tubes.outermost, tubes.middle or tubes.inner, tubes.inner)]
+        )
         clear, length, mapped, by_width = self._weights
         values: dict[str, object] = {
             "axis_points": points,
@@ -233,11 +220,10 @@ class Problem:
             "sideways": self.sideways,
             "target": self.task.target.lps_mm,
             "max_curvature_per_mm": self._needle.max_curvature_per_mm,
-            "shared_curvature_per_mm": constants[index.OVERLAP_CURVATURE],
-            "inner_curvature_per_mm": constants[index.INNER_CURVATURE],
-            "curved_length_mm": constants[index.CURVED_LENGTH],
-            "straight_out": float(self._straight_out),
-            "outer_radius_step_mm": tubes.outermost.radius_mm - tubes.inner.radius_mm,
+            "outer_radius_step_mm": steps[0],
+            "middle_radius_step_mm": steps[1],
+            "model_centre": model.centre,
+            "model": model.matrix,
             "exempt_mm": self._exempt_mm,
             "weigh_clear": clear,
             "weigh_length": length,
@@ -246,14 +232,6 @@ class Problem:
             "inner_width_mm": tubes.inner.outer_diameter_mm,
             "wall_mm": self._candidate.deployment.wall_run_mm,
         }
-        if model is not None:
-            radii = [
-                tubes.outermost.radius_mm,
-                (tubes.middle or tubes.inner).radius_mm,
-                tubes.inner.radius_mm,
-            ]
-            values["outer_radius_step_mm"], values["middle_radius_step_mm"] = -np.diff(radii)
-            values |= {"model_centre": model.centre, "model": model.matrix}
         for n, box in enumerate(self.boxes):
             values[f"affine{n}"] = box.lattice_from_lps.T
             values[f"shape{n}"] = box.shape
@@ -263,37 +241,33 @@ class Problem:
         return out
 
     def _variable_bounds(self) -> tuple[Float, Float]:
-        at, system = self.layout.variables, self.task.system
+        at = self.layout.variables
         lower, upper = np.full(self.layout.n_variables, -1.0), np.full(self.layout.n_variables, 1.0)
         rotation = self._candidate.deployment.rotation_rad
         bounds = {
             "site": (self.axis.low_mm, self.axis.high_mm),
             "rotation": (rotation - MAX_TURN_RAD, rotation + MAX_TURN_RAD),
             "outer": (0.0, self.longest_mm),
-            "inner": (system.tubes.inner.curved_length_mm if self._straight_out else 0.0, self.longest_mm),
+            "inner": (0.0, self.longest_mm),
             "exit": (0.0, self.longest_mm),
             "lengths": (SHORTEST_ARC_MM, self._needle.max_length_mm),
         }
         for name, (low, high) in bounds.items():
             lower[at[name]], upper[at[name]] = low, high
         lower[at["lengths"].start] += self._exempt_mm
-        if self.model is not None:
-            joints = self.layout.joints
-            lower[joints], upper[joints] = self.model.lower, self.model.upper
-            inserted = joints[: self.layout.tubes]
-            lower[inserted] = np.maximum(lower[inserted], 0.0)
-            upper[inserted] = np.minimum(upper[inserted], self.longest_mm)
+        joints = self.layout.joints
+        lower[joints], upper[joints] = self.model.lower, self.model.upper
+        inserted = joints[: self.layout.tubes]
+        lower[inserted] = np.maximum(lower[inserted], 0.0)
+        upper[inserted] = np.minimum(upper[inserted], self.longest_mm)
         return lower, upper
 
     def _constraint_bounds(self) -> tuple[Float, Float]:
         system, deployment = self.task.system, self._candidate.deployment
         needle, tubes, margin = self._needle, system.tubes, system.margins.total_mm
         level, slope = self._lumen_at_exit()
-        swept, allowed = deployment.lateral_sweep_mm, tubes.max_lateral_sweep_mm - SWEEP_SLACK_MM
-        if deployment.shape is not None:
-            # The sweep is a feature of the model instead, and the arcs' error with it.
-            allowed, swept = max(allowed, swept) + deployment.shape.arc_error_mm, 0.0
-        thick = tubes.inner.radius_mm + swept + TUBE_SLACK_MM
+        allowed = max(tubes.max_lateral_sweep_mm - SWEEP_SLACK_MM, deployment.lateral_sweep_mm)
+        thick = tubes.inner.radius_mm + TUBE_SLACK_MM
         clear = needle.radius_mm + margin + NEEDLE_SLACK_MM
         steep = math.sin(math.radians(tubes.min_wall_angle_deg) + ANGLE_SLACK_RAD)
         bounds = {
@@ -303,7 +277,6 @@ class Problem:
             "turn": (-np.inf, math.radians(needle.max_accumulated_turn_deg)),
             "cosine": (math.cos(math.radians(needle.max_angle_from_start_deg)), np.inf),
             "order": (0.0, tubes.max_inner_protrusion_mm),
-            "overlap": (0.0, np.inf),
             "in_tissue": (index.WALL_ZONE_MM + NEEDLE_SLACK_MM, np.inf),
             "exit": (level, level),
             "slope": (slope * steep, np.inf),
@@ -311,7 +284,7 @@ class Problem:
             "needle": (clear, np.inf),
             "tube": (thick + margin, np.inf),
             "wall": (thick, np.inf),
-            "beside": (-np.inf, allowed),
+            "beside": (-np.inf, allowed + deployment.shape.arc_error_mm),
             "middle": (0.0, np.inf),
         }
         least, most = np.zeros(self.layout.n_constraints), np.zeros(self.layout.n_constraints)

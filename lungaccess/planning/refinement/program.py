@@ -199,14 +199,9 @@ class Program:
 
     def _constraints(self, p: Any, geometry: Geometry, fields: list[list[Any]], thicker: list[Any]) -> Any:
         zone = self.layout.zone_points
-        further = []
-        if self.layout.tubes:
-            thicker = [step + geometry.beside for step in thicker]
-            ends = [geometry.outer, *casadi.vertsplit(geometry.middle), geometry.inner]
-            steps = (
-                [after - before for before, after in itertools.pairwise(ends)] if self.layout.middle else []
-            )
-            further = [geometry.beside, *steps]
+        thicker = [step + geometry.beside for step in thicker]
+        ends = [geometry.outer, *casadi.vertsplit(geometry.middle), geometry.inner]
+        steps = [after - before for before, after in itertools.pairwise(ends)] if self.layout.middle else []
         tubes = fields[SPARED][zone:] + fields[WALL]
         at_exit, before, behind = fields[LUMEN_SHARE]
         return casadi.vertcat(
@@ -216,14 +211,14 @@ class Program:
             geometry.turn(),
             *geometry.cosines_from_start(),
             geometry.inner - geometry.outer,
-            geometry.outer - geometry.straight,
             geometry.inner - geometry.exit,
             at_exit,
             (before - behind) / (2.0 * SLOPE_MM),
             *fields[SPARED][:zone],
             *fields[CLEARANCE][zone : zone + self.layout.arcs * self.layout.arc_points],
             *[c - step for c, step in zip(tubes, thicker, strict=True)],
-            *further,
+            geometry.beside,
+            *steps,
         )
 
     def _connect(

@@ -69,9 +69,7 @@ class Reconstruction:
             return None
         x[at["site"]] = 0.0
         x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm
-        design = self._problem.design
-        if deployment.shape is not None and design is not None:
-            x[self._problem.layout.joints] = joints_of(design, deployment.shape)
+        x[self._problem.layout.joints] = joints_of(self._problem.design, deployment.shape)
         x[at["exit"]] = deployment.exit_mm
         return Placement(share=share, x=x, tip=tip, deployment=deployment)
 
@@ -92,11 +90,7 @@ class Reconstruction:
         at, frame = self._problem.layout.variables, tip.lps_from_scope_tip
         smooth = poses.pose(frame[:3, 3], frame[:3, 2], self._problem.sideways)
         bend = poses.bending_directions(smooth, x[at["rotation"]])[0]
-        if self._problem.model is not None:
-            shape = self._problem.model.shape_at(x[self._problem.layout.joints])
-            if shape is None:
-                return "the shape of the tubes keeps no limits"
-            return self._evaluator.tubes.validate_shape(frame, poses.roll_towards(frame, bend), shape)
-        inner = min(max(float(x[at["inner"]]), 0.0), self._problem.longest_mm)
-        outer = min(max(float(x[at["outer"]]), 0.0), inner)
-        return self._evaluator.tubes.validate(frame, poses.roll_towards(frame, bend), outer, inner)
+        shape = self._problem.model.shape_at(x[self._problem.layout.joints])
+        if shape is None:
+            return "the shape of the tubes keeps no limits"
+        return self._evaluator.tubes.validate_shape(frame, poses.roll_towards(frame, bend), shape)

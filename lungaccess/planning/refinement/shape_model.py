@@ -1,4 +1,4 @@
-"""Tubes that are not planar near a shape: polynomials of second order in their joints, from the mechanics."""
+"""Tubes near a shape: polynomials of second order in their joints, from the mechanics."""
 
 from __future__ import annotations
 
@@ -42,6 +42,8 @@ class ShapeModel:
     design : DesignArrays
     shape : TubeShape
         The one about which the polynomials are made.
+    most_mm : float
+        No tube is inserted farther.
     constant : bool
         Whether only that shape is asked for.
 
@@ -54,8 +56,10 @@ class ShapeModel:
         Of the terms of `terms`.
     """
 
-    def __init__(self, design: DesignArrays, shape: TubeShape, *, constant: bool = False) -> None:
-        self._design, self._shape = design, shape
+    def __init__(
+        self, design: DesignArrays, shape: TubeShape, most_mm: float, *, constant: bool = False
+    ) -> None:
+        self._design, self._shape, self._most_mm = design, shape, most_mm
         self.centre = joints_of(design, shape)
         self._steps = np.where(np.arange(len(self.centre)) < len(design.lengths), INSERTED_MM, TURNED_RAD)
         self.lower, self.upper = self.centre - self._steps, self.centre + self._steps
@@ -67,7 +71,7 @@ class ShapeModel:
 
     def shape_at(self, joints: Float) -> TubeShape | None:
         """Return the shape of joints, put in order; None if a limit of the design is not kept."""
-        return _shape_at(self._design, self._shape, joints)
+        return self._shape_at(self._design, joints)
 
     def _fit(self) -> None:
         loose = with_any_sweep(self._design)
@@ -77,7 +81,7 @@ class ShapeModel:
             moves += [a * unit[one] + b * unit[other] for a in (0.6, -0.6) for b in (0.6, -0.6)]
         rows, values = [], []
         for move in moves:
-            made = _shape_at(loose, self._shape, self.centre + move * self._steps)
+            made = self._shape_at(loose, self.centre + move * self._steps)
             if made is not None:
                 rows.append(terms(joints_of(self._design, made) - self.centre)[1:])
                 values.append(_features(made) - self.matrix[:, 0])
@@ -85,6 +89,14 @@ class ShapeModel:
             scale = terms(self._steps)[1:]
             fitted = np.linalg.lstsq(np.array(rows) / scale, np.array(values), rcond=1e-9)[0]
             self.matrix[:, 1:] = fitted.T / scale
+
+    def _shape_at(self, design: DesignArrays, joints: Float) -> TubeShape | None:
+        n = len(design.lengths)
+        inserted, turned = np.clip(joints[:n], 0.0, self._most_mm), np.array(self._shape.rotations_rad)
+        inserted = np.minimum.accumulate(np.maximum(inserted, SHORTEST_MM * (np.arange(n) == n - 1))[::-1])
+        turned[design.turned] = joints[n:]
+        made = deployed(design, inserted, turned)
+        return None if made is None else shape_of_arrays(made)
 
 
 def terms(moved: Float) -> Float:
@@ -96,15 +108,6 @@ def terms(moved: Float) -> Float:
 def joints_of(design: DesignArrays, shape: TubeShape) -> Float:
     """Return the joints of a shape as a `ShapeModel` has them."""
     return np.concatenate([shape.insertions_mm[::-1], shape.rotations_rad[design.turned]])
-
-
-def _shape_at(design: DesignArrays, near: TubeShape, joints: Float) -> TubeShape | None:
-    n = len(design.lengths)
-    inserted, turned = np.maximum(joints[:n], 0.0), np.array(near.rotations_rad)
-    inserted = np.minimum.accumulate(np.maximum(inserted, SHORTEST_MM * (np.arange(n) == n - 1))[::-1])
-    turned[design.turned] = joints[n:]
-    made = deployed(design, inserted, turned)
-    return None if made is None else shape_of_arrays(made)
 
 
 def _features(shape: TubeShape) -> Float:

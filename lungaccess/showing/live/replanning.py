@@ -139,7 +139,7 @@ class TrackedReplanner:
         rest = self._from_scope(pose) if name == SCOPE_TIP else self._from_tube(pose)
         tubes = None
         if rest.tube is not None:
-            pieces = tube_pieces(rest.tube, self._plan.system.tubes)
+            pieces = tube_pieces(rest.tube)
             tubes = poses_on_pieces(rest.lps_from_measured, pieces, PATH_STEP_MM)[0][:, :3, 3]
         needle = rest.path.sample(PATH_STEP_MM)[0] if rest.needle is not None else None
         return tubes, needle, f"plan: cost {rest.cost:.4g}, needle {rest.path.length_mm:.1f} mm"
@@ -155,7 +155,7 @@ class TrackedReplanner:
             return None, None, words
         out = None
         if decision.tube is not None:
-            pieces = tube_pieces(decision.tube, self._plan.system.tubes)
+            pieces = tube_pieces(decision.tube)
             out = poses_on_pieces(decision.lps_from_device, pieces, PATH_STEP_MM)[0][:, :3, 3]
         if decision.needle is None:
             return out, None, words

@@ -13,7 +13,7 @@ from anatomy.base.settings import quantity, settings
 from anatomy.base.typed import Float
 from anatomy.grid import freeze_arrays
 from anatomy.poses import poses_on_pieces
-from lungaccess.plans.curves import deployed_pieces, needle_pieces
+from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.plan import Plan
 from stages.needle import arc_transform
@@ -217,16 +217,12 @@ def _tube_tips(plan: Plan, inserted_mm: Float) -> Float:
     turned = np.array(tube.rotations_rad(tubes))[::-1] - tube.rotation_rad
     around = None
     for n, row in enumerate(inserted_mm):
-        if tube.shape is None:
-            outer = 0.0 if tubes.outer is None else float(row[0])
-            pieces = deployed_pieces(tubes, tube.rotation_rad, outer, float(row[-1]))
-        else:
-            around = around or Neighbourhood.of(tubes.nested, row[::-1], turned)
-            found = around.at(row[::-1], turned)
-            if found is None:
-                raise SettingsError("The tubes of the plan snap on the way", remedy="Run `lungaccess check`")
-            around = around.moved(found)
-            pieces = pieces_of_arcs(np.asarray(found.arcs), tube.rotation_rad)
+        around = around or Neighbourhood.of(tubes.nested, row[::-1], turned)
+        found = around.at(row[::-1], turned)
+        if found is None:
+            raise SettingsError("The tubes of the plan snap on the way", remedy="Run `lungaccess check`")
+        around = around.moved(found)
+        pieces = pieces_of_arcs(np.asarray(found.arcs), tube.rotation_rad)
         tips[n] = poses_on_pieces(base, pieces, np.inf)[0][-1]
     return tips
 

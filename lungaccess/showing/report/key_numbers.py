@@ -55,7 +55,8 @@ def _stage_rows(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
     scope, tube, tubes = plan.scope, plan.tube, plan.system.tubes
     names = " / ".join(name for name, _tube in tubes.named) if tubes.outer is not None else "length"
     insertions = " / ".join(f"{length:.1f}" for length in tube.insertions_mm(tubes)) + " mm"
-    rotations = [tube.rotation_rad] if tube.shape is None else tube.rotations_rad(tubes)
+    alike = not any(tube.shape.relative_rotations_rad.values())
+    rotations = [tube.rotation_rad] if alike else tube.rotations_rad(tubes)
     turned = " / ".join(f"{np.degrees(angle) % 360.0:.1f}°" for angle in rotations)
     scope_rows = [
         ("airway generation at the tip", f"{scope.generation}"),

@@ -61,12 +61,13 @@ def needle_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
 def _bending_plane(plan: Plan, tube: Float) -> Float:
     """Return points that span the plane in which a tube bends, also where its bend is slight.
 
-    Tubes that are not planar bend most nearly in the plane of the scope's direction and their own tip.
+    Tubes bend most nearly in the plane of the scope's direction and their own tip; where the tip is straight
+    ahead, in that of their rotation.
     """
     pose = np.asarray(plan.scope.lps_from_scope_tip)
     angle = plan.tube.rotation_rad
-    if plan.tube.shape is not None:
-        aside = pose[:3, :2].T @ (tube[-1] - tube[0])
+    aside = pose[:3, :2].T @ (tube[-1] - tube[0])
+    if np.hypot(*aside) > SHORTEST_MM:
         angle = float(np.arctan2(aside[1], aside[0]))
     sideways = pose[:3, 0] * np.cos(angle) + pose[:3, 1] * np.sin(angle)
     start, length = pose[:3, 3], float(np.linalg.norm(tube[-1] - tube[0])) + 1.0

@@ -60,7 +60,7 @@ class DevicePoints:
 def device_points(plan: Plan) -> DevicePoints:
     """Return tubes and needle of a plan as points, section by section."""
     system, tube, needle = plan.system, plan.tube, plan.needle
-    pieces = tube_pieces(tube, system.tubes)
+    pieces = tube_pieces(tube)
     length, way_out = float(pieces[:, 0].sum()), tube.exit.arc_length_mm
     hole_mm = float(tube_radii(tube, system.tubes, np.array([way_out]))[0])
     zone = exit_zone_mm(hole_mm, tube.exit.wall_angle_rad)

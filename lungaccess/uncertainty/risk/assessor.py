@@ -83,7 +83,7 @@ class RiskAssessor:
             raise SettingsError("The needle of the plan has no arc", expected="at least one arc")
         self.plan = plan
         self.n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
-        self._n_twisted = 0 if plan.tube.shape is None else len(plan.system.tubes.nested)
+        self._n_twisted = 0 if plan.system.tubes.planar else len(plan.system.tubes.nested)
         self.kinds = tuple(name for name in UNITS if plan.needle is not None or name not in OF_NEEDLE)
         tip = np.asarray(plan.scope.lps_from_scope_tip)[:3, 3]
         heights = (lung.height_share(np.asarray(plan.target_lps)), lung.height_share(tip))

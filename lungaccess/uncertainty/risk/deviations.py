@@ -157,14 +157,14 @@ class DeviatedPlan:
         self._needle[:, 1] = np.cumsum([arc.roll_rad for arc in arcs])
         self._needle[:, 2] = [arc.curvature_per_mm for arc in arcs]
         self._needle[:, 3] = plan.system.track_radius_mm
-        twisted, tubes = plan.tube.shape is not None, plan.system.tubes
+        twisted, tubes = not plan.system.tubes.planar, plan.system.tubes
         self._tubes = np.zeros(0) if twisted else _tube_values(tubes, plan.tube)
 
     def kernel_inputs(self, deviations: Deviations) -> tuple[Devices, Float, Int]:
         """Return the devices, the errors in rows, and the number of each draw's shape; see `Devices`."""
         which, n_tube = np.zeros(deviations.count, dtype=np.int64), TUBE_PIECES
         shapes, rolled = np.zeros((0, 0, kernel.N_PIECE)), np.zeros(0)
-        if self.plan.tube.shape is not None:
+        if not self.plan.system.tubes.planar:
             shapes, rolled, which = twisted_shapes(
                 self.plan, deviations.insertion_mm, deviations.relative_rad
             )

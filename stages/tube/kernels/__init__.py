@@ -5,15 +5,8 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from stages.tube.kernels.aiming import CLOSE_MM, aim, aim_shape
-    from stages.tube.kernels.deployment import (
-        ENTRY_COLUMNS,
-        ENTRY_TIP,
-        enumerate_site,
-        tip_of_arcs,
-        validate_arcs,
-        validate_deployment,
-    )
+    from stages.tube.kernels.aiming import CLOSE_MM, aim_shape
+    from stages.tube.kernels.deployment import tip_of_arcs, validate_arcs
     from stages.tube.kernels.insertions import (
         INSERTION_STEP_MM,
         greatest_insertions,
@@ -47,13 +40,16 @@ if TYPE_CHECKING:
         lateral_sweep,
         off_track,
         planar_point,
-        planar_points,
-        planar_points_of_many,
-        tip_pose,
-        tube_pieces,
-        turned_ends,
     )
-    from stages.tube.kernels.shapes import ARC_COLUMNS, bend_towards, carried
+    from stages.tube.kernels.shapes import (
+        ARC_COLUMNS,
+        DIRECTION,
+        LENGTH,
+        RADIUS,
+        SWEEP,
+        bend_towards,
+        carried,
+    )
     from stages.tube.kernels.wall_exit import (
         ACCEPTED,
         BRANCH,
@@ -71,11 +67,8 @@ if TYPE_CHECKING:
         NEAR_PLEURA,
         NEAR_VESSEL,
         NO_EXIT,
-        PROTRUDES,
         REENTERS_LUMEN,
         RUN_STEP_MM,
-        SWEEPS,
-        TOO_LONG,
         UNNOTICED_MM,
         WALL_ANGLE,
         WALL_RUN,

@@ -1,30 +1,24 @@
-"""Rotation and insertions with which the tip of the tubes comes to a point.
+"""Joint values with which the tip of the tubes comes to a point.
 
-The common rotation turns the plane of the tubes to the point; in that plane the two insertions bring the tip
-to the point's distance beside and ahead of the scope tip.  `tubes` is the array of `planar`.
+The common rotation turns the tip to the side where the point is; the other joints bring it to the point's
+distance beside and ahead of the scope tip.
 """
 
 import math
 
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from stages.tube.kernels.deployment import tip_of_arcs
-from stages.tube.kernels.one_shape import MAX_EXTENSION as MOST_OUT
-from stages.tube.kernels.one_shape import in_order, near_shape, take_over, whole_way
-from stages.tube.kernels.planar import MAX_EXTENSION, planar_point
+from stages.tube.kernels.one_shape import MAX_EXTENSION, in_order, near_shape, take_over, whole_way
 from stages.tube.kernels.shapes import TIP
 
 ITERATIONS = 30
 """Newton's method doubles the digits in each; from a start a few millimetres away it needs about five."""
-DIFFERENCE_MM = 1e-6
-"""Step of the derivatives: their error of about 1e-8 costs no more than an iteration."""
-CLOSE_MM = 1e-9
-"""A tip that is so near is at the point: the positions of a plan are stated to rounding."""
 STEP_MM = 1e-4
-"""The same for shapes of the mechanics, which are right to some 1e-9 mm."""
-SHAPE_CLOSE_MM = 1e-8
-"""Such a shape that ends so near is at the point."""
+"""Step of the derivatives, for shapes that are right to some 1e-9 mm."""
+CLOSE_MM = 1e-8
+"""A tip that ends so near is at the point."""
 TURN_MM = 20.0
 """A turn of one tube against the others counts as so many mm of insertion a radian: about how far it moves a
 tip that is some tens of millimetres out."""
@@ -44,49 +38,6 @@ def _seen_from(base, target):
         + z * (base[3] * base[7] - base[4] * base[6])
     )
     return math.hypot(along, across), ahead, math.atan2(across, along)
-
-
-@kernel()
-def aim(tubes, base, target, outer, inner):
-    """Return rotation, both insertions and the distance in mm by which the tip then misses a point.
-
-    Newton's method from given insertions, which stay in order and within the tubes' reach.
-
-    Parameters
-    ----------
-    tubes : (N_TUBES,) float64
-    base : (9,) float64
-        Scope tip: point, tangent, and +x, from which the rotation counts.
-    target : tuple of 3 floats
-    outer, inner : float
-        Insertions to begin with, mm.
-    """
-    aside, ahead, towards = _seen_from(base, target)
-    rotation = towards % (2.0 * math.pi)
-    most = tubes[MAX_EXTENSION]
-    here = planar_point(tubes, outer, inner, inner)
-    miss = math.hypot(aside - here[0], ahead - here[1])
-    for _ in range(ITERATIONS):
-        if miss <= CLOSE_MM:
-            break
-        step = DIFFERENCE_MM if outer + DIFFERENCE_MM <= inner else -DIFFERENCE_MM
-        by_outer = planar_point(tubes, outer + step, inner, inner)
-        by_inner = planar_point(tubes, outer, inner + DIFFERENCE_MM, inner + DIFFERENCE_MM)
-        a, c = (by_outer[0] - here[0]) / step, (by_outer[1] - here[1]) / step
-        b, d = (by_inner[0] - here[0]) / DIFFERENCE_MM, (by_inner[1] - here[1]) / DIFFERENCE_MM
-        determinant = a * d - b * c
-        if determinant == 0.0:
-            break
-        u, v = aside - here[0], ahead - here[1]
-        change_outer = (d * u - b * v) / determinant
-        change_inner = (a * v - c * u) / determinant
-        longest = max(abs(change_outer), abs(change_inner))
-        share = min(1.0, LONGEST_STEP_MM / longest) if longest > 0.0 else 1.0
-        inner = min(max(inner + share * change_inner, 0.0), most)
-        outer = min(max(outer + share * change_outer, 0.0), inner)
-        here = planar_point(tubes, outer, inner, inner)
-        miss = math.hypot(aside - here[0], ahead - here[1])
-    return rotation, outer, inner, miss
 
 
 @inner_kernel
@@ -145,7 +96,7 @@ def _change(design, near, shape, want_aside, want_ahead, change):
 
 @merged_kernel
 def aim_shape(design, near, shape, base, target):
-    """Turn and insert tubes that are not planar so that their tip comes to a point.
+    """Turn and insert tubes so that their tip comes to a point.
 
     Newton's method with the least change of the joints in each step, from the shape `near`, which is changed.
     Then the whole way is followed.
@@ -156,8 +107,8 @@ def aim_shape(design, near, shape, base, target):
     near, shape : ShapeArrays
         The second receives the shape.
     base : (9,) float64
+        Scope tip: point, tangent, and +x, from which the rotation counts.
     target : tuple of 3 floats
-        See `aim`.
 
     Returns
     -------
@@ -176,13 +127,13 @@ def aim_shape(design, near, shape, base, target):
         return 0.0, miss, False
     take_over(near, shape)
     for _ in range(ITERATIONS):
-        if miss <= SHAPE_CLOSE_MM:
+        if miss <= CLOSE_MM:
             break
         if not _change(design, near, shape, want_aside - aside, want_ahead - ahead, change):
             break
         for m in range(2 * n):
             shape.joints[m] = near.joints[m] + change[m]
-        shape.joints[0] = min(max(shape.joints[0], 0.0), design.limits[MOST_OUT])
+        shape.joints[0] = min(max(shape.joints[0], 0.0), design.limits[MAX_EXTENSION])
         for i in range(1, n):
             shape.joints[i] = min(max(shape.joints[i], 0.0), shape.joints[i - 1])
         if not near_shape(design, near, shape):
@@ -190,7 +141,7 @@ def aim_shape(design, near, shape, base, target):
         take_over(near, shape)
         aside, ahead, direction = _tip(near)
         miss = math.hypot(want_aside - aside, want_ahead - ahead)
-    if miss > SHAPE_CLOSE_MM:
+    if miss > CLOSE_MM:
         return 0.0, miss, False
     shape.joints[:] = near.joints
     allowed = whole_way(design, shape)

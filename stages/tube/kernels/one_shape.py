@@ -12,6 +12,7 @@ import numpy as np
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import SHORTEST_PIECE_MM as SAME_MM
+from stages.tube.kernels.planar import lateral_sweep
 from stages.tube.kernels.pose import frames_at, lay
 from stages.tube.kernels.shapes import (
     CURVATURE,
@@ -26,7 +27,9 @@ from stages.tube.kernels.shapes import (
     arcs_near,
     largest_strain,
     lay_out,
+    lay_untwisted,
     reach,
+    twists,
 )
 from stages.tube.kernels.sweep import sweep_of
 
@@ -36,7 +39,7 @@ rear end at which the tube bends towards +x of the scope tip, and what is kept."
 
 
 class DesignArrays(NamedTuple):
-    """A design of n tubes for the kernels, the innermost first; planar tubes have none of them.
+    """A design of n tubes for the kernels, the innermost first.
 
     Parameters
     ----------
@@ -47,6 +50,8 @@ class DesignArrays(NamedTuple):
     turned : (n,) bool
         Whether the shape changes as the tube is turned against the others.
     limits : (N_LIMITS,) float64
+    planar : (N_TUBES,) float64
+        The numbers of `planar` where the tubes are, of which the sweep is then exact; else empty.
     """
 
     stiffness: Float
@@ -56,6 +61,7 @@ class DesignArrays(NamedTuple):
     strained: Float
     turned: Bool
     limits: Float
+    planar: Float
 
 
 class ShapeArrays(NamedTuple):
@@ -121,6 +127,9 @@ def near_shape(design, near, shape):
     n = design.lengths.shape[0]
     if not in_order(design, shape.joints):
         return False
+    if not twists(design.bends):
+        _fill_untwisted(design, shape)
+        return True
     shape.tips[:] = near.tips
     shape.number[0] = arcs_near(
         (design.stiffness, design.lengths, design.bends), design.radii, near.joints[n:] + design.limits[BEND],
@@ -128,6 +137,28 @@ def near_shape(design, near, shape):
         shape.joints[:n] - design.lengths, design.limits[STEP], shape.tips, shape.result, shape.arcs,
     )  # fmt: skip
     return shape.number[0] > 0
+
+
+@inner_kernel
+def _fill_untwisted(design, shape):
+    """Fill a shape of tubes that do not twist each other at its joints, but for its sweep."""
+    n, result = design.lengths.shape[0], shape.result
+    arrays = design.stiffness, design.lengths, design.bends
+    shape.tips[:] = shape.joints[n:] + design.limits[BEND]
+    result[LEAST], result[STRAIN] = 1.0, _strain_at_rest(design)
+    shape.number[0] = lay_untwisted(
+        arrays, design.radii, design.strained, shape.tips, shape.joints[:n] - design.lengths,
+        design.limits[STEP], result, shape.arcs,
+    )  # fmt: skip
+
+
+@inner_kernel
+def _strain_at_rest(design):
+    """Return the largest strain of the tubes held straight in the scope."""
+    worst = 0.0
+    for b in range(design.bends.shape[0]):
+        worst = max(worst, design.strained[int(design.bends[b, 0])] * design.bends[b, 3])
+    return worst
 
 
 @kernel(nogil=True)
@@ -142,6 +173,10 @@ def whole_way(design, shape):
         return False
     n = lengths.shape[0]
     arrays = design.stiffness, lengths, design.bends
+    if design.planar.shape[0] > 0:
+        _fill_untwisted(design, shape)
+        result[SWEEP] = result[LEADER] = lateral_sweep(design.planar, joints[n - 1], joints[0])
+        return result[STRAIN] <= design.limits[MAX_STRAIN] and result[SWEEP] <= design.limits[MAX_SWEEP]
     base, still = joints[n:] + design.limits[BEND], np.zeros(n)
     steps_out = max(int(math.ceil(joints[0] / design.limits[STOP] - SAME_MM)), 1)
     spacing = joints[0] / steps_out
@@ -153,9 +188,7 @@ def whole_way(design, shape):
     scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
     shape.tips[:] = base
     result[:] = 0.0
-    result[LEAST], result[EXTENSION] = 1.0, joints[0]
-    for b in range(design.bends.shape[0]):
-        result[STRAIN] = max(result[STRAIN], design.strained[int(design.bends[b, 0])] * design.bends[b, 3])
+    result[LEAST], result[EXTENSION], result[STRAIN] = 1.0, joints[0], _strain_at_rest(design)
     begin = -lengths
     for k in range(1, steps_out + 1):
         end = np.minimum(stops[k], joints[:n]) - lengths

@@ -154,41 +154,22 @@ def _seen(base, forward, row, at):
     )
 
 
-@kernel(nogil=True)
-def place_tree(environment, tubes, frame, tree, reasons, traces, placed):
-    """Follow all shapes from one scope tip with one rotation of all tubes together.
-
-    Parameters
-    ----------
-    environment : TubeEnvironment
-    tubes : (N_TUBES,) float64
-        See `planar`; only the limits at the wall are looked at.
-    frame : (4, 4) float64
-        The scope tip, with +x where the tubes are turned to.
-    tree : tuple
-        Nodes in the order in which they are followed, M of them: `depth` (M,) int64 from 1 on, `skip` (M,)
-        int64 the node to go on with if this one is refused, `beneath` (M,) int64 how many shapes end in it or
-        beyond, `first` (M + 1,) int64 where its `stretches` (R, STRETCH_COLUMNS) begin, `radius` and
-        `clearance` (M,) float64, `first_shape` (M + 1,) int64 where the `shapes` (S,) int64 begin that end
-        there.
-    reasons : (N_REASONS,) int64
-        Counts refused shapes by reason.
-    traces : (depths + 1, N_TRACE) float64
-        Scratch.
-    placed : (S, PLACED_COLUMNS) float64
-        Is filled.
-
-    Returns
-    -------
-    int
-        Number of shapes that fit.
-    """
-    depth, skip, beneath, first, stretches, radius, clearance, first_shape, shapes = tree
+@inner_kernel
+def _place_turned(environment, tubes, frame, tree, wanted, reasons, traces, placed):
+    """Follow shapes from one scope tip with one rotation of all tubes together; see `place_tree`."""
+    depth, skip, first, stretches, radius, clearance, first_shape, shapes = tree
+    before = np.zeros(shapes.shape[0] + 1, np.int64)
+    for e in range(shapes.shape[0]):
+        before[e + 1] = before[e] + wanted[shapes[e]]
     across = (frame[0, 0], frame[1, 0], frame[2, 0], frame[0, 1], frame[1, 1], frame[2, 1])
     forward = (frame[0, 2], frame[1, 2], frame[2, 2])
     wall_exit.reset(traces[0])
     count, node = 0, 0
     while node < depth.shape[0]:
+        beneath = before[first_shape[skip[node]]] - before[first_shape[node]]
+        if beneath == 0:
+            node = skip[node]
+            continue
         trace = traces[depth[node]]
         for m in range(trace.shape[0]):
             trace[m] = traces[depth[node] - 1, m]
@@ -206,10 +187,12 @@ def place_tree(environment, tubes, frame, tree, reasons, traces, placed):
             if reason != wall_exit.ACCEPTED:
                 break
         if reason != wall_exit.ACCEPTED:
-            reasons[reason] += beneath[node]
+            reasons[reason] += beneath
             node = skip[node]
             continue
         for e in range(first_shape[node], first_shape[node + 1]):
+            if not wanted[shapes[e]]:
+                continue
             if trace[wall_exit.PHASE] != wall_exit.IN_TISSUE:
                 reasons[wall_exit.NO_EXIT] += 1
                 continue
@@ -223,3 +206,38 @@ def place_tree(environment, tubes, frame, tree, reasons, traces, placed):
             count += 1
         node += 1
     return count
+
+
+@kernel(nogil=True)
+def place_tree(environment, tubes, frames, tree, wanted, reasons, traces, placed, counts):
+    """Follow shapes from one scope tip with T rotations of all tubes together.
+
+    Parameters
+    ----------
+    environment : TubeEnvironment
+    tubes : (N_TUBES,) float64
+        Only the limits at the wall are looked at.
+    frames : (T, 4, 4) float64
+        The scope tip, with +x where the tubes are turned to.
+    tree : tuple
+        Nodes in the order in which they are followed, M of them: `depth` (M,) int64 from 1 on, `skip` (M,)
+        int64 the node to go on with if this one is refused, `first` (M + 1,) int64 where its `stretches` (R,
+        STRETCH_COLUMNS) begin, `radius` and `clearance` (M,) float64, `first_shape` (M + 1,) int64 where the
+        `shapes` (S,) int64 begin that end there.
+    wanted : (T, S) bool
+        Which shapes are looked at.
+    reasons : (N_REASONS,) int64
+        Counts refused shapes by reason.
+    traces : (depths + 1, N_TRACE) float64
+        Scratch.
+    placed : (T S, PLACED_COLUMNS) float64
+        Receives the shapes that fit, one rotation after the other.
+    counts : (T,) int64
+        Receives how many fit with each rotation.
+    """
+    total = 0
+    for t in range(frames.shape[0]):
+        counts[t] = _place_turned(
+            environment, tubes, frames[t], tree, wanted[t], reasons, traces, placed[total:]
+        )
+        total += counts[t]

@@ -7,7 +7,7 @@ the numbers below: curvatures in 1/mm, lengths in mm, the angle in rad.
 
 import math
 
-from anatomy.kernels.arcs import normal_on_arc, pose_on_arc, sine_length, versine_length
+from anatomy.kernels.arcs import sine_length, versine_length
 from anatomy.kernels.compiling import inner_kernel, kernel
 
 OVERLAP_CURVATURE, INNER_CURVATURE, CURVED_LENGTH, OUTER_RADIUS, INNER_RADIUS, MARGIN = range(6)
@@ -35,45 +35,6 @@ def planar_point(tubes, outer, inner, s):
     aside += math.sin(angle) * along + math.cos(angle) * out
     ahead += math.cos(angle) * along - math.sin(angle) * out
     return aside, ahead
-
-
-@kernel()
-def planar_points(tubes, outer, inner, arc_lengths, out):
-    """Fill `out` (N, 2) with `planar_point` at `arc_lengths` (N,)."""
-    for n in range(arc_lengths.shape[0]):
-        out[n, 0], out[n, 1] = planar_point(tubes, outer, inner, arc_lengths[n])
-
-
-@kernel()
-def planar_points_of_many(tubes, outers, inners, arc_lengths, out):
-    """Fill `out` (N, 2) with `planar_point` of N deployments, each at its own of `arc_lengths` (N,)."""
-    for n in range(arc_lengths.shape[0]):
-        out[n, 0], out[n, 1] = planar_point(tubes, outers[n], inners[n], arc_lengths[n])
-
-
-@kernel()
-def tube_pieces(tubes, outer, inner):
-    """Return the four arcs of the centreline, some empty: begin and end in mm, curvature, radius."""
-    straight = max(inner - tubes[CURVED_LENGTH], 0.0)
-    return (
-        (0.0, min(straight, outer), 0.0, tubes[OUTER_RADIUS]),
-        (min(straight, outer), outer, tubes[OVERLAP_CURVATURE], tubes[OUTER_RADIUS]),
-        (outer, max(straight, outer), 0.0, tubes[INNER_RADIUS]),
-        (max(straight, outer), inner, tubes[INNER_CURVATURE], tubes[INNER_RADIUS]),
-    )
-
-
-@kernel()
-def tip_pose(tubes, base, normal, outer, inner):
-    """Return the pose at the tip of the inner tube, from the scope tip `base`, bending towards `normal`."""
-    pose = (base[0], base[1], base[2], base[3], base[4], base[5])
-    towards = (normal[0], normal[1], normal[2])
-    for begin, end, kappa, _radius in tube_pieces(tubes, outer, inner):
-        if end > begin:
-            bend = (kappa, towards[0], towards[1], towards[2])
-            towards = normal_on_arc(pose, bend, end - begin)
-            pose = pose_on_arc(pose, bend, end - begin)
-    return pose
 
 
 @inner_kernel
@@ -109,26 +70,3 @@ def sampled_sweep(tubes, outer, inner, every):
     for m in range(every, SWEEP_SAMPLES + 1, every):
         worst = max(worst, off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
     return worst
-
-
-@kernel()
-def turned_ends(ends, frame, normals, at, towards):
-    """Turn ends of tubes in the plane of their bend to each of several directions.
-
-    Parameters
-    ----------
-    ends : (K, 4) float64
-        Position and tangent of the tip, each aside and ahead.
-    frame : (4, 4) float64
-        Of the scope tip.
-    normals : (T, 3) float64
-        Directions of the bend.
-    at, towards : (T K, 3) float64
-        Are filled: positions and tangents, LPS mm.
-    """
-    for t in range(normals.shape[0]):
-        for k in range(ends.shape[0]):
-            row = t * ends.shape[0] + k
-            for m in range(3):
-                at[row, m] = frame[m, 3] + (normals[t, m] * ends[k, 0] + frame[m, 2] * ends[k, 1])
-                towards[row, m] = normals[t, m] * ends[k, 2] + frame[m, 2] * ends[k, 3]

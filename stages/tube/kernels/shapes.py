@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
-from stages.tube.kernels.assembly import BENT, FAR, NEAR, PIECE_COLUMNS, cut
+from stages.tube.kernels.assembly import BENT, BENT_TUBE, FAR, NEAR, PIECE_COLUMNS, SOFTNESS, cut
 from stages.tube.kernels.equilibrium import TOLERANCE, cutting_scratch, least_determinant, newton, scratch_for
 from stages.tube.kernels.pose import GAUSS, curvature, frames_at, lay
 from stages.tube.kernels.sweep import sweep_of
@@ -207,6 +207,56 @@ def lay_out(design, radii, beta, cutting, nodes, steps, poses, arcs, first, plac
             off += (found[m, 9 + axis] - places[m, 1 + axis]) ** 2
         worst = max(worst, off)
     return number, math.sqrt(worst) + error
+
+
+@inner_kernel
+def twists(bends):
+    """Tell whether tubes can twist each other: at least two are bent."""
+    bent = -1.0
+    for b in range(bends.shape[0]):
+        if bends[b, 3] != 0.0:
+            if bent >= 0.0 and bends[b, 0] != bent:
+                return True
+            bent = bends[b, 0]
+    return False
+
+
+@inner_kernel
+def lay_untwisted(design, radii, strained, base, beta, step, result, arcs):
+    """Write the arcs of tubes that do not twist each other, which are exact; return how many there are.
+
+    Raises the strain of `result` to that of the shape where it is less, and fills its error, length and tip.
+    """
+    _stiffness, lengths, _bends = design
+    n = lengths.shape[0]
+    pieces, moments, directions = cutting_scratch(design, n)
+    count, _steps = cut(design, beta, step, pieces, moments, directions)
+    pose, across = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+    for k in range(count):
+        middle, outermost = 0.5 * (pieces[k, NEAR] + pieces[k, FAR]), 0
+        kappa, direction = 0.0, 0.0
+        if pieces[k, BENT] > 0.0:
+            i = int(pieces[k, BENT_TUBE])
+            kappa, angle = pieces[k, SOFTNESS] * moments[k, i], base[i] + directions[k, i]
+            direction = math.atan2(-math.cos(angle), math.sin(angle))
+        for i in range(n):
+            if beta[i] + lengths[i] > middle:
+                outermost = i
+                off = abs(kappa - moments[k, i] / pieces[k, PIECE_COLUMNS + i])
+                result[STRAIN] = max(result[STRAIN], strained[i] * off)
+        arcs[k, LENGTH], arcs[k, DIRECTION] = pieces[k, FAR] - pieces[k, NEAR], direction
+        arcs[k, CURVATURE], arcs[k, RADIUS] = kappa, radii[outermost]
+        bend = bend_towards(pose, across, direction, kappa)
+        pose, across = carried(pose, across, bend, direction, arcs[k, LENGTH])
+    result[ERROR], result[EXTENSION] = 0.0, beta[0] + lengths[0]
+    _x, _y, _z, tx, ty, tz = pose
+    ax, ay, az = across
+    beside = (ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax)
+    for axis in range(3):
+        row = result[TIP + 3 * axis :]
+        row[0], row[1], row[2] = across[axis], beside[axis], pose[3 + axis]
+        result[TIP + 9 + axis] = pose[axis]
+    return count
 
 
 @inner_kernel

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.base.typed import Bool, Float, Labels, UInt16
-from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
+from anatomy.kernels.arcs import point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
@@ -23,7 +23,7 @@ IN_LUMEN, LEAVING, IN_WALL, IN_TISSUE = 0.0, 1.0, 2.0, 3.0
 
 # reasons why a deployment is refused
 ACCEPTED, NO_EXIT, NEAR_VESSEL, NEAR_PLEURA, NEAR_FISSURE, NEAR_OTHER_BRANCH, REENTERS_LUMEN = range(7)
-FLAT_EXIT, SWEEPS, TOO_LONG, PROTRUDES, LEAVES_MEDIASTINAL, LONG_WALL_RUN, N_REASONS = range(7, 14)
+FLAT_EXIT, LEAVES_MEDIASTINAL, LONG_WALL_RUN, N_REASONS = range(7, 11)
 
 FREE = -1
 """Stands for the label of an obstacle where a bound says that there is none."""
@@ -318,11 +318,3 @@ def reset(trace):
     for m in range(trace.shape[0]):
         trace[m] = 0.0
     trace[BRANCH] = -1.0
-
-
-@kernel()
-def advance(environment, tubes, trace, pose, normal, kappa, s0, s1, radius, clearance):
-    """March along one arc; return the reason, and pose and bending direction at its end."""
-    bend = (kappa, normal[0], normal[1], normal[2])
-    reason = march(environment, tubes, trace, pose, bend, s0, s1 - s0, radius, clearance)
-    return reason, pose_on_arc(pose, bend, s1 - s0), normal_on_arc(pose, bend, s1 - s0)

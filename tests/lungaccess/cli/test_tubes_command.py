@@ -21,7 +21,7 @@ from lungaccess.planning.one_stage.tubes import (
     load_tubes,
 )
 from lungaccess.problem.system import load_system
-from stages.tube.validation import centreline
+from tests.stages.tube.closed_form import centreline
 
 PNG = b"\x89PNG\r\n\x1a\n"
 CURVED_PAIR = """

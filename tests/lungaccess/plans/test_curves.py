@@ -14,6 +14,7 @@ from lungaccess.judging.checking import shapes
 from lungaccess.plans.curves import STEP_MM
 from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
+from tests.lungaccess.tube_shapes import stated_shape
 
 lengths_of_arcs = st.lists(
     st.tuples(st.floats(1.0, 30.0), st.floats(-3.1, 3.1), st.floats(0.0, 0.02)), max_size=5
@@ -51,11 +52,11 @@ def test_any_needle_is_the_one_that_the_check_integrates(arcs: list[Any], toy_pl
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(outer=st.floats(0.0, 40.0), more=st.floats(0.1, 30.0))
 def test_any_tubes_are_the_ones_that_the_check_integrates(outer: float, more: float, toy_plan: Plan) -> None:
-    tube = replace(toy_plan.tube, outer_insertion_mm=outer, inner_insertion_mm=outer + more)
-    curve = replace(toy_plan, tube=tube).curves().tubes
-    bend = shapes.bend_of(toy_plan.system.tubes, outer, outer + more)
-    pieces = shapes.planar_pieces(tube.rotation_rad, bend)
-    integrated = shapes.integrate(toy_plan.scope.lps_from_scope_tip, pieces)
+    shape = stated_shape(toy_plan.system.tubes, outer, outer + more)
+    tube = replace(toy_plan.tube, outer_insertion_mm=outer, inner_insertion_mm=outer + more, shape=shape)
+    plan = replace(toy_plan, tube=tube)
+    curve = plan.curves().tubes
+    integrated = shapes.integrate(toy_plan.scope.lps_from_scope_tip, shapes.tube_pieces(plan))
     np.testing.assert_allclose(curve.lps_from_device[-1], integrated.end, atol=1e-6)
     nearest = shapes.distance_to_polyline(curve.points_lps, integrated.points)
     assert nearest.max() < 1e-4

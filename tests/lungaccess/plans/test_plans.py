@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from anatomy.base.errors import FileError, PlanFileError
-from lungaccess.plans.file import SCHEMA
-from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit
+from lungaccess.plans.file import SCHEMA, SHAPELESS
+from lungaccess.plans.parts import (
+    DeployedShape,
+    Exemption,
+    NeedleArc,
+    NeedlePath,
+    ScopeInsertion,
+    TubeDeployment,
+    WallExit,
+)
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 
@@ -48,6 +57,12 @@ def make_plan(values: np.ndarray | None = None, **changes: Any) -> Plan:
             ),
             lateral_sweep_mm=v[14],
             follow_the_leader_error_mm=v[15],
+            shape=DeployedShape(
+                relative_rotations_rad={"inner": v[30], "outer": v[31]},
+                arcs=v[:12].reshape(3, 4),
+                arc_error_mm=v[12],
+                least_determinant=v[13],
+            ),
         ),
         "needle": NeedlePath(
             lps_from_start=pose,
@@ -261,3 +276,21 @@ def test_a_plan_with_a_line_for_the_scope_says_what_it_lacks() -> None:
     with pytest.raises(PlanFileError, match="a line but no motion") as refused:
         Plan.from_json(old)
     assert "again for the same patient, target and system" in str(refused.value)
+
+
+def test_a_plan_that_states_no_shape_gets_that_of_its_insertions(toy_plan: Plan) -> None:
+    content = json.loads(toy_plan.to_json())
+    content["schema"] = SHAPELESS
+    del content["digest"], content["tube"]["shape"]
+    kept = {key: value for key, value in content.items() if key != "timing"}
+    canonical = json.dumps(kept, sort_keys=True, separators=(",", ":")).encode()
+    content["digest"] = hashlib.sha256(canonical).hexdigest()
+    read = Plan.from_json(json.dumps(content))
+    wanted, found = toy_plan.tube.shape, read.tube.shape
+    assert found.relative_rotations_rad == wanted.relative_rotations_rad
+    np.testing.assert_allclose(found.arcs, wanted.arcs, atol=1e-9)
+    same = dataclasses.replace(read, tube=dataclasses.replace(read.tube, shape=wanted))
+    assert same.to_json() == toy_plan.to_json()
+    content["tube"]["outer_insertion_mm"] += 1.0
+    with pytest.raises(PlanFileError, match="edited or damaged"):
+        Plan.from_json(json.dumps(content))

@@ -58,7 +58,7 @@ def validated(
         lung, tubes, Margins(segmentation_margin_mm=MARGIN), with_fissures=with_fissures
     )
     tip = pose(base, forward, (1.0, 0.0, 0.0))
-    return validator.validate(tip, rotation, outer, inner)
+    return validator.validate(tip, rotation, [outer, inner])
 
 
 CHAIN = forked_tree(
@@ -93,5 +93,5 @@ REFUSALS = {
     "none": "the tube does not leave the airway",
     "long": "the tube would extend too far",
     "short": "the inner tube is too short to protrude so far",
-    "sweep": "the tube would sweep tissue sideways",
+    "sweep": "the tubes would sweep tissue sideways",
 }

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
 
 from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.poses import pose
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from stages.tube import Deployment, kernels, tube_constants, tube_environment
+from stages.tube import (
+    Deployment,
+    DeploymentValidator,
+    ShapeGrid,
+    ShapeLimits,
+    SiteEnumerator,
+    TubeShapes,
+    kernels,
+    tree_of_shapes,
+    tube_shapes,
+)
 from stages.tube.device import ConcentricTubes
 from tests.stages.scenes import brute_clearance
 from tests.stages.tube.flat_wall import (
@@ -177,8 +190,13 @@ def spare_behind_exit(lung: Lung, outer: float, inner: float, rotation: float) -
     return float((gap - radius[behind] - MARGIN).min())
 
 
+def shapes_at_stops(tubes: ConcentricTubes) -> tuple[Any, TubeShapes, Any]:
+    shapes = tube_shapes(tubes.nested, ShapeLimits(max_extension_mm=34.0), ShapeGrid(stop_mm=2.0))
+    return np.arange(shapes.count), shapes, tree_of_shapes(shapes)
+
+
 class TestEnumeration:
-    """`enumerate_site` shares the beginnings of deployments; each alone has the same verdict."""
+    """A tree of shapes shares the beginnings of deployments; each alone has the same verdict."""
 
     @pytest.mark.parametrize("tubes", [TUBES, tubes_of(inner_length_mm=660.0)])
     def test_agrees_with_deployments_one_by_one(self, tubes: ConcentricTubes) -> None:
@@ -187,61 +205,43 @@ class TestEnumeration:
         for _ in range(10):
             canvas.add(canvas.ball(rng.uniform([2, -8, -12], [12, 8, 16]), rng.uniform(0.6, 1.6)), VESSEL)
         canvas.labels[(canvas.labels & LUMEN) != 0] &= ~np.uint16(VESSEL)
-        lung = canvas.lung()
-        environment, numbers = tube_environment(lung, with_fissures=False), tube_constants(tubes, Margins())
-        base = np.array([*BASE, 0.0, 0.0, 1.0])
-        angles = np.linspace(0.0, 2 * math.pi, 16, endpoint=False)
-        normals = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(16)])
-        stops = np.linspace(0.0, 34.0, 18)
-        rows = np.zeros((16 * 18 * 19 // 2, kernels.ENTRY_COLUMNS))
-        reasons = np.zeros(kernels.N_REASONS, dtype=np.int64)
-        every = np.repeat(np.triu(np.ones((18, 18), dtype=bool))[None], 16, axis=0)
-        every[:, 0, 0] = False
-        work = np.zeros((2, kernels.N_TRACE))
-        count = kernels.enumerate_site(
-            environment,
-            numbers,
-            base,
-            normals,
-            7,
-            stops,
-            every,
-            rows,
-            reasons,
-            np.zeros((2, kernels.N_TRACE)),
+        lung, at_stops = canvas.lung(), shapes_at_stops(tubes)
+        enumerator = SiteEnumerator(
+            lung, tubes, Margins(), with_fissures=False, rotations=16, at_stops=at_stops
         )
-        found = {(int(row[1]), row[2], row[3]): row for row in rows[:count]}
-        assert len(found) == count and (rows[:count, 0] == 7).all()
-        assert count + reasons.sum() == 16 * (18 * 19 // 2 - 1)
-        trace, tip, alone = np.zeros(kernels.N_TRACE), np.zeros(9), np.zeros(kernels.N_REASONS, dtype=int)
-        for t in range(16):
-            for m in range(18):
-                for e in range(m, 18):
-                    if e == 0:
-                        continue
-                    reason = kernels.validate_deployment(
-                        environment, numbers, base, normals[t], stops[m], stops[e], trace, tip
-                    )
-                    key = (t, stops[m], stops[e])
-                    assert (reason == kernels.ACCEPTED) == (key in found), (key, reason)
-                    alone[reason] += 1
-                    if key in found:
-                        row = found[key]
-                        assert np.allclose(row[kernels.ENTRY_TIP :], tip[:6], atol=1e-9)
-                        assert row[4] == trace[kernels.BRANCH]
-                        assert row[5] == pytest.approx(trace[kernels.LEFT_AT], abs=1e-3)
-                        assert row[6] == pytest.approx(trace[kernels.WALL_ANGLE], abs=1e-2)
-                        assert row[7] == pytest.approx(trace[kernels.WALL_RUN], abs=0.1)
-        assert count > 100
-        assert reasons[kernels.NEAR_VESSEL] > 0
-        if tubes is not TUBES:
-            assert reasons[kernels.PROTRUDES] > 0
-        some = every & (rng.uniform(size=every.shape) < 0.05)
-        fewer, left_out = np.zeros_like(rows), np.zeros_like(reasons)
-        part = kernels.enumerate_site(
-            environment, numbers, base, normals, 7, stops, some, fewer, left_out, work
-        )
-        at = np.rint(rows[:count, 2:4] / stops[1]).astype(int)
-        chosen = some[rows[:count, 1].astype(int), at[:, 0], at[:, 1]]
-        assert (fewer[:part] == rows[:count][chosen]).all()
-        assert part + left_out.sum() == some.sum()
+        row = np.array([*BASE, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+        every = lambda at, _towards: np.ones(len(at), dtype=bool)  # noqa: E731
+        found = enumerator.deployments(row, every)
+        shapes, validator = at_stops[1], DeploymentValidator(lung, tubes, Margins(), with_fissures=False)
+        places = {
+            (round(turn, 9), shape): n
+            for n, (turn, shape) in enumerate(
+                zip(found.rotation_rad.tolist(), found.shape.tolist(), strict=True)
+            )
+        }
+        assert len(places) == found.count > 100
+        assert found.candidates == found.count + sum(found.refused.values()) == 32 * shapes.count
+        alone: Counter[str] = Counter()
+        for turn in enumerator.angles.tolist():
+            for shape in range(shapes.count):
+                one = validator.validate_shape(pose(row[:3], row[3:6], row[6:]), turn, shapes.member(shape))
+                n = places.get((round(turn, 9), shape))
+                assert isinstance(one, Deployment) == (n is not None), one
+                if isinstance(one, str):
+                    alone[one] += 1
+                    continue
+                assert np.allclose(found.positions[n], one.lps_from_tip[:3, 3], atol=1e-9)
+                assert found.branch[n] == one.branch
+                assert found.exit_mm[n] == pytest.approx(one.exit_mm, abs=1e-3)
+                assert found.wall_angle_rad[n] == pytest.approx(one.wall_angle_rad, abs=1e-2)
+                assert found.wall_run_mm[n] == pytest.approx(one.wall_run_mm, abs=0.1)
+        assert set(alone) == set(found.refused) and alone["the tube comes too near a vessel"] > 0
+        kept = rng.uniform(size=32 * shapes.count) < 0.05
+        some = enumerator.deployments(row, lambda _at, _towards: kept)
+        wanted = [
+            kept[n * shapes.count + shape]
+            for n, turn in enumerate(enumerator.angles.tolist())
+            for shape in found.shape[np.isclose(found.rotation_rad, turn)].tolist()
+        ]
+        assert np.array_equal(some.positions, found.positions[np.array(wanted)])
+        assert some.candidates == some.count + sum(some.refused.values()) == kept.sum()

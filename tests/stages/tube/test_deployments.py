@@ -17,9 +17,9 @@ from stages.tube import (
     Deployment,
     DeploymentValidator,
     enumerate_deployments,
-    insertion_stops,
     kernels,
-    tracking_length_mm,
+    longest_mm,
+    shapes_of,
     tube_constants,
 )
 from stages.tube.device import ConcentricTubes
@@ -62,19 +62,11 @@ def test_constants() -> None:
     assert numbers[kernels.MAX_PROTRUSION] == 40.0
 
 
-def test_tracking_length() -> None:
-    assert tracking_length_mm(TUBES) == 30.0
-    assert tracking_length_mm(ConcentricTubes(outer=OUTER, inner=INNER, max_extension_mm=20.0)) == 20.0
-    assert tracking_length_mm(STRAIGHT) == STRAIGHT.max_extension_mm
-
-
-@pytest.mark.parametrize("spacing", [0.7, 2.0, 100.0])
-def test_stops(spacing: float) -> None:
-    stops = insertion_stops(TUBES, spacing)
-    assert stops[0] == 0.0 and stops[-1] == 30.0 and len(stops) >= 2
-    assert np.allclose(np.diff(stops), np.diff(stops)[0])
-    if spacing < 30.0:
-        assert np.diff(stops)[0] == pytest.approx(spacing, rel=0.2)
+def test_longest_insertions() -> None:
+    assert longest_mm(TUBES) == 30.0 < TUBES.max_extension_mm
+    short = ConcentricTubes(outer=OUTER, inner=INNER, max_extension_mm=20.0)
+    assert longest_mm(short) == 20.0
+    assert longest_mm(STRAIGHT) == STRAIGHT.max_extension_mm
 
 
 def test_every_reason_has_a_sentence() -> None:
@@ -84,8 +76,7 @@ def test_every_reason_has_a_sentence() -> None:
 
 def test_every_candidate_is_accepted_or_counted(lung: Lung) -> None:
     found = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
-    stops = len(insertion_stops(TUBES))
-    a_turn = stops * (stops + 1) // 2 - 1
+    a_turn = shapes_of(TUBES).count
     assert 3 * 12 * a_turn <= found.candidates <= 3 * 24 * a_turn and found.candidates % a_turn == 0
     assert found.count + sum(found.refused.values()) == found.candidates
     assert found.count > 50
@@ -101,16 +92,15 @@ def test_each_is_what_the_judge_says(lung: Lung) -> None:
     found = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=12)
     validator = DeploymentValidator(lung, TUBES, MARGINS, with_fissures=True)
     for n in np.random.default_rng(0).choice(found.count, 60, replace=False):
-        one = validator.validate(
-            FRAMES[found.site[n]], found.rotation_rad[n], found.outer_mm[n], found.inner_mm[n]
-        )
+        inserted = [found.outer_mm[n], found.inner_mm[n]]
+        one = validator.validate(FRAMES[found.site[n]], found.rotation_rad[n], inserted)
         assert isinstance(one, Deployment)
         assert np.allclose(one.lps_from_tip[:3, 3], found.positions[n], atol=1e-9)
         assert np.allclose(one.lps_from_tip[:3, 2], found.tangents[n], atol=1e-9)
         assert one.branch == found.branch[n] == 0
         assert one.exit_mm == pytest.approx(found.exit_mm[n], abs=2e-3)
         assert one.wall_angle_rad == pytest.approx(found.wall_angle_rad[n], abs=1e-2)
-        assert one.lateral_sweep_mm == 0.0
+        assert one.lateral_sweep_mm == pytest.approx(shapes_of(TUBES).lateral_sweep_mm[found.shape[n]])
 
 
 def test_without_fissures_as_obstacles_there_are_more(lung: Lung) -> None:
@@ -179,4 +169,4 @@ def test_straight_tubes_leave_along_the_axis_of_the_scope(lung: Lung) -> None:
 def test_impossible_insertions(lung: Lung, outer: float, inner: float) -> None:
     validator = DeploymentValidator(lung, TUBES, MARGINS, with_fissures=False)
     with pytest.raises(SettingsError, match="insertions"):
-        validator.validate(pose([-3, 0, -15], [0, 0, 1]), 0.0, outer, inner)
+        validator.validate(pose([-3, 0, -15], [0, 0, 1]), 0.0, [outer, inner])

@@ -16,7 +16,7 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.typed import Float
 from stages.tube import Equilibrium, TubeMechanics
 from stages.tube.device import BentPiece, ConcentricTubes, Tube
-from stages.tube.validation import centreline
+from tests.stages.tube.closed_form import centreline
 
 NU = 0.3
 CURVED_MM = 40.0

@@ -1,4 +1,4 @@
-"""Shapes placed in a patient: as the enumeration of today's design, and as each shape by itself."""
+"""Shapes placed in a patient: as each shape by itself."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import pytest
 
 from anatomy.lung import Lung
 from stages.tube import (
-    PlacedShapes,
+    Deployments,
     ShapeGrid,
     ShapeLimits,
+    SiteEnumerator,
     enumerate_deployments,
     kernels,
-    place_shapes,
-    tracking_length_mm,
     tree_of_shapes,
     tube_shapes,
 )
@@ -34,52 +33,13 @@ def lung() -> Lung:
     return scene()
 
 
-def placed(lung: Lung, shapes: TubeShapes, tolerance_mm: float) -> PlacedShapes:
-    return place_shapes(
-        lung,
-        shapes,
-        MARGINS,
-        FRAMES,
-        min_wall_angle_rad=math.radians(TUBES.min_wall_angle_deg),
-        max_wall_run_mm=TUBES.max_wall_run_mm,
-        with_fissures=True,
-        rotations=ROTATIONS,
-        tree=tree_of_shapes(shapes, tolerance_mm=tolerance_mm),
-    )
-
-
-def test_todays_design_as_today(lung: Lung) -> None:
-    shapes = tube_shapes(
-        (TUBES.inner, TUBES.outer),
-        ShapeLimits(
-            max_extension_mm=tracking_length_mm(TUBES), max_lateral_sweep_mm=TUBES.max_lateral_sweep_mm
-        ),
-    )
-    found = placed(lung, shapes, 0.1)
-    today = enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, rotations=ROTATIONS)
-
-    def key(site: int, rotation: float, inner: float, outer: float) -> tuple[float, ...]:
-        return site, round(rotation, 6), round(inner, 6), round(outer, 6)
-
-    wanted = {
-        key(*values): row
-        for row, values in enumerate(
-            zip(today.site, today.rotation_rad, today.inner_mm, today.outer_mm, strict=True)
-        )
-        if math.isclose(math.remainder(values[1], 2.0 * math.pi / ROTATIONS), 0.0, abs_tol=1e-9)
-    }
-    ours = {
-        key(site, turn, *shapes.insertions_mm[shape]): row
-        for row, (site, turn, shape) in enumerate(
-            zip(found.site, found.rotation_rad, found.shape, strict=True)
-        )
-    }
-    assert len(wanted) > 100 and ours.keys() == wanted.keys()
-    rows = [ours[each] for each in wanted], list(wanted.values())
-    for name in ("branch", "exit_mm", "wall_angle_rad", "wall_run_mm", "positions", "tangents"):
-        one, other = getattr(found, name)[rows[0]], getattr(today, name)[rows[1]]
-        assert one == pytest.approx(other, abs=1e-9), name
-    assert sum(found.refused.values()) + found.count == found.candidates
+def placed(lung: Lung, shapes: TubeShapes, tolerance_mm: float) -> Deployments:
+    tree = tree_of_shapes(shapes, tolerance_mm=tolerance_mm)
+    enumerator = SiteEnumerator(
+        lung, TUBES, MARGINS, with_fissures=True, rotations=ROTATIONS,
+        at_stops=(np.arange(shapes.count), shapes, tree),
+    )  # fmt: skip
+    return enumerate_deployments(lung, TUBES, MARGINS, TIPS, with_fissures=True, enumerator=enumerator)
 
 
 def follow_alone(lung: Lung, shapes: TubeShapes, shape: int, frame: np.ndarray, clearance: float) -> bool:
@@ -138,7 +98,6 @@ def test_tree_shares_more_with_more_tolerance() -> None:
     assert len(loose.depth) < len(exact.depth)
     for tree in (exact, loose):
         assert sorted(tree.shapes) == list(range(shapes.count))
-        assert tree.beneath[tree.depth == 1].sum() == shapes.count
         assert tree.skip[-1] == len(tree.depth) and (tree.skip > np.arange(len(tree.depth))).all()
         ends = tree.first_shape[1:] > tree.first_shape[:-1]
         for node in np.flatnonzero(ends):

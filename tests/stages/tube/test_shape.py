@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages.tube.validation import centreline
+from stages.tube import deployed, design_arrays, points_on_arcs
+from tests.stages.tube.closed_form import centreline
 from tests.stages.tube.pairs import thin_pair
 
 TUBES = thin_pair(40.0)
@@ -41,6 +42,18 @@ def by_steps(frame: np.ndarray, rotation: float, outer: float, inner: float, ste
     return np.array(points)
 
 
+@given(inner=st.floats(0.5, 60.0), share=st.floats(0.0, 1.0))
+def test_the_mechanics_give_the_closed_form(inner: float, share: float) -> None:
+    design, frame = design_arrays(TUBES), scope_tip(2)
+    made = deployed(design, [inner, share * inner], [0.0, 0.0])
+    sweeps = inner > 40.0
+    if made is not None:
+        arcs, at = made.arcs[: made.number[0]], np.linspace(0.0, inner, 50)
+        expected = centreline(TUBES, frame, 0.7, share * inner, inner, at)
+        assert np.abs(points_on_arcs(arcs, frame, 0.7, at) - expected).max() < 1e-9
+    assert made is not None or sweeps
+
+
 @given(
     seed=st.integers(0, 1000),
     rotation=st.floats(-7.0, 7.0),
@@ -62,23 +75,3 @@ def test_ends() -> None:
     aside = (1 - math.cos(0.5)) / 0.025
     assert np.allclose(local, [aside * math.cos(0.4), aside * math.sin(0.4), math.sin(0.5) / 0.025])
     assert centreline(TUBES, frame, 0.4, 0.0, 20.0, 7.0).shape == (1, 3)
-
-
-@given(insertions=st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 1.0)), min_size=1, max_size=4))
-def test_arcs_lead_along_the_centreline(insertions: list[tuple[float, float]]) -> None:
-    inner = np.array([each for each, _share in insertions])
-    outer = inner * [share for _each, share in insertions]
-    arcs = TUBES.arcs(outer, inner)
-    assert arcs.length_mm.shape == (len(inner), 4)
-    assert np.allclose(arcs.length_mm.sum(axis=1), inner) and (arcs.length_mm >= 0.0).all()
-    assert np.allclose(arcs.length_mm[:, :2].sum(axis=1), outer)
-    for lengths, out, whole in zip(arcs.length_mm, outer, inner, strict=True):
-        at, heading = np.zeros(2), 0.0
-        for length, curvature in zip(lengths, arcs.curvature_per_mm, strict=True):
-            half = 0.5 * curvature * length
-            at = at + length * np.sinc(half / np.pi) * np.array(
-                [np.sin(heading + half), np.cos(heading + half)]
-            )
-            heading += 2.0 * half
-        end = centreline(TUBES, np.eye(4), 0.0, out, whole, whole)[0]
-        assert np.allclose(end, [at[0], 0.0, at[1]], atol=1e-9)

@@ -33,9 +33,9 @@ from stages.tube import (
     tube_shapes,
 )
 from stages.tube import shapes as shapes_module
-from stages.tube.kernels.planar import tube_pieces
 from stages.tube.sequences import BEND_RAD
 from stages.tube.shapes import SNAPS, STRAINS, SWEEPS, TubeShapes
+from tests.stages.tube.closed_form import pieces
 from tests.stages.tube.pairs import WIDE
 
 ANY = ShapeLimits(max_lateral_sweep_mm=20.0, max_strain=0.1)
@@ -87,11 +87,10 @@ def tip_of(arcs: np.ndarray) -> np.ndarray:
 
 class TestTodaysDesign:
     def test_arcs_are_those_of_the_closed_form(self, planar: TubeShapes) -> None:
-        constants = tube_constants(WIDE, Margins())
         for shape, (inner, outer) in enumerate(planar.insertions_mm):
             wanted = [
                 (end - begin, kappa, radius)
-                for begin, end, kappa, radius in tube_pieces(constants, outer, inner)
+                for begin, end, kappa, radius in pieces(WIDE, outer, inner)
                 if end > begin + ROUNDING
             ]
             found = planar.arcs_of(shape)

@@ -9,18 +9,13 @@ import math
 
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, kernel
+from anatomy.kernels.compiling import kernel
 from lungaccess.planning.coupled.kernels.candidate import why_refused
-from lungaccess.planning.coupled.kernels.tubes_cost import (
-    bent_towards,
-    cost_beyond,
-    cost_in_tissue,
-    pieces_of,
-)
-from stages.tube.kernels import ACCEPTED, CLOSE_MM, LEFT_AT, N_TRACE, WALL_RUN, aim, aim_shape, take_member
+from lungaccess.planning.coupled.kernels.tubes_cost import bent_towards, cost_beyond, cost_in_tissue
+from stages.tube.kernels import ACCEPTED, LEFT_AT, N_TRACE, WALL_RUN, aim_shape, take_member
 
-ROTATION, OUTER, INNER, COST, JOINTS = range(5)
-"""Columns of what is found; tubes that are not planar have all their joints from JOINTS on."""
+ROTATION, COST, JOINTS = range(3)
+"""Columns of what is found; the joints of the tubes begin at the last."""
 MISSES = -1
 """Stands for a reason where no insertions bring the tip to the target."""
 SPOILT_WAY = -3
@@ -29,22 +24,6 @@ TIP_OFF_MM = 5e-7
 """So far from the target may a tip be after its whole way was followed: half of what a proof allows."""
 NOT_TRIED = -2
 """Stands for a reason where the scope cannot take the tip, or enough were found before."""
-
-
-@inner_kernel
-def _aimed(constants, design, near, shape, shapes, n, base, target, outer, inner, joints):
-    """Return ACCEPTED or why the tubes miss the target, rotation and insertions; fill `joints`."""
-    if design is None:
-        rotation, outer, inner, miss = aim(constants, base, target, outer, inner)
-        return ACCEPTED if miss <= CLOSE_MM else MISSES, rotation, outer, inner
-    take_member(near, shapes, n)
-    rotation, miss, kept = aim_shape(design, near, shape, base, target)
-    if not miss <= TIP_OFF_MM:
-        return MISSES, rotation, outer, inner
-    if not kept:
-        return SPOILT_WAY, rotation, outer, inner
-    joints[:] = shape.joints
-    return ACCEPTED, rotation, shape.joints[design.lengths.shape[0] - 1], shape.joints[0]
 
 
 @kernel(nogil=True)
@@ -57,8 +36,6 @@ def aim_tubes(
     scope_poses,
     allowed,
     pose_of,
-    outers,
-    inners,
     shapes,
     targets,
     enough,
@@ -80,16 +57,14 @@ def aim_tubes(
         Which of these poses the scope can take.
     pose_of : (N,) int64
         The row of `scope_poses` of each attempt.
-    outers, inners : (N,) float64
-        Insertions from which each begins, mm.
     shapes : ManyShapes
-        The shapes from which they begin instead where tubes are not planar.
+        The shapes from which they begin.
     targets : (K, 3) float64
         Where they are to end from each pose.
     enough : int
         So many deployments end the attempts.
     found : (N, JOINTS + 2 n) float64
-        Receives rotation, insertions and estimated cost; the cost is infinite where the tubes are refused.
+        Receives rotation, estimated cost and joints; the cost is infinite where the tubes are refused.
     why : (N,) int64
         Receives ACCEPTED, MISSES, SPOILT_WAY, NOT_TRIED, or the reason of `stages.tube.kernels`.
     """
@@ -103,28 +78,21 @@ def aim_tubes(
         why[n] = NOT_TRIED
         if enough <= 0 or not allowed[pose_of[n]]:
             continue
-        why[n], rotation, outer, inner = _aimed(
-            constants, design, near, shape, shapes, n, base, target, outers[n], inners[n], found[n, JOINTS:]
-        )
-        if why[n] != ACCEPTED:
+        take_member(near, shapes, n)
+        rotation, miss, kept = aim_shape(design, near, shape, base, target)
+        if not (miss <= TIP_OFF_MM and kept):
+            why[n] = SPOILT_WAY if miss <= TIP_OFF_MM else MISSES
             continue
         normal = bent_towards(base, rotation)
-        found[n, ROTATION] = rotation
-        found[n, OUTER] = outer
-        found[n, INNER] = inner
-        towards = np.array(normal)
-        reason = why_refused(
-            environment, constants, design, shape, base[:6], towards, outer, inner, trace, tip
-        )
-        why[n] = reason
-        if reason != ACCEPTED:
+        found[n, ROTATION], found[n, JOINTS:] = rotation, shape.joints
+        why[n] = why_refused(environment, constants, shape, base[:6], np.array(normal), trace, tip)
+        if why[n] != ACCEPTED:
             continue
         left_at = trace[LEFT_AT]
         behind, arcs = left_at + trace[WALL_RUN], shape.arcs[: shape.number[0]]
-        pieces = pieces_of(constants, outer, inner, arcs)
-        cost = cost_beyond(obstacles, weights, base, normal, pieces, left_at, False)
+        cost = cost_beyond(obstacles, weights, base, normal, arcs, left_at, False)
         if map_weights.map_integral > 0.0 or map_weights.voxel_sum > 0.0:
-            cost += cost_beyond(obstacles, map_weights, base, normal, pieces, behind, False)
-        cost += cost_in_tissue(obstacles, of_tubes, constants, base, normal, outer, inner, arcs, behind)
+            cost += cost_beyond(obstacles, map_weights, base, normal, arcs, behind, False)
+        cost += cost_in_tissue(obstacles, of_tubes, base, normal, arcs, behind)
         found[n, COST] = cost
         enough -= 1

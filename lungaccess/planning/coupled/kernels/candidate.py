@@ -1,13 +1,12 @@
 """Compiled kernels of the coupled search: they validate and cost a choice of scope pose, tubes and needle.
 
 `tube` is the tuple (environment, constants, design, near, shape): the first two are those of
-`stages.tube.kernels`.  The others count for tubes that are not planar: their `DesignArrays`, None for planar
-tubes, a proved shape near that of the choice, and a shape that is filled with that of the choice.
-`needle` is a `lungaccess.plans.evaluator.NeedleArrays`.  A choice has two parts.  `x` holds a row of
-`scope_poses`, the rotation in rad, and the insertions of the tubes in mm, the outermost first; then, of tubes
-that are not planar, how far the rear end of each is turned beside that rotation, in rad.  `vias` are points
-(LPS mm) through which single arcs lead from the tube to the target.  A row of `scope_poses` (9,) is a scope
-tip: point, unit tangent, and the unit vector across the tangent from which the rotation counts.
+`stages.tube.kernels`; then follow the `DesignArrays`, a proved shape near that of the choice, and a shape
+that is filled with that of the choice.  `needle` is a `lungaccess.plans.evaluator.NeedleArrays`.  A choice
+has two parts.  `x` holds a row of `scope_poses`, the rotation in rad, and the insertions of the tubes in mm,
+the outermost first; then how far the rear end of each is turned beside that rotation, in rad.  `vias` are
+points (LPS mm) through which single arcs lead from the tube to the target.  A row of `scope_poses` (9,) is a
+scope tip: point, unit tangent, and the unit vector across the tangent from which the rotation counts.
 """
 
 from __future__ import annotations
@@ -24,24 +23,19 @@ from stages.tube.kernels import (
     ACCEPTED,
     BRANCH,
     LEFT_AT,
-    MAX_EXTENSION,
-    MAX_PROTRUSION,
     WALL_RUN,
     near_shape,
     required_beside,
     take_over,
     tip_of_arcs,
-    tip_pose,
     validate_arcs,
-    validate_deployment,
     whole_way,
 )
 
 SCOPE_POSE = 0
 ROTATION = 1
-OUTER = 2
-INNER = 3
-"""Places of the numbers of a choice of planar tubes in `x`."""
+INSERTED = 2
+"""Places of the numbers of a choice in `x`; the insertions of all tubes begin at the last."""
 
 ROUNDING = 1e-9
 """Share of each limit that stays unused, so that rounding does not carry a plan beyond the limit."""
@@ -110,8 +104,8 @@ def _shape_nearby(design, near, shape, x):
     n = design.lengths.shape[0]
     same = True
     for i in range(n):
-        shape.joints[i] = x[OUTER + n - 1 - i]
-        shape.joints[n + i] = x[OUTER + 2 * n - 1 - i]
+        shape.joints[i] = x[INSERTED + n - 1 - i]
+        shape.joints[n + i] = x[INSERTED + 2 * n - 1 - i]
         same = same and shape.joints[i] == near.joints[i] and shape.joints[n + i] == near.joints[n + i]
     if same:
         take_over(shape, near)
@@ -120,36 +114,10 @@ def _shape_nearby(design, near, shape, x):
 
 
 @inner_kernel
-def _tip(constants, design, near, shape, base, normal, x):
-    """Return whether a choice has a tip, whether the way to it is that of the shape nearby, and its pose."""
-    if design is None:
-        outer, inner = x[OUTER], x[INNER]
-        possible = 0.0 <= outer <= inner <= constants[MAX_EXTENSION]
-        possible = possible and inner - outer <= constants[MAX_PROTRUSION]
-        return possible, True, tip_pose(constants, base, normal, outer, inner)
-    found, followed = _shape_nearby(design, near, shape, x)
-    return found, followed, tip_of_arcs(base, normal, shape.arcs[: shape.number[0]])
-
-
-@inner_kernel
-def _follow_way(design, shape):
-    """Fill a shape by its whole way; tell whether that keeps all limits, as the closed form always does."""
-    if design is None:
-        return True
-    return whole_way(design, shape)
-
-
-@inner_kernel
-def why_refused(environment, constants, design, shape, base, towards, outer, inner, trace, tip):
-    """Return ACCEPTED, or why tubes from a scope tip `base` (6,) are refused; fill `trace` and `tip`.
-
-    The others are those of `validate_deployment`; `shape` counts instead of the insertions where there is a
-    design.
-    """
-    if design is None:
-        return validate_deployment(environment, constants, base, towards, outer, inner, trace, tip)
-    beside, arcs = required_beside(shape), shape.arcs[: shape.number[0]]
-    return validate_arcs(environment, constants, base, towards, arcs, beside, trace, tip)
+def why_refused(environment, constants, shape, base, towards, trace, tip):
+    """Return ACCEPTED, or why a shape from a scope tip `base` (6,) is refused; see `validate_arcs`."""
+    arcs = shape.arcs[: shape.number[0]]
+    return validate_arcs(environment, constants, base, towards, arcs, required_beside(shape), trace, tip)
 
 
 @inner_kernel
@@ -157,8 +125,8 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
     """Return the cost of a choice if it is below `cost_limit` and all of it is proved; else infinity.
 
     The fast tests come first: limits and cost of the needle, the deployment and its cost, the needle's
-    clearance.  Of tubes that are not planar the tip is that of a shape reached from the one nearby; only
-    where it passes those of the needle, the whole way to it is followed.
+    clearance.  The tip is that of a shape reached from the one nearby; only where it passes those of the
+    needle, the whole way to it is followed.
     """
     environment, constants, design, near, shape = tube
     row = int(x[SCOPE_POSE])
@@ -166,19 +134,17 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
         return math.inf
     base = scope_poses[row]
     normal = bent_towards(base, x[ROTATION])
-    found, followed, pose = _tip(constants, design, near, shape, base, normal, x)
+    found, followed = _shape_nearby(design, near, shape, x)
     if not found:
         return math.inf
+    pose = tip_of_arcs(base, normal, shape.arcs[: shape.number[0]])
     cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
     if cost == math.inf:
         return math.inf
     towards = np.array(normal)
-    if not followed and not _follow_way(design, shape):
+    if not followed and not whole_way(design, shape):
         return math.inf
-    reason = why_refused(
-        environment, constants, design, shape, base[:6], towards, x[OUTER], x[INNER], trace, tip
-    )
-    if reason != ACCEPTED:
+    if why_refused(environment, constants, shape, base[:6], towards, trace, tip) != ACCEPTED:
         return math.inf
     if not followed:
         pose = (tip[0], tip[1], tip[2], tip[3], tip[4], tip[5])
@@ -188,11 +154,8 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
     cost += cost_in_tissue(
         needle.obstacles,
         needle.of_tubes,
-        constants,
         base,
         normal,
-        x[OUTER],
-        x[INNER],
         shape.arcs[: shape.number[0]],
         trace[LEFT_AT] + trace[WALL_RUN],
     )

@@ -16,7 +16,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.random import uniform
-from lungaccess.planning.coupled.kernels.candidate import INNER, OUTER, ROTATION, SCOPE_POSE, validated_cost
+from lungaccess.planning.coupled.kernels.candidate import INSERTED, ROTATION, SCOPE_POSE, validated_cost
 from stages.tube.kernels import N_TRACE, take_member, take_over
 
 MAX_VIAS = 5
@@ -36,7 +36,7 @@ TUBES_ONLY = 0.3
 NEEDLE_ONLY = 0.6
 """Below the first share of the other changes only the tubes are changed, between both only the needle."""
 OTHER_SHAPE = 0.05
-"""Of so many samples of tubes that are not planar the shape is another one, which takes ten times as long."""
+"""Of so many samples the shape of tubes that twist each other is another one, which takes long."""
 EACH_SHARE = 0.6
 """The probability with which each number is changed, so that most changes leave some numbers as they are."""
 
@@ -64,28 +64,19 @@ def _add_via(vias, count, start, target, spread, state):
 
 @inner_kernel
 def _vary_tubes(design, x, spread, state):
-    """Change rotation and insertions, and of tubes that are not planar how they are turned beside it."""
-    insertions = 2 if design is None else design.lengths.shape[0]
+    """Change rotation and insertions, and how the tubes are turned beside it where that changes the shape."""
+    n = design.lengths.shape[0]
     if uniform(state) < EACH_SHARE:
         x[ROTATION] += ROTATION_SPREAD_RAD * spread * _normal(state)
-    for m in range(OUTER, OUTER + insertions):
+    for m in range(INSERTED, INSERTED + n):
         if uniform(state) < EACH_SHARE:
             x[m] += INSERTION_SPREAD_MM * spread * _normal(state)
-    x[OUTER] = max(x[OUTER], 0.0)
-    for m in range(OUTER + insertions - 2, OUTER - 1, -1):
+    x[INSERTED] = max(x[INSERTED], 0.0)
+    for m in range(INSERTED + n - 2, INSERTED - 1, -1):
         x[m] = min(x[m], x[m + 1])
-    _vary_relative_rotations(design, x, spread, state)
-
-
-@inner_kernel
-def _vary_relative_rotations(design, x, spread, state):
-    """Change how tubes that are not planar are turned one against the other."""
-    if design is None:
-        return
-    n = design.lengths.shape[0]
     for i in range(n):
         if design.turned[i] and uniform(state) < EACH_SHARE:
-            x[OUTER + 2 * n - 1 - i] += RELATIVE_SPREAD_RAD * spread * _normal(state)
+            x[INSERTED + 2 * n - 1 - i] += RELATIVE_SPREAD_RAD * spread * _normal(state)
 
 
 @merged_kernel
@@ -117,8 +108,8 @@ def _vary(design, x, vias, count, start, target, state):
 def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, state):
     """Improve a choice by a stochastic local search: vary it at random and keep what is cheaper.
 
-    A choice is kept only if it is proved: the tubes by `validate_deployment`, or by their whole way and
-    `validate_arcs`, the needle by `blocker_on_arc`.  The shape nearby in `tube` becomes that of the choice.
+    A choice is kept only if it is proved: the tubes by their whole way and `validate_arcs`, the needle by
+    `blocker_on_arc`.  The shape nearby in `tube` becomes that of the choice.
 
     Parameters
     ----------
@@ -173,25 +164,21 @@ def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, s
 
 
 @inner_kernel
-def _draw(design, near, shapes, row, numbers, spreads, x, state):
-    """Draw a choice near a deployment with rotation and insertions `numbers`, and near its shape."""
-    x[ROTATION] = numbers[0] + spreads[0] * (2.0 * uniform(state) - 1.0)
-    if design is None:
-        x[OUTER] = max(numbers[1] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
-        x[INNER] = max(numbers[2] + spreads[1] * (2.0 * uniform(state) - 1.0), x[OUTER])
-        return
+def _draw(design, near, shapes, row, rotation, spreads, x, state):
+    """Draw a choice near a deployment with a rotation, and near its shape."""
+    x[ROTATION] = rotation + spreads[0] * (2.0 * uniform(state) - 1.0)
     n = design.lengths.shape[0]
     take_member(near, shapes, row)
     for m in range(2 * n):
-        x[OUTER + m] = near.joints[n - 1 - m if m < n else 3 * n - 1 - m]
-    if uniform(state) >= OTHER_SHAPE:
+        x[INSERTED + m] = near.joints[n - 1 - m if m < n else 3 * n - 1 - m]
+    if design.turned.any() and uniform(state) >= OTHER_SHAPE:
         return
     for m in range(n):
-        x[OUTER + m] = max(x[OUTER + m] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
+        x[INSERTED + m] = max(x[INSERTED + m] + spreads[1] * (2.0 * uniform(state) - 1.0), 0.0)
         if m > 0:
-            x[OUTER + m] = max(x[OUTER + m], x[OUTER + m - 1])
+            x[INSERTED + m] = max(x[INSERTED + m], x[INSERTED + m - 1])
         if design.turned[n - 1 - m]:
-            x[OUTER + n + m] += spreads[0] * (2.0 * uniform(state) - 1.0)
+            x[INSERTED + n + m] += spreads[0] * (2.0 * uniform(state) - 1.0)
 
 
 @kernel(nogil=True)
@@ -200,7 +187,7 @@ def sample_deployments(
     needle,
     scope_poses,
     pose_of,
-    numbers,
+    rotations,
     shapes,
     spreads,
     target,
@@ -218,10 +205,10 @@ def sample_deployments(
         Poses that the scope can take.
     pose_of : (N,) int64
         The row of `scope_poses` of each deployment.
-    numbers : (N, 3) float64
-        The deployments: rotation in rad, insertions of outer and inner tube in mm.
+    rotations : (N,) float64
+        Rotation of each, rad.
     shapes : ManyShapes
-        Those of deployments that are not planar.
+        The shape of each.
     spreads : (2,) float64
         The largest change of rotations in rad and of insertions in mm.
     target : tuple of 3 floats
@@ -250,7 +237,7 @@ def sample_deployments(
     for _ in range(tries):
         n = min(int(uniform(state) * pose_of.shape[0]), pose_of.shape[0] - 1)
         x[SCOPE_POSE] = pose_of[n]
-        _draw(design, near, shapes, n, numbers[n], spreads, x, state)
+        _draw(design, near, shapes, n, rotations[n], spreads, x, state)
         cost = validated_cost(
             tube, needle, scope_poses, allowed, x, vias, none, target, cost_limit, trace, tip
         )

@@ -15,14 +15,14 @@ from anatomy.base.records import frozen_record
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import Obstacles
-from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator
+from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator, path_of
 from lungaccess.planning.coupled.search.base import SearchInParts, Step
 from lungaccess.planning.coupled.search.random_placement import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath
-from stages.tube import Deployment
+from stages.tube import Deployment, design_arrays, shape_or_reason
 
 PHASE = "reference"
 FOUND = "found"
@@ -84,7 +84,6 @@ class ReferenceSearch(SearchInParts):
         rrt_time_s: float | None = None,
         obstacles: Obstacles | None = None,
     ) -> None:
-        task.system.tubes.require_planar("Algorithm 1 of [Kuntz2015]")
         if not (rrt_iterations if rrt_time_s is None else rrt_time_s) > 0:
             raise SettingsError("The RRT has no budget", expected="rrt_iterations or rrt_time_s above 0")
         if task.needle_planner:
@@ -99,7 +98,7 @@ class ReferenceSearch(SearchInParts):
         super().__init__(self._evaluator.blocked)
         self.obstacles = obstacles or obstacles_for(task)
         self._budget = (rrt_iterations, None) if rrt_time_s is None else (None, rrt_time_s)
-        self._tubes = TubeValidator(system, self.obstacles)
+        self._tubes, self._design = TubeValidator(system, self.obstacles), design_arrays(system.tubes)
         needle = system.require_needle("Algorithm 1 of [Kuntz2015]")
         required_mm = needle.radius_mm + system.margins.total_mm
         self._needle_rrt = NeedleRRT(needle, required_mm, self.obstacles)
@@ -121,15 +120,18 @@ class ReferenceSearch(SearchInParts):
     def _attempt(self, placement: Placement, began: float) -> Candidate | None:
         """Carry out lines 8 and 9 for a placement that has been drawn since `began`."""
         tip = placement.tip
-        shape = self._tubes.shape(
-            tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
-        )
-        reached = not self._rejects or self._evaluator.reaches(shape.frames()[-1])
+        frame, rotation = tip.lps_from_scope_tip, placement.rotation_rad
+        shape = shape_or_reason(self._design, placement.insertions_mm[::-1], placement.rotations_rad[::-1])
+        if isinstance(shape, str):
+            self._spend("placement", began)
+            self.counts[shape] += 1
+            return None
+        reached = not self._rejects or self._evaluator.reaches(path_of(frame, rotation, shape).frames()[-1])
         began = self._spend("placement", began)
         if not reached:
             self.counts[OUT_OF_WORKSPACE] += 1
             return None
-        deployment = self._tubes.validate(shape)
+        deployment = self._tubes.validate(frame, rotation, shape)
         began = self._spend("tubes", began)
         if isinstance(deployment, str):
             self.counts[deployment] += 1
@@ -154,8 +156,8 @@ class ReferenceSearch(SearchInParts):
     def _proved(self, found: Candidate) -> Candidate | None:
         """Return what was found with the tubes and the needle as the planner proves them."""
         began, own = time.thread_time(), found.deployment
-        deployment = self._evaluator.tubes.validate(
-            found.tip.lps_from_scope_tip, own.rotation_rad, own.outer_mm, own.inner_mm
+        deployment = self._evaluator.tubes.validate_shape(
+            found.tip.lps_from_scope_tip, own.rotation_rad, own.shape
         )
         stage = "tubes" if isinstance(deployment, str) else ""
         if not isinstance(deployment, str):

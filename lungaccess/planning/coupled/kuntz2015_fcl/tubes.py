@@ -18,7 +18,7 @@ from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import (
 )
 from lungaccess.problem.system import System
 from stages.needle import ArcPath, arc_transform
-from stages.tube import REASONS, Deployment, kernels, tube_constants
+from stages.tube import REASONS, Deployment, TubeShape, kernels, pieces_of_arcs
 
 NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
 """The meshes of these are one solid, so that the reason does not tell them apart."""
@@ -31,31 +31,16 @@ EXIT_SAMPLES = 51
 
 
 class TubeValidator:
-    """Validates deployments without sideways sweep, by the rules of `stages.tube` but none of its fields."""
+    """Validates shapes of the tubes by the rules of `stages.tube`, but none of its fields."""
 
     def __init__(self, system: System, obstacles: Obstacles) -> None:
         self._system = system
         self._obstacles = obstacles
-        constants = tube_constants(system.tubes, system.margins)
-        self._curvatures = (
-            float(constants[kernels.OVERLAP_CURVATURE]),
-            float(constants[kernels.INNER_CURVATURE]),
-        )
         self._mediastinal = obstacles.lung.tree.mediastinal
 
-    def shape(
-        self, lps_from_scope_tip: Float, rotation_rad: float, outer_mm: float, inner_mm: float
-    ) -> ArcPath:
-        """Return the centreline: one arc inside the outer tube, one beyond it, in one plane."""
-        overlap, free = self._curvatures
-        arcs = np.array([[outer_mm, rotation_rad, overlap], [inner_mm - outer_mm, 0.0, free]])
-        return ArcPath(lps_from_start=lps_from_scope_tip, arcs=arcs)
-
-    def validate(self, shape: ArcPath) -> Deployment | str:
-        """Return the deployment of a centreline, or the reason why it is refused."""
-        (outer_mm, rotation, _), (protrusion, _, _) = shape.arcs
-        if protrusion > self._system.tubes.max_inner_protrusion_mm:
-            return REASONS[kernels.PROTRUDES]
+    def validate(self, lps_from_scope_tip: Float, rotation_rad: float, made: TubeShape) -> Deployment | str:
+        """Return the deployment of a shape from a scope tip, or the reason why it is refused."""
+        shape = path_of(lps_from_scope_tip, rotation_rad, made)
         points, at_mm = shape.sample(LABEL_STEP_MM)
         labels = labels_at(self._obstacles.lung, points)
         first = self._first_outside(points, at_mm, (labels & LUMEN) != 0)
@@ -71,23 +56,24 @@ class TubeValidator:
         angle = self._wall_angle_rad(shape, exit_mm)
         if angle < math.radians(self._system.tubes.min_wall_angle_deg):
             return REASONS[kernels.FLAT_EXIT]
-        contact_mm = self._contact_mm(points[:first], at_mm[:first], float(outer_mm))
-        refused = self._clear(shape, contact_mm, exit_mm, branch)
+        contact_mm = self._contact_mm(points[:first], at_mm[:first], made)
+        refused = self._clear(shape, made, contact_mm, exit_mm, branch)
         if refused:
             return refused
-        wall_run_mm = self._wall_run_mm(shape, exit_mm)
+        wall_run_mm = self._wall_run_mm(shape, made, exit_mm)
         if wall_run_mm > self._system.tubes.max_wall_run_mm:
             return REASONS[kernels.LONG_WALL_RUN]
         return Deployment(
-            rotation_rad=float(rotation),
-            outer_mm=float(outer_mm),
-            inner_mm=float(outer_mm + protrusion),
-            lps_from_tip=shape.frames()[-1],
+            rotation_rad=rotation_rad,
+            outer_mm=float(made.insertions_mm[-1]),
+            inner_mm=float(made.insertions_mm[0]),
+            lps_from_tip=tip_of(shape, made),
             branch=branch,
             exit_mm=exit_mm,
             wall_angle_rad=angle,
             wall_run_mm=wall_run_mm,
-            lateral_sweep_mm=0.0,
+            lateral_sweep_mm=made.lateral_sweep_mm,
+            shape=made,
         )
 
     def _first_outside(self, points: Float, at_mm: Float, inside: Bool) -> int:
@@ -129,35 +115,33 @@ class TubeValidator:
             return REASONS[kernels.NEAR_OTHER_BRANCH]
         return ""
 
-    def _wall_run_mm(self, shape: ArcPath, exit_mm: float) -> float:
+    def _wall_run_mm(self, shape: ArcPath, made: TubeShape, exit_mm: float) -> float:
         """Return how much of the tube beyond the exit is nearer to an airway than its radius, if not less."""
-        tubes, outer_mm = self._system.tubes, float(shape.arcs[0, 0])
-        run, at = 0.0, exit_mm
+        run, at, pieces = 0.0, exit_mm, pieces_of(made)
         while at < shape.length_mm:
-            in_outer = at < outer_mm
-            radius = tubes.outermost.radius_mm if in_outer else tubes.inner.radius_mm
-            end = outer_mm if in_outer else shape.length_mm
+            _begin, end, radius = next((piece for piece in pieces if at < piece[1]), pieces[-1])
             beyond = self._obstacles.airways.distance_mm(frame_at(shape, at)[:3, 3]) - radius
-            step = min(max(abs(beyond), kernels.RUN_STEP_MM), end - at)
+            step = min(
+                max(abs(beyond), kernels.RUN_STEP_MM),
+                shape.length_mm - at if end >= shape.length_mm else end - at,
+            )
             run += step if beyond < kernels.RUN_STEP_MM else 0.0
             at += step
         return run
 
-    def _contact_mm(self, points: Float, at_mm: Float, outer_mm: float) -> float:
+    def _contact_mm(self, points: Float, at_mm: Float, made: TubeShape) -> float:
         """Return the arc length from which on the tube is never clear of the wall, up to its exit."""
-        tubes = self._system.tubes
+        radii, ends = made.arcs[:, kernels.RADIUS], np.cumsum(made.arcs[:, kernels.LENGTH])
         for n in range(len(points) - 1, 0, -SAMPLES_PER_CONTACT):
-            radius = tubes.outermost.radius_mm if at_mm[n] <= outer_mm else tubes.inner.radius_mm
+            radius = radii[min(int(np.searchsorted(ends, at_mm[n])), len(radii) - 1)]
             if self._obstacles.lumen.depth_mm(points[n]) >= radius:
                 return float(at_mm[n])
         return 0.0
 
-    def _clear(self, shape: ArcPath, contact_mm: float, exit_mm: float, branch: int) -> str:
+    def _clear(self, shape: ArcPath, made: TubeShape, contact_mm: float, exit_mm: float, branch: int) -> str:
         """Return what the tubes touch from their contact with the wall on, or an empty text."""
-        tubes, margin = self._system.tubes, self._system.margins.total_mm
-        outer_mm, end_mm = float(shape.arcs[0, 0]), shape.length_mm
-        pieces = ((0.0, outer_mm, tubes.outermost.radius_mm), (outer_mm, end_mm, tubes.inner.radius_mm))
-        for begin, end, radius in pieces:
+        margin = self._system.margins.total_mm + made.required_beside_mm
+        for begin, end, radius in pieces_of(made):
             distance = radius + margin + SAGITTA_MM
             if max(begin, contact_mm) < end:
                 line = line_between(shape, max(begin, contact_mm), end)
@@ -168,6 +152,23 @@ class TubeValidator:
                 if self._obstacles.other_airways(branch).is_near(line, distance):
                     return REASONS[kernels.NEAR_OTHER_BRANCH]
         return ""
+
+
+def path_of(lps_from_scope_tip: Float, rotation_rad: float, made: TubeShape) -> ArcPath:
+    """Return the centreline of a shape, all tubes turned by a rotation, from a scope tip."""
+    return ArcPath(lps_from_start=lps_from_scope_tip, arcs=pieces_of_arcs(made.arcs, rotation_rad))
+
+
+def pieces_of(made: TubeShape) -> list[tuple[float, float, float]]:
+    """Return begin and end in mm, and radius in mm, of each arc of a shape."""
+    lengths, radii = made.arcs[:, kernels.LENGTH], made.arcs[:, kernels.RADIUS]
+    ends = np.cumsum(lengths)
+    return list(zip((ends - lengths).tolist(), ends.tolist(), radii.tolist(), strict=True))
+
+
+def tip_of(path: ArcPath, made: TubeShape) -> Float:
+    """Return the frame `(4, 4)` at the end of a shape's path, carried there without turning."""
+    return np.asarray(path.frames()[-1] @ arc_transform(0.0, -float(made.arcs[-1, kernels.DIRECTION]), 0.0))
 
 
 def frame_at(path: ArcPath, at_mm: float) -> Float:

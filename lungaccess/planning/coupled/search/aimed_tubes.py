@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,10 +13,8 @@ from anatomy.structures import obstacle_bits
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.aimed_tubes import (
     COST,
-    INNER,
     JOINTS,
     MISSES,
-    OUTER,
     ROTATION,
     SPOILT_WAY,
     aim_tubes,
@@ -29,7 +26,6 @@ from lungaccess.problem.task import Task
 from stages.needle import ArcPath, Objective, Obstacles
 from stages.scope import ScopeTip
 from stages.tube import (
-    NO_SHAPES,
     REASONS,
     ConcentricTubes,
     Deployment,
@@ -38,7 +34,6 @@ from stages.tube import (
     copies,
     deployed,
     design_arrays,
-    insertion_stops,
     many_shapes,
     shape_arrays,
     shape_of_arrays,
@@ -52,57 +47,21 @@ TURN_RAD = math.pi / 12.0
 """The tubes are aimed from deployments that end near the target: as near as one of the same scope tip ends to
 every point that the tubes can come to.  Stops of turned tips are 4 mm apart, 2.8 mm in both insertions from
 the middle between them, and their rotations 30 degrees apart."""
-STARTS_MM = 8.0
-"""Spacing of the insertions from which the tubes are aimed from one pose: Newton's method goes as far."""
 SHAPES_TRIED = 60
-"""Shapes of tubes that are not planar from which they are aimed from one pose, half a millisecond each."""
+"""Shapes from which the tubes are aimed from one pose, half a millisecond each at most."""
 NO_WAY = "on their way to the target the tubes would snap, sweep tissue or be strained too much"
 NO_SOLUTION = "no insertions bring the tip of the tubes to the target"
 
 
-class AimStarts(NamedTuple):
-    """Deployments from which the tubes are aimed, N of them.
+def starts_of(atlas: Atlas, entries: Int) -> ManyShapes:
+    """Return the shapes of entries (N,) of an atlas, from which the tubes are aimed."""
+    return many_shapes(shapes_of(atlas.system.tubes), atlas.deployments.shape[entries])
 
-    Parameters
-    ----------
-    outer_mm, inner_mm : (N,) float64
-        Insertions of planar tubes.
-    shapes : ManyShapes
-        Those of tubes that are not planar.
-    """
 
-    outer_mm: Float
-    inner_mm: Float
-    shapes: ManyShapes
-
-    @classmethod
-    def of(cls, atlas: Atlas, entries: Int) -> AimStarts:
-        """Return entries (N,) of an atlas."""
-        made, tubes = atlas.deployments, atlas.system.tubes
-        shapes = NO_SHAPES if tubes.planar else many_shapes(shapes_of(tubes), made.shape[entries])
-        return cls(made.outer_mm[entries], made.inner_mm[entries], shapes)
-
-    @classmethod
-    def around(
-        cls, tubes: ConcentricTubes, insertions_mm: tuple[float, float], joints: Float, count: int
-    ) -> AimStarts | None:
-        """Return `count` times one deployment; None if tubes that are not planar refuse it.
-
-        Parameters
-        ----------
-        insertions_mm : tuple of 2 floats
-            Of outer and inner tube.
-        joints : (2 n,) float64
-            Insertions and rotations of tubes that are not planar, see `TubeShape`.
-        """
-        shapes, design = NO_SHAPES, design_arrays(tubes)
-        if design is not None:
-            made = deployed(design, *np.split(joints, 2))
-            if made is None:
-                return None
-            shapes = copies(made, count)
-        outer, inner = insertions_mm
-        return cls(np.full(count, outer), np.full(count, inner), shapes)
+def aim_starts(tubes: ConcentricTubes, joints: Float, count: int) -> ManyShapes | None:
+    """Return `count` times the shape of joints (2 n,), see `TubeShape`; None if the tubes refuse it."""
+    made = deployed(design_arrays(tubes), *np.split(joints, 2))
+    return None if made is None else copies(made, count)
 
 
 class TubeAiming:
@@ -128,7 +87,7 @@ class TubeAiming:
         self._weights = arrays._replace(map_integral=0.0, voxel_sum=0.0), of_map, of_tubes
 
     def aim(
-        self, ends: Float, tips: Float, allowed: Bool, row_of: Int, starts: AimStarts, enough: int = 0
+        self, ends: Float, tips: Float, allowed: Bool, row_of: Int, starts: ManyShapes, enough: int = 0
     ) -> tuple[Float, Int]:
         """Aim the tubes at a point from scope tips, or from each at its own.
 
@@ -141,7 +100,7 @@ class TubeAiming:
             Which of them the scope can take.
         row_of : (N,) int64
             The tip of each attempt.
-        starts : AimStarts
+        starts : ManyShapes
             From which each begins.
         enough : int
             So many deployments end the attempts; 0 to make all of them.
@@ -149,8 +108,7 @@ class TubeAiming:
         Returns
         -------
         found : (N, JOINTS + 2 n) float64
-            Rotation in rad, insertions in mm and estimated cost, which is infinite where there is nothing; of
-            tubes that are not planar all joints, too.
+            Rotation in rad, estimated cost, which is infinite where there is nothing, and all joints.
         why : (N,) int64
             0 for a deployment that ends at the point, MISSES, SPOILT_WAY, NOT_TRIED, or why tubes refuse it.
         """
@@ -160,7 +118,7 @@ class TubeAiming:
         tube = (self._environment, self._constants, self._design, *scratch)
         points = np.ascontiguousarray(np.broadcast_to(ends, (len(tips), 3)))
         aim_tubes(
-            tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), *starts,
+            tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), starts,
             points, enough or len(row_of), found, why,
         )  # fmt: skip
         return found, why
@@ -182,11 +140,10 @@ def nearest_of_each_tip(atlas: Atlas, entries: Int, away_mm: Float) -> Int:
     Where tubes are turned one against the other, it is the nearest of each tip and relative rotation.
     """
     ordered = entries[np.argsort(away_mm, kind="stable")]
-    kinds, tubes = atlas.deployments.site[ordered], atlas.system.tubes
-    if not tubes.planar:
-        shapes = shapes_of(tubes)
-        turns = np.unique(shapes.rotations_rad, axis=0, return_inverse=True)[1].ravel()
-        kinds = kinds * (turns.max() + 1) + turns[atlas.deployments.shape[ordered]]
+    shapes = shapes_of(atlas.system.tubes)
+    turns = np.unique(shapes.rotations_rad, axis=0, return_inverse=True)[1].ravel()
+    kinds = atlas.deployments.site[ordered] * (turns.max(initial=0) + 1)
+    kinds += turns[atlas.deployments.shape[ordered]]
     _kinds, first = np.unique(kinds, return_index=True)
     return ordered[np.sort(first)]
 
@@ -218,7 +175,7 @@ class AimedFromPose:
         task, frame = self._evaluator.task, self._frame
         aiming = TubeAiming(task.lung, task.system, task.objective, with_fissures=task.with_fissures)
         starts = self._starts()
-        count = len(starts.outer_mm)
+        count = len(starts.joints)
         row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])[None]
         found, why = aiming.aim(
             task.target.lps_mm, row, np.ones(1, dtype=np.bool_), np.zeros(count, dtype=np.int64), starts
@@ -230,7 +187,7 @@ class AimedFromPose:
             made = self._evaluator.tubes.choose(frame, *chosen_of(task.system.tubes, found[n]))
             if isinstance(made, str):
                 continue
-            path = tubes_in_tissue(task.system, frame, made)
+            path = tubes_in_tissue(frame, made)
             if self._evaluator.proves(made, path):
                 return made, path
         stopped = {name: n for name, n in reasons_of(why).items() if name != NO_SOLUTION}
@@ -238,29 +195,22 @@ class AimedFromPose:
             self.why = max(stopped, key=stopped.__getitem__)
         return None
 
-    def _starts(self) -> AimStarts:
-        """Return insertions all over the reach, or the shapes that, turned, end nearest to the target."""
+    def _starts(self) -> ManyShapes:
+        """Return the shapes that, turned, end nearest to the target."""
         tubes, target = self._evaluator.task.system.tubes, self._evaluator.task.target.lps_mm
-        if tubes.planar:
-            stops = insertion_stops(tubes, STARTS_MM)
-            outer, inner = (each.ravel() for each in np.meshgrid(stops, stops))
-            return AimStarts(outer[outer <= inner].copy(), inner[outer <= inner].copy(), NO_SHAPES)
         shapes, seen = shapes_of(tubes), (target - self._frame[:3, 3]) @ self._frame[:3, :3]
         tips = shapes.scope_from_tip[:, :3, 3]
         aside = np.hypot(tips[:, 0], tips[:, 1]) - np.hypot(seen[0], seen[1])
         near = np.argsort(np.hypot(aside, tips[:, 2] - seen[2]), kind="stable")[:SHAPES_TRIED]
-        inserted = shapes.insertions_mm[near]
-        return AimStarts(inserted[:, -1].copy(), inserted[:, 0].copy(), many_shapes(shapes, near))
+        return many_shapes(shapes, near)
 
 
-def chosen_of(tubes: ConcentricTubes, found: Float) -> tuple[float, float, float, int | TubeShape]:
+def chosen_of(tubes: ConcentricTubes, found: Float) -> tuple[float, TubeShape]:
     """Return a row of what was found as `DeploymentValidator.choose` takes it."""
-    rotation, outer, inner = (float(found[column]) for column in (ROTATION, OUTER, INNER))
-    design, n = design_arrays(tubes), len(tubes.nested)
-    if design is None:
-        return rotation, outer, inner, -1
-    made = deployed(design, found[JOINTS : JOINTS + n], found[JOINTS + n :])
-    return rotation, outer, inner, -1 if made is None else shape_of_arrays(made)
+    made = deployed(design_arrays(tubes), *np.split(found[JOINTS:], 2))
+    if made is None:
+        raise ValueError("the way to a shape that was found keeps the limits of its design")
+    return float(found[ROTATION]), shape_of_arrays(made)
 
 
 def reasons_of(why: Int) -> dict[str, int]:
@@ -308,10 +258,10 @@ class AimedTubes:
     def aim(self, entries: Int) -> tuple[Float, Int]:
         """Aim from entries (N,) of the atlas at the aims of their scope tips; see `TubeAiming.aim`."""
         sites, tips, row_of = tips_of(self.atlas, entries)
-        ends, starts = self._aims[sites], AimStarts.of(self.atlas, entries)
+        ends, starts = self._aims[sites], starts_of(self.atlas, entries)
         return self._aiming.aim(ends, tips, np.isfinite(ends[:, 0]), row_of, starts)
 
-    def aim_from(self, tips: Float, allowed: Bool, starts: AimStarts) -> tuple[Float, Int]:
+    def aim_from(self, tips: Float, allowed: Bool, starts: ManyShapes) -> tuple[Float, Int]:
         """Aim once from each of other scope tips (N, 9); see `TubeAiming.aim`."""
         ends = np.array([self.evaluator.aim(tip) for tip in tips[:, :3]]).reshape(-1, 3)
         return self._aiming.aim(ends, tips, allowed, np.arange(len(tips)), starts)
@@ -331,8 +281,7 @@ class AimedTubes:
 
     def candidate(self, entry: int) -> Candidate | None:
         """Return the deployment from the scope tip of an entry, None if the tubes are refused."""
-        found = self.aim(np.array([entry]))[0][0]
-        return self.made(self.tip(entry), found) if np.isfinite(found[COST]) else None
+        return self.made(self.tip(entry), self.aim(np.array([entry]))[0][0])
 
     def proved(self, entry: int) -> Candidate | None:
         """Return the deployment from the scope tip of an entry, None if its proof fails."""
@@ -356,6 +305,8 @@ class AimedTubes:
 
     def made(self, tip: ScopeTip, found: Float) -> Candidate | None:
         """Return a row of what was found as a candidate, None if the tubes are refused."""
+        if not np.isfinite(found[COST]):
+            return None
         return self.evaluator.aimed(tip, *chosen_of(self.task.system.tubes, found))
 
 

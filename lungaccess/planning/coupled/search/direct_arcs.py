@@ -18,8 +18,7 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator, blocker_counts
 from lungaccess.problem.task import Task
 from stages.needle import NeedleEnvironment, direct_arcs, workspace_lengths
-from stages.tube import Deployments, shapes_of, tube_constants
-from stages.tube.kernels import ARC_COLUMNS
+from stages.tube import Deployments, shapes_of
 
 CHUNK = 1000
 """Arcs that are evaluated in one call of a kernel: between two calls the caller can end the search."""
@@ -228,16 +227,12 @@ def costs_of_tubes(evaluator: CandidateEvaluator, tips: Float, entries: Deployme
     if evaluator.objective.tissue == 0.0:
         return costs
     system, arrays = evaluator.task.system, evaluator.needle_arrays
-    arcs, first_arc = np.zeros((0, ARC_COLUMNS)), np.zeros(1, dtype=np.int64)
-    if not system.tubes.planar:
-        shapes = shapes_of(system.tubes)
-        arcs, first_arc = np.array(shapes.arcs), np.array(shapes.first_arc)
-    behind_mm = entries.exit_mm + entries.wall_run_mm
-    deployed = np.stack([entries.rotation_rad, entries.outer_mm, entries.inner_mm, behind_mm], axis=1)
-    constants, shape = tube_constants(system.tubes, system.margins), np.array(entries.shape)
+    shapes = shapes_of(system.tubes)
+    deployed = np.stack([entries.rotation_rad, entries.exit_mm + entries.wall_run_mm], axis=1)
     costs_in_tissue(
-        arrays.obstacles, arrays.of_tubes, constants, np.array(tips), deployed, shape, arcs, first_arc, costs
-    )
+        arrays.obstacles, arrays.of_tubes, np.array(tips), deployed, np.array(entries.shape),
+        np.array(shapes.arcs), np.array(shapes.first_arc), costs,
+    )  # fmt: skip
     return costs
 
 

@@ -35,7 +35,6 @@ class KuntzSearch(SearchInParts):
     phase = "Algorithm 1"
 
     def __init__(self, task: Task, atlas: Atlas, *, rejects: bool = True) -> None:
-        task.system.tubes.require_planar("Algorithm 1 of [Kuntz2015]")
         self._task, self._atlas, self._rejects = task, atlas, rejects
         self._evaluator = CandidateEvaluator(task)
         self._needle_planner = NamedNeedlePlanner(self._evaluator, PLANNER)
@@ -52,7 +51,7 @@ class KuntzSearch(SearchInParts):
         """Carry out lines 8 and 9 for a placement."""
         evaluator, tip = self._evaluator, placement.tip
         deployment = evaluator.tubes.validate(
-            tip.lps_from_scope_tip, placement.rotation_rad, placement.outer_mm, placement.inner_mm
+            tip.lps_from_scope_tip, placement.rotation_rad, placement.insertions_mm, placement.rotations_rad
         )
         if isinstance(deployment, str) or (self._rejects and not evaluator.reaches(deployment.lps_from_tip)):
             return None

@@ -15,7 +15,7 @@ from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.local_search import LocalSearch, TubeChoice
 from lungaccess.plans.candidate import Candidate
 from stages.needle import Needle
-from stages.tube import NO_SHAPES, many_shapes, shapes_of
+from stages.tube import many_shapes, shapes_of
 
 MOST = 1000
 """Deployments of the atlas around which samples are drawn: about as many as one iteration has samples for."""
@@ -47,11 +47,8 @@ class LocalSampling:
         numbers, self._pose_of = np.unique(entries.site[chosen], return_inverse=True)
         self._motions, self._numbers = motions, numbers
         self._poses = np.ascontiguousarray(motions.tips[numbers])
-        self._deployed = np.column_stack(
-            [column[chosen] for column in (entries.rotation_rad, entries.outer_mm, entries.inner_mm)]
-        )
-        tubes = arcs.task.system.tubes
-        self._shapes = NO_SHAPES if tubes.planar else many_shapes(shapes_of(tubes), entries.shape[chosen])
+        self._rotations = np.array(entries.rotation_rad[chosen])
+        self._shapes = many_shapes(shapes_of(arcs.task.system.tubes), entries.shape[chosen])
 
     def sample(self, cost_limit: float) -> Candidate | None:
         """Return the cheapest of TRIES samples if its estimated cost is below a limit."""
@@ -62,7 +59,7 @@ class LocalSampling:
             search.needle,
             self._poses,
             self._pose_of,
-            self._deployed,
+            self._rotations,
             self._shapes,
             SPREADS,
             search.target,

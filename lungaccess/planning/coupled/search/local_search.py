@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from anatomy.base.typed import Float, UInt64
-from lungaccess.planning.coupled.kernels.candidate import OUTER, ROTATION, SCOPE_POSE
+from lungaccess.planning.coupled.kernels.candidate import INSERTED, ROTATION, SCOPE_POSE
 from lungaccess.planning.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -29,7 +29,7 @@ from stages.tube import (
     tube_environment,
 )
 
-TubeArguments = tuple[TubeEnvironment, Float, DesignArrays | None, ShapeArrays, ShapeArrays]
+TubeArguments = tuple[TubeEnvironment, Float, DesignArrays, ShapeArrays, ShapeArrays]
 """Tubes for the kernels; see `lungaccess.planning.coupled.kernels.candidate`."""
 
 SHIFTS_MM = evenly(0.25, 4.0)
@@ -52,46 +52,40 @@ class TubeChoice:
     x : (c,) float64
         See `lungaccess.planning.coupled.kernels.candidate`.
     shape : ShapeArrays
-        That of tubes which are not planar.
     """
 
     x: Float
     shape: ShapeArrays
 
     @classmethod
-    def empty(cls, design: DesignArrays | None) -> TubeChoice:
+    def empty(cls, design: DesignArrays) -> TubeChoice:
         """Return one without a deployment."""
         shape = shape_arrays(design)
-        return cls(x=np.zeros(OUTER + (len(shape.joints) or 2)), shape=shape)
+        return cls(x=np.zeros(INSERTED + len(shape.joints)), shape=shape)
 
     @classmethod
-    def of(cls, design: DesignArrays | None, deployment: Deployment, row: float) -> TubeChoice | None:
+    def of(cls, design: DesignArrays, deployment: Deployment, row: float) -> TubeChoice | None:
         """Return that of a deployment; None if its way does not keep the limits when it is followed anew."""
-        made, shape = deployment.shape, shape_arrays(design)
-        joints = np.array([deployment.outer_mm, deployment.inner_mm])
-        if made is not None and design is not None:
-            again = deployed(design, made.insertions_mm, made.rotations_rad)
-            if again is None:
-                return None
-            shape, joints = again, np.concatenate([made.insertions_mm[::-1], made.rotations_rad[::-1]])
-        return cls(x=np.concatenate([[row, deployment.rotation_rad], joints]), shape=shape)
+        made = deployment.shape
+        shape = deployed(design, made.insertions_mm, made.rotations_rad)
+        if shape is None:
+            return None
+        joints = made.insertions_mm[::-1], made.rotations_rad[::-1]
+        return cls(x=np.concatenate([[row, deployment.rotation_rad], *joints]), shape=shape)
 
     @property
-    def numbers(self) -> tuple[float, float, float, int | TubeShape]:
-        """Rotation, insertions and shape, as `DeploymentValidator.choose` takes them."""
-        n, x = len(self.shape.tips), self.x.tolist()
-        rotation = x[ROTATION] % (2.0 * math.pi)
-        return rotation, x[OUTER], x[OUTER + (n or 2) - 1], shape_of_arrays(self.shape) if n else -1
+    def numbers(self) -> tuple[float, TubeShape]:
+        """Rotation and shape, as `DeploymentValidator.choose` takes them."""
+        return float(self.x[ROTATION]) % (2.0 * math.pi), shape_of_arrays(self.shape)
 
-    def perturb(self, design: DesignArrays | None, rng: np.random.Generator) -> None:
+    def perturb(self, design: DesignArrays, rng: np.random.Generator) -> None:
         """Move it some distance away at random."""
         n, x = len(self.shape.tips), self.x
         row, turn, insertion, relative = PERTURBATION
-        turned = () if design is None else relative * design.turned[::-1]
-        spreads = np.array([row, turn, *(insertion,) * (n or 2), *turned])
+        spreads = np.array([row, turn, *(insertion,) * n, *(relative * design.turned[::-1])])
         x[:] = x + rng.standard_normal(len(x)) * spreads
         x[SCOPE_POSE] = min(max(round(x[SCOPE_POSE]), 0), len(SHIFTS_MM) - 1)
-        inserted = x[OUTER : OUTER + (n or 2)]
+        inserted = x[INSERTED : INSERTED + n]
         inserted[0] = max(inserted[0], 0.0)
         inserted[:] = np.maximum.accumulate(inserted)
 
@@ -199,7 +193,7 @@ class LocalSearch:
 
 
 def tube_arguments(
-    evaluator: CandidateEvaluator, design: DesignArrays | None
+    evaluator: CandidateEvaluator, design: DesignArrays
 ) -> Callable[[TubeChoice], TubeArguments]:
     """Return what gives the tubes of a task, with the shape of a choice, as the kernels take them."""
     task, scratch = evaluator.task, shape_arrays(design)

@@ -8,10 +8,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.problem.task import Task
 from stages.scope import ScopeTip
-from stages.tube import tracking_length_mm
+from stages.tube import design_arrays, longest_mm
 
 
 @frozen_record
@@ -20,16 +21,18 @@ class Placement:
 
     Parameters
     ----------
-    rotation_rad, outer_mm, inner_mm : float
-        Rotation and insertions of the tubes.
+    rotation_rad : float
+        Rotation of all tubes.
+    insertions_mm, rotations_rad : (n,) float64
+        Insertion of each tube, the outermost first, and how much farther it is turned.
     needle_seed : int
         Seed of the needle's RRT from there.
     """
 
     tip: ScopeTip
     rotation_rad: float
-    outer_mm: float
-    inner_mm: float
+    insertions_mm: Float
+    rotations_rad: Float
     needle_seed: int
 
 
@@ -41,15 +44,17 @@ def random_placements(task: Task, atlas: Atlas, number: int = 0) -> Iterator[Pla
     """
     rng = np.random.Generator(np.random.PCG64([task.seed, number] if number else task.seed))
     along = np.flatnonzero(~atlas.motions.turned)
-    longest_mm = tracking_length_mm(task.system.tubes)
+    tubes = task.system.tubes
+    most_mm, turned = longest_mm(tubes), design_arrays(tubes).turned[::-1]
     while len(along):
         tip = atlas.motions.tip(int(rng.choice(along)))
         rotation = float(rng.uniform(0.0, 2.0 * math.pi))
-        outer, inner = np.sort(rng.uniform(0.0, longest_mm, 2)).tolist()
+        inserted = np.sort(rng.uniform(0.0, most_mm, len(turned)))
+        relative = np.where(turned, rng.uniform(0.0, 2.0 * math.pi, len(turned)), 0.0)
         yield Placement(
             tip=tip,
             rotation_rad=rotation,
-            outer_mm=outer,
-            inner_mm=inner,
+            insertions_mm=inserted,
+            rotations_rad=relative,
             needle_seed=int(rng.integers(2**63)),
         )

@@ -12,11 +12,11 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.aimed_tubes import COST
 from lungaccess.planning.coupled.search.aimed_tubes import (
-    AimStarts,
     TubeAiming,
     chosen_of,
     near_mm,
     nearest_of_each_tip,
+    starts_of,
     tips_of,
 )
 from lungaccess.plans.candidate import tubes_in_tissue
@@ -98,7 +98,7 @@ class TubeReachScan:
             return None
         _sites, tips, row_of = tips_of(atlas, chosen)
         found, _why = self._aiming.aim(
-            point, tips, np.ones(len(tips), dtype=np.bool_), row_of, AimStarts.of(atlas, chosen), self._enough
+            point, tips, np.ones(len(tips), dtype=np.bool_), row_of, starts_of(atlas, chosen), self._enough
         )
         best = int(found[:, COST].argmin())
         if not np.isfinite(found[best, COST]):
@@ -114,7 +114,7 @@ class TubeReachScan:
         made = tubes.choose(frame, *chosen_of(system.tubes, found))
         if isinstance(made, str):
             return 0.0
-        return tubes_clearance_mm(atlas, tubes_in_tissue(system, frame, made), made.branch)
+        return tubes_clearance_mm(atlas, tubes_in_tissue(frame, made), made.branch)
 
 
 def tubes_clearance_mm(atlas: Atlas, path: ArcPath, branch: int) -> float:

@@ -9,8 +9,8 @@ import numpy as np
 
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.kernels.aimed_tubes import COST, INNER, JOINTS, OUTER
-from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes, AimStarts, cheapest_first
+from lungaccess.planning.coupled.kernels.aimed_tubes import COST, JOINTS
+from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes, aim_starts, cheapest_first
 from lungaccess.planning.coupled.search.base import SearchInParts, Step, evaluated_step
 from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK
@@ -87,8 +87,7 @@ class TubeSearch(SearchInParts):
         tip, best = self.arcs.tip(entry), first
         for shifts_mm in ROWS_MM:
             row = self.evaluator.tip_rows.along(tip, shifts_mm)
-            inserted = float(best[OUTER]), float(best[INNER])
-            starts = AimStarts.around(tubes, inserted, best[JOINTS:], len(shifts_mm))
+            starts = aim_starts(tubes, best[JOINTS:], len(shifts_mm))
             if starts is None:
                 break
             rows, why = self.arcs.aim_from(row.tips, row.proved, starts)

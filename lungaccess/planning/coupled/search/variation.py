@@ -9,10 +9,10 @@ import numpy as np
 
 from anatomy.base.typed import Float
 from lungaccess.planning.coupled.kernels.aimed_tubes import COST
-from lungaccess.planning.coupled.search.aimed_tubes import AimStarts, TubeAiming, chosen_of
+from lungaccess.planning.coupled.search.aimed_tubes import TubeAiming, aim_starts, chosen_of
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
-from stages.tube import ConcentricTubes, Deployment, TubeShape, deployed, design_arrays, shape_of_arrays
+from stages.tube import ConcentricTubes, Deployment, deployed, design_arrays, shape_of_arrays
 
 TURN_RAD, SHIFT_MM = math.radians(10.0), 2.0
 """Standard deviations of the first variations: less than the spacing of the atlas."""
@@ -25,8 +25,7 @@ def random_change(rng: np.random.Generator, size: float, tubes: ConcentricTubes)
 
     The spreads are TURN_RAD and SHIFT_MM times `size`.
     """
-    relative = 0 if tubes.planar else len(tubes.nested)
-    spreads = np.array([TURN_RAD, SHIFT_MM, SHIFT_MM, *[TURN_RAD] * relative])
+    spreads = np.array([TURN_RAD, SHIFT_MM, SHIFT_MM, *[TURN_RAD] * len(tubes.nested)])
     changes: list[float] = (rng.standard_normal(len(spreads)) * spreads * size).tolist()
     return changes
 
@@ -48,31 +47,24 @@ def varied(
     turn_rad : float
         By which all tubes are turned.
     shifts : sequence of float
-        Of outer and inner tube, mm.  Behind them, of tubes that are not planar, by how much each is turned
-        against the others, the innermost first, rad.
+        Of outer and inner tube, mm.  Behind them by how much each is turned against the others, the innermost
+        first, rad.
     end : (3,) float64, optional
         Where the devices end, LPS mm; what the evaluator aims at if None.
     """
     tubes, old, tip = evaluator.task.system.tubes, candidate.deployment, candidate.tip
     joints = _changed_joints(tubes, old, shifts)
-    outer = max(old.outer_mm + shifts[0], 0.0)
-    inner = max(old.inner_mm + shifts[1], outer)
-    if tubes.outer is None:
-        outer = inner
     if evaluator.task.system.needle is None:
-        return _aimed_anew(evaluator, candidate, shifts[0], (outer, inner), joints, end)
-    turned, shape = (old.rotation_rad + turn_rad) % (2.0 * math.pi), _shape_of(tubes, joints)
-    if shape is None:
+        return _aimed_anew(evaluator, candidate, shifts[0], joints, end)
+    made = deployed(design_arrays(tubes), *np.split(joints, 2))
+    if made is None:
         return None
-    if not isinstance(shape, int):
-        outer, inner = float(joints[len(joints) // 2 - 1]), float(joints[0])
-    return evaluator.direct(tip, turned, outer, inner, shape, end)
+    turned = (old.rotation_rad + turn_rad) % (2.0 * math.pi)
+    return evaluator.direct(tip, turned, shape_of_arrays(made), end)
 
 
 def _changed_joints(tubes: ConcentricTubes, old: Deployment, shifts: Sequence[float]) -> Float:
-    """Return insertions and rotations `(2 n,)` of tubes that are not planar; of planar ones nothing."""
-    if old.shape is None:
-        return np.zeros(0)
+    """Return insertions and rotations `(2 n,)`."""
     n = len(tubes.nested)
     inserted = np.maximum(old.shape.insertions_mm + np.linspace(shifts[1], shifts[0], n), 0.0)
     turns = np.array(shifts[2:] or [0.0] * n)
@@ -82,26 +74,12 @@ def _changed_joints(tubes: ConcentricTubes, old: Deployment, shifts: Sequence[fl
     return np.concatenate([np.minimum.accumulate(inserted), turned])
 
 
-def _shape_of(tubes: ConcentricTubes, joints: Float) -> int | TubeShape | None:
-    """Return the shape of joints as `DeploymentValidator.choose` takes it, None if the tubes refuse it."""
-    design = design_arrays(tubes)
-    made = None if design is None else deployed(design, *np.split(joints, 2))
-    if made is None:
-        return -1 if design is None else None
-    return shape_of_arrays(made)
-
-
 def _aimed_anew(
-    evaluator: CandidateEvaluator,
-    candidate: Candidate,
-    shift_mm: float,
-    insertions_mm: tuple[float, float],
-    joints: Float,
-    end: Float | None,
+    evaluator: CandidateEvaluator, candidate: Candidate, shift_mm: float, joints: Float, end: Float | None
 ) -> Candidate | None:
     """Return the tubes aimed from a scope tip farther along its motion, beginning with changed ones."""
     task, row = evaluator.task, evaluator.tip_rows.along(candidate.tip, [shift_mm])
-    starts = AimStarts.around(task.system.tubes, insertions_mm, joints, 1)
+    starts = aim_starts(task.system.tubes, joints, 1)
     if starts is None or not row.proved[0]:
         return None
     ends = evaluator.aim(row.tips[0, :3]) if end is None else end

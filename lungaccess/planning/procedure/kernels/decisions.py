@@ -35,7 +35,7 @@ from lungaccess.planning.procedure.kernels.spread import (
 from lungaccess.uncertainty.risk.kernels.chain import TARGET, TILT, TUBE_PIECES, find_end, set_planar
 from lungaccess.uncertainty.risk.kernels.deviation import N_PIECE, follow
 from stages.needle.kernels import Limits, Obstacles, blocker_on_arc, single_arc_exceeds
-from stages.tube.kernels import ACCEPTED, BRANCH, N_TRACE, validate_arcs, validate_deployment
+from stages.tube.kernels import ACCEPTED, BRANCH, N_TRACE, validate_arcs
 
 STATIONS = 16
 """Points of a path at which clearance is compared with the errors: some mm apart, as vessels are wide."""
@@ -76,8 +76,8 @@ class Scene(NamedTuple):
 class Choices(NamedTuple):
     """C deployments to choose from; the first is the planned one.
 
-    `tubes` `(C, 11)` are those of planar tubes as `chain.Devices` has them.  Of others it is empty; `shapes`
-    `(C, A, ARC_COLUMNS)` then holds `n_arcs` arcs of each, and `beside` what these need free around them.
+    `shapes` `(C, A, ARC_COLUMNS)` holds `n_arcs` arcs of each, and `beside` what these need free around them.
+    `tubes` `(C, 11)` are those of planar tubes as `chain.Devices` has them; of others it is empty.
     """
 
     scope_from_tip: Float
@@ -366,9 +366,6 @@ def _validated(environment, constants, choices, c, frame, trace, tip):
     for m in range(3):
         base[m], base[3 + m] = frame[m, 3], frame[m, 2]
         normal[m] = math.cos(turn) * frame[m, 0] + math.sin(turn) * frame[m, 1]
-    if choices.tubes.shape[0] > 0:
-        outer, inner = choices.tubes[c, 1], choices.tubes[c, 2]
-        return validate_deployment(environment, constants, base, normal, outer, inner, trace, tip) == ACCEPTED
     arcs = choices.shapes[c, : choices.n_arcs[c]]
     beside = choices.beside[c]
     return validate_arcs(environment, constants, base, normal, arcs, beside, trace, tip) == ACCEPTED

@@ -20,7 +20,7 @@ from lungaccess.plans.tip_section import tip_sections
 from lungaccess.showing.report.pack import Packed, pack
 from stages.needle import Objective
 from stages.scope import ScopeMotion
-from stages.tube import Neighbourhood, centreline, points_on_arcs
+from stages.tube import Neighbourhood, points_on_arcs
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -130,19 +130,12 @@ def moved_mm(motion: ScopeMotion) -> Float:
 
 def _tubes(plan: Plan) -> Packed:
     """Return the tubes at every step of their deployment, each as `TUBE_POINTS` points of equal distance."""
-    tube, pose = plan.tube, np.asarray(plan.scope.lps_from_scope_tip)
+    tube = plan.tube
     inserted = plan.tube.insertions_mm(plan.system.tubes)
     inner = _insertions(inserted)
     outer = np.minimum(inner, tube.outer_insertion_mm)
-    if tube.shape is None:
-        shapes_lps = [
-            centreline(plan.system.tubes, pose, tube.rotation_rad, o, i, np.linspace(0.0, i, TUBE_POINTS))
-            for o, i in zip(outer.tolist(), inner.tolist(), strict=True)
-        ]
-    else:
-        shapes_lps = _twisted_shapes(plan, inner)
     return {
-        "points": pack(np.array(shapes_lps), "f4"),
+        "points": pack(np.array(_shapes_lps(plan, inner)), "f4"),
         "inner_mm": pack(inner, "f4"),
         "outer_mm": pack(outer, "f4"),
         "middle_mm": pack(np.minimum(inner, max(tube.outer_insertion_mm, tube.middle_insertion_mm)), "f4"),
@@ -150,7 +143,7 @@ def _tubes(plan: Plan) -> Packed:
     }
 
 
-def _twisted_shapes(plan: Plan, inner_mm: Float) -> list[Float]:
+def _shapes_lps(plan: Plan, inner_mm: Float) -> list[Float]:
     """Return the tubes where the inner one is out so far: each stops at its own insertion."""
     tube, tubes, pose = plan.tube, plan.system.tubes, np.asarray(plan.scope.lps_from_scope_tip)
     inserted = np.array(tube.insertions_mm(tubes))[::-1]
@@ -242,7 +235,7 @@ def _clearances(plan: Plan, lung: Lung, points: Float, exempt: Bool) -> dict[str
 
 
 def _curvature(plan: Plan, along: Float) -> Float:
-    tubes = tube_pieces(plan.tube, plan.system.tubes)
+    tubes = tube_pieces(plan.tube)
     lengths, _rolls, curvatures = np.concatenate([tubes, needle_pieces(plan.needle)]).T
     place = np.searchsorted(np.cumsum(lengths), along - SHORTEST_MM)
     return np.asarray(np.abs(curvatures[np.minimum(place, len(curvatures) - 1)]))

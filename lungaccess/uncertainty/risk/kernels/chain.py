@@ -12,7 +12,7 @@ from anatomy.kernels.field import distance_bound
 from lungaccess.uncertainty.risk.kernels.deviation import CURVATURE, LENGTH, RADIUS, ROLL, STEP_MM
 
 TUBE_PIECES = 4
-"""Arcs of planar tubes, see `stages.tube.device.TubeArcs`."""
+"""Arcs of planar tubes: straight and bent within the outer tube, straight and bent beyond it."""
 SHIFT, TILT, ROTATION, FACTOR, TARGET, INSERTION = 0, 3, 5, 6, 7, 10
 """Where the errors of a draw begin in a row: behind the insertions of all tubes stand the roll and the stop
 of each arc of the needle."""
@@ -104,7 +104,7 @@ def set_start(frame, depth, geometry, least_mm, errors, n, start):
 
 @borrowing_kernel
 def set_planar(tubes, errors, n, pieces):
-    """Fill the first four pieces, see `stages.tube.device.ConcentricTubes.arcs`.
+    """Fill the first four pieces.
 
     No tube goes back behind the scope tip nor behind the tube around it, and none farther than it can.
     """

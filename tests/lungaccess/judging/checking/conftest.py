@@ -21,6 +21,7 @@ from lungaccess.problem.system import System, load_system, system_fingerprint
 from stages.scope import ScopeMotion
 from tests.lungaccess.pursuit import pursued
 from tests.lungaccess.rigid import arc, turned
+from tests.lungaccess.tube_shapes import stated_shape
 from tests.stages.scenes import box_distance, forked_tree
 
 SPACING_MM = (1.0, 0.9, 1.1)
@@ -286,6 +287,7 @@ def toy_tube(
         exit=wall_exit,
         lateral_sweep_mm=0.0,
         follow_the_leader_error_mm=0.0,
+        shape=stated_shape(tubes, outer_mm, inner_mm),
     )
     return tube, points, last
 

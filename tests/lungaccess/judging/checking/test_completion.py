@@ -56,6 +56,9 @@ def motions_of(plan: Plan) -> Motions:
         rotation_rad=plan.tube.rotation_rad,
         outer_insertion_mm=plan.tube.outer_insertion_mm,
         inner_insertion_mm=plan.tube.inner_insertion_mm,
+        shape=plan.tube.shape,
+        lateral_sweep_mm=plan.tube.lateral_sweep_mm,
+        follow_the_leader_error_mm=plan.tube.follow_the_leader_error_mm,
         lps_from_tube_tip=plan.tube.lps_from_tip,
         arcs=plan.needle.arcs,
     )

@@ -46,32 +46,6 @@ def test_a_cut_changes_no_pose(at: float) -> None:
         assert np.abs(cut.arc_mm - at).min() < 1e-8
 
 
-def test_bend_of_the_tubes(system: Any) -> None:
-    """A share of the precurvature in the overlap, all of it beyond, none where the curve is over."""
-    tubes = system.tubes
-    inner, outer = tubes.inner, tubes.outer
-    share = inner.bending_stiffness_n_mm2 / (inner.bending_stiffness_n_mm2 + outer.bending_stiffness_n_mm2)
-    bend = shapes.bend_of(tubes, 20.0, 50.0)
-    assert bend.edges_mm == (0.0, 10.0, 20.0, 50.0)
-    np.testing.assert_allclose(bend.per_mm, (0.0, 0.025 * share, 0.025))
-    assert shapes.bend_of(tubes, 0.0, 30.0).per_mm == (0.025,)
-    np.testing.assert_allclose(shapes.bend_of(tubes, 30.0, 30.0).per_mm, 0.025 * share)
-
-
-def test_planar_quadrature_is_the_curve_in_space(system: Any) -> None:
-    bend = shapes.bend_of(system.tubes, 22.0, 47.0)
-    flat = shapes.planar_shape(bend, 0.25)
-    curve = shapes.integrate(np.eye(4), shapes.planar_pieces(0.0, bend))
-    np.testing.assert_allclose(curve.end[[0, 2], 3], flat[-1], atol=1e-5)
-    assert shapes.distance_to_polyline(curve.points[::7, [0, 2]], flat).max() < 1e-3
-
-
-def test_follow_the_leader_within_the_curved_length(system: Any) -> None:
-    final = shapes.planar_shape(shapes.bend_of(system.tubes, 15.0, 40.0), 0.1)
-    for bend in shapes.deployment_bends(system.tubes, 15.0, 40.0, 3.0):
-        assert shapes.distance_to_polyline(shapes.planar_shape(bend, 0.5), final).max() < 1e-3
-
-
 @given(curvature=st.floats(0.0, 1.0), length=st.floats(1e-6, 50.0), turn=st.floats(-7.0, 7.0))
 def test_exponential_against_that_of_scipy(curvature: float, length: float, turn: float) -> None:
     for matrix in (shapes.twist(curvature) * length, shapes.twist(0.0) * turn):

@@ -12,10 +12,10 @@ import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.planning.coupled import tip_clearances_mm, tube_stability
-from stages.tube import DEFAULT_ROTATIONS, REASONS, enumerate_deployments, insertion_stops, kernels
-from stages.tube.validation import centreline
+from stages.tube import DEFAULT_ROTATIONS, REASONS, coarser_shapes, enumerate_deployments, kernels, shapes_of
 from tests.lungaccess.planning.coupled.planning import SYSTEM
 from tests.stages.scenes import brute_clearance
+from tests.stages.tube.closed_form import centreline
 
 COARSE: dict[str, Any] = {"rotations": 9, "stop_spacing_mm": 4.0, "site_spacing_mm": 3.0}
 
@@ -26,12 +26,12 @@ def coarse(small_lung: Lung) -> la.Atlas:
 
 
 def test_counts_add_up(atlas: la.Atlas) -> None:
-    stops = len(insertion_stops(SYSTEM.tubes))
+    shapes = shapes_of(SYSTEM.tubes)
     found = atlas.deployments
     turned = int(atlas.motions.turned.sum())
-    fewer = len(insertion_stops(SYSTEM.tubes, 4.0))
-    even = (atlas.motions.count - turned) * DEFAULT_ROTATIONS * (stops * (stops + 1) // 2 - 1)
-    even += turned * (DEFAULT_ROTATIONS // 2) * (fewer * (fewer + 1) // 2 - 1)
+    fewer = coarser_shapes(shapes, 4.0)[1].count
+    even = (atlas.motions.count - turned) * DEFAULT_ROTATIONS * shapes.count
+    even += turned * (DEFAULT_ROTATIONS // 2) * fewer
     assert even < found.candidates < 2 * even
     assert found.count + sum(found.refused.values()) == found.candidates
     assert found.count > 5000 and atlas.motions.count > 50

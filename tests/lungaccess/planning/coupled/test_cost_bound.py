@@ -316,7 +316,7 @@ def test_no_deployment_costs_less_than_the_bound(
         tip = atlas.motions.tip(int(entries.site[entry]))
         outer, inner = entries.outer_mm[entry], entries.inner_mm[entry] + rng.uniform(-1.0, 1.0)
         rotation = entries.rotation_rad[entry] + rng.uniform(-0.2, 0.2)
-        made = evaluator.tubes.choose(tip.lps_from_scope_tip, rotation, min(outer, inner), inner, -1)
+        made = evaluator.tubes.validate(tip.lps_from_scope_tip, rotation, [min(outer, inner), inner])
         if isinstance(made, str):
             continue
         path = direct_path(made.lps_from_tip, target.lps_mm)
@@ -345,9 +345,8 @@ def _attacked(
     any_arcs = DirectArcs(Task(lung=lung, system=SYSTEM, target=target), atlas)
     while done < targets:
         entry = int(rng.integers(entries.count))
-        rotation, outer, inner, _shape = entries.choice(entry)
         base = atlas.motions.tip(int(entries.site[entry])).lps_from_scope_tip
-        made = any_arcs.evaluator.tubes.choose(base, rotation, outer, inner, -1)
+        made = any_arcs.evaluator.tubes.choose(base, *entries.choice(entry))
         assert not isinstance(made, str)
         curvature, length = needle.max_curvature_per_mm * rng.uniform(0.1, 0.999), rng.uniform(8.0, 60.0)
         roll, aside = rng.uniform(0.0, 2.0 * math.pi), (1.0 - math.cos(curvature * length)) / curvature
@@ -392,7 +391,7 @@ def _accepted_beside(
     inner = float(entries.inner_mm[entry] + rng.uniform(-1.0, 1.0))
     outer = float(np.clip(entries.outer_mm[entry] + rng.uniform(-1.0, 1.0), 0.0, inner))
     rotation = float(entries.rotation_rad[entry] + rng.uniform(-0.2, 0.2))
-    made = arcs.evaluator.tubes.choose(tip.lps_from_scope_tip, rotation, outer, inner, -1)
+    made = arcs.evaluator.tubes.validate(tip.lps_from_scope_tip, rotation, [outer, inner])
     if isinstance(made, str):
         return None
     path = direct_path(made.lps_from_tip, end)
@@ -422,7 +421,7 @@ def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
     def why_refused(site: int, place: Points) -> str | None:
         rotation, outer, inner = place.tolist()
         base = atlas.motions.tip(site).lps_from_scope_tip
-        made = validator.choose(base, rotation, min(max(outer, 0.0), inner), inner, -1)
+        made = validator.validate(base, rotation, [min(max(outer, 0.0), inner), inner])
         return made if isinstance(made, str) else None
 
     def ruled_out(site: int, place: Points, widths: Points) -> bool:
@@ -435,7 +434,8 @@ def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
     accepted, at_hazard = 0, []
     for entry in rng.integers(entries.count, size=4000):
         site = int(entries.site[entry])
-        begin = np.array(entries.choice(int(entry))[:3])
+        columns = entries.rotation_rad, entries.outer_mm, entries.inner_mm
+        begin = np.array([column[entry] for column in columns])
         wide = 10.0 ** rng.uniform(-1.0, 1.0)
         place = begin + rng.normal(0.0, 1.0, 3) * np.array([0.1, 1.0, 1.0]) * wide
         place[1:] = np.clip(place[1], 0.0, max(place[2], 0.1)), max(place[2], 0.1)

@@ -56,7 +56,7 @@ def test_points_of_exit_are_those_of_the_deployments(
         candidate = arcs.candidate(entry)
         assert candidate is not None
         tip, deployment = candidate.tip.lps_from_scope_tip, candidate.deployment
-        point = deployment.points(SYSTEM.tubes, tip, [deployment.exit_mm])[0]
+        point = deployment.points(tip, [deployment.exit_mm])[0]
         assert np.abs(point - last.exit_lps[place]).max() <= PLACE_MM + 1e-3
         found = exit_points(SYSTEM.tubes, atlas.motions.tips, atlas.deployments, np.array([entry]))[0]
         np.testing.assert_allclose(found, point, atol=1e-4)

@@ -24,13 +24,13 @@ from lungaccess.planning.coupled import ReferenceSearch
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT, sample_ahead
 from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, Solid, chord_mm
 from lungaccess.planning.coupled.kuntz2015_fcl.search import FOUND, OUT_OF_WORKSPACE, obstacles_for
-from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator, frame_at, line_between
+from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator, frame_at, line_between, path_of
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle.device import Needle
-from stages.tube import Deployment, DeploymentValidator, tracking_length_mm
+from stages.tube import Deployment, DeploymentValidator, TubeShape, design_arrays, longest_mm, shape_or_reason
 from tests.lungaccess.planning.coupled.planning import SYSTEM
 from tests.lungaccess.resample import problems
 
@@ -152,7 +152,7 @@ class TestTubes:
 
     @pytest.mark.slow
     def test_they_agree(self, atlas: la.Atlas, small_lung: Lung, obstacles: Obstacles) -> None:
-        validator = TubeValidator(SYSTEM, obstacles)
+        validator, design = TubeValidator(SYSTEM, obstacles), design_arrays(SYSTEM.tubes)
         proof = DeploymentValidator(
             small_lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=atlas.with_fissures
         )
@@ -162,9 +162,10 @@ class TestTubes:
         for _ in range(2500):
             frame = atlas.motions.tip(int(rng.choice(tips))).lps_from_scope_tip
             rotation = float(rng.uniform(0.0, 2.0 * math.pi))
-            outer, inner = np.sort(rng.uniform(0.0, tracking_length_mm(SYSTEM.tubes), 2))
-            ours = validator.validate(validator.shape(frame, rotation, float(outer), float(inner)))
-            theirs = proof.validate(frame, rotation, float(outer), float(inner))
+            inserted = np.sort(rng.uniform(0.0, longest_mm(SYSTEM.tubes), 2))
+            made = shape_or_reason(design, inserted[::-1], np.zeros(2))
+            ours = made if isinstance(made, str) else validator.validate(frame, rotation, made)
+            theirs = proof.validate(frame, rotation, inserted)
             if isinstance(ours, Deployment) and isinstance(theirs, Deployment):
                 both += 1
                 np.testing.assert_allclose(ours.lps_from_tip, theirs.lps_from_tip, atol=1e-9)
@@ -176,9 +177,11 @@ class TestTubes:
         # Chords are padded by 0.01 mm.
         assert both >= 20 and only_proof <= 1 and only_meshes <= 0.25 * both
 
-    def test_lines_follow_their_curves(self, obstacles: Obstacles) -> None:
+    def test_lines_follow_their_curves(self) -> None:
         frame = poses.pose([1.0, 2.0, 3.0], [0.2, 0.4, 1.0])
-        shape = TubeValidator(SYSTEM, obstacles).shape(frame, 0.7, 6.0, 25.0)
+        made = shape_or_reason(design_arrays(SYSTEM.tubes), np.array([25.0, 6.0]), np.zeros(2))
+        assert isinstance(made, TubeShape)
+        shape = path_of(frame, 0.7, made)
         dense, at_mm = shape.sample(0.01)
         line = line_between(shape, 2.5, 21.0)
         np.testing.assert_allclose(line[0], frame_at(shape, 2.5)[:3, 3])

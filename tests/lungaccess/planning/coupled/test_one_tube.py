@@ -100,9 +100,6 @@ def test_a_curved_tube_may_be_alone(system: System) -> None:
     alone = replace(pair, outer=None)
     assert alone.outermost == pair.inner
     assert alone.overlap_curvature_per_mm == pair.inner.precurvature_per_mm
-    arcs = alone.arcs([10.0], [30.0])
-    assert (arcs.curvature_per_mm[[1, 3]] == pair.inner.precurvature_per_mm).all()
-    assert (arcs.radius_mm == pair.inner.radius_mm).all()
     assert isinstance(system.tubes, ConcentricTubes)
 
 

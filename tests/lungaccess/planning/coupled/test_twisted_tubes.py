@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from experiments.support.mutants.mutant import Case
 from lungaccess.planning.coupled import AtlasSearch
 from lungaccess.planning.coupled.atlas_measures import tube_stability
 from lungaccess.planning.coupled.search.local_search import LocalSearch
+from lungaccess.planning.coupled.search.random_placement import random_placements
 from lungaccess.planning.one_stage.replan import replan_from_scope
 from lungaccess.planning.reachability import UnreachableProof
 from lungaccess.planning.refinement import refine
@@ -78,7 +80,7 @@ def test_plans_state_each_tube_and_are_accepted(
         report = la.check(plan, small_lung, system=system)
         assert report.accepted, report
         assert {"tube.stable", "tube.arcs"} <= {finding.name for finding in report.findings}
-        assert plan.tube.shape is not None and plan.tube.shape.least_determinant > 0.0
+        assert plan.tube.shape.least_determinant > 0.0
         assert plan.rotations.startswith("turn the outer tube to")
 
 
@@ -166,7 +168,7 @@ def test_the_model_of_shapes_is_that_of_the_mechanics(system: System) -> None:
     design, shapes = design_arrays(system.tubes), shapes_of(system.tubes)
     rng, off = np.random.default_rng(1), []
     for number in rng.choice(np.flatnonzero(shapes.insertions_mm[:, 1] > 6.0), 6):
-        model = ShapeModel(design, shapes.member(int(number)))
+        model = ShapeModel(design, shapes.member(int(number)), system.tubes.max_extension_mm)
         for share in rng.uniform(-0.5, 0.5, (8, len(model.centre))):
             made = model.shape_at(model.centre + share * (model.upper - model.centre))
             if made is not None:
@@ -203,18 +205,19 @@ def test_the_page_shows_the_tubes_where_they_end(case: Case) -> None:
 def test_the_rest_is_planned_from_a_measured_pose(case: Case, system: System) -> None:
     target = point_target(case.lung, case.plan.target_lps)
     found = replan_from_scope(case.lung, system, case.plan.scope.lps_from_scope_tip, target)
-    assert found.tube is not None and found.tube.shape is not None
+    assert found.tube is not None
     assert found.cost <= case.plan.cost * 1.5
 
 
-def test_what_needs_a_closed_form_says_so(
-    small_lung: Lung, system: System, case: Case, atlas: la.Atlas
-) -> None:
-    target = point_target(small_lung, case.plan.target_lps)
-    for method in ("kuntz2015", "reference"):
-        with pytest.raises(SettingsError, match="closed form"):
-            next(
-                la.plan(small_lung, system, target, atlas=atlas, method=method, iterations=1, goal="default")
-            )
+def test_the_modes_of_the_paper_draw_each_tube(case: Case, system: System, atlas: la.Atlas) -> None:
+    target = point_target(case.lung, case.plan.target_lps)
+    task = Task(lung=case.lung, system=system, target=target)
+    drawn = list(islice(random_placements(task, atlas), 20))
+    assert all((np.diff(each.insertions_mm) >= 0.0).all() for each in drawn)
+    turned = np.array([each.rotations_rad for each in drawn])
+    assert (np.ptp(turned, axis=0) > 1.0).sum() == 1
+
+
+def test_what_needs_a_closed_form_says_so(small_lung: Lung, system: System) -> None:
     with pytest.raises(SettingsError, match="closed form"):
         UnreachableProof(small_lung, system, with_fissures=False)

@@ -66,7 +66,7 @@ def test_from_where_the_scope_was_planned_to_be(small_lung: Lung, plan: Plan, ta
     validator = DeploymentValidator(small_lung, SYSTEM.tubes, SYSTEM.margins, with_fissures=True)
     tube = rest.tube
     again = validator.validate(
-        plan.scope.lps_from_scope_tip, tube.rotation_rad, tube.outer_insertion_mm, tube.inner_insertion_mm
+        plan.scope.lps_from_scope_tip, tube.rotation_rad, tube.insertions_mm(SYSTEM.tubes)
     )
     assert not isinstance(again, str) and again.branch == tube.exit.branch == rest.branch
     assert np.allclose(rest.needle.lps_from_start, tube.lps_from_tip)

@@ -27,7 +27,7 @@ from lungaccess.problem.procedures import Procedure, ScopePlacing, load_procedur
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle import Objective
-from stages.tube import enumerate_deployments, one_site_enumerator
+from stages.tube import SiteEnumerator, enumerate_deployments
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 SYSTEM = la.load_system("ultrathin")
@@ -125,9 +125,9 @@ def test_fewer_rotations_are_some_of_all(plan: Plan, small_lung: Lung) -> None:
     every = enumerate_deployments(
         small_lung, SYSTEM.tubes, SYSTEM.margins, row[None], worthwhile=towards, **options
     )
-    some = one_site_enumerator(
+    some = SiteEnumerator(
         small_lung, SYSTEM.tubes, SYSTEM.margins, enough=every.candidates // 3, **options
-    )(row, towards)
+    ).deployments(row, towards)
     assert 0 < some.candidates <= every.candidates // 3 and 0 < some.count < every.count
     whole = {every.choice(n) for n in range(every.count)}
     assert {some.choice(n) for n in range(some.count)} <= whole

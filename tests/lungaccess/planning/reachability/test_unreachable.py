@@ -35,8 +35,8 @@ from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
 from stages.needle.kernels.limits import Limits
 from stages.scope import MAX_OFF_AXIS_MM, find_motions, in_tip_region
-from stages.tube import tube_environment
-from stages.tube.kernels import ACCEPTED, N_TRACE, NEAR_VESSEL, validate_deployment
+from stages.tube import deployed, design_arrays, tube_environment
+from stages.tube.kernels import ACCEPTED, N_REASONS, N_TRACE, NEAR_VESSEL, SWEEP, validate_arcs
 
 
 @numba.njit
@@ -173,7 +173,7 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
     """Deployments as near to a limit as it gets, between one that can be and one that cannot."""
     rng = np.random.default_rng(6)
     deploying = tube_environment(small_lung, with_fissures=False)
-    environment = proof._environment(plans[0].target_lps)
+    environment, design = proof._environment(plans[0].target_lps), design_arrays(plans[0].system.tubes)
     trace, tip = np.zeros(N_TRACE), np.zeros(9)
     at_limits: Counter[int] = Counter()
     n_blocked = 0
@@ -182,7 +182,11 @@ def test_no_box_with_a_deployment_that_can_be_is_blocked(
         turned = Rotation.from_rotvec(values[0] * frame[0] + values[1] * frame[1]).as_matrix()
         normal = turned @ (math.cos(values[2]) * frame[0] + math.sin(values[2]) * frame[1])
         base = np.concatenate([place, turned @ frame[2]])
-        return int(validate_deployment(deploying, tubes, base, normal, values[3], values[4], trace, tip))
+        shape = deployed(design, values[4:2:-1], [0.0, 0.0])
+        if shape is None:
+            return N_REASONS
+        arcs, beside = shape.arcs[: shape.number[0]], float(shape.result[SWEEP])
+        return int(validate_arcs(deploying, tubes, base, normal, arcs, beside, trace, tip))
 
     def box_around(frame: Float, place: Float, values: Float) -> Float:
         scale = 10.0 ** rng.uniform(-5.0, -1.0)
@@ -253,8 +257,9 @@ def test_what_direct_arcs_of_a_real_lung_reach_is_never_ruled_out(
         environment = real._environment(target.lps_mm)
         for entry in rng.permutation(arcs.in_workspace)[:600]:
             tip = atlas.motions.tip(int(atlas.deployments.site[entry]))
-            rotation, outer, inner, _shape = atlas.deployments.choice(int(entry))
-            candidate = arcs.evaluator.direct(tip, rotation, outer, inner)
+            made = atlas.deployments
+            rotation, outer, inner = made.rotation_rad[entry], made.outer_mm[entry], made.inner_mm[entry]
+            candidate = arcs.evaluator.direct(tip, *made.choice(int(entry)))
             if candidate is None or not math.isfinite(arcs.evaluator.evaluate(candidate)):
                 continue
             deployment = tip.lps_from_scope_tip, rotation, outer, inner

@@ -30,7 +30,7 @@ from stages.needle import SHORTEST, Objective
 from stages.needle.environment import direct_arcs, needle_environment
 from stages.needle.path import ArcPath, direct_path
 from stages.scope import MotionProver, find_motions
-from stages.tube import Deployment, DeploymentValidator, enumerate_deployments, tracking_length_mm
+from stages.tube import Deployment, DeploymentValidator, enumerate_deployments, longest_mm
 from tests.lungaccess.cli.ahead import turned_candidates
 from tests.lungaccess.resample import problems
 
@@ -52,7 +52,7 @@ def case(small_lung: Lung) -> Case:
     system, lung = SYSTEM, small_lung
     target = la.resolve_target(lung, "lps:-58.2,55.4,-47.4")
     task = Task(lung=lung, system=system, target=target)
-    places = find_motions(lung, system.scope, reach_mm=tracking_length_mm(system.tubes))
+    places = find_motions(lung, system.scope, reach_mm=longest_mm(system.tubes))
     fissures = {"with_fissures": task.with_fissures}
     found = enumerate_deployments(lung, system.tubes, system.margins, places.tips[::5], **fissures)
     environment = needle_environment(lung, system.needle, system.margins, **fissures)
@@ -66,8 +66,7 @@ def case(small_lung: Lung) -> Case:
     candidates = []
     for entry in ranked[np.linspace(0, len(ranked) - 1, 6).astype(int)]:
         tip = places.tip(5 * int(found.site[entry]))
-        numbers = (found.rotation_rad[entry], found.outer_mm[entry], found.inner_mm[entry])
-        deployment = validator.validate(tip.lps_from_scope_tip, *(float(n) for n in numbers))
+        deployment = validator.choose(tip.lps_from_scope_tip, *found.choice(int(entry)))
         assert isinstance(deployment, Deployment)
         path = direct_path(deployment.lps_from_tip, target.lps_mm)
         candidates.append(Candidate(tip=tip, deployment=deployment, path=path))
@@ -231,7 +230,8 @@ class TestProgram:
         value, jacobian = (np.asarray(out) for out in function(problem.start, problem.numbers.parameters))
         deployment = case.candidates[1].deployment
         np.testing.assert_allclose(value.ravel(), pose_numbers(deployment), atol=1e-9)
-        for name, tolerance in (("rotation", 1e-4), ("outer", 1e-4), ("inner", 1e-4)):
+        # The polynomials of the insertions are fitted over millimetres, so their slopes are not exact.
+        for name, tolerance in (("rotation", 1e-4), ("outer", 1e-3), ("inner", 1e-3)):
             n = problem.layout.variables[name]
             slope = planner_slope(case, name, 1e-4)
             np.testing.assert_allclose(jacobian[:, n], slope, atol=tolerance)
@@ -276,7 +276,8 @@ def planner_slope(case: Case, name: str, step: float) -> Float:
             "inner": old.deployment.inner_mm,
         }
         numbers[name] += sign * step
-        moved = validator.validate(old.tip.lps_from_scope_tip, *numbers.values())
+        rotation, *inserted = numbers.values()
+        moved = validator.validate(old.tip.lps_from_scope_tip, rotation, inserted)
         assert isinstance(moved, Deployment), moved
         ends.append(pose_numbers(moved))
     return np.asarray((ends[0] - ends[1]) / (2.0 * step))

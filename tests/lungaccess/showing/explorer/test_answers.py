@@ -128,9 +128,7 @@ def _are_feasible(patient: Path, exits: dict[str, Any]) -> None:
         candidate = arcs.proved(entry)
         assert candidate is not None
         tip, deployment = candidate.tip.lps_from_scope_tip, candidate.deployment
-        np.testing.assert_allclose(
-            deployment.points(system.tubes, tip, [deployment.exit_mm])[0], point, atol=1e-3
-        )
+        np.testing.assert_allclose(deployment.points(tip, [deployment.exit_mm])[0], point, atol=1e-3)
 
 
 @pytest.mark.slow

@@ -195,7 +195,7 @@ def test_exits_of_the_atlas_are_those_of_its_deployments(small_atlas: la.Atlas) 
         frame = poses.pose(tip[:3], tip[3:6], tip[6:9])
         deployment = validator.choose(frame, *every.choice(entry))
         assert not isinstance(deployment, str)
-        expected = deployment.points(system.tubes, frame, [deployment.exit_mm])[0]
+        expected = deployment.points(frame, [deployment.exit_mm])[0]
         assert np.abs(found - expected).max() < 1e-4
 
 

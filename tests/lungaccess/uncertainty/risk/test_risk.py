@@ -43,8 +43,8 @@ from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
 from lungaccess.uncertainty.risk.statistics import Share
 from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances
 from stages.needle.path import arc_transform
-from stages.tube.validation import centreline
 from tests.stages.scenes import brute_clearance
+from tests.stages.tube.closed_form import centreline
 
 SYSTEM = la.load_system("ultrathin")
 SAMPLES_MM = 0.02

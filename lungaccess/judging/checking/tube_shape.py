@@ -1,4 +1,4 @@
-"""Tubes that are not planar, derived anew by the CasADi model from their insertions and rotations alone."""
+"""The tubes, derived anew by the CasADi model from their insertions and rotations alone."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ SPACING_MM = 0.5
 """Spacing of the points of a body that are compared with its final place."""
 
 
-def check_twisted(plan: Plan, curve: Curve, found: Findings) -> float | None:
-    """Record everything about a shape of the mechanics; None if the tubes snap.
+def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
+    """Record everything about the shape of the tubes; None if they snap.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def check_twisted(plan: Plan, curve: Curve, found: Findings) -> float | None:
     from stages.tube.casadi_shape import derive_shape
 
     names = {name for name, _tube in tubes.named}
-    if shape is None or not found.true(
+    if not found.true(
         "tube.rotations", set(shape.relative_rotations_rad) == names, f"of {', '.join(sorted(names))}"
     ):
         return None
@@ -65,13 +65,12 @@ def check_twisted(plan: Plan, curve: Curve, found: Findings) -> float | None:
 def _check_arcs(plan: Plan, curve: Curve, derived: DerivedShape, found: Findings) -> float:
     """The stated arcs are the derived shape up to their stated error; return how far they are from it."""
     shape, scope = plan.tube.shape, plan.scope.lps_from_scope_tip
-    if shape is None:
-        return 0.0
     length = float(shape.arcs[:, 0].sum())
     found.agrees("tube.arcs.length", length, plan.tube.inner_insertion_mm, SHAPE_TOLERANCE_MM, "mm")
     edges = np.append(0.0, np.cumsum(shape.arcs[:, 0]))
-    wrong = np.abs(shape.arcs[:, 3] - radius_at(plan, 0.5 * (edges[:-1] + edges[1:])))
-    wrong = wrong[shape.arcs[:, 0] > SHAPE_TOLERANCE_MM]
+    ends = edges[:-1] + SHAPE_TOLERANCE_MM, edges[1:] - SHAPE_TOLERANCE_MM
+    wrong = np.abs(shape.arcs[:, 3] - np.array([radius_at(plan, each) for each in ends]))
+    wrong = wrong[:, shape.arcs[:, 0] > 2.0 * SHAPE_TOLERANCE_MM]
     found.at_most("tube.arcs.radius", float(wrong.max(initial=0.0)), 0.0, "mm", "", SHAPE_TOLERANCE_MM)
     points = derived.points_mm @ scope[:3, :3].T + scope[:3, 3]
     stated = np.stack(

@@ -11,11 +11,11 @@ from anatomy.fields import distance_corners
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.poses import pose
-from anatomy.structures import AIRWAY, LUMEN, OBSTACLES, OUTSIDE, VESSEL
+from anatomy.structures import LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.judging.selftest import scenes
-from lungaccess.planning.coupled.cost_to_go import cost_to_go
+from lungaccess.planning.coupled.cost_bound import bound_environment
 from lungaccess.planning.coupled.kernels import box_queue, deployment_box
-from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment
+from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, ROTATION
 from lungaccess.planning.reachability.kernels import deployment_boxes as reach_boxes
 from lungaccess.planning.reachability.kernels import unreachable
 from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment
@@ -241,21 +241,17 @@ def cost_bound(rng: scenes.Random) -> scenes.Case:
     """Draw a deployment and a path to a target; no bound of a box that holds it is above the path's cost."""
     case, bounds = drawn_reaching(rng), []
     cost = path_cost(case)
-    about = (
-        _bound_environment(case, 3.0 * cost),
-        TUBES,
-        greatest_insertions(),
-        case.base[None, None],
-        np.zeros((1, 2)),
-    )
+    tips, limits = case.base[None], case.needle.limits
+    environment = bound_environment(case.tubes, limits, WEIGHTS, case.target, tips, 3.0 * cost)
+    about = environment, TUBES, greatest_insertions(), tips
     for scale in (0.001, 0.01, 0.03, 0.1, 0.3):
         halves = scale * HALVES[2:5] * rng.uniform(0.3, 1.0, 3)
         boxes = np.zeros((8, deployment_box.BOX_COLUMNS))
         middles = case.values[2:5] + rng.uniform(-1.0, 1.0, 3) * halves
-        boxes[0, deployment_box.ROTATION : deployment_box.INNER + 1] = middles
-        boxes[0, deployment_box.HALF_ROTATION : deployment_box.HALF_INNER + 1] = halves
-        boxes[0, [deployment_box.HALF_ACROSS, deployment_box.HALF_UP]] = -1.0
-        boxes[0, deployment_box.LOSS + 1] = 1.0
+        boxes[0, ROTATION : INNER + 1] = middles
+        boxes[0, HALF + ROTATION : HALF + INNER + 1] = halves
+        boxes[0, [HALF + deployment_box.ACROSS, HALF + deployment_box.UP]] = -1.0
+        boxes[0, deployment_box.LOSS + ROTATION] = 1.0
         state = boxes, np.zeros(8, dtype=np.int64), np.arange(8)[::-1].copy(), np.array([1, 7])
         box_queue.divide(*about, tuple(case.target.tolist()), 1, 3.0 * cost, state)
         waiting = state[1][: int(state[3][box_queue.WAITING])]
@@ -274,20 +270,3 @@ def path_cost(case: Reaching) -> float:
     clearance = scenes.true_distances(case.lung.labels, case.lung.grid, middle, OBSTACLES)
     rates = WEIGHTS[0] / np.maximum(clearance, CLEARANCE_FLOOR_MM) + WEIGHTS[1]
     return float((rates * np.diff(lengths)).sum())
-
-
-def _bound_environment(case: Reaching, limit: float) -> BoundEnvironment:
-    tubes, limits = case.tubes, case.needle.limits
-    x, y, z = case.target.tolist()
-    togo = cost_to_go(tubes.field, tubes.geometry, limits, WEIGHTS, (x, y, z), case.base[None, :3], limit)
-    return BoundEnvironment(
-        obstacles=tubes.field, geometry=tubes.geometry, kappa=limits.kappa, togo=togo,
-        surroundings=deployment_box.TubeSurroundings(
-            clearance=tubes.field, labels=tubes.labels, geometry=tubes.geometry, depth=tubes.lumen,
-            depth_geometry=tubes.lumen_geometry, bits=tubes.bits, hazard_bits=tubes.bits & ~AIRWAY,
-            mediastinal=tubes.mediastinal,
-        ),
-        max_length_mm=limits.max_length_mm, goal_tolerance_mm=limits.goal_tolerance_mm,
-        per_clearance=WEIGHTS[0], per_mm=WEIGHTS[1], required_mm=limits.required_mm,
-        exempt_mm=limits.exempt_mm,
-    )  # fmt: skip

@@ -14,23 +14,17 @@ from anatomy.base.typed import Float
 from anatomy.structures import AIRWAY
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.cost_to_go import cost_to_go
+from lungaccess.planning.coupled.kernels.box_of_tubes import INNER, OUTER, ROTATION
 from lungaccess.planning.coupled.kernels.box_queue import ENDED, MOST_BOXES, WAITING, begin_queue, divide
 from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment
-from lungaccess.planning.coupled.kernels.deployment_box import (
-    BOUND,
-    BOX_COLUMNS,
-    INNER,
-    OUTER,
-    ROTATION,
-    TIP,
-    TubeSurroundings,
-)
+from lungaccess.planning.coupled.kernels.deployment_box import BOUND, BOX_COLUMNS, TIP, TubeSurroundings
 from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import Step, evaluated_step
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
+from stages.needle.kernels import Limits
 from stages.tube import deployed, design_arrays, shape_of_arrays, tube_constants, tube_environment
-from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
+from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, TubeEnvironment, greatest_insertions
 
 BOXES_A_STEP = 500
 """Boxes that are divided beside one step of a search: in two threads they take as long, or twice as long."""
@@ -110,7 +104,7 @@ class CostBound:
         self._most_boxes, self._beside_mm = most_boxes, beside_mm
         self._task = task
         self._tubes = tube_constants(system.tubes, system.margins)
-        self._tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
+        self._tips = atlas.motions.tips
         self.queues: list[BoxQueue] = []
         """Once it has begun."""
         self._workers = ThreadPoolExecutor(QUEUES)
@@ -153,13 +147,13 @@ class CostBound:
             return
         self._left_out = min(self._left_out, cost)
         if not self.queues:
-            environment = _environment(self._task, self._tips[:, 0], cost, self._beside_mm)
+            environment = _environment(self._task, self._tips, cost, self._beside_mm)
             insertions = np.zeros(int(self._tubes[MAX_EXTENSION] / INSERTION_STEP_MM) + 1)
             greatest_insertions(self._tubes, self._tubes[MAX_EXTENSION], INSERTION_SPACING_MM, insertions)
             x, y, z = self._task.target.lps_mm.tolist()
             for n in range(QUEUES):
                 tips = np.ascontiguousarray(self._tips[n::QUEUES])
-                about = (environment, self._tubes, insertions, tips, np.zeros((len(tips), 2)), (x, y, z))
+                about = (environment, self._tubes, insertions, tips, (x, y, z))
                 self.queues.append(BoxQueue(about, self._most_boxes // QUEUES))
         self._running = [self._workers.submit(each.go_on, cost, boxes // QUEUES) for each in self.queues]
 
@@ -192,7 +186,7 @@ class BoxQueue:
     Parameters
     ----------
     about : tuple
-        What `begin_queue` and `divide` take first: environment, tubes, insertions, tips, rates and target.
+        What `begin_queue` and `divide` take first: environment, tubes, insertions, tips and target.
     most_boxes : int
     """
 
@@ -306,14 +300,35 @@ class GapGoal:
 
 
 def _environment(task: Task, tips: Float, limit: float, beside_mm: float) -> BoundEnvironment:
-    lung = task.lung
     evaluator = CandidateEvaluator(task)
     limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
     limits = limits._replace(goal_tolerance_mm=limits.goal_tolerance_mm + beside_mm)
-    tubes = tube_environment(lung, with_fissures=task.with_fissures)
+    tubes = tube_environment(task.lung, with_fissures=task.with_fissures)
     weights = objective.inverse_clearance, objective.length
-    x, y, z = task.target.lps_mm.tolist()
-    togo = cost_to_go(tubes.field, tubes.geometry, limits, weights, (x, y, z), tips[:, :3], limit)
+    return bound_environment(tubes, limits, weights, task.target.lps_mm, tips, limit)
+
+
+def bound_environment(
+    tubes: TubeEnvironment,
+    limits: Limits,
+    weights: tuple[float, float],
+    target_lps: Float,
+    tips: Float,
+    limit: float,
+) -> BoundEnvironment:
+    """Return what the bounds look at.
+
+    Parameters
+    ----------
+    weights : tuple of 2 float
+        Those of a path's integral of 1 / clearance, and of its length.
+    target_lps : (3,) float64
+    tips : (S, 9) float64
+        Scope tips, LPS mm.
+    limit : float
+        A cost that no path need be told to exceed.
+    """
+    x, y, z = target_lps.tolist()
     return BoundEnvironment(
         obstacles=tubes.field,
         geometry=tubes.geometry,
@@ -330,9 +345,9 @@ def _environment(task: Task, tips: Float, limit: float, beside_mm: float) -> Bou
         kappa=limits.kappa,
         max_length_mm=limits.max_length_mm,
         goal_tolerance_mm=limits.goal_tolerance_mm,
-        per_clearance=objective.inverse_clearance,
-        per_mm=objective.length,
+        per_clearance=weights[0],
+        per_mm=weights[1],
         required_mm=limits.required_mm,
         exempt_mm=limits.exempt_mm,
-        togo=togo,
+        togo=cost_to_go(tubes.field, tubes.geometry, limits, weights, (x, y, z), tips[:, :3], limit),
     )

@@ -11,11 +11,13 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int, Int32
+from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, ROTATION
 from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment
-from lungaccess.planning.reachability.kernels.deployment_boxes import BOX_COLUMNS
-from lungaccess.planning.reachability.kernels.unreachable import Pieces, divide, first_boxes, measures
+from lungaccess.planning.reachability.kernels.deployment_boxes import BOX_COLUMNS, EAST, NORTH, PLACE_X
+from lungaccess.planning.reachability.kernels.unreachable import Pieces, divide, measures
 from lungaccess.planning.reachability.layers import THREADS
 from lungaccess.planning.reachability.tip_places import PlacePiece
+from stages.tube.kernels import CURVED_LENGTH
 
 MOST_PARTS = 150_000
 """Boxes into which the space is divided: 20 MB, and a second or two of work before the first target."""
@@ -121,14 +123,21 @@ def _as_arrays(pieces: Sequence[PlacePiece]) -> Pieces:
 
 
 def _first_boxes(tubes: Float, longest: float, pieces: Sequence[PlacePiece]) -> tuple[Float, Int32]:
-    boxes = np.zeros((2 * len(pieces), BOX_COLUMNS))
-    owners = np.zeros(2 * len(pieces), dtype=np.int32)
-    count = 0
-    for n, piece in enumerate(pieces):
-        added = first_boxes(tubes, longest, piece.wide, piece.places, boxes[count : count + 2])
-        owners[count : count + added] = n
-        count += added
-    return boxes[:count], owners[:count]
+    """Return boxes that hold everything of each piece, up to the curved length and beyond; and the pieces."""
+    curved = min(float(tubes[CURVED_LENGTH]), longest)
+    ranges = [each for each in ((0.0, curved), (curved, longest)) if each[1] > each[0]]
+    boxes = np.zeros((len(pieces), len(ranges), BOX_COLUMNS))
+    boxes[..., [OUTER, HALF + OUTER]] = 0.5 * longest
+    boxes[..., HALF + ROTATION] = np.pi
+    for part, (low, high) in enumerate(ranges):
+        boxes[:, part, [INNER, HALF + INNER]] = 0.5 * (low + high), 0.5 * (high - low)
+    for each, piece in zip(boxes, pieces, strict=True):
+        each[:, [HALF + EAST, HALF + NORTH]] = piece.wide
+        least, greatest = piece.places
+        each[:, PLACE_X:HALF] = 0.5 * (least + greatest)
+        each[:, HALF + PLACE_X :] = 0.5 * (greatest - least)
+    owners = np.repeat(np.arange(len(pieces), dtype=np.int32), len(ranges))
+    return boxes.reshape(-1, BOX_COLUMNS), owners
 
 
 def _measures(boxes: Float) -> Float:

@@ -7,8 +7,9 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
+from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER
 from lungaccess.planning.reachability.deployment_space import DeploymentSpace
-from lungaccess.planning.reachability.kernels.deployment_boxes import HALF, INNER, OUTER, PLACE_X
+from lungaccess.planning.reachability.kernels.deployment_boxes import PLACE_X
 from lungaccess.planning.reachability.kernels.unreachable import RULED_OUT, TOO_MANY, Found
 
 TOGETHER_MM = 12.0

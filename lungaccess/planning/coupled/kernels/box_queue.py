@@ -7,23 +7,14 @@ import math
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel
+from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, ROTATION, costliest, split
 from lungaccess.planning.coupled.kernels.cost_bound import bound_box
 from lungaccess.planning.coupled.kernels.deployment_box import (
     ACROSS,
     AWAY,
     BOUND,
     BOX_COLUMNS,
-    FIRST,
-    HALF_ACROSS,
-    HALF_INNER,
-    HALF_OUTER,
-    HALF_ROTATION,
-    HALF_UP,
-    INNER,
-    LAST,
     LOSS,
-    OUTER,
-    ROTATION,
     SIDES,
     TIP,
     UP,
@@ -31,7 +22,7 @@ from lungaccess.planning.coupled.kernels.deployment_box import (
 )
 
 MOST_BOXES = 1_000_000
-"""Boxes that may wait; they take 180 MB."""
+"""Boxes that may wait; they take 150 MB."""
 WAITING, UNUSED = 0, 1
 """Of the numbers of a queue: boxes that wait, and rows that hold none."""
 ENDED, EMPTY, FULL, WHOLE = 0, 1, 2, 3
@@ -39,8 +30,6 @@ ENDED, EMPTY, FULL, WHOLE = 0, 1, 2, 3
 BEGUN_MM = 40.0
 """Tips differ by less in the boxes with which a bound begins."""
 MOST_STACKED = 200
-TIP_SIDES = 4
-"""The first sides, which tell where the tips of the tubes are."""
 SMALL_MM = 0.005
 """Sides that make less difference are not halved."""
 
@@ -78,53 +67,15 @@ def _pop(boxes, heap, numbers):
     return lowest
 
 
-@inner_kernel
-def _halve(parent, child, sides):
-    """Halve a box on the side that costs most.
-
-    Returns 2; 1 if its paths are to be told apart halfway from now on; 0 if it is too small.  And whether the
-    halves hold the same tubes.
-    """
-    if parent[LAST] - parent[FIRST] < 2.0:
-        parent[LOSS] = 0.0
-    side = 0
-    for m in range(1, sides):
-        if parent[LOSS + m] > parent[LOSS + side]:
-            side = m
-    if parent[LOSS + side] < SMALL_MM:
-        return 0, True
-    if side == 4 and parent[HALF_ACROSS] < 0.0:
-        return 1, True
-    child[:] = parent
-    if side == 0:
-        parent[LAST] = child[FIRST] = math.floor(0.5 * (parent[FIRST] + parent[LAST]))
-        return 2, False
-    if side == 1:
-        middle, half = ROTATION, HALF_ROTATION
-    elif side == 2:
-        middle, half = OUTER, HALF_OUTER
-    elif side == 3:
-        middle, half = INNER, HALF_INNER
-    elif side == 4:
-        middle, half = ACROSS, HALF_ACROSS
-    else:
-        middle, half = UP, HALF_UP
-    parent[half] *= 0.5
-    child[half] = parent[half]
-    parent[middle] -= parent[half]
-    child[middle] += parent[half]
-    return 2, side >= TIP_SIDES
-
-
 @kernel(nogil=True)
-def begin_queue(environment, tubes, insertions, tips, rates, target, longest, limit, first, last, state):
+def begin_queue(environment, tubes, insertions, tips, target, longest, limit, first, last, state):
     """Let boxes wait that hold all deployments whose bound may be below a limit, from tips `first` to `last`.
 
     Boxes of more than BEGUN_MM are divided at once, depth first.
 
     Parameters
     ----------
-    environment, tubes, insertions, tips, rates, target
+    environment, tubes, insertions, tips, target
         Those of `bound_box`.
     longest : float
         Greatest insertion, mm.
@@ -149,21 +100,18 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
     for n in range(first, last):
         box = stack[0]
         box[:] = 0.0
-        box[TIP], box[FIRST], box[LAST] = n, 0.0, tips.shape[1] - 1.0
-        box[HALF_ROTATION] = math.pi
-        box[OUTER] = box[INNER] = box[HALF_OUTER] = box[HALF_INNER] = 0.5 * longest
-        box[HALF_ACROSS] = box[HALF_UP] = -1.0
+        box[TIP], box[HALF + ROTATION] = n, math.pi
+        box[OUTER] = box[INNER] = box[HALF + OUTER] = box[HALF + INNER] = 0.5 * longest
+        box[HALF + ACROSS] = box[HALF + UP] = -1.0
         stacked = 1
         while stacked > 0:
             box = stack[stacked - 1]
-            box[BOUND] = bound_box(environment, tubes, insertions, tips, rates, target, limit, box, False)
+            box[BOUND] = bound_box(environment, tubes, insertions, tips, target, limit, box, False)
             if box[BOUND] >= limit:
                 stacked -= 1
                 continue
-            halves = 0
             if box[AWAY] > BEGUN_MM and stacked < MOST_STACKED:
-                halves, _same = _halve(box, stack[stacked], TIP_SIDES)
-            if halves == 2:
+                split(box, stack[stacked], costliest(box, LOSS, SIDES))
                 stacked += 1
                 continue
             if numbers[UNUSED] == 0:
@@ -177,12 +125,12 @@ def begin_queue(environment, tubes, insertions, tips, rates, target, longest, li
 
 
 @kernel(nogil=True)
-def divide(environment, tubes, insertions, tips, rates, target, most, limit, state):
+def divide(environment, tubes, insertions, tips, target, most, limit, state):
     """Divide the box of the lowest bound, and so on.
 
     Parameters
     ----------
-    environment, tubes, insertions, tips, rates, target
+    environment, tubes, insertions, tips, target
         Those of `bound_box`.
     most : int
         Boxes to divide.
@@ -205,18 +153,21 @@ def divide(environment, tubes, insertions, tips, rates, target, most, limit, sta
         row = _pop(boxes, heap, numbers)
         floor = boxes[row, BOUND]
         other = unused[numbers[UNUSED] - 1]
-        halves, same_tubes = _halve(boxes[row], boxes[other], SIDES)
-        if halves == 0:
+        side, halves = costliest(boxes[row], LOSS, SIDES), 2
+        if boxes[row, LOSS + side] < SMALL_MM:
             _push(boxes, heap, numbers, row)
             return WHOLE, done
-        if halves == 1:
-            boxes[row, HALF_ACROSS] = boxes[row, HALF_UP] = boxes[row, WIDE]
+        same_tubes = side <= UP
+        if same_tubes and boxes[row, HALF + ACROSS] < 0.0:  # From now on paths are told apart halfway.
+            boxes[row, HALF + ACROSS] = boxes[row, HALF + UP] = boxes[row, WIDE]
+            halves = 1
         else:
             numbers[UNUSED] -= 1
+            split(boxes[row], boxes[other], side)
         for part in range(halves):
             at = row if part == 0 else other
             box = boxes[at]
-            bound = bound_box(environment, tubes, insertions, tips, rates, target, limit, box, same_tubes)
+            bound = bound_box(environment, tubes, insertions, tips, target, limit, box, same_tubes)
             box[BOUND] = max(bound, floor)
             if boxes[at, BOUND] < limit:
                 _push(boxes, heap, numbers, at)

@@ -12,38 +12,37 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import most_distance
+from lungaccess.planning.coupled.kernels.box_of_tubes import (
+    HALF,
+    INNER,
+    OUTER,
+    ROTATION,
+    SPARE,
+    cross,
+    dot,
+    has_insertions,
+    minus,
+    norm,
+    seen_target,
+    times,
+    tip_moves,
+    tip_of,
+)
 from lungaccess.planning.coupled.kernels.cost_to_go import LARGEST_SINE, CostToGo, angle_at, cost_from
 from lungaccess.planning.coupled.kernels.deployment_box import (
     ACROSS,
     AWAY,
-    HALF_ACROSS,
-    HALF_INNER,
-    HALF_OUTER,
-    HALF_ROTATION,
-    HALF_UP,
-    INNER,
     LOSS,
-    OUTER,
-    SPARE,
+    SIDES,
     UP,
     WIDE,
     TubeSurroundings,
     least_sweep,
-    point_of,
-    pose_of,
+    tubes_at,
     tubes_blocked,
 )
-from lungaccess.planning.coupled.kernels.tips_in_reach import dot, leans_too_far, least_distance
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
-from stages.tube.kernels import (
-    CURVED_LENGTH,
-    INNER_CURVATURE,
-    MAX_EXTENSION,
-    MAX_SWEEP,
-    OVERLAP_CURVATURE,
-    insertions_exist,
-    planar_point,
-)
+from stages.tube.kernels import CORNER_MM, MAX_EXTENSION, MAX_SWEEP
 
 COST_STEP_MM = 0.7
 """Longest step of the bounds of an integral where both ends are known well."""
@@ -203,21 +202,7 @@ def along_tangent(environment, tip, tangent, swing, away, far, limit):
 
 
 @inner_kernel
-def _across(direction):
-    """Return two unit vectors across a unit vector, and across each other."""
-    x, y, z = direction
-    if abs(x) < 0.6:
-        size = math.sqrt(y * y + z * z)
-        one = (0.0, z / size, -y / size)
-    else:
-        size = math.sqrt(x * x + y * y)
-        one = (y / size, -x / size, 0.0)
-    other = (y * one[2] - z * one[1], z * one[0] - x * one[2], x * one[1] - y * one[0])
-    return one, other
-
-
-@inner_kernel
-def bound_box(environment, tubes, insertions, tips, rates, target, limit, box, same_tubes):
+def bound_box(environment, tubes, insertions, tips, target, limit, box, same_tubes):
     """Bound the cost of every path from the deployments of a box from below; inf if there is none.
 
     Tubes are not looked at where the bound is `limit` or more without.
@@ -228,10 +213,8 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box, s
     tubes : (N_TUBES,) float64
     insertions : (N,) float64
         See `stages.tube.kernels.greatest_insertions`.
-    tips : (S, K, 9) float64
-        Rows of scope tips, LPS mm.
-    rates : (S, 2) float64
-        By how many mm the place, and by what angle (rad) the frame may change from a sample to the next.
+    tips : (S, 9) float64
+        Scope tips, LPS mm.
     target : tuple of 3 float
     limit : float
     box : (BOX_COLUMNS,) float64
@@ -241,38 +224,23 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box, s
         of the paths alone.
     """
     kappa = environment.kappa
-    outer, half_outer, inner, half_inner = box[OUTER], box[HALF_OUTER], box[INNER], box[HALF_INNER]
-    if not insertions_exist(tubes, insertions, outer, half_outer, inner, half_inner):
+    if not has_insertions(tubes, insertions, box):
         return math.inf
     sweep = least_sweep(tubes, box)
-    if sweep > tubes[MAX_SWEEP] or inner - half_inner > tubes[MAX_EXTENSION]:
+    if sweep > tubes[MAX_SWEEP] or box[INNER] - box[HALF + INNER] > tubes[MAX_EXTENSION]:
         return math.inf
-    pose = pose_of(tips, rates, box)
-    _base, forward, normal, place, tilt = pose
-    tip, away = point_of(tubes, pose, box, inner)
-    away += half_inner
+    family = tubes_at(tubes, tips, box)
+    tip, tangent, away, swing = tip_of(tubes, family, box)
     box[AWAY] = away
-    ahead = (target[0] - tip[0], target[1] - tip[1], target[2] - tip[2])
-    far = math.sqrt(ahead[0] * ahead[0] + ahead[1] * ahead[1] + ahead[2] * ahead[2])
+    ahead = minus(target, tip, 1.0)
+    far = norm(ahead)
     off = environment.goal_tolerance_mm + SPARE
-    if far - away - off > environment.max_length_mm:
+    if far - away - off > environment.max_length_mm or leans_too_far(
+        kappa, tangent, ahead, swing, away + off
+    ):
         return math.inf
-    straight = max(inner - tubes[CURVED_LENGTH], 0.0)
-    shared = min(max(outer - straight, 0.0), inner - straight)
-    heading = tubes[OVERLAP_CURVATURE] * shared + tubes[INNER_CURVATURE] * (inner - straight - shared)
-    sine, cosine = math.sin(heading), math.cos(heading)
-    tangent = (
-        sine * normal[0] + cosine * forward[0],
-        sine * normal[1] + cosine * forward[1],
-        sine * normal[2] + cosine * forward[2],
-    )
-    unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
-    most = max(abs(tubes[OVERLAP_CURVATURE]), abs(tubes[INNER_CURVATURE]))
-    turned = unlike * half_outer + most * half_inner
-    swing = tilt + turned + box[HALF_ROTATION] * min(abs(sine) + turned, 1.0)
-    if leans_too_far(kappa, tangent, ahead, swing, away + off):
-        return math.inf
-    least = max(least_distance(tubes, kappa, pose, box, tip, tangent, target, off), far - away - off)
+    seen = seen_target(tubes, kappa, target, family, tip, tangent, box)
+    least = max(least_distance(kappa, seen, off), far - away - off)
     if least == math.inf or least > environment.max_length_mm:
         return math.inf
     ahead_cost = 0.0
@@ -280,54 +248,110 @@ def bound_box(environment, tubes, insertions, tips, rates, target, limit, box, s
         ahead_cost = along_tangent(environment, tip, tangent, swing, away, far - away - off, limit)
     if ahead_cost >= limit:
         return math.inf
-    x, z = planar_point(tubes, outer, inner, inner)
-    box[LOSS] = place + tilt * math.hypot(x, z)
-    box[LOSS + 1] = box[HALF_ROTATION] * abs(x)
-    box[LOSS + 2] = unlike * half_outer * max(inner - outer + half_outer, 0.0)
-    box[LOSS + 3] = half_inner * (1.0 + (most * inner if inner + half_inner > tubes[CURVED_LENGTH] else 0.0))
-    box[LOSS + 4] = box[LOSS + 5] = 0.0
+    box[LOSS : LOSS + SIDES] = 0.0
+    box[LOSS + ROTATION], box[LOSS + OUTER], box[LOSS + INNER] = tip_moves(tubes, family, box)
     most_far = far + away + off
     box[WIDE] = max(angle_at(kappa, most_far) - angle_at(kappa, 0.5 * most_far), 0.0)
     bound = ahead_cost
     if away < KNOWN_MM:
-        if box[HALF_ACROSS] < 0.0 or far <= away + off or 0.5 * kappa * most_far > LARGEST_SINE:
-            box[LOSS + 4] = HALFWAY_LOSS * 0.06 * kappa * far * far
+        if box[HALF + ACROSS] < 0.0 or far <= away + off or 0.5 * kappa * most_far > LARGEST_SINE:
+            box[LOSS + ACROSS] = HALFWAY_LOSS * 0.06 * kappa * far * far
             bound = max(bound, as_far_as(environment, target, tip, off, away, least))
         else:
             bound = max(bound, _by_halfway(environment, target, tip, tangent, swing, off, away, least, box))
     if same_tubes or bound >= limit or away >= FOLLOWED_MM:
         return bound
-    return math.inf if tubes_blocked(environment.surroundings, tubes, pose, box, sweep) else bound
+    return math.inf if tubes_blocked(environment.surroundings, tubes, family, box, sweep) else bound
 
 
 @merged_kernel
 def _by_halfway(environment, target, tip, tangent, swing, off, away, least, box):
     """Bound the cost of paths that cross the sphere halfway to the target in a range; see the module."""
     kappa = environment.kappa
-    x, y, z = tip[0] - target[0], tip[1] - target[1], tip[2] - target[2]
-    far = math.sqrt(x * x + y * y + z * z)
+    back = minus(tip, target, 1.0)
+    far = norm(back)
     angle = math.hypot(box[ACROSS], box[UP])
-    half = math.hypot(box[HALF_ACROSS], box[HALF_UP])
+    half = math.hypot(box[HALF + ACROSS], box[HALF + UP])
     if angle - half > box[WIDE] + SPARE:
         return math.inf
-    direction = (x / far, y / far, z / far)
-    one, other = _across(direction)
+    direction = times(back, 1.0 / far)
+    one = cross(direction, (1.0, 0.0, 0.0) if abs(direction[0]) < 0.6 else (0.0, 0.0, 1.0))
+    one = times(one, 1.0 / norm(one))
+    other = cross(direction, one)
     a, b = (box[ACROSS] / angle, box[UP] / angle) if angle > 0.0 else (1.0, 0.0)
     c, s = math.cos(angle), math.sin(angle)
     reach = 0.5 * far
-    via = (
-        target[0] + reach * (c * direction[0] + s * (a * one[0] + b * other[0])),
-        target[1] + reach * (c * direction[1] + s * (a * one[1] + b * other[1])),
-        target[2] + reach * (c * direction[2] + s * (a * one[2] + b * other[2])),
-    )
+    aside = minus(times(one, a), other, -b)
+    via = minus(target, minus(times(direction, c), aside, -s), -reach)
     unsure = reach * half + 0.5 * away + 1.5 * off
     # The path has to get there from the tip's direction.
-    ahead = (via[0] - tip[0], via[1] - tip[1], via[2] - tip[2])
+    ahead = minus(via, tip, 1.0)
     if leans_too_far(kappa, tangent, ahead, swing, unsure + away):
         return math.inf
-    box[LOSS + 4] = HALFWAY_LOSS * 0.5 * reach * box[HALF_ACROSS]
-    box[LOSS + 5] = HALFWAY_LOSS * 0.5 * reach * box[HALF_UP]
+    box[LOSS + ACROSS] = HALFWAY_LOSS * 0.5 * reach * box[HALF + ACROSS]
+    box[LOSS + UP] = HALFWAY_LOSS * 0.5 * reach * box[HALF + UP]
     far_via = reach - unsure
     total = as_far_as(environment, target, via, off, unsure, max(0.5 * least - 1.5 * off, far_via - off))
-    ahead_via = math.sqrt(dot(ahead, ahead)) - unsure - away
+    ahead_via = norm(ahead) - unsure - away
     return total + as_far_as(environment, via, tip, unsure, away, max(0.5 * least - 0.5 * off, ahead_via))
+
+
+@merged_kernel
+def least_distance(kappa, seen, off):
+    """Return how far the tips of a box with the target in reach are at least, mm; inf if there is none.
+
+    The target moves, as the tips see it, with each side of the box.  To first order its distance from the
+    middle tip, and from the centre of the tightest circle there, change with each in proportion.  The least
+    distance with the target outside of that circle is that of a linear program with one condition.
+
+    Parameters
+    ----------
+    kappa : float
+    seen : Seen
+        Of a box with one scope tip.
+    off : float
+        How far beside the target a needle may end, mm.
+    """
+    far = math.hypot(seen.aside, seen.ahead)
+    if min(far, seen.size) < CORNER_MM:
+        return max(far - seen.moved - off, 0.0)
+    second = seen.second + off + SPARE
+    sides = (seen.by_rotation, seen.by_outer, seen.by_inner)
+    outward = across = nearer = 0.0
+    for side in sides:
+        part = dot(seen.line, side)
+        outward += abs(part)
+        across += math.sqrt(max(dot(side, side) - part * part, 0.0))
+        nearer += abs(dot(seen.from_tip, side)) / far
+    needed = max(1.0 / kappa - second, 0.0)
+    needed = math.sqrt(max(needed * needed - across * across, 0.0)) - seen.size
+    if needed > outward:
+        return math.inf
+    best = -nearer
+    for at in sides:
+        slope = dot(seen.line, at)
+        if slope == 0.0:
+            continue
+        price = dot(seen.from_tip, at) / (far * slope)
+        if price <= 0.0:
+            continue
+        total = price * needed
+        for side in sides:
+            total -= abs(dot(seen.from_tip, side) / far - price * dot(seen.line, side))
+        best = max(best, total)
+    return max(far + best - second, 0.0)
+
+
+@inner_kernel
+def leans_too_far(kappa, tangent, ahead, swing, off):
+    """Tell whether no path of the curvature `kappa` leads as far as `ahead`, an offset known to `off` mm.
+
+    `swing` (rad) is how well the direction at the start is known.
+    """
+    x, y, z = ahead
+    far = math.sqrt(x * x + y * y + z * z)
+    if far <= off:
+        return False
+    cosine = (tangent[0] * x + tangent[1] * y + tangent[2] * z) / far
+    lean = math.acos(min(max(cosine, -1.0), 1.0)) - swing - math.asin(min(off / far, 1.0))
+    return lean > angle_at(kappa, far + off) + SPARE

@@ -1,9 +1,8 @@
-"""Boxes of deployments from a scope tip: where their tubes are, and whether all of them are ruled out.
+"""Boxes of deployments from a scope tip: whether all tubes of one are ruled out.
 
-A box is a row of `BOX_COLUMNS` float64: a range of places of the scope tip along a motion (samples FIRST to
-LAST of a row of tips), of the rotation of the tubes, and of both insertions (middles and half widths); and
-where the paths cross a sphere halfway to the target, as a rotation vector (rad) from the straight line, with
-half widths; a half width below 0 is no such range.  docs/explanation/cost_bound.md derives what is ruled out.
+A box is one of `box_of_tubes`, from one scope tip.  Its first two sides say where the paths cross a sphere
+halfway to the target, as a rotation vector (rad) from the straight line; a half width below 0 is no such
+range.  docs/explanation/cost_bound.md derives what is ruled out.
 """
 
 from __future__ import annotations
@@ -16,6 +15,18 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance, most_distance
 from anatomy.kernels.labels import BRANCH_SHIFT, LUMEN
+from lungaccess.planning.coupled.kernels.box_of_tubes import (
+    HALF,
+    INNER,
+    OUTER,
+    ROTATION,
+    SPARE,
+    cross,
+    minus,
+    sample_of,
+    times,
+    tubes_of,
+)
 from stages.tube.kernels import (
     CORNER_MM,
     CURVED_LENGTH,
@@ -29,20 +40,15 @@ from stages.tube.kernels import (
     SWEEP_SAMPLES,
     UNNOTICED_MM,
     off_track,
-    planar_point,
     refused_exits,
 )
 
-BOUND, TIP, FIRST, LAST, ROTATION, OUTER, INNER, ACROSS, UP = range(9)
-HALF_ROTATION, HALF_OUTER, HALF_INNER, HALF_ACROSS, HALF_UP = range(9, 14)
-AWAY, WIDE, LOSS, SIDES = 14, 15, 16, 6
+ACROSS, UP, SIDES = 0, 1, 5
+BOUND, TIP, AWAY, WIDE, LOSS = 5, 6, 7, 13, 14
 BOX_COLUMNS = LOSS + SIDES
-"""`AWAY` is how far tips are from the middle one at most, mm, and `WIDE` the greatest angle (rad) of that
-rotation vector; from `LOSS` on stands what each side costs, mm: place, rotation, outer, inner, and the two
-sides of the rotation vector."""
+"""`TIP` is the row of the scope tip, `AWAY` how far tips are from the middle one at most, mm, and `WIDE` the
+greatest angle (rad) of that rotation vector; from `LOSS` on stands what each side costs, mm."""
 
-SPARE = 1e-6
-"""For rounding, mm and rad."""
 TUBE_STEP_MM = 0.5
 """Step at which tubes of a small box are looked at."""
 LOOSE_SWEEP_MM = 0.3
@@ -87,46 +93,13 @@ class TubeSurroundings(NamedTuple):
 
 
 @inner_kernel
-def pose_of(tips, rates, box):
-    """Return the middle scope tip of a box, its tubes' normal, and how far others may be from it.
-
-    That is: point, direction, normal; by how many mm the places and by what angle the frames differ.
-    """
-    n, m = int(box[TIP]), int(0.5 * (box[FIRST] + box[LAST]))
-    tip = tips[n, m]
-    base = (tip[0], tip[1], tip[2])
-    forward = (tip[3], tip[4], tip[5])
-    binormal = (
-        forward[1] * tip[8] - forward[2] * tip[7],
-        forward[2] * tip[6] - forward[0] * tip[8],
-        forward[0] * tip[7] - forward[1] * tip[6],
-    )
-    c, s = math.cos(box[ROTATION]), math.sin(box[ROTATION])
-    normal = (c * tip[6] + s * binormal[0], c * tip[7] + s * binormal[1], c * tip[8] + s * binormal[2])
-    samples = max(box[LAST] - m, m - box[FIRST])
-    return base, forward, normal, samples * rates[n, 0], samples * rates[n, 1]
-
-
-@inner_kernel
-def point_of(tubes, pose, box, s):
-    """Return the point of the middle tubes at arc length `s`, and how far from it those of others are, mm."""
-    base, forward, normal, place, tilt = pose
-    outer, half_inner = box[OUTER], box[HALF_INNER]
-    longest = box[INNER] + half_inner
-    bent = longest > tubes[CURVED_LENGTH]
-    x, z = planar_point(tubes, outer, box[INNER] if bent else longest, s)
-    unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
-    most = max(abs(tubes[OVERLAP_CURVATURE]), abs(tubes[INNER_CURVATURE]))
-    wrong = unlike * box[HALF_OUTER] * max(s - max(outer - box[HALF_OUTER], 0.0), 0.0)
-    if bent:
-        wrong += most * half_inner * s
-    away = place + wrong + tilt * (math.hypot(x, z) + wrong) + box[HALF_ROTATION] * (abs(x) + wrong)
-    point = (
-        base[0] + x * normal[0] + z * forward[0],
-        base[1] + x * normal[1] + z * forward[1],
-        base[2] + x * normal[2] + z * forward[2],
-    )
-    return point, away
+def tubes_at(tubes, tips, box):
+    """Return the `BoxTubes` of a box from its scope tip, a row of `tips` (S, 9)."""
+    tip = tips[int(box[TIP])]
+    forward, first = (tip[3], tip[4], tip[5]), (tip[6], tip[7], tip[8])
+    second = cross(forward, first)
+    normal = minus(times(first, math.cos(box[ROTATION])), second, -math.sin(box[ROTATION]))
+    return tubes_of(tubes, (tip[0], tip[1], tip[2]), forward, normal, 0.0, 0.0, box)
 
 
 @inner_kernel
@@ -137,24 +110,24 @@ def least_sweep(tubes, box):
     most.  docs/explanation/cost_bound.md derives how both change with the insertions.
     """
     curved, inner, outer = tubes[CURVED_LENGTH], box[INNER], box[OUTER]
-    longest, first_outer = inner + box[HALF_INNER], max(outer - box[HALF_OUTER], 0.0)
-    if inner - box[HALF_INNER] <= curved or outer > inner:
+    longest, first_outer = inner + box[HALF + INNER], max(outer - box[HALF + OUTER], 0.0)
+    if inner - box[HALF + INNER] <= curved or outer > inner:
         return 0.0
     unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
     opening = abs(tubes[OVERLAP_CURVATURE])
     if longest - curved > first_outer:
         opening = max(opening, abs(tubes[INNER_CURVATURE]))
-    least = off_track(tubes, outer, inner, curved) - opening * curved * box[HALF_INNER]
-    least -= 2.0 * unlike * max(curved - first_outer, 0.0) * box[HALF_OUTER]
-    if opening * curved * box[HALF_INNER] < LOOSE_SWEEP_MM:
+    least = off_track(tubes, outer, inner, curved) - opening * curved * box[HALF + INNER]
+    least -= 2.0 * unlike * max(curved - first_outer, 0.0) * box[HALF + OUTER]
+    if opening * curved * box[HALF + INNER] < LOOSE_SWEEP_MM:
         greatest = share = 0.0
         for m in range(SWEEPS_EVERY, SWEEP_SAMPLES + 1, SWEEPS_EVERY):
             off = off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES)
             if off > greatest:
                 greatest, share = off, m / SWEEP_SAMPLES
         by_inner = opening * (curved + share * ((1.0 - share) * longest + curved))
-        greatest -= by_inner * box[HALF_INNER]
-        greatest -= 2.0 * unlike * max(share * longest - first_outer, 0.0) * box[HALF_OUTER]
+        greatest -= by_inner * box[HALF + INNER]
+        greatest -= 2.0 * unlike * max(share * longest - first_outer, 0.0) * box[HALF + OUTER]
         least = max(least, greatest)
     return max(least - SPARE, 0.0)
 
@@ -213,7 +186,7 @@ def _within(surroundings, point, bits, branch, reach):
 
 
 @inner_kernel
-def tubes_blocked(surroundings, tubes, pose, box, sweep):
+def tubes_blocked(surroundings, tubes, family, box, sweep):
     """Tell whether all tubes of a box are refused, or end in a lumen.
 
     A tube leaves its airway behind the last sample at which all tubes are in the lumen, and before the first
@@ -225,13 +198,12 @@ def tubes_blocked(surroundings, tubes, pose, box, sweep):
     ----------
     surroundings : TubeSurroundings
     tubes : (N_TUBES,) float64
-    pose
-        See `pose_of`.
+    family : BoxTubes
     sweep : float
         No tube of the box sweeps sideways by less, mm.
     """
-    first_outer, longer = box[OUTER] - box[HALF_OUTER], 2.0 * box[HALF_INNER]
-    shortest = max(box[INNER] - box[HALF_INNER], 0.0)
+    first_outer, longer = box[OUTER] - box[HALF + OUTER], 2.0 * box[HALF + INNER]
+    shortest = max(box[INNER] - box[HALF + INNER], 0.0)
     hazards, bits = surroundings.hazard_bits, surroundings.bits
     beside = tubes[MARGIN] + sweep - SPARE
     left, branches = False, (NONE, NONE)
@@ -239,7 +211,7 @@ def tubes_blocked(surroundings, tubes, pose, box, sweep):
     refuted = 0.0  # Tubes that leave before this arc length are refused.
     s = back = looked = 0.0
     while True:
-        point, away = point_of(tubes, pose, box, s)
+        point, away = sample_of(tubes, family, s)
         x, y, z = point
         deep = distance_bound(surroundings.depth, surroundings.depth_geometry, x, y, z)
         radius = tubes[OUTER_RADIUS] if s <= first_outer else tubes[INNER_RADIUS]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +9,7 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
-from lungaccess.planning.reachability.kernels.deployment_boxes import (
-    HALF,
-    INNER,
-    OUTER,
-    SPARE_MM,
-    heading,
-    sample_of,
-)
+from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, SPARE, minus, sample_of
 from stages.needle.infeasibility.kernels import BackwardReach, never_along
 from stages.tube.kernels import (
     CORNER_MM,
@@ -121,44 +113,32 @@ def no_tip_near(environment, place, away):
 
 
 @inner_kernel
-def tips_differ(tubes, family, box):
-    """Return how far the tips of the tubes of a box are from the middle one at most, mm."""
-    return sample_of(tubes, family, box[INNER])[1] + box[HALF + INNER]
-
-
-@inner_kernel
-def tips_in_lumen(environment, family, tubes, box, away):
+def tips_in_lumen(environment, tip, away):
     """Tell whether the tips of all tubes of a box, within `away` of the middle one, are in the lumen."""
-    tip, _away = sample_of(tubes, family, box[INNER])
     return distance_bound(environment.depth, environment.depth_geometry, tip[0], tip[1], tip[2]) > away
 
 
 @merged_kernel
-def tips_blocked(environment, tubes, limits, seen, family, box, away):
-    """Tell whether all tips, within `away` of the middle one, are in the lumen or blocked ahead."""
-    pose, rho, ahead, _size, _moved, _second = seen
-    _middle, _forward, _normal, bounds, _outer, _inner = family
-    _place, tilt, roll, sharing, _first_outer, opening = bounds
-    half_inner = box[HALF + INNER]
-    if tips_in_lumen(environment, family, tubes, box, away):
+def tips_blocked(environment, limits, tip, tangent, far, away, swing):
+    """Tell whether all tips are in the lumen or blocked ahead.
+
+    They are within `away` (mm) and `swing` (rad) of the middle one, which is `far` mm from the target.
+    """
+    if tips_in_lumen(environment, tip, away):
         return True
-    spare = limits.goal_tolerance_mm + SPARE_MM
+    spare = limits.goal_tolerance_mm + SPARE
     exempt = limits.exempt_mm
-    far = math.hypot(rho, ahead)
-    most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
-    turned = sharing + opening + most * half_inner
-    angle = turned + tilt + roll * min(abs(math.sin(heading(tubes, box[OUTER], box[INNER]))) + turned, 1.0)
     # A needle that ends within the exempt length keeps clear of nothing but hazards.
     length = exempt
     while length < far - away - spare:
-        around = away + length * angle + 0.5 * limits.kappa * length * length
+        around = away + length * swing + 0.5 * limits.kappa * length * length
         if around > FARTHEST_LOOK_MM:
             break
-        x, y, z = pose[0] + length * pose[3], pose[1] + length * pose[4], pose[2] + length * pose[5]
+        x, y, z = minus(tip, tangent, -length)
         if distance_bound(environment.passable, environment.geometry, x, y, z) > around + spare:
             return True
         length += max(around, LOOK_STEP_MM)
-    return never_along(environment.backward, pose, away + spare, angle, exempt)
+    return never_along(environment.backward, tip + tangent, away + spare, swing, exempt)
 
 
 @merged_kernel
@@ -224,7 +204,7 @@ def tubes_blocked(environment, tubes, family, box):
             distance_bound(environment.depth, environment.depth_geometry, point[0], point[1], point[2]) - away
         )
         if out:
-            if s <= shortest and (deep > LOOK_MM or lacking > SPARE_MM):
+            if s <= shortest and (deep > LOOK_MM or lacking > SPARE):
                 return True
             to_lumen = distance_bound(environment.lumen, environment.geometry, point[0], point[1], point[2])
             step = max(step, min(-lacking, to_lumen))
@@ -232,7 +212,7 @@ def tubes_blocked(environment, tubes, family, box):
             to_allowed = distance_bound(
                 environment.may_be_left, environment.geometry, point[0], point[1], point[2]
             )
-            if s <= shortest and lacking > SPARE_MM:
+            if s <= shortest and lacking > SPARE:
                 refuted = max(refuted, refused_exits(tubes, s, lacking, first_outer))
             may_here = to_allowed <= away + step + CORNER_MM and refuted < s + step
             if (deep > 0.0 and s <= shortest) or refuted >= s:
@@ -240,7 +220,7 @@ def tubes_blocked(environment, tubes, family, box):
             else:
                 may_leave = may_leave or may_here
             out = _is_out(environment, point, away)
-            if out and (not may_leave or refuted >= s or (lacking > SPARE_MM and s <= shortest)):
+            if out and (not may_leave or refuted >= s or (lacking > SPARE and s <= shortest)):
                 return True
             if deep > step:
                 step = deep

@@ -15,33 +15,40 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from lungaccess.planning.coupled.kernels.box_of_tubes import (
+    HALF,
+    INNER,
+    OUTER,
+    ROTATION,
+    SPARE,
+    costliest,
+    has_insertions,
+    seen_target,
+    split,
+    tip_moves,
+    tip_of,
+)
 from lungaccess.planning.reachability.kernels.blocked import (
     no_tip_near,
     tips_blocked,
-    tips_differ,
     tips_in_lumen,
     tubes_blocked,
 )
 from lungaccess.planning.reachability.kernels.deployment_boxes import (
     BOX_COLUMNS,
     EAST,
-    HALF,
-    INNER,
     NORTH,
-    OUTER,
     PLACE_X,
     PLACE_Y,
     PLACE_Z,
-    ROTATION,
     SIDES,
-    SPARE_MM,
+    box_tubes,
     place_of,
-    target_seen,
-    tubes_of,
+    sum_changes,
     turned_vector,
 )
 from stages.needle.infeasibility.kernels import escape_depth
-from stages.tube.kernels import CURVED_LENGTH, insertions_exist, planar_point
+from stages.tube.kernels import planar_point
 
 RULED_OUT, UNDECIDED, TOO_MANY = 1, 2, 3
 """Of a box: no deployment of it reaches; a part too small to halve may; not looked at to the end."""
@@ -92,13 +99,6 @@ class Found(NamedTuple):
 
 
 @inner_kernel
-def _insertions_exist(tubes, insertions, box):
-    """Tell whether a box holds insertions that are possible and sweep little."""
-    outer, inner = box[OUTER], box[INNER]
-    return insertions_exist(tubes, insertions, outer, box[HALF + OUTER], inner, box[HALF + INNER])
-
-
-@inner_kernel
 def _away_from_point(cones, m, place):
     return math.sqrt(
         (place[0] - cones[m, 0]) ** 2 + (place[1] - cones[m, 1]) ** 2 + (place[2] - cones[m, 2]) ** 2
@@ -114,7 +114,7 @@ def _may_look(cones, place, away, forward, tilt):
     for m in range(len(cones)):
         cosine = forward[0] * cones[m, 3] + forward[1] * cones[m, 4] + forward[2] * cones[m, 5]
         may_look = math.acos(min(max(cosine, -1.0), 1.0)) - tilt <= cones[m, 6]
-        if may_look and _away_from_point(cones, m, place) <= nearest + 2.0 * away + SPARE_MM:
+        if may_look and _away_from_point(cones, m, place) <= nearest + 2.0 * away + SPARE:
             return True
     return False
 
@@ -131,21 +131,20 @@ def tips_may_be(environment, frame, cones, box):
 
 
 @inner_kernel
-def _outside_workspace(limits, seen, sums, away):
-    """Tell whether no tip of a box has the target in its workspace; `seen`, `sums`: of `target_seen`.
+def _outside_workspace(limits, aside, ahead, size, moved, second, sums, away):
+    """Tell whether no tip of a box has the target in its workspace; see `Seen` and `sum_changes`.
 
     Tips are within `away` mm of the middle one: their distance to the target differs by no more, however
     far they turn.
     """
-    _pose, rho, ahead, size, moved, second = seen
-    spare = limits.goal_tolerance_mm + SPARE_MM
+    spare = limits.goal_tolerance_mm + SPARE
     radius = 1.0 / limits.kappa
-    if math.hypot(rho, ahead) - min(moved, away) - spare > limits.max_length_mm:
+    if math.hypot(aside, ahead) - min(moved, away) - spare > limits.max_length_mm:
         return True
     forward_only = limits.max_angle_rad <= 0.5 * math.pi
     if not forward_only and limits.max_turn_rad > math.pi:
         return False  # A needle that may turn so much comes to every point.
-    depth = escape_depth(rho, ahead, radius)
+    depth = escape_depth(aside, ahead, radius)
     if forward_only:
         depth = min(depth, ahead)
     if depth + moved + spare < 0.0:
@@ -161,29 +160,32 @@ def may_reach(environment, tubes, insertions, limits, target, frame, cones, box,
 
     Returns that, and how far tips, and the target as they see it, may differ from the middle ones, mm.
     """
-    if not _insertions_exist(tubes, insertions, box) or not tips_may_be(environment, frame, cones, box):
+    if not has_insertions(tubes, insertions, box) or not tips_may_be(environment, frame, cones, box):
         return False, 0.0, 0.0
-    seen = target_seen(tubes, limits.kappa, target, frame, box, sums, costs)
-    family = tubes_of(tubes, frame, box)
-    away = tips_differ(tubes, family, box)
-    if _outside_workspace(limits, seen, sums, away):
+    family = box_tubes(tubes, frame, box)
+    tip, tangent, away, swing = tip_of(tubes, family, box)
+    seen = seen_target(tubes, limits.kappa, target, family, tip, tangent, box)
+    sum_changes(seen, family, tangent, target, frame, box, sums, costs)
+    aside, ahead, size, moved, second = seen.aside, seen.ahead, seen.size, seen.moved, seen.second
+    if _outside_workspace(limits, aside, ahead, size, moved, second, sums, away):
         return False, 0.0, 0.0
-    if tips_blocked(environment, tubes, limits, seen, family, box, away) or (
+    far = math.hypot(aside, ahead)
+    if tips_blocked(environment, limits, tip, tangent, far, away, swing) or (
         away <= FOLLOWED_MM and tubes_blocked(environment, tubes, family, box)
     ):
-        return False, away, seen[4]
+        return False, away, moved
     _add_tip_costs(tubes, family, box, costs)
-    return True, away, seen[4]
+    return True, away, moved
 
 
 @inner_kernel
 def may_exist(environment, tubes, insertions, frame, cones, box, costs):
     """Tell whether a box may hold a deployment at all, whatever the target: False if it holds none."""
-    if not _insertions_exist(tubes, insertions, box) or not tips_may_be(environment, frame, cones, box):
+    if not has_insertions(tubes, insertions, box) or not tips_may_be(environment, frame, cones, box):
         return False
-    family = tubes_of(tubes, frame, box)
-    away = tips_differ(tubes, family, box)
-    if tips_in_lumen(environment, family, tubes, box, away):
+    family = box_tubes(tubes, frame, box)
+    tip, _tangent, away, _swing = tip_of(tubes, family, box)
+    if tips_in_lumen(environment, tip, away):
         return False
     if away <= FOLLOWED_MM and tubes_blocked(environment, tubes, family, box):
         return False
@@ -196,30 +198,15 @@ def may_exist(environment, tubes, insertions, frame, cones, box, costs):
 @inner_kernel
 def _add_tip_costs(tubes, family, box, costs):
     """Add half of what each side displaces the tip."""
-    _middle, _forward, _normal, bounds, _outer, _inner = family
     x, z = planar_point(tubes, box[OUTER], box[INNER], box[INNER])
     for m in (PLACE_X, PLACE_Y, PLACE_Z):
         costs[m] += 0.5 * box[HALF + m]
-    costs[EAST] += 0.5 * box[HALF + EAST] * math.hypot(x, z)
-    costs[NORTH] += 0.5 * box[HALF + NORTH] * math.hypot(x, z)
-    costs[ROTATION] += 0.5 * box[HALF + ROTATION] * abs(x)
-    costs[OUTER] += 0.5 * bounds[3] * max(box[INNER] - box[OUTER], 0.0)
-    costs[INNER] += 0.5 * box[HALF + INNER]
-
-
-@inner_kernel
-def _halve(boxes, row, costs):
-    """Halve a box on the side that costs most; the second half becomes the row after it."""
-    side = 0
-    for m in range(1, SIDES):
-        if costs[m] > costs[side]:
-            side = m
-    for n in range(BOX_COLUMNS):
-        boxes[row + 1, n] = boxes[row, n]
-    half = 0.5 * boxes[row, HALF + side]
-    boxes[row, HALF + side] = boxes[row + 1, HALF + side] = half
-    boxes[row, side] -= half
-    boxes[row + 1, side] += half
+    for m in (EAST, NORTH):
+        costs[m] += 0.5 * box[HALF + m] * math.hypot(x, z)
+    by_rotation, by_outer, by_inner = tip_moves(tubes, family, box)
+    costs[ROTATION] += 0.5 * by_rotation
+    costs[OUTER] += 0.5 * by_outer
+    costs[INNER] += 0.5 * by_inner
 
 
 @inner_kernel
@@ -236,47 +223,6 @@ def measures(boxes, out):
     """Write the measure of each of N boxes to `out` (N,)."""
     for n in range(len(boxes)):
         out[n] = _measure(boxes[n])
-
-
-@kernel(nogil=True)
-def first_boxes(tubes, longest, wide, places, boxes):
-    """Write the boxes that hold everything of a piece of the airway: up to the curved length, and beyond.
-
-    Parameters
-    ----------
-    tubes : (N_TUBES,) float64
-    longest : float
-        Greatest insertion, mm.
-    wide : float
-        Greatest angle (rad) from the axis in `frame` to where a tip may look.
-    places : (2, 3) float64
-        Least and greatest coordinates of the places of tips along the rows of `frame`, mm.
-    boxes : (2, BOX_COLUMNS) float64
-        Receives them.
-
-    Returns
-    -------
-    int
-        How many they are.
-    """
-    curved = min(tubes[CURVED_LENGTH], longest)
-    count = 0
-    for part in range(2):
-        low, high = (0.0, curved) if part == 0 else (curved, longest)
-        if high <= low:
-            continue
-        box = boxes[count]
-        box[OUTER] = box[HALF + OUTER] = 0.5 * longest
-        box[INNER] = 0.5 * (low + high)
-        box[HALF + INNER] = 0.5 * (high - low)
-        box[EAST] = box[NORTH] = box[ROTATION] = 0.0
-        box[HALF + EAST] = box[HALF + NORTH] = wide
-        box[HALF + ROTATION] = math.pi
-        for m in range(3):
-            box[PLACE_X + m] = 0.5 * (places[0, m] + places[1, m])
-            box[HALF + PLACE_X + m] = 0.5 * (places[1, m] - places[0, m])
-        count += 1
-    return count
 
 
 @kernel(nogil=True)
@@ -305,16 +251,16 @@ def divide(environment, tubes, insertions, pieces, boxes, owners, greatest, part
     kept = 0
     for n in range(len(boxes)):
         frame, cones = _piece_of(pieces, owners[n])
-        _copy(boxes[n], pair[0])
+        pair[0] = boxes[n]
         halves = 1
         if _measure(boxes[n]) > greatest:
             if not may_exist(environment, tubes, insertions, frame, cones, pair[0], costs):
                 continue
-            _halve(pair, 0, costs)
+            split(pair[0], pair[1], costliest(costs, 0, SIDES))
             halves = 2
         for m in range(halves):
             if halves == 1 or may_exist(environment, tubes, insertions, frame, cones, pair[m], costs):
-                _copy(pair[m], parts[kept])
+                parts[kept] = pair[m]
                 part_owners[kept] = owners[n]
                 kept += 1
     return kept
@@ -323,12 +269,6 @@ def divide(environment, tubes, insertions, pieces, boxes, owners, greatest, part
 @inner_kernel
 def _piece_of(pieces, n):
     return pieces.frames[n], pieces.cones[pieces.first_cone[n] : pieces.first_cone[n + 1]]
-
-
-@inner_kernel
-def _copy(box, to):
-    for n in range(BOX_COLUMNS):
-        to[n] = box[n]
 
 
 @kernel(nogil=True)
@@ -364,7 +304,7 @@ def rule_out(
     for row in rows:
         frame, cones = _piece_of(pieces, owners[row])
         whole = _measure(boxes[row])
-        _copy(boxes[row], waiting_boxes[0])
+        waiting_boxes[0] = boxes[row]
         waiting, looked = 1, 0
         ruled_out, left = 0.0, False
         while waiting > 0 and looked < most and (to_the_end or not left):
@@ -378,11 +318,11 @@ def rule_out(
                 waiting -= 1
             elif waiting == MOST_WAITING or (away < LEAST_TIP_MM and moved < LEAST_VIEW_MM):
                 if not left:
-                    _copy(box, found.left[row])
+                    found.left[row] = box
                 left = True
                 waiting -= 1
             else:
-                _halve(waiting_boxes, waiting - 1, costs)
+                split(box, waiting_boxes[waiting], costliest(costs, 0, SIDES))
                 waiting += 1
         found.looked[row] = looked
         found.share[row] = ruled_out
@@ -392,4 +332,4 @@ def rule_out(
             found.outcome[row], found.share[row] = RULED_OUT, 1.0
         else:
             found.outcome[row] = TOO_MANY
-            _copy(waiting_boxes[waiting - 1], found.left[row])
+            found.left[row] = waiting_boxes[waiting - 1]

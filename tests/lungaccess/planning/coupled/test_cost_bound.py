@@ -18,22 +18,17 @@ from anatomy.kernels.field import most_distance
 from anatomy.lung import Lung
 from lungaccess.planning.coupled.cost_bound import QUEUES, CostBound, GapGoal
 from lungaccess.planning.coupled.cost_to_go import cost_to_go
+from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, ROTATION
 from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment, between, bound_box
 from lungaccess.planning.coupled.kernels.cost_to_go import cost_from
 from lungaccess.planning.coupled.kernels.deployment_box import (
+    ACROSS,
     BOX_COLUMNS,
-    HALF_ACROSS,
-    HALF_INNER,
-    HALF_OUTER,
-    HALF_ROTATION,
-    HALF_UP,
-    INNER,
-    OUTER,
-    ROTATION,
     TIP,
+    UP,
     TubeSurroundings,
     least_sweep,
-    pose_of,
+    tubes_at,
     tubes_blocked,
 )
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
@@ -252,7 +247,7 @@ def test_no_deployment_of_a_box_sweeps_less_than_its_bound() -> None:
         inner = float(rng.uniform(0.9 * tubes[CURVED_LENGTH], tubes[MAX_EXTENSION]))
         outer = float(rng.uniform(0.0, inner))
         box = np.zeros(BOX_COLUMNS)
-        box[[OUTER, INNER, HALF_OUTER, HALF_INNER]] = outer, inner, *half
+        box[[OUTER, INNER, HALF + OUTER, HALF + INNER]] = outer, inner, *half
         other, longer = np.array([outer, inner]) + rng.choice([-1.0, 1.0, 0.3], 2) * half
         if 0.0 <= other <= longer:
             slack.append(lateral_sweep(tubes, other, longer) - _least_sweep(tubes, box))
@@ -329,8 +324,7 @@ def test_no_deployment_costs_less_than_the_bound(
 
 @numba.njit
 def _box_bound(environment: Any, tubes: Any, insertions: Any, tips: Any, target: Any, box: Any) -> float:
-    rates = np.zeros((len(tips), 2))
-    return float(bound_box(environment, tubes, insertions, tips, rates, target, math.inf, box, False))
+    return float(bound_box(environment, tubes, insertions, tips, target, math.inf, box, False))
 
 
 def _attacked(
@@ -375,9 +369,9 @@ def _attacked(
             box = np.zeros(BOX_COLUMNS)
             queue, box[TIP] = bound.queues[entries.site[entry] % QUEUES], entries.site[entry] // QUEUES
             box[[ROTATION, OUTER, INNER]] = place + rng.uniform(-1.0, 1.0, 3) * widths
-            box[[HALF_ROTATION, HALF_OUTER, HALF_INNER]] = widths
-            box[[HALF_ACROSS, HALF_UP]] = -1.0
-            environment, tubes, insertions, tips, _rates, goal = queue.about
+            box[[HALF + ROTATION, HALF + OUTER, HALF + INNER]] = widths
+            box[[HALF + ACROSS, HALF + UP]] = -1.0
+            environment, tubes, insertions, tips, goal = queue.about
             looked_at += 1
             highest = max(highest, _box_bound(environment, tubes, insertions, tips, goal, box) / cost)
     return looked_at, highest
@@ -401,8 +395,8 @@ def _accepted_beside(
 
 @numba.njit
 def _all_refused(surroundings: Any, tubes: Any, tips: Any, box: Any) -> bool:
-    pose = pose_of(tips, np.zeros((len(tips), 2)), box)
-    return bool(tubes_blocked(surroundings, tubes, pose, box, least_sweep(tubes, box)))
+    family = tubes_at(tubes, tips, box)
+    return bool(tubes_blocked(surroundings, tubes, family, box, least_sweep(tubes, box)))
 
 
 @pytest.mark.slow
@@ -414,7 +408,7 @@ def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
     bound = CostBound(task, atlas)
     bound.improve(0.0, 1)
     surroundings, tubes = bound.queues[0].about[0].surroundings, bound.queues[0].about[1]
-    tips = np.ascontiguousarray(atlas.motions.tips[:, None, :])
+    tips = atlas.motions.tips
     validator = DirectArcs(task, atlas).evaluator.tubes
     entries, rng = atlas.deployments, np.random.default_rng(7)
 
@@ -428,7 +422,7 @@ def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
         box = np.zeros(BOX_COLUMNS)
         box[TIP] = site
         box[[ROTATION, OUTER, INNER]] = place + rng.uniform(-1.0, 1.0, 3) * widths
-        box[[HALF_ROTATION, HALF_OUTER, HALF_INNER]] = widths
+        box[[HALF + ROTATION, HALF + OUTER, HALF + INNER]] = widths
         return _all_refused(surroundings, tubes, tips, box)
 
     accepted, at_hazard = 0, []

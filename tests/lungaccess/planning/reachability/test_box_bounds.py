@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from anatomy.base.typed import Float
+from lungaccess.planning.coupled.kernels.box_of_tubes import sample_of, seen_target, tip_of
 from lungaccess.planning.reachability.kernels import deployment_boxes as boxes
 from stages.tube.kernels import (
     CURVED_LENGTH,
@@ -26,12 +27,17 @@ from tests.lungaccess.planning.reachability.deployment_cases import KAPPA, draw,
 
 @numba.njit
 def seen_from_middle(tubes, kappa, target, frame, box, sums, costs):  # type: ignore[no-untyped-def]
-    return boxes.target_seen(tubes, kappa, (target[0], target[1], target[2]), frame, box, sums, costs)
+    place = target[0], target[1], target[2]
+    family = boxes.box_tubes(tubes, frame, box)
+    tip, tangent, _away, _swing = tip_of(tubes, family, box)
+    seen = seen_target(tubes, kappa, place, family, tip, tangent, box)
+    boxes.sum_changes(seen, family, tangent, place, frame, box, sums, costs)
+    return tip, seen.aside, seen.ahead, seen.size, seen.moved, seen.second
 
 
 @numba.njit
 def sampled(tubes, frame, box, s):  # type: ignore[no-untyped-def]
-    return boxes.sample_of(tubes, boxes.tubes_of(tubes, frame, box), s)
+    return sample_of(tubes, boxes.box_tubes(tubes, frame, box), s)
 
 
 def tip_frame(tubes: Float, frame: Float, place: Float, values: Float) -> Float:
@@ -63,9 +69,7 @@ def test_no_deployment_of_a_box_sees_the_target_farther_off_than_its_bounds(tube
         if box[3] - box[11] > box[4] + box[12] - 0.02:
             continue
         sums, costs = np.zeros(3), np.zeros(boxes.SIDES)
-        pose, rho, ahead, size, moved, second = seen_from_middle(
-            tubes, KAPPA, target, frame, box, sums, costs
-        )
+        tip, rho, ahead, size, moved, second = seen_from_middle(tubes, KAPPA, target, frame, box, sums, costs)
         middle = tip_frame(tubes, frame, box[5:8] @ frame, box[:5]) if box[3] <= box[4] else None
         for _ in range(40):
             place, values = draw(rng, frame, box)
@@ -76,7 +80,7 @@ def test_no_deployment_of_a_box_sees_the_target_farther_off_than_its_bounds(tube
             first = middle[:3, :3].T @ (target - middle[:3, 3])
             assert abs(math.hypot(first[0], first[1]) - rho) < 1e-3
             assert abs(first[2] - ahead) < 1e-3
-            assert (np.abs(pose[:3] - middle[:3, 3]) < 1e-6).all()
+            assert (np.abs(tip - middle[:3, 3]) < 1e-6).all()
             displaced = float(np.linalg.norm(seen - first))
             assert displaced <= moved + 2e-3
             towards = first[:2] / max(np.hypot(*first[:2]), 1e-9)

@@ -24,7 +24,8 @@ Rule = Callable[[Limits, Any, Float, float], bool]
 
 @numba.njit
 def outside_workspace(limits, seen, sums, away):  # type: ignore[no-untyped-def]
-    return kernel._outside_workspace(limits, seen, sums, away)
+    _tip, aside, ahead, size, moved, second = seen
+    return kernel._outside_workspace(limits, aside, ahead, size, moved, second, sums, away)
 
 
 def without_the_turn(limits: Limits, seen: Any, sums: Float, away: float) -> bool:

@@ -41,7 +41,8 @@ from stages.tube.kernels import ACCEPTED, N_REASONS, N_TRACE, NEAR_VESSEL, SWEEP
 
 @numba.njit
 def outside_workspace(limits, seen, sums):  # type: ignore[no-untyped-def]
-    return kernel._outside_workspace(limits, seen, sums, 0.1)
+    _tip, aside, ahead, size, moved, second = seen
+    return kernel._outside_workspace(limits, aside, ahead, size, moved, second, sums, 0.1)
 
 
 @pytest.mark.parametrize("max_turn_deg", [90.0, 180.0, 540.0])
@@ -64,7 +65,7 @@ def test_a_needle_that_may_turn_without_end_comes_to_every_point(
 
 @numba.njit
 def all_blocked(environment, tubes, frame, box):  # type: ignore[no-untyped-def]
-    return blocked.tubes_blocked(environment, tubes, boxes.tubes_of(tubes, frame, box), box)
+    return blocked.tubes_blocked(environment, tubes, boxes.box_tubes(tubes, frame, box), box)
 
 
 @numba.njit

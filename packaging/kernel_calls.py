@@ -40,7 +40,7 @@ WORKLOADS = (
 RECORDER = """
 import json, sys
 
-from anatomy.machine_code import ahead, cache, signatures
+from anatomy.machine_code import ahead, cache
 
 ahead.first_compilation.prepare = lambda: False  # All is compiled here, where it is seen.
 noted, inner, calls = {}, {}, {}
@@ -48,7 +48,7 @@ load, save = cache.KernelCache.load_overload, cache.KernelCache.save_overload
 
 def note(self, sig, codegen, library=None):
     try:
-        kinds = [signatures.encoded(each) for each in sig]
+        kinds = [ahead.encoded(each) for each in sig]
     except TypeError:
         return None
     if "<" in self._function.__qualname__:

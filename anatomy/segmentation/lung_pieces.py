@@ -1,13 +1,16 @@
-"""Which pieces of air in a chest are lungs: those that lie at the bronchi, without the gas beside them."""
+"""What of a chest is lung: pieces of air at the bronchi, without the gas beside them and the air outside, and
+with the notches of nodules that lie on the chest wall, too wide for a closing of the lung."""
 
 import numpy as np
 
 from anatomy.base.errors import AnatomyError
-from anatomy.base.typed import Mask
+from anatomy.base.typed import Float32, Int, Mask
 from anatomy.morphology import bounds, window
-from anatomy.segmentation.closing import distance_mm
+from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 
+OUTSIDE_HU = -950.0
+"""Air that touches the edge of a slice and has a median below this is not lung."""
 SMALLEST_LUNG_ML = 150.0
 """The smallest lung of a child after breathing out is about this large."""
 SMALLER_SHARE = 0.1
@@ -21,6 +24,53 @@ GAS_RADIUS_MM = 4.0
 bronchi."""
 SMALLEST_GAS_ML = 20.0
 """Holes of emphysema are smaller; a layer of gas over half a lung, 4 mm thick, is larger."""
+NOTCH_MM = 12.0
+"""Ball of the wider closing: notches of up to about 24 mm across become lung."""
+BELOW_HULL_MM = 15.0
+"""Half the diameter of the largest nodule that is not called a mass, 30 mm."""
+FROM_OTHER_LUNG_MM = 40.0
+"""A notch of the chest wall lies near the convex hull of both lungs and far from the other lung; what does
+not may be the heart, the aorta or the hilum, and stays outside."""
+LEAST_HALF_THICKNESS_MM = 2.0
+"""Ribs indent the lung less than this."""
+SOFT_HU = 150.0
+"""Bone is denser on coarse voxels."""
+
+
+def outside_air(hu: Float32, air: Mask) -> Mask:
+    """Mark the air around the patient.
+
+    In every axial slice, pieces of air that touch the edge of the image are taken, because the chest wall
+    closes the lungs off within a slice even where mouth or trachea open to the outside.  Where the field
+    of view cuts off the skin, a lung may touch the edge too; the lung holds tissue, so its median is
+    higher than that of air.
+
+    Parameters
+    ----------
+    hu : (Ni, Nj, Nk) float32
+        Coarse CT, axis 2 along the body.
+    air : (Ni, Nj, Nk) bool
+        Voxels of air and lung.
+
+    Returns
+    -------
+    (Ni, Nj, Nk) bool
+    """
+    from scipy import ndimage
+
+    outside = np.zeros(air.shape, dtype=np.bool_, order="F")
+    for k in range(air.shape[2]):
+        pieces, count = ndimage.label(air[:, :, k])
+        if not count:
+            continue
+        edge = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
+        touching = np.unique(edge[edge > 0])
+        sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+        thin = np.bincount(pieces[hu[:, :, k] < OUTSIDE_HU], minlength=count + 1)
+        chosen = np.zeros(count + 1, dtype=np.bool_)
+        chosen[touching] = 2 * thin[touching] > sizes[touching]
+        outside[:, :, k] = chosen[pieces]
+    return outside
 
 
 def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
@@ -97,3 +147,49 @@ def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> Mask:
     volumes_ml[0] = 0.0
     found[box] = (volumes_ml >= SMALLEST_GAS_ML)[pieces]
     return found
+
+
+def notches(ct: CoarseCt, right: Mask, left: Mask, closing_mm: float) -> tuple[Mask, Mask]:
+    """Return nodule-like notches in the costal side of each lung, bool `(Ni, Nj, Nk)` on coarse voxels.
+
+    One lung may be empty; a closing of the radius `closing_mm` fills what is narrower anyway.
+    """
+    hull = _near_hull(right | left, ct)
+    return _notches_of(ct, right, left, hull, closing_mm), _notches_of(ct, left, right, hull, closing_mm)
+
+
+def _notches_of(ct: CoarseCt, side: Mask, other: Mask, hull: Mask, closing_mm: float) -> Mask:
+    """Return the notches of one lung that lie near the hull of both."""
+    found = np.zeros(side.shape, dtype=np.bool_, order="F")
+    pad = np.ceil(2.0 * NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64)
+    box = window(*bounds(side, pad))
+    filled = without_holes(closed(np.asfortranarray(side[box]), closing_mm, ct.spacing_mm))
+    added = closed(filled, NOTCH_MM, ct.spacing_mm) & ~filled & (ct.hu[box] < SOFT_HU) & hull[box]
+    core = distance_mm(added, ct.spacing_mm) > LEAST_HALF_THICKNESS_MM
+    if core.any() and other.any():
+        core &= distance_mm(~other, ct.spacing_mm)[box] > FROM_OTHER_LUNG_MM
+    if core.any():
+        found[box] = added & (distance_mm(~core, ct.spacing_mm) <= 2.0 * LEAST_HALF_THICKNESS_MM)
+    return found
+
+
+def _near_hull(lungs: Mask, ct: CoarseCt) -> Mask:
+    """Mark, in every axial slice, what lies close below the convex hull of both lungs."""
+    import edt
+    from skimage.morphology import convex_hull_image
+
+    near = np.zeros(lungs.shape, dtype=np.bool_, order="F")
+    for k in np.flatnonzero(lungs.any(axis=(0, 1))):
+        hull = np.asfortranarray(convex_hull_image(lungs[:, :, k]))
+        depth = edt.edt(hull, anisotropy=ct.spacing_mm[:2], order="F", black_border=True)
+        near[:, :, k] = hull & (depth <= BELOW_HULL_MM)
+    _clear_edge(near, np.ceil(NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64))
+    return near
+
+
+def _clear_edge(mask: Mask, width: Int) -> None:
+    """Empty the border of an array: near the edge of the image a closing cannot tell notch from outside."""
+    for axis, n in enumerate(width):
+        layers = np.moveaxis(mask, axis, 0)
+        layers[:n] = False
+        layers[-n:] = False

@@ -23,9 +23,7 @@ from anatomy.segmentation.hounsfield import (
     without_offset,
 )
 from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right
-from anatomy.segmentation.lung_pieces import gas_pockets, lung_pieces
-from anatomy.segmentation.outside_air import outside_air
-from anatomy.segmentation.pleural_nodules import notches
+from anatomy.segmentation.lung_pieces import gas_pockets, lung_pieces, notches, outside_air
 
 Progress = Callable[[str], None]
 

@@ -173,15 +173,5 @@ def _findings_table(stage: str, findings: list[Finding]) -> Table:
         made.add_column(heading, justify="right")
     made.add_column("")
     for finding in findings:
-        mark = MARKS[finding.ok]
-        limit = "" if finding.side is None else f"{finding.side} {finding.limit:.4g}"
-        unit = f" {finding.unit}" if finding.unit else ""
-        made.add_row(
-            mark,
-            finding.name,
-            "" if finding.value is None else f"{finding.value:.4g}{unit}",
-            limit,
-            "" if finding.margin is None else f"{finding.margin:.3g}",
-            finding.detail,
-        )
+        made.add_row(MARKS[finding.ok], *finding.cells()[1:])
     return made

@@ -11,7 +11,6 @@ from lungaccess.judging.checking.completion import Motions, completed_plan
 from lungaccess.judging.checking.deployment import check_deployment
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.findings import CheckReport, Findings
-from lungaccess.judging.checking.functions import check_functions
 from lungaccess.judging.checking.needle_load import check_needle_load
 from lungaccess.judging.checking.outcome import check_tubes_at_target
 from lungaccess.judging.checking.record import check_record
@@ -19,10 +18,14 @@ from lungaccess.judging.checking.scope import check_scope
 from lungaccess.judging.checking.steering import check_needle
 from lungaccess.judging.checking.window import check_window
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.goals import goals
 from lungaccess.problem.system import System
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
+
+ROUNDING = 1e-9
+"""A function of the same plan may differ by this share of its value on another machine."""
 
 
 class Checker:
@@ -87,3 +90,15 @@ def check(
     CheckReport
     """
     return Checker(lung).check(plan, system, target_lps=target_lps)
+
+
+def check_functions(plan: Plan, lung: Lung, found: Findings) -> None:
+    """Compute every function that the plan states a value of, where it is known here."""
+    known = goals()
+    for name, stated in plan.goals.items():
+        goal = known.get(name)
+        if goal is None or not goal.is_function:
+            found.unchecked(f"goals.{name}", "no such goal is known here: import the code that registers it")
+            continue
+        value = goal.computed(plan, lung)
+        found.agrees(f"goals.{name}", stated, value, ROUNDING * abs(value), goal.unit)

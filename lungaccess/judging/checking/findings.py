@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from html import escape
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.records import frozen_value
+from anatomy.display import title
 
 Side = Literal["at least", "at most"]
+_HEADINGS = ("", "what", "found", "limit", "margin", "")
+Row = tuple[str, ...]
+"""The cells of one finding, in the order of the headings; see `Finding.cells`."""
 
 
 @frozen_value
@@ -96,8 +102,6 @@ class CheckReport:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows."""
-        from lungaccess.judging.checking.display import report_html
-
         rows, refused = ([each.cells() for each in some] for some in (self.findings, self.refusals))
         return report_html(rows, refused, accepted=self.accepted)
 
@@ -192,3 +196,26 @@ class Findings:
         """Return what was collected; nothing collected is not accepted."""
         accepted = any(each.ok for each in self._all) and all(each.ok is not False for each in self._all)
         return CheckReport(accepted=accepted, findings=tuple(self._all))
+
+
+def report_html(findings: Sequence[Row], refused: Sequence[Row], *, accepted: bool) -> str:
+    """Return the verdict and the findings as HTML; only a refusal has a colour.
+
+    Accepted geometry says nothing of the chance of success, so it is not shown in green.
+    """
+    verdict = "accepts the plan" if accepted else f"REFUSES the plan ({len(refused)} findings)"
+    colour = "inherit" if accepted else "#c00000"
+    everything = f"<details><summary>{len(findings)} findings</summary>{_table(findings)}</details>"
+    return (
+        f'<div style="color:{colour}">{title(f"The independent check {verdict}")}</div>'
+        f"{_table(refused) if refused else ''}{everything}"
+    )
+
+
+def _table(rows: Sequence[Row]) -> str:
+    head = "".join(f"<th>{heading}</th>" for heading in _HEADINGS)
+    return f"<table><tr>{head}</tr>{''.join(_row(row) for row in rows)}</table>"
+
+
+def _row(row: Row) -> str:
+    return "<tr>" + "".join(f'<td style="text-align:left">{escape(cell)}</td>' for cell in row) + "</tr>"

@@ -14,7 +14,7 @@ import pytest
 from numba import types
 
 from anatomy.machine_code import ahead
-from anatomy.machine_code.signatures import decoded, encoded
+from anatomy.machine_code.ahead import decoded, encoded
 from tests.anatomy.machine_code.test_cache import Tree
 
 READ_ONLY = np.zeros((2, 3), dtype=np.float32)

@@ -11,22 +11,91 @@ import numpy as np
 
 from anatomy.base.typed import Int
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.search.base import DirectSearch, SearchInParts, Step, evaluated_step
+from lungaccess.planning.coupled.search.base import (
+    DirectSearch,
+    Incumbent,
+    SearchInParts,
+    Step,
+    evaluated_step,
+)
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
 from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.local_sampling import sampling_near_target
 from lungaccess.planning.coupled.search.local_search import LocalSearch, LocalSearchRun
-from lungaccess.planning.coupled.search.needle_planner import NamedNeedlePlanner
-from lungaccess.planning.coupled.search.needle_search import PLANNER, needle_searches
-from lungaccess.planning.coupled.search.rounds import LocalSearchRounds
-from lungaccess.planning.coupled.search.settings import SearchSettings
+from lungaccess.planning.coupled.search.needle_planner import PLANNER, NamedNeedlePlanner, needle_searches
+from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
 from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
+from stages.needle import successive_halving
 
+TRIES = 50
+"""Variations of an iteration, which takes about a millisecond."""
+WORTH_EVALUATING = 0.999
+"""A run is evaluated in full only when its estimated cost has fallen by this factor, which saves time."""
 FUTILE_ITERATIONS = 1000
 """So many iterations without a deployment that has the target in its needle's workspace end the search."""
 WORTH_REFINING = 0.99
 """The best candidate is refined again once it is cheaper by this factor, as a refinement takes long."""
+
+
+class LocalSearchRounds:
+    """Shares iterations among local searches."""
+
+    phase = "local search"
+
+    def __init__(
+        self,
+        local_search: LocalSearch,
+        evaluator: CandidateEvaluator,
+        incumbent: Incumbent,
+        settings: SearchSettings,
+    ) -> None:
+        self._local_search, self._evaluator = local_search, evaluator
+        self._incumbent, self._settings = incumbent, settings
+
+    def halve(self, runs: list[LocalSearchRun]) -> Iterator[Step]:
+        """Advance runs by successive halving: after each rung the better half goes on."""
+        rungs = successive_halving(
+            runs,
+            lambda run: run.cost,
+            work=self._settings.rung_iterations,
+            survivors=lambda _count, finite: (finite + 1) // 2,
+            rungs=self._settings.rungs,
+        )
+        for left, iterations in rungs:
+            for run in left:
+                yield from self._advanced(run, iterations)
+
+    def intensify(self) -> Iterator[Step]:
+        """Continue the local search from the best candidate."""
+        run = self._local_search.begin(self._incumbent.candidate)
+        if run is not None:
+            for _ in range(self._settings.intensifications):
+                yield from self._advanced(run, self._settings.intensification_iterations)
+
+    def perturbed(self) -> list[LocalSearchRun]:
+        """Return runs that begin at random some distance from the best candidate."""
+        best = self._incumbent.candidate
+        begun = [self._local_search.begin(best) for _ in range(self._settings.perturbations)]
+        runs = [run for run in begun if run is not None]
+        for run in runs:
+            self._local_search.perturb(run)
+        return runs
+
+    def _advanced(self, run: LocalSearchRun, iterations: int) -> Iterator[Step]:
+        """Advance a run by iterations; the last step has what it has found."""
+        for n in range(1, iterations + 1):
+            self._local_search.advance(run, TRIES)
+            yield self._evaluated(run) if n == iterations else Step(iteration=0, phase=self.phase)
+
+    def _evaluated(self, run: LocalSearchRun) -> Step:
+        """Return what a run has found, if that may be the best."""
+        limit = min(WORTH_EVALUATING * run.evaluated_cost, ESTIMATE_SLACK * self._incumbent.cost)
+        if not run.cost < limit:
+            return Step(iteration=0, phase=self.phase)
+        run.evaluated_cost = run.cost
+        return evaluated_step(self._evaluator, self.phase, self._local_search.candidate(run))
 
 
 class AtlasSearch(SearchInParts):

@@ -2,16 +2,78 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.typed import Int, UInt64
 from anatomy.lung import Lung
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.search.tube_reach import TubeReachScan
-from lungaccess.planning.coupled.search.window_reach import WindowReachScan
-from stages.needle import DEFAULT_ARCS, Reached, ReachScan, needle_environment
+from lungaccess.planning.coupled.search.tube_reach import TubeReachScan, tubes_clearance_mm
+from lungaccess.planning.coupled.search.window_search import window_search
+from lungaccess.plans.assemble import assemble
+from lungaccess.plans.candidate import Candidate
+from lungaccess.problem.target import Target
+from lungaccess.problem.task import Task
+from lungaccess.uncertainty.breathing.window import breathing_window
+from stages.needle import DEFAULT_ARCS, DIRECT, UNREACHED, Reached, ReachScan, needle_environment
+
+STEP_MM = 0.25
+"""Spacing of the points at which the clearance of a needle is looked up; half of it is taken off."""
+
+
+class WindowReachScan:
+    """The direct ways of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
+
+    A point is reached if an arc of the needle, or the tubes alone, to an aim beside it is proved clear and on
+    target in all of the phases.
+
+    Parameters
+    ----------
+    lung : Lung
+        With a motion, which that of the atlas need not have.
+    """
+
+    def __init__(self, lung: Lung, atlas: Atlas, phases: tuple[float, float]) -> None:
+        self._lung, self._atlas, self._phases = lung, atlas, phases
+        self._field = lung.obstacle_field(with_fissures=atlas.with_fissures)
+
+    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
+        """Try all points, one after the other; neither seeds nor neighbours matter.
+
+        Parameters
+        ----------
+        points : (N, 3) float64, LPS mm
+        """
+        places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
+        kinds = np.full(len(places), UNREACHED, dtype=np.uint8)
+        cost, clearance, share = np.zeros(len(places)), np.zeros(len(places)), np.zeros(len(places))
+        for n, point in enumerate(places):
+            target = Target(lps_mm=point, origin="point")
+            task = Task(lung=self._lung, system=self._atlas.system, target=target)
+            search = window_search(task, self._atlas, self._phases, widest=False)
+            found = [step for step in search.direct_steps() if step.candidate is not None]
+            if found and found[-1].candidate is not None:
+                kinds[n], cost[n] = DIRECT, found[-1].cost
+                clearance[n] = self._clearance_mm(found[-1].candidate)
+                share[n] = self._share(task, found[-1].candidate)
+        entries = np.full(len(places), -1, dtype=np.int64)
+        return Reached(kinds=kinds, cost=cost, clearance_mm=clearance, entries=entries, window_share=share)
+
+    def _clearance_mm(self, candidate: Candidate) -> float:
+        """Return a lower bound of the clearance of a needle beyond the exempt length, or of the tubes."""
+        needle = self._atlas.system.needle
+        if needle is None:
+            return tubes_clearance_mm(self._atlas, candidate.path, candidate.deployment.branch)
+        points, lengths = candidate.path.sample(STEP_MM)
+        beyond = self._field.lower_bound_mm(points[lengths >= needle.exit_exemption_mm])
+        return max(float(beyond.min(initial=math.inf)) - 0.5 * STEP_MM, 0.0) if len(beyond) else 0.0
+
+    def _share(self, task: Task, candidate: Candidate) -> float:
+        plan = assemble(task, candidate, iteration=0, timing={})
+        return breathing_window(plan, self._lung).share
 
 
 class Scan(Protocol):

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy.base.typed import Int
-from lungaccess.planning.coupled.kernels.separation import choose_separated
+from lungaccess.planning.coupled.kernels.direct_arcs import choose_separated
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.plans.candidate import Candidate
 

@@ -18,7 +18,7 @@ from anatomy.lung import Lung
 from lungaccess.cli import app as cli
 from lungaccess.planning import Alternative, diverse_plans, with_front
 from lungaccess.planning.coupled import DirectArcs
-from lungaccess.planning.coupled.kernels.separation import choose_separated
+from lungaccess.planning.coupled.kernels.direct_arcs import choose_separated
 from lungaccess.planning.coupled.search.separated_arcs import SAMPLES, _branches_first, _samples
 from lungaccess.problem.request import Request
 from lungaccess.problem.target import Target

@@ -18,7 +18,7 @@ from anatomy.io.image_header import ImageHeader
 from anatomy.io.metaimage import open_metaimage
 from anatomy.io.nifti import begins_as_nifti, open_nifti
 from anatomy.io.nrrd import open_nrrd
-from anatomy.io.voxels import read_nonzero, read_values, require_whole
+from anatomy.io.voxels import read_array, read_nonzero, require_whole
 
 if TYPE_CHECKING:
     import SimpleITK
@@ -80,7 +80,8 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
     """
     path = require_file(path)
     with reading(path):
-        return read_values(*open_image(path, frame), path)
+        header, stream = open_image(path, frame)
+        return Volume(grid=header.grid, array=read_array(header, stream, path))
 
 
 def read_mask(path: str | Path, *, frame: Frame | None = None) -> Volume:

@@ -85,7 +85,8 @@ def union_grid(reference: Grid, others: list[tuple[str, Grid]]) -> Grid:
         first, last = box_in(reference, grid)
         low, high = np.minimum(low, first), np.maximum(high, last)
         largest = max(np.prod(grid.shape), np.prod(reference.shape))
-        if np.prod(high - low) > LARGEST_GROWTH * largest * _finer(reference, grid):
+        finer = max(1.0, grid.voxel_volume_mm3 / reference.voxel_volume_mm3)
+        if np.prod(high - low) > LARGEST_GROWTH * largest * finer:
             raise FrameError(
                 f"{name} lies apart from the other masks: its header says {grid.describe()}",
                 expected=f"a place near {reference.describe()}",
@@ -111,11 +112,6 @@ def covers_same_voxels(grid: Grid, other: Grid) -> bool:
         return False
     low, high = box_in(other, grid)
     return bool(max(np.abs(low).max(), np.abs(high - other.shape).max()) <= SHIFT_TOLERANCE)
-
-
-def _finer(reference: Grid, grid: Grid) -> float:
-    """Return how many voxels of the reference one of the other grid makes, at least 1."""
-    return max(1.0, grid.voxel_volume_mm3 / reference.voxel_volume_mm3)
 
 
 def _axis_order(target_from_source: Float, shape: tuple[int, ...]) -> Int | None:

@@ -11,25 +11,22 @@ from anatomy.grid import Volume
 from anatomy.io.image_header import ImageHeader, truncated
 
 
-def read_values(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume:
-    """Read the voxels in their own type (float32 where the header scales).
+def require_whole(header: ImageHeader, stream: Iterator[bytes], path: Path) -> None:
+    """Read all voxels and keep none; errors as `read_array`."""
+    for _ in _chunks(header, stream, path):
+        pass
+
+
+def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Array:
+    """Read the voxels `(ni, nj, nk)`, or the vectors `(ni, nj, nk, components)`, in their own type.
+
+    They are float32 where the header scales.
 
     Raises
     ------
     FileError
         If there are fewer or many more bytes than the header says, or they are damaged.
     """
-    return Volume(grid=header.grid, array=read_array(header, stream, path))
-
-
-def require_whole(header: ImageHeader, stream: Iterator[bytes], path: Path) -> None:
-    """Read all voxels and keep none; errors as `read_values`."""
-    for _ in _chunks(header, stream, path):
-        pass
-
-
-def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Array:
-    """Read the voxels `(ni, nj, nk)`, or the vectors `(ni, nj, nk, components)`, as `read_values` does."""
     values = np.zeros(header.stored_shape, np.float32 if header.is_scaled else header.dtype, order="F")
     flat = values.reshape(-1, order="F")
     for at, chunk in _chunks(header, stream, path):
@@ -47,7 +44,7 @@ def read_nonzero(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Vo
     AnatomyError
         If a voxel is not a number.
     FileError
-        As `read_values`.
+        As `read_array`.
     """
     mask = np.zeros(header.grid.shape, dtype=np.bool_, order="F")
     flat = mask.reshape(-1, order="F")

@@ -131,11 +131,6 @@ SAME_DICE = 0.005
 """Two Dice scores of samples that differ by less are equal."""
 
 
-def other_phase(motion: Motion) -> float:
-    """Return the end of the breath that is farther from the phase of the masks."""
-    return 1.0 if motion.masks_phase <= 0.5 else 0.0
-
-
 def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume) -> dict[str, float]:
     """Return how well the motion leads lungs onto lungs, or raise AnatomyError if it does not.
 
@@ -159,7 +154,7 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
     there = _at(other.array, other.grid, points)
     lungs = (labels & OUTSIDE) == 0
     still, is_left = _at(lungs, grid, points), points[:, 0] > motion.middle_x_mm
-    moved, phase = np.zeros(len(points), dtype=bool), other_phase(motion)
+    moved, phase = np.zeros(len(points), dtype=bool), 1.0 if motion.masks_phase <= 0.5 else 0.0
     for side, chosen in ((RIGHT, ~is_left), (LEFT, is_left)):
         moved[chosen] = _at(lungs, grid, motion.pulled_back(points[chosen], phase, side))
     dice, unmoved = _dice(moved, there), _dice(still, there)

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.base.typed import Array, Float, Int, Int16, Mask, UInt8
+from anatomy.base.typed import Array, Float, Int16, Mask, UInt8
 from anatomy.grid import Grid
-from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.chest import CAGE_CENTRE_Z, Chest, Side
 from anatomy.phantom.kernels import NODULE_OWNER, paint_tree
 from anatomy.phantom.plan import PlannedTree
@@ -182,7 +181,8 @@ def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
         tree.outer_mm,
         np.concatenate([[0], np.cumsum(sprouts.counts)]),
         np.array(sprouts.parent, dtype=np.int64),
-        _large_first(sprouts),
+        # Children are thinner than their parents, so parents come first.
+        np.argsort(-np.array(sprouts.diameter_mm), kind="stable").astype(np.int64),
         tree.freedom,
         base,
         canvas.spacing_mm if airway else -1.0,
@@ -193,11 +193,6 @@ def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
         keep,
     )
     return keep
-
-
-def _large_first(tree: Sprouts) -> Int:
-    """Order branches by falling diameter; children are thinner than parents, so parents come first."""
-    return np.argsort(-np.array(tree.diameter_mm), kind="stable").astype(np.int64)
 
 
 def draw_bulla(canvas: Canvas, centre_lps: Float, radius_mm: float) -> None:

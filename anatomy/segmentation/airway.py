@@ -13,7 +13,7 @@ from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Int16, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
-from anatomy.morphology import Window, bounds, window
+from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.kernels.local_minima import depth_slice, smooth_slice
@@ -90,7 +90,8 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
             expected="lungs segmented in this CT",
         )
     tell("airway: map of local minima")
-    box = _box(inside | lungs.central_airway, ct.grid.spacing_mm)
+    margin = np.ceil(BOX_MARGIN_MM / ct.grid.spacing_mm).astype(np.int64)
+    box = window(*bounds(inside | lungs.central_airway, margin))
     hu = _hounsfield(ct.array[box])
     lung = np.ascontiguousarray(inside[box].T)
     spacing_mm = np.ascontiguousarray(ct.grid.spacing_mm[::-1])
@@ -120,10 +121,6 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     lumen[box] = solid.T
     wall[box] = (grown.wall & ~solid).T
     return Airways(lumen=lumen, wall=wall, leak_mm3=grown.undone * ct.grid.voxel_volume_mm3)
-
-
-def _box(mask: Mask, spacing_mm: Float) -> Window:
-    return window(*bounds(mask, np.ceil(BOX_MARGIN_MM / spacing_mm).astype(np.int64)))
 
 
 def _hounsfield(values: Array) -> Int16:

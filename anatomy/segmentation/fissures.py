@@ -106,7 +106,8 @@ def _in_agreement(strength: Float32, normal: Float32) -> Float32:
     total = np.zeros(len(at[0]), dtype=np.float32)
     for a in range(3):
         for b in range(a, 3):
-            summed = _block_mean(strength * normal[a] * normal[b])
+            blocks = blocks_of(strength * normal[a] * normal[b])
+            summed = blocks.mean(axis=(1, 3, 5), dtype=np.float32)
             around = ndimage.gaussian_filter(summed, AGREEMENT_MM / BLOCK, truncate=2.5)[place]
             along += np.float32(1 if a == b else 2) * normal[a][at] * normal[b][at] * around
             if a == b:
@@ -121,7 +122,3 @@ def blocks_of(image: Array) -> Array:
     nk, nj, ni = (n // BLOCK for n in image.shape)
     cut = image[: nk * BLOCK, : nj * BLOCK, : ni * BLOCK]
     return cut.reshape(nk, BLOCK, nj, BLOCK, ni, BLOCK)
-
-
-def _block_mean(image: Float32) -> Float32:
-    return np.asarray(blocks_of(image).mean(axis=(1, 3, 5), dtype=np.float32))

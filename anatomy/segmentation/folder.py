@@ -87,13 +87,11 @@ class SegmentationFolder:
         for name in IMAGES:
             for suffix in SUFFIXES:
                 path = self.path / f"{name}{suffix}"
-                made_here = suffix == _MADE_SUFFIX and self._is_made(path, name)
-                if path.is_file() and not made_here:
+                if not path.is_file():
+                    continue
+                if suffix != _MADE_SUFFIX or sha256(path) not in self._entry(name).get("written", ()):
                     require_writable_folder(self.path / CORRECTIONS)
                     os.replace(path, self.path / CORRECTIONS / path.name)
-
-    def _is_made(self, path: Path, name: str) -> bool:
-        return path.is_file() and sha256(path) in self._entry(name).get("written", ())
 
     def read(self, path: Path) -> Volume:
         """Read an image and put it on the grid of the CT."""

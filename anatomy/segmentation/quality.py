@@ -61,14 +61,9 @@ def quality_of(parts: Parts) -> Quality:
     if isinstance(tree, AnatomyError):
         failed = f"No airway tree could be made: {tree}"
         return Quality(volumes_l=volumes, tree=None, ends=0, warnings=(*warnings, failed))
-    ends = tree_ends(tree)
+    ends = sum(len(tree.children(branch)) == 0 for branch in range(tree.n_branches))
     warnings += [*tree.report.warnings, *_leaks(tree)]
-    return Quality(volumes_l=volumes, tree=tree, ends=len(ends), warnings=tuple(warnings))
-
-
-def tree_ends(tree: AirwayTree) -> list[int]:
-    """Return the branches without children."""
-    return [branch for branch in range(tree.n_branches) if len(tree.children(branch)) == 0]
+    return Quality(volumes_l=volumes, tree=tree, ends=ends, warnings=tuple(warnings))
 
 
 def _volume_warnings(volumes: dict[str, float]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
 from anatomy.segmentation.misplaced import misplaced
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
 from anatomy.segmentation.parts import Parts, RefusedError
-from anatomy.segmentation.request import Given, SegmentationRequest
+from anatomy.segmentation.request import SegmentationRequest
 from anatomy.segmentation.scan_warnings import scan_warnings
 
 if TYPE_CHECKING:
@@ -223,7 +222,8 @@ class Steps:
 
     def _nodule(self) -> Mask:
         given, grid = self._request.given, self._folder.grid
-        files = {name: sha256(path) for name, path in _nodule_files(given).items()}
+        stated = {"contours": given.nodule_contours, "mask": given.nodule_mask}
+        files = {name: sha256(path) for name, path in stated.items() if path is not None}
         key = self._key("nodule", sources=("nodule",), grid=grid_digest(grid), files=files)
 
         def compute() -> tuple[Images, dict[str, Any]]:
@@ -361,11 +361,6 @@ class Steps:
     def _read(self, name: str) -> Array:
         array = self._folder.read(self._folder.path_of(name)).array
         return array if name in _NOT_MASKS else np.asfortranarray(array != 0)
-
-
-def _nodule_files(given: Given) -> dict[str, Path]:
-    files = {"contours": given.nodule_contours, "mask": given.nodule_mask}
-    return {name: path for name, path in files.items() if path is not None}
 
 
 def _airways(airway: Images) -> Airways:

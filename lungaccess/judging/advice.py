@@ -215,18 +215,15 @@ def advise(
     if success is None or success.value >= GOOD:
         return ()
     chance = None if appraisal.risk is None else chance_of(appraisal.risk)
-    stated = procedure or (load_procedure(chance.procedure) if chance and _ships(chance.procedure) else None)
+    if not procedure and chance and chance.procedure in procedure_names():
+        procedure = load_procedure(chance.procedure)
     began, found = working_s(), []
-    for each in Adviser(plan, lung, errors, stated, atlas_of, systems).trials():
+    for each in Adviser(plan, lung, errors, procedure, atlas_of, systems).trials():
         if each is not None and each.success.value > success.value + WORTH_SAYING:
             found.append(each)
         if working_s() - began > time_s:
             break
     return tuple(sorted(found, key=lambda each: -each.success.value)[:MOST])
-
-
-def _ships(procedure: str) -> bool:
-    return procedure in procedure_names()
 
 
 def _inside(nodules: object, point: Float) -> bool:

@@ -186,7 +186,8 @@ def nodule_target(lung: Organ, number: int) -> Target:
     centres = lung.nodules.grid.lps(voxels)
     clearance = lung.obstacle_field(with_fissures=True).lower_bound_mm(centres)
     nearest = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
-    point = nearest if _is_free(lung, nearest) else centres[int(np.argmax(clearance))]
+    is_free = lung.label_at(nearest) & (OUTSIDE | VESSEL | AIRWAY) == 0
+    point = nearest if is_free else centres[int(np.argmax(clearance))]
     require_free(lung, point)
     return Target(lps_mm=read_only(point), origin=f"nodule {number}")
 
@@ -202,10 +203,6 @@ def _nodule_voxels(nodules: Volume, number: int) -> Int:
             remedy="Choose one of these numbers, or name a point with --target",
         )
     return np.asarray(voxels[part == np.argsort(-sizes, kind="stable")[number - 1]])
-
-
-def _is_free(lung: Organ, point: Float) -> bool:
-    return lung.label_at(point) & (OUTSIDE | VESSEL | AIRWAY) == 0
 
 
 def require_free(lung: Organ, point: Float, origin: str = "") -> None:

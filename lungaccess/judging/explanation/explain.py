@@ -96,14 +96,11 @@ def explain_no_plan(
     own = atlas or build_atlas(lung, system)
     task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective), seed=seed)
     made = Explainer(
-        task, own, time_s, atlas_of or _built(lung), is_kept or (lambda _system: False),
-        on_part or (lambda _name: None),
+        task, own, time_s,
+        atlas_of or (lambda other, progress: build_atlas(lung, other, progress=progress)),
+        is_kept or (lambda _system: False), on_part or (lambda _name: None),
     )  # fmt: skip
     return made.explanation(failure)
-
-
-def _built(lung: Lung) -> AtlasOf:
-    return lambda system, progress: build_atlas(lung, system, progress=progress)
 
 
 class Explainer:
@@ -135,7 +132,7 @@ class Explainer:
 
     def explanation(self, failure: NoPlan) -> Explanation:
         """Do all parts for which there is time, the most useful first."""
-        others = presets_by_invasiveness(fissures_allowed=self._fissures_allowed())
+        others = presets_by_invasiveness(fissures_allowed=self._task.system.fissures_allowed or None)
         known = {self._task.system.name, *failure.attempts}
         untried = [each for each in others if each.name not in known]
         tried: list[Attempt] = []
@@ -175,10 +172,6 @@ class Explainer:
 
     def _chance(self, plan: Plan) -> Share:
         return assess(plan, self._task.lung, samples=DRAWS, seed=SEED).succeeds
-
-    def _fissures_allowed(self) -> bool | None:
-        """Return the rule about fissures that the presets take over: only if it is not their own."""
-        return True if self._task.system.fissures_allowed else None
 
     def _part(self, name: str, do: Callable[[], None], *, at_any_time: bool = False) -> None:
         """Do a part, unless the time is up before or during it and it is not one for any time."""

@@ -496,7 +496,8 @@ class Policy:
         left = max(procedure.scope.placements - measured.placements, 0)
         chosen = self.as_planned(1)
         if procedure.scope.measured:
-            chosen = self.from_scopes(self._mean_scope(poses.scope))
+            placed = self.scopes_measured(mean_pose(poses.scope)[None], len(poses.scope))
+            chosen = self.from_scopes(placed)
         if not len(poses.tubes) and not len(poses.needle):
             return self._decision(chosen, left, tubes_out=False)
         target = self._target[None]
@@ -508,9 +509,6 @@ class Policy:
         if not len(poses.needle) or self.plan.needle is None:
             return self._decision(chosen, left, tubes_out=True)
         return self._on_the_way(chosen, mean_pose(poses.needle), target[0])
-
-    def _mean_scope(self, poses: Float) -> Placed:
-        return self.scopes_measured(mean_pose(poses)[None], len(poses))
 
     def _decision(self, chosen: Chosen, left: int, *, tubes_out: bool) -> Decision:
         """Return what was chosen in one procedure as a decision."""

@@ -101,7 +101,7 @@ class ReachStream:
                 voxels=voxels[again], kinds=kinds, entries=entries, share=done / max(len(voxels), 1)
             )
             voxels, points = voxels[~again], points[~again]
-        scan = reach_scan(self._atlas_of_system, arcs=1)
+        scan = reach_scan(replace(self._atlas, system=self._system), arcs=1)
         begin, count = 0, FIRST_POINTS
         while begin < len(voxels):
             part = slice(begin, begin + count)
@@ -111,10 +111,6 @@ class ReachStream:
             share = min(1.0, (done + begin) / len(self.counted))
             yield ReachPart(voxels=voxels[part], kinds=found.kinds, entries=found.entries, share=share)
             count = min(2 * count, MOST_POINTS)
-
-    @property
-    def _atlas_of_system(self) -> Atlas:
-        return replace(self._atlas, system=self._system)
 
     def _again(self, points: ArrayLike, entries: Int) -> Bool:
         """Tell which points `(N, 3)` the arc from a deployment reaches with the needle of the system."""

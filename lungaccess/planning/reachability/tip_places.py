@@ -129,7 +129,8 @@ def _piece(tree: AirwayTree, points: Int, centres: Float, half_mm: float) -> Pla
 
     turns = np.full((len(points), 1), MAX_TURN_AT_TIP_RAD + SPARE_RAD)
     own = np.hstack([tree.points_lps[points], tree.tangents[points], turns])
-    axis = _unit(own[:, 3:6].sum(axis=0))
+    axis = own[:, 3:6].sum(axis=0)
+    axis = axis / np.linalg.norm(axis)
     frame = frames.pose(own[0, :3], axis)[:3, :3].T
     seen = centres @ frame.T
     from_axis = np.arccos(np.clip(own[:, 3:6] @ axis, -1.0, 1.0))
@@ -142,7 +143,3 @@ def _piece(tree: AirwayTree, points: Int, centres: Float, half_mm: float) -> Pla
         places=np.stack([seen.min(axis=0) - half_mm, seen.max(axis=0) + half_mm]),
         wide=float((from_axis + own[:, 6]).max()) + SPARE_RAD,
     )
-
-
-def _unit(vector: Float) -> Float:
-    return np.asarray(vector / np.linalg.norm(vector))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from anatomy.base.files import atomic_write, require_writable_folder
 from lungaccess.running.study.results import ResultsFile
@@ -90,7 +89,7 @@ def _write_parquet(content: Table, path: Path) -> None:
 
     schema = pyarrow.schema([(name, _kind(name)) for name in content.columns])
     with parquet.ParquetWriter(path, schema) as writer:
-        for batch in _batches(content.rows):
+        while batch := list(islice(content.rows, BATCH)):
             arrays = [
                 pyarrow.array(
                     [bool(v) if name in TRUTHS else v for v in values], type=schema.field(name).type
@@ -98,11 +97,6 @@ def _write_parquet(content: Table, path: Path) -> None:
                 for name, values in zip(content.columns, zip(*batch, strict=True), strict=True)
             ]
             writer.write_batch(pyarrow.record_batch(arrays, schema=schema))
-
-
-def _batches(rows: Iterator[tuple[Any, ...]]) -> Iterator[list[tuple[Any, ...]]]:
-    while batch := list(islice(rows, BATCH)):
-        yield batch
 
 
 def _kind(column: str) -> pyarrow.DataType:

@@ -107,7 +107,14 @@ def _measured(run: Run, cache: Path | None) -> answers.Answer:
         began, cpu_began = time.perf_counter(), time.process_time()
         made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
     except NoPlan as failure:
-        made = _no_plan(run, failure)
+        made = answers.Answer(
+            key=run.key,
+            outcome=answers.NO_PLAN,
+            status=answers.TIMEOUT,
+            message=failure.found,
+            advice=failure.advice,
+            rejections=dict(failure.reasons),
+        )
     except ANSWERS as error:
         status = answers.INVALID_GOAL if isinstance(error, TargetError) else answers.UNKNOWN
         made = answers.Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
@@ -176,17 +183,6 @@ def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:
     seed = run.seed + FRESH_SEED
     return chance_of(
         estimate_success(found, lung, errors=errors, procedure=procedure, samples=samples, seed=seed)
-    )
-
-
-def _no_plan(run: Run, failure: NoPlan) -> answers.Answer:
-    return answers.Answer(
-        key=run.key,
-        outcome=answers.NO_PLAN,
-        status=answers.TIMEOUT,
-        message=failure.found,
-        advice=failure.advice,
-        rejections=dict(failure.reasons),
     )
 
 

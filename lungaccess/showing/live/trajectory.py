@@ -111,7 +111,7 @@ def plan_trajectory(plan: Plan, speeds: Speeds | None = None, *, step_s: float =
     if not 0.0 < step_s < np.inf:
         raise SettingsError(f"The samples are {step_s} s apart", expected="a time above 0")
     chosen = speeds or Speeds()
-    parts = [_scope_waypoints(plan), _tube_waypoints(plan), _needle_waypoints(plan)]
+    parts = [np.asarray(plan.scope.states), _tube_waypoints(plan), _needle_waypoints(plan)]
     rows, stages = _joined([part for part in parts if len(part)])
     most = _most_per_s(plan, chosen)
     steps_s = (np.abs(np.diff(rows, axis=0)) / most).max(axis=1)
@@ -145,11 +145,6 @@ def _most_per_s(plan: Plan, speeds: Speeds) -> Float:
     tubes = [speeds.tube_mm_per_s, np.radians(speeds.tube_deg_per_s)] * len(plan.system.tubes.named)
     needle = [speeds.needle_mm_per_s, np.radians(speeds.needle_deg_per_s), np.inf]
     return np.array([speeds.scope_mm_per_s, turn, turn, *tubes, *needle])
-
-
-def _scope_waypoints(plan: Plan) -> Float:
-    """Return the joints of the scope `(W, 3)`, the rest still."""
-    return np.asarray(plan.scope.states)
 
 
 def _tube_waypoints(plan: Plan) -> Float:

@@ -63,7 +63,7 @@ def joint_trajectory(trajectory: Trajectory) -> dict[str, Any]:
 
     Velocities are those up to the next sample, 0 at the last.
     """
-    scales = np.array([_scale(name) for name in trajectory.joints])
+    scales = np.array([_SI[_unit(name)][1] for name in trajectory.joints])
     values = trajectory.values * scales
     rates = np.diff(values, axis=0) / np.diff(trajectory.time_s)[:, None]
     rates = np.vstack([rates, np.zeros(values.shape[1])])
@@ -111,10 +111,6 @@ def quaternions(poses: Float) -> Float:
 
 def _unit(name: str) -> str:
     return next(unit for unit in ("_per_mm", "_mm", "_rad") if name.endswith(unit))
-
-
-def _scale(name: str) -> float:
-    return _SI[_unit(name)][1]
 
 
 def _header(time_s: float) -> dict[str, Any]:

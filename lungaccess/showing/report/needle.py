@@ -49,7 +49,7 @@ def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) 
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)
     start, forward = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
-    points = np.array([start, *_path_points(answer)])
+    points = np.array([start, *(() if answer.path is None else answer.path.sample(STEP_MM)[0])])
     shown = points if len(points) > 1 else np.array([start, start + 10.0 * forward, query.target])
     view = plane_view(shown, "")
     found = answer.obstruction
@@ -71,10 +71,6 @@ def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) 
     style.heading(figure, f"Needle in {lung.name}: {said}", size=12.5)
     _legend(figure.add_axes((0.0, 0.0, 1.0, 0.11)), answer)
     return style.save_png(figure, path)
-
-
-def _path_points(answer: NeedleAnswer) -> Float:
-    return np.zeros((0, 3)) if answer.path is None else answer.path.sample(STEP_MM)[0]
 
 
 def _whole_panel(

@@ -62,7 +62,10 @@ def reach_png(reach: ReachMap, lung: Lung, path: str | os.PathLike[str]) -> Path
             uv = view.project(points)
             drawing.fit(axes, uv.min(axis=0) - 6.0, uv.max(axis=0) + 6.0)
             lps, extent = _plane(axes, view, centre)
-            _paint(axes, paint(reach, lps), extent)
+            image = paint(reach, lps)
+            axes.imshow(
+                image, extent=extent, origin="lower", aspect="auto", interpolation="nearest", zorder=1
+            )
             _anatomy(axes, layers, lps, extent)
             drawing.dress(axes, view, ticks=True)
             depth = float(centre @ view.towards_viewer)
@@ -131,10 +134,6 @@ def _clearance_colours(reach: ReachMap, lps: Float) -> Float:
     shades = matplotlib.colormaps["viridis"](Normalize(*CLEARANCE_MM)(_values(reach.clearance_mm, lps)))
     image[reached] = shades[reached]
     return image
-
-
-def _paint(axes: Axes, image: Float, extent: tuple[float, float, float, float]) -> None:
-    axes.imshow(image, extent=extent, origin="lower", aspect="auto", interpolation="nearest", zorder=1)
 
 
 def _anatomy(axes: Axes, layers: Layers, lps: Float, extent: tuple[float, float, float, float]) -> None:

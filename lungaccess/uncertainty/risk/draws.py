@@ -153,13 +153,10 @@ class Draws:
             attempt = 0 if level == PATIENT else self._attempt
             key = (list(UNITS).index(kind), level, attempt)
             rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self._seed, spawn_key=key)))
-            self._made[kind, level] = _columns(rng, self.count, shape[1:])
+            # By columns: a further arc leaves the numbers of those before alone.
+            columns = rng.standard_normal((*shape[1:], self.count))
+            self._made[kind, level] = np.asarray(np.moveaxis(columns, -1, 0))
         return self._made[kind, level]
-
-
-def _columns(rng: np.random.Generator, count: int, columns: tuple[int, ...]) -> Float:
-    """Return normal numbers `(count, *columns)`, by columns: a further arc leaves those before alone."""
-    return np.asarray(np.moveaxis(rng.standard_normal((*columns, count)), -1, 0))
 
 
 def _uniform(normal: Float) -> Float:

@@ -15,7 +15,6 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_value
-from anatomy.grid import Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom import Phantom, make_phantom, write_phantom
 from lungaccess.problem.peripheral import peripheral_targets
@@ -54,12 +53,9 @@ def masks_sha256(images: PatientImages) -> str:
     for name in MASKS:
         volume = getattr(images, name)
         digest.update(name.encode())
-        digest.update(np.packbits(_mask(volume)).tobytes())
+        voxels = np.zeros(0, dtype=np.bool_) if volume is None else np.asarray(volume.array > 0).T
+        digest.update(np.packbits(voxels).tobytes())
     return digest.hexdigest()
-
-
-def _mask(volume: Volume | None) -> np.ndarray:
-    return np.zeros(0, dtype=np.bool_) if volume is None else np.asarray(volume.array > 0).T
 
 
 @cache

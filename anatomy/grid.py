@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from anatomy.base.errors import FrameError, GridMismatchError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Array, Bool, Float
+from anatomy.base.typed import Array, Bool, Float, Int
 
 ORTHONORMAL_TOLERANCE = 1e-4
 """Headers store directions in single precision with six digits or so; grids have the nearest rotation."""
@@ -139,6 +139,20 @@ class Grid:
         """The middles of the eight voxels in the corners, `(8, 3)`."""
         return self.lps(list(product(*[(0, n - 1) for n in self.shape])))
 
+    def voxels(self, lps: ArrayLike) -> Int:
+        """Return the indices of the voxels that hold points `(..., 3)` LPS mm, beyond the grid as well."""
+        return np.floor(self.ijk(lps) + 0.5).astype(np.int64)
+
+    def values_at(self, array: Array, lps: ArrayLike, beyond: float) -> Array:
+        """Return what an array `(ni, nj, nk)` holds at points `(..., 3)` LPS mm, `beyond` off the grid."""
+        places = np.moveaxis(self.voxels(lps), -1, 0)
+        # Axis by axis: of many points numpy.all over the last axis would take longer than all else.
+        within = [(place >= 0) & (place < n) for place, n in zip(places, self.shape, strict=True)]
+        inside = within[0] & within[1] & within[2]
+        found = np.full(inside.shape, beyond, dtype=array.dtype)
+        found[inside] = array[tuple(place[inside] for place in places)]
+        return found
+
     def contains(self, lps: ArrayLike) -> Bool:
         """Tell which points `(..., 3)` lie in a voxel of the grid."""
         ijk = np.floor(self.ijk(lps) + 0.5)
@@ -207,3 +221,7 @@ class Volume:
                 remedy="Index arrays as [i, j, k]",
             )
         object.__setattr__(self, "array", read_only(np.asfortranarray(self.array)))
+
+    def at(self, lps: ArrayLike, beyond: float) -> Array:
+        """Return the values of the voxels that hold points `(..., 3)` LPS mm, `beyond` off the grid."""
+        return self.grid.values_at(self.array, lps, beyond)

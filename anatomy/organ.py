@@ -136,6 +136,10 @@ class Organ:
         x, y, z = (float(c) for c in point_lps)
         return int(kernel.label_at(self.labels, self.geometry, x, y, z))
 
+    def labels_at(self, points_lps: Float) -> Labels:
+        """Return the labels of the voxels that hold points `(..., 3)` LPS mm; OUTSIDE beyond the grid."""
+        return self.grid.values_at(self.labels, points_lps, structures.OUTSIDE)
+
     def exact_clearance_mm(
         self, points_lps: Float, bits: int, *, cap_mm: float, exempt_branch: int = -1
     ) -> Float:

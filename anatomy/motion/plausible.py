@@ -151,12 +151,12 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
     shape = np.ceil((high - low) / SAMPLE_MM).astype(int) + 1
     lattice = Grid.from_spacing(shape, (SAMPLE_MM,) * 3, low)
     points = lattice.lps(np.moveaxis(np.indices(lattice.shape), 0, -1)).reshape(-1, 3)
-    there = _at(other.array, other.grid, points)
+    there = other.at(points, False)
     lungs = (labels & OUTSIDE) == 0
-    still, is_left = _at(lungs, grid, points), points[:, 0] > motion.middle_x_mm
+    still, is_left = grid.values_at(lungs, points, False), points[:, 0] > motion.middle_x_mm
     moved, phase = np.zeros(len(points), dtype=bool), 1.0 if motion.masks_phase <= 0.5 else 0.0
     for side, chosen in ((RIGHT, ~is_left), (LEFT, is_left)):
-        moved[chosen] = _at(lungs, grid, motion.pulled_back(points[chosen], phase, side))
+        moved[chosen] = grid.values_at(lungs, motion.pulled_back(points[chosen], phase, side), False)
     dice, unmoved = _dice(moved, there), _dice(still, there)
     if dice < max(LEAST_DICE, unmoved - SAME_DICE):
         raise AnatomyError(
@@ -175,15 +175,6 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
     both = np.concatenate([away[1][borders[0]], away[0][borders[1]]])
     apart = float(both.mean())
     return {"lungs_dice": dice, "lungs_dice_unmoved": unmoved, "lungs_borders_mm": apart}
-
-
-def _at(mask: Mask, grid: Grid, points: Float) -> Mask:
-    """Return whether points `(N, 3)` LPS mm are in a mask; beyond its grid they are not."""
-    index = np.rint(grid.ijk(points)).astype(int)
-    within = ((index >= 0) & (index < np.asarray(grid.shape))).all(axis=1)
-    inside = np.zeros(len(points), dtype=bool)
-    inside[within] = mask[tuple(index[within].T)]
-    return inside
 
 
 def _dice(a: Mask, b: Mask) -> float:

@@ -101,7 +101,7 @@ class CoarseCt:
 
     def block(self, lps: Float) -> tuple[int, int, int] | None:
         """Return the block that a point lies in, or None outside the CT."""
-        i, j, k = (int(n) for n in np.floor(self.grid.ijk(lps) + 0.5))
+        i, j, k = (int(n) for n in self.grid.voxels(lps))
         return (i, j, k) if bool(self.grid.contains(lps)) else None
 
     def _turned(self, blocks: Array) -> Array:

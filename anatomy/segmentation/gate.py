@@ -72,9 +72,8 @@ def plausibility(
         name = "axes" if "upside down" in tree.found else "airway"
         remedy = "Check the header of the image" if name == "axes" else "Correct the mask of the airway"
         return (*failed, Implausible(name=name, found=tree.found, remedy=remedy)), tuple(warnings)
-    at = np.clip(np.rint(ct.grid.ijk(tree.points_lps)).astype(np.int64), 0, np.array(ct.grid.shape) - 1)
     for name, lung in (("left", lungs.left), ("right", lungs.right)):
-        if lung.any() and not lung[tuple(at.T)].any():
+        if lung.any() and not ct.grid.values_at(lung, tree.points_lps, False).any():
             failed.append(
                 Implausible(
                     name="bronchi",

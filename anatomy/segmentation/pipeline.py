@@ -141,8 +141,7 @@ def target_warnings(target_lps: Float | None, parts: Parts, ct_grid: Grid) -> li
     if not bool(ct_grid.contains(target_lps)):
         return [f"{place} lies outside the image: check its frame."]
     grid = parts.ct.grid
-    at = np.floor(grid.ijk(target_lps) + 0.5).astype(np.int64)
-    i, j, k = (int(n) for n in np.clip(at, 0, np.array(grid.shape) - 1))
+    i, j, k = np.clip(grid.voxels(target_lps), 0, np.array(grid.shape) - 1).tolist()
     if parts.nodule[i, j, k]:
         return []
     if not (parts.left[i, j, k] or parts.right[i, j, k]):

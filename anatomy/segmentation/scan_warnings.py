@@ -126,8 +126,8 @@ def airway_warnings(tree: AirwayTree | AnatomyError, left: Mask, right: Mask, gr
         )
     ends = np.setdiff1d(np.arange(len(tree.branch_parent)), tree.branch_parent)
     tips = tree.points_lps[tree.branch_start[ends + 1] - 1]
-    at = tuple(np.clip(np.rint(grid.ijk(tips)).astype(np.int64), 0, np.array(left.shape) - 1).T)
-    counts = {"left": int(left[at].sum()), "right": int(right[at].sum())}
+    lungs = {"left": left, "right": right}
+    counts = {side: int(grid.values_at(lung, tips, False).sum()) for side, lung in lungs.items()}
     for side, count in counts.items():
         if count < max(LEAST_ENDS, LEAST_SHARE * max(counts.values())):
             warnings.append(

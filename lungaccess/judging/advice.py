@@ -8,7 +8,6 @@ import numpy as np
 
 from anatomy.base.kernel_clock import working_s
 from anatomy.base.records import frozen_value
-from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import Appraisal
 from lungaccess.judging.appraisal.headline import of_hundred
@@ -145,7 +144,7 @@ class Adviser:
         radius_mm = 5.0 if chance is None else chance.radius_mm
         for offset in np.concatenate([np.eye(3), -np.eye(3)]):
             point = plan.target_lps + OF_A_NODULE * radius_mm * offset
-            if not _inside(nodules, point):
+            if not nodules.at(point, False):
                 continue
             found = self._planned(plan.system, Target(lps_mm=point, origin=plan.target_origin))
             text = ",".join(f"{value:.1f}" for value in point)
@@ -224,9 +223,3 @@ def advise(
         if working_s() - began > time_s:
             break
     return tuple(sorted(found, key=lambda each: -each.success.value)[:MOST])
-
-
-def _inside(nodules: object, point: Float) -> bool:
-    grid, array = nodules.grid, nodules.array  # type: ignore[attr-defined]
-    ijk = np.rint(grid.ijk(point)).astype(int)
-    return bool(grid.contains(point)) and bool(array[tuple(ijk)])

@@ -193,8 +193,7 @@ def _ends(tree: AirwayTree, branch: int) -> Float:
 def _lobe(lung: Lung, point_lps: Float) -> str:
     if lung.lobes is None:
         return ""
-    index = np.floor(lung.grid.ijk(point_lps) + 0.5).astype(np.int64)
-    number = int(lung.lobes.array[tuple(np.clip(index, 0, np.array(lung.grid.shape) - 1))])
+    number = int(lung.lobes.at(point_lps, 0))
     return LOBES[number] if number else lung.lobe_at(point_lps)
 
 

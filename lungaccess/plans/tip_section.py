@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float, Int, Mask
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN
 
@@ -47,10 +47,11 @@ def tip_sections(lung: Lung, lps_from_tip: Float, radius_mm: float) -> TipSectio
     rays = rays.reshape(-1, 3)
     starts = np.repeat(axes, DIRECTIONS, axis=0)
     away = np.zeros(len(rays))
-    going = np.flatnonzero(_in_lumen(lung, starts))
+    going = np.flatnonzero(lung.labels_at(starts) & LUMEN)
     while len(going):
         away[going] += RAY_STEP_MM
-        going = going[_in_lumen(lung, starts[going] + away[going, None] * rays[going])]
+        ahead = starts[going] + away[going, None] * rays[going]
+        going = going[(lung.labels_at(ahead) & LUMEN) != 0]
         going = going[away[going] < FARTHEST_MM]
     border = away.reshape(-1, DIRECTIONS)
     return TipSections(
@@ -59,11 +60,3 @@ def tip_sections(lung: Lung, lps_from_tip: Float, radius_mm: float) -> TipSectio
         nearest=border.argmin(axis=1),
         depth_gap_mm=lung.lumen_depth.lower_bound_mm(axes) - radius_mm,
     )
-
-
-def _in_lumen(lung: Lung, points_lps: Float) -> Mask:
-    index = np.floor(lung.grid.ijk(points_lps) + 0.5).astype(np.int64)
-    inside = ((index >= 0) & (index < lung.grid.shape)).all(axis=1)
-    found = np.zeros(len(points_lps), dtype=np.bool_)
-    found[inside] = (lung.labels[tuple(index[inside].T)] & LUMEN) != 0
-    return found

@@ -83,8 +83,6 @@ def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
 
 def _free_tissue(lung: Lung, point: Float) -> str:
     """Name tissue that is no structure."""
-    if lung.nodules is None:
-        return "lung tissue"
-    ijk = np.floor(lung.nodules.grid.ijk(point) + 0.5).astype(np.int64)
-    inside = bool(((ijk >= 0) & (ijk < lung.nodules.grid.shape)).all())
-    return "nodule" if inside and bool(lung.nodules.array[tuple(ijk)]) else "lung tissue"
+    nodules = lung.nodules
+    in_nodule = nodules is not None and bool(nodules.at(point, False))
+    return "nodule" if in_nodule else "lung tissue"

@@ -380,13 +380,9 @@ class Policy:
         found = self._target + fused_share(expected, self.procedure.imaging.position_mm) * (
             measured - self._target
         )
-        grid = self.lung.grid
-        at = np.floor(grid.ijk(found) + 0.5).astype(np.int64)
-        inside = ((at >= 0) & (at < np.array(grid.shape))).all(axis=1)
-        at[~inside] = 0
-        # The masks say that a nodule cannot be there: the measurement is not believed.
-        free = (self.lung.labels[tuple(at.T)] & (OUTSIDE | VESSEL | AIRWAY)) == 0
-        return np.where((inside & free)[:, None], found, self._target)
+        # Where the masks say that a nodule cannot be, the measurement is not believed.
+        free = (self.lung.labels_at(found) & (OUTSIDE | VESSEL | AIRWAY)) == 0
+        return np.where(free[:, None], found, self._target)
 
     def from_tubes(self, chosen: Chosen, tips: Float, targets: Float) -> Chosen:
         """Return what is chosen from the most likely poses of the tubes' tip to targets, `(N, 3)`."""

@@ -29,11 +29,7 @@ def counted_voxels(lung: Lung, grid: Grid, with_fissures: bool) -> Mask:
     bits = obstacle_bits(with_fissures)
     counted = np.zeros(grid.shape, dtype=bool, order="F")
     for k in range(grid.shape[2]):
-        ijk = np.floor(lung.grid.ijk(_layer_points(grid, k)) + 0.5).astype(np.int64)
-        inside = ((ijk >= 0) & (ijk < lung.grid.shape)).all(axis=-1)
-        layer = np.zeros(inside.shape, dtype=bool)
-        layer[inside] = (lung.labels[tuple(ijk[inside].T)] & bits) == 0
-        counted[:, :, k] = layer
+        counted[:, :, k] = (lung.labels_at(_layer_points(grid, k)) & bits) == 0
     return counted
 
 

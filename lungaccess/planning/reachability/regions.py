@@ -59,7 +59,7 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     points = grid.lps(ijk)
     # LPS: the patient's left is +x.
     codes = np.where(points[:, 0] > lung.tree.carina_lps[0], LEFT, RIGHT).astype(np.uint8)
-    voxels = tuple(np.clip(np.floor(lung.grid.ijk(points) + 0.5).astype(int), 0, np.array(parts.shape) - 1).T)
+    voxels = tuple(np.clip(lung.grid.voxels(points), 0, np.array(parts.shape) - 1).T)
     if lungs_are_separate:
         here = parts[voxels]
         first, second = here == two[0], here == two[1]

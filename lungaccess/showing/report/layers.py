@@ -87,10 +87,7 @@ class Layers:
 
     def labels(self, lps: Float) -> Int:
         """Return the label of the voxel of each point `(..., 3)`; OUTSIDE alone beyond the grid."""
-        found = np.full(lps.shape[:-1], OUTSIDE, dtype=np.int64)
-        inside, ijk = self._voxels(lps)
-        found[inside] = self._lung.labels[ijk]
-        return found
+        return self._lung.grid.values_at(self._lung.labels, lps, OUTSIDE).astype(np.int64)
 
     def cut(self, name: str, lps: Float, labels: Int | None = None) -> Bool:
         """Tell which points `(..., 3)` lie in a mask (nearest voxel; beyond the grid: in "outside" only).
@@ -98,21 +95,13 @@ class Layers:
         Whoever asks for several structures gives the `labels` of the points as well.
         """
         if name == "nodule":
-            found = np.zeros(lps.shape[:-1], dtype=np.bool_)
-            inside, ijk = self._voxels(lps)
-            if self._lung.nodules is not None:
-                found[inside] = self._lung.nodules.array[ijk]
-            return found
+            nodules = self._lung.nodules
+            if nodules is None:
+                return np.zeros(lps.shape[:-1], dtype=np.bool_)
+            return nodules.at(lps, False)
         there = self.labels(lps) if labels is None else labels
         held = (there & OUTSIDE) == 0 if name == "lung" else (there & BITS[name]) != 0
         return np.asarray(held)
-
-    def _voxels(self, lps: Float) -> tuple[Bool, tuple[Int, ...]]:
-        """Return which points lie in the grid, and the indices of their voxels."""
-        places = np.moveaxis(np.floor(self._lung.grid.ijk(lps) + 0.5).astype(np.int64), -1, 0)
-        ins = [(place >= 0) & (place < n) for place, n in zip(places, self._lung.grid.shape, strict=True)]
-        inside = ins[0] & ins[1] & ins[2]
-        return inside, tuple(place[inside] for place in places)
 
 
 def _unfold(mask: Array, grid: Grid) -> tuple[Float, int]:

@@ -105,19 +105,10 @@ def _plane(axes: Axes, view: View, centre: Float) -> tuple[Float, tuple[float, f
     return lps, (left, left + len(u) * PIXEL_MM, bottom, bottom + len(v) * PIXEL_MM)
 
 
-def _values(volume: Volume, lps: Float) -> Float:
-    """Return the values of the voxels that hold points, 0 beyond the grid."""
-    inside = volume.grid.contains(lps)
-    values = np.zeros(lps.shape[:-1])
-    ijk = np.floor(volume.grid.ijk(lps[inside]) + 0.5).astype(np.int64)
-    values[inside] = volume.array[tuple(ijk.T)]
-    return values
-
-
 def _kind_colours(reach: ReachMap, lps: Float) -> Float:
     from lungaccess.planning.reachability import KINDS
 
-    kinds = _values(reach.kinds, lps)
+    kinds = reach.kinds.at(lps, 0)
     image = np.zeros((*kinds.shape, 4))
     for name, code in KINDS.items():
         image[kinds == code] = (*to_rgb(COLOURS[name]), 0.85)
@@ -127,11 +118,11 @@ def _kind_colours(reach: ReachMap, lps: Float) -> Float:
 def _clearance_colours(reach: ReachMap, lps: Float) -> Float:
     from lungaccess.planning.reachability import KINDS
 
-    kinds = _values(reach.kinds, lps)
+    kinds = reach.kinds.at(lps, 0)
     reached = (kinds == KINDS["direct arc"]) | (kinds == KINDS["search"])
     image = np.zeros((*kinds.shape, 4))
     image[(kinds > 0) & ~reached] = (*to_rgb("#E6E6E6"), 1.0)
-    shades = matplotlib.colormaps["viridis"](Normalize(*CLEARANCE_MM)(_values(reach.clearance_mm, lps)))
+    shades = matplotlib.colormaps["viridis"](Normalize(*CLEARANCE_MM)(reach.clearance_mm.at(lps, 0.0)))
     image[reached] = shades[reached]
     return image
 

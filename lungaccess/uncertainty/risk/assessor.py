@@ -204,12 +204,9 @@ def goal_radius(lung: Lung, target_lps: Float, radius_mm: float | None = None) -
             )
         return float(radius_mm), "given"
     nodules = lung.nodules
-    inside = nodules is not None and bool(nodules.grid.contains(target_lps))
-    if nodules is not None and inside:
-        ijk = np.floor(nodules.grid.ijk(target_lps) + 0.5).astype(int)
-        if nodules.array[tuple(ijk)]:
-            voxels, part = components(nodules.array)
-            own = part[(voxels == ijk).all(axis=1)]
-            volume = float(np.count_nonzero(part == own)) * nodules.grid.voxel_volume_mm3
-            return (0.75 * volume / math.pi) ** (1.0 / 3.0), "ball of the nodule's volume"
+    if nodules is not None and nodules.at(target_lps, False):
+        voxels, part = components(nodules.array)
+        own = part[(voxels == nodules.grid.voxels(target_lps)).all(axis=1)]
+        volume = float(np.count_nonzero(part == own)) * nodules.grid.voxel_volume_mm3
+        return (0.75 * volume / math.pi) ** (1.0 / 3.0), "ball of the nodule's volume"
     return DEFAULT_RADIUS_MM, "assumed: the target lies in no nodule of a mask"

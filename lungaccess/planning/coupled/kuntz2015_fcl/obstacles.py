@@ -56,19 +56,19 @@ class Solid:
         ----------
         line_lps : (N, 3) float64, LPS mm
         """
-        if self._holds(labels_at(self._lung, line_lps)).any():
+        if self._holds(self._lung.labels_at(line_lps)).any():
             return True
         return self._surface.polyline_distance_mm(line_lps) <= distance_mm
 
     def distance_mm(self, point_lps: Float) -> float:
         """Return the distance of a point `(3,)` from the solid, 0 inside it."""
-        if self._holds(labels_at(self._lung, point_lps[None]))[0]:
+        if self._holds(self._lung.labels_at(point_lps)):
             return 0.0
         return self._surface.polyline_distance_mm(point_lps)
 
     def depth_mm(self, point_lps: Float) -> float:
         """Return how far inside the solid a point `(3,)` lies, 0 outside it."""
-        if not self._holds(labels_at(self._lung, point_lps[None]))[0]:
+        if not self._holds(self._lung.labels_at(point_lps)):
             return 0.0
         return self._surface.polyline_distance_mm(point_lps)
 
@@ -128,15 +128,6 @@ class Obstacles:
                 self.lung, lambda labels: ((labels & AIRWAY) != 0) & (branch_of(labels) != branch), low, high
             )
         return self._other_airways[branch]
-
-
-def labels_at(lung: Lung, points_lps: Float) -> Labels:
-    """Return the labels `(N,)` of the voxels that hold the points `(N, 3)`; OUTSIDE beyond the grid."""
-    index = np.floor(lung.grid.ijk(points_lps) + 0.5).astype(np.int64)
-    inside = ((index >= 0) & (index < lung.labels.shape)).all(axis=-1)
-    labels = np.full(len(index), OUTSIDE, dtype=np.uint16)
-    labels[inside] = lung.labels[tuple(index[inside].T)]
-    return labels
 
 
 def branch_of(labels: Labels) -> Int32:

@@ -251,9 +251,7 @@ def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
     clearance = obstacle_clearance_mm(lung, points, with_fissures=plan.fissures_are_obstacles)
     rates = {"inverse_clearance": 1.0 / np.maximum(clearance, FLOOR_MM)}
     if lung.cost is not None:
-        ijk = np.floor(lung.cost.grid.ijk(points) + 0.5).astype(np.int64)
-        ijk = np.clip(ijk, 0, np.array(lung.cost.grid.shape) - 1)
-        values = np.asarray(lung.cost.array, dtype=np.float64)[tuple(ijk.T)]
+        values = lung.cost.at(points, np.inf).astype(np.float64)
         if np.isfinite(values).all():
             rates["cost_map"] = values
     steps = np.diff(lengths_mm)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -70,8 +69,6 @@ class CandidateEvaluator:
     Parameters
     ----------
     task : Task
-    holds : callable, optional
-        Tells of a candidate whether what is asked for beside the proof holds, such as a stated exit.
 
     Attributes
     ----------
@@ -81,8 +78,8 @@ class CandidateEvaluator:
         How many direct arcs were stopped, by what stopped them.
     """
 
-    def __init__(self, task: Task, holds: Callable[[Candidate], bool] | None = None) -> None:
-        self.task, self._holds = task, holds
+    def __init__(self, task: Task) -> None:
+        self.task = task
         system, fissures = task.system, task.with_fissures
         self.tubes = DeploymentValidator(task.lung, system.tubes, system.margins, with_fissures=fissures)
         self.blocked: Counter[str] = Counter()
@@ -123,9 +120,8 @@ class CandidateEvaluator:
         return self.task.target.lps_mm
 
     def accepts(self, candidate: Candidate) -> bool:
-        """Tell whether a candidate is proved, and what is asked for holds; its cost only has to be finite."""
-        holds = self._holds is None or self._holds(candidate)
-        return holds and self.allows(candidate.tip.lps_from_scope_tip, candidate.deployment, candidate.path)
+        """Tell whether a candidate is proved; its cost only has to be finite."""
+        return self.allows(candidate.tip.lps_from_scope_tip, candidate.deployment, candidate.path)
 
     def allows(self, lps_from_scope_tip: Float, deployment: Deployment, path: ArcPath) -> bool:
         """Tell whether a path is proved, and no tube enters an infinite cost that the objective weighs."""

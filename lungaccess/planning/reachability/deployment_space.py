@@ -60,7 +60,6 @@ def divided_space(
     insertions: Float,
     pieces: Sequence[PlacePiece],
     *,
-    most_parts: int = MOST_PARTS,
     between: Callable[[], None] = lambda: None,
 ) -> DeploymentSpace:
     """Halve the boxes of all pieces, the largest first, and drop those that hold no deployment.
@@ -71,8 +70,6 @@ def divided_space(
         Its `passable` does not count.
     insertions : (N,) float64
         See `greatest_insertions`.
-    most_parts : int
-        No box is halved any more when there are more than half of this.
     between : callable, optional
         Called now and then.
     """
@@ -81,7 +78,7 @@ def divided_space(
     looked = 0
     greatest = np.inf if not len(boxes) else float(_measures(boxes).max())
     with ThreadPoolExecutor(THREADS) as pool:
-        while 0 < len(boxes) <= most_parts // 2:
+        while 0 < len(boxes) <= MOST_PARTS // 2:
             between()
             greatest *= 0.5
             looked += int((_measures(boxes) > greatest).sum())

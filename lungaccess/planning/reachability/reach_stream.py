@@ -54,8 +54,6 @@ class ReachStream:
     ----------
     atlas : Atlas
         The deployments, made for this lung, scope and tubes.
-    spacing_mm : float
-        Side of the voxels, whose centres are tried.
 
     Attributes
     ----------
@@ -66,14 +64,12 @@ class ReachStream:
     Raises
     ------
     SettingsError
-        If the spacing is out of range, or the atlas belongs to another lung or system.
+        If the atlas belongs to another lung or system.
     """
 
-    def __init__(
-        self, lung: Lung, system: System, atlas: Atlas, spacing_mm: float = STREAM_SPACING_MM
-    ) -> None:
+    def __init__(self, lung: Lung, system: System, atlas: Atlas) -> None:
         require_same(atlas, lung, system)
-        self.grid: Grid = reach_grid(lung, spacing_mm)
+        self.grid: Grid = reach_grid(lung, STREAM_SPACING_MM)
         self.counted: Int = np.flatnonzero(counted_voxels(lung, self.grid, atlas.with_fissures))
         self._lung, self._system, self._atlas = lung, system, atlas
 

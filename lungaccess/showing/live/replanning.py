@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -82,8 +81,6 @@ class TrackedReplanner:
     policy : Policy, optional
         What then decides about the tracked poses of scope, tubes and needle, as long as the target is where
         the plan has it; else the cheapest way is taken.
-    clock : callable
-        Returns the processor time in seconds.
 
     Raises
     ------
@@ -91,15 +88,9 @@ class TrackedReplanner:
         If the plan was made for another patient.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        lung: Lung,
-        policy: Policy | None = None,
-        clock: Callable[[], float] = time.process_time,
-    ) -> None:
+    def __init__(self, plan: Plan, lung: Lung, policy: Policy | None = None) -> None:
         plan.require_lung(lung)
-        self._plan, self._lung, self._policy, self._clock = plan, lung, policy, clock
+        self._plan, self._lung, self._policy = plan, lung, policy
         self._seen: dict[str, Float] = {}
         self._target = Target(lps_mm=np.asarray(plan.end_lps), origin=plan.target_origin)
 
@@ -119,14 +110,13 @@ class TrackedReplanner:
 
     def answer(self, name: str, lps_from_device: Float) -> Answer:
         """Return what comes of a tracked pose `(4, 4)` LPS mm of a name of `TRACKED`, or of the target."""
-        began = self._clock()
+        began = time.process_time()
         try:
             tubes, needle, words = self._planned(name, lps_from_device)
         except LungaccessError as reason:
             tubes, needle, words = None, None, f"no plan: {reason.found}"
-        return Answer(
-            name=name, words=words, tubes_lps=tubes, needle_lps=needle, processor_s=self._clock() - began
-        )
+        took = time.process_time() - began
+        return Answer(name=name, words=words, tubes_lps=tubes, needle_lps=needle, processor_s=took)
 
     def _planned(self, name: str, pose: Float) -> tuple[Float | None, Float | None, str]:
         if name == TARGET:

@@ -79,8 +79,8 @@ class LiveSession:
         Gets every `Answer`.
     policy : Policy, optional
         What decides about tracked poses, see `TrackedReplanner`.
-    clock, wall_clock : callable
-        Return the time since some moment, and since 1970, in seconds.
+    wall_clock : callable
+        Returns the time since 1970 in seconds.
 
     Raises
     ------
@@ -101,7 +101,6 @@ class LiveSession:
         loop: bool = False,
         on_answer: Callable[[Answer], None] | None = None,
         policy: Policy | None = None,
-        clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
         if not 0.0 < rate_hz <= 1000.0:
@@ -112,7 +111,7 @@ class LiveSession:
         self._masks_phase = None if lung.motion is None else lung.motion.masks_phase
         self._plan, self._link, self._rate_hz, self._loop = plan, link, rate_hz, loop
         self._on_answer = on_answer or (lambda _answer: None)
-        self._clock, self._wall_clock = clock, wall_clock
+        self._wall_clock = wall_clock
         self._counts: Counter[str] = Counter()
         self._replan_s: list[float] = []
         scope, tubes, needle = (curve.points_lps for curve in plan.curves(1.0))
@@ -133,15 +132,15 @@ class LiveSession:
     def run(self, seconds: float | None = None) -> None:
         """Go round until so many seconds have passed, or for ever."""
         self._replanner.warm_up()
-        began = self._clock()
+        began = time.monotonic()
         due = began
-        while seconds is None or self._clock() - began < seconds:
-            self.tick(self._clock() - began)
+        while seconds is None or time.monotonic() - began < seconds:
+            self.tick(time.monotonic() - began)
             due += 1.0 / self._rate_hz
-            late = self._clock() - due
+            late = time.monotonic() - due
             if late > 0.0:
                 self._counts["overrun"] += 1
-                due = self._clock()
+                due = time.monotonic()
             self._wait(due)
 
     def tick(self, elapsed_s: float) -> None:
@@ -152,7 +151,7 @@ class LiveSession:
 
     def _wait(self, due: float) -> None:
         """Wait until a round is due, and answer what comes meanwhile."""
-        while (left := due - self._clock()) > 0.0:
+        while (left := due - time.monotonic()) > 0.0:
             self._take(self._link.poll(left))
 
     def _take(self, received: list[Received]) -> None:

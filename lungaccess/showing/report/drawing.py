@@ -206,7 +206,7 @@ def target_mark(axes: Axes, uv: Float, order: int = 12) -> None:
     )  # fmt: skip
 
 
-def aim_mark(axes: Axes, uv: Float, order: int = 13) -> None:
+def aim_mark(axes: Axes, uv: Float) -> None:
     """Mark where devices end that were planned for a moving target."""
     axes.plot(
         uv[0],
@@ -215,7 +215,7 @@ def aim_mark(axes: Axes, uv: Float, order: int = 13) -> None:
         ms=7,
         mec=style.AIM,
         mew=2.0,
-        zorder=order,
+        zorder=13,
         path_effects=halo(4.0, style.INK),
         ls="none",
     )

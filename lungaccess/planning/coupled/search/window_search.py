@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain, islice
 
@@ -66,8 +66,6 @@ class WindowEvaluator(CandidateEvaluator):
         Whether a wider window counts before cost.
     middle : float, optional
         See `MovingTarget`.
-    holds : callable, optional
-        See `CandidateEvaluator`.
 
     Attributes
     ----------
@@ -78,15 +76,9 @@ class WindowEvaluator(CandidateEvaluator):
     """
 
     def __init__(
-        self,
-        task: Task,
-        phases: tuple[float, float] | None,
-        *,
-        widest: bool,
-        middle: float | None = None,
-        holds: Callable[[Candidate], bool] | None = None,
+        self, task: Task, phases: tuple[float, float] | None, *, widest: bool, middle: float | None = None
     ) -> None:
-        super().__init__(task, holds)
+        super().__init__(task)
         self.moving = MovingTarget(
             require_motion(task.lung), task.target.lps_mm, phases, widened=widest, middle=middle
         )
@@ -288,22 +280,16 @@ class WindowTubeSearch(TubeSearch):
 
 
 def window_search(
-    task: Task,
-    atlas: Atlas,
-    phases: tuple[float, float] | None,
-    *,
-    widest: bool,
-    middle: float | None = None,
-    holds: Callable[[Candidate], bool] | None = None,
+    task: Task, atlas: Atlas, phases: tuple[float, float] | None, *, widest: bool, middle: float | None = None
 ) -> WindowSearch | WindowTubeSearch:
     """Return the search for a window of the breath, with the needle of a system or with its tubes alone.
 
     Parameters
     ----------
-    phases, widest, middle, holds
+    phases, widest, middle
         As of `WindowEvaluator`.
     """
-    evaluator = WindowEvaluator(task, phases, widest=widest, middle=middle, holds=holds)
+    evaluator = WindowEvaluator(task, phases, widest=widest, middle=middle)
     return (WindowTubeSearch if task.system.needle is None else WindowSearch)(evaluator, atlas)
 
 

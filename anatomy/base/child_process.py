@@ -1,11 +1,17 @@
 """Processes that help another one: they end when it ends, however it ends."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection
+from typing import Any
+
+from anatomy.base.errors import AnatomyError
 
 LOOK_EVERY_S = 0.5
 """A process that outlives its parent by less is no nuisance, and looking takes microseconds."""
@@ -31,3 +37,43 @@ def _watch(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(LOOK_EVERY_S)
     os._exit(1)
+
+
+def can_fork() -> bool:
+    """Tell whether processes can begin with all that this one has in memory; on Windows they cannot."""
+    return "fork" in multiprocessing.get_all_start_methods()
+
+
+@contextlib.contextmanager
+def forked(work: Callable[..., None], parts: Iterable[tuple[Any, ...]]) -> Iterator[list[Connection]]:
+    """Do parts of some work in forked processes, which end with the block; yield a pipe to each.
+
+    `work` gets the arguments of a part and the other end of its pipe, and calls `end_with_parent` first.
+    """
+    context = multiprocessing.get_context("fork")
+    ends, workers = [], []
+    try:
+        for part in parts:
+            here, there = context.Pipe()
+            worker = context.Process(target=work, args=(*part, there), daemon=True)
+            worker.start()
+            there.close()
+            ends.append(here)
+            workers.append(worker)
+        yield ends
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.join()
+
+
+def received(end: Connection, what: str) -> Any:
+    """Return what a process sends that does a part of something; AnatomyError if it has ended instead."""
+    try:
+        return end.recv()
+    except EOFError as reason:
+        raise AnatomyError(
+            f"A process of the {what} has ended before its time",
+            expected=f"processes that run until the {what} ends",
+            remedy="Give it more memory, or fewer processes with --processes",
+        ) from reason

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count, islice
 from multiprocessing.connection import Connection
 
-from anatomy.base.child_process import end_with_parent
-from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.child_process import can_fork, end_with_parent, forked, received
+from anatomy.base.errors import SettingsError
 from lungaccess.planning.coupled.search.base import ParallelSearch, Step
 
 ROUND_ITERATIONS = 100
@@ -29,35 +28,22 @@ def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
     SettingsError
         If there are fewer than two processes, or this system cannot fork.
     """
-    if processes < 2 or "fork" not in multiprocessing.get_all_start_methods():
+    if processes < 2 or not can_fork():
         raise SettingsError(
             f"{processes} processes are asked for",
             expected="at least 2, on a system that can fork processes: not Windows",
             remedy="Leave out --processes; studies use several processes on every system",
         )
     yield from search.direct_steps()
-    context = multiprocessing.get_context("fork")
-    ends, workers = [], []
-    try:
-        for number in range(processes):
-            here, there = context.Pipe()
-            worker = context.Process(target=_work, args=(search, number, processes, there), daemon=True)
-            worker.start()
-            there.close()
-            ends.append(here)
-            workers.append(worker)
+    with forked(_work, [(search, number, processes) for number in range(processes)]) as ends:
         for turn in count(1):
             for end in ends:
                 end.send(search.incumbent.step)
-            found = [_received(end) for end in ends]
+            found: list[tuple[Step | None, bool]] = [received(end, "search") for end in ends]
             iteration = turn * processes * ROUND_ITERATIONS
             yield _best_of(search, [step for step, _more in found], iteration)
             if search.is_futile(iteration) or not any(more for _step, more in found):
                 return
-    finally:
-        for worker in workers:
-            worker.terminate()
-            worker.join()
 
 
 def _best_of(search: ParallelSearch, found: list[Step | None], iteration: int) -> Step:
@@ -66,19 +52,6 @@ def _best_of(search: ParallelSearch, found: list[Step | None], iteration: int) -
     if better is None:
         return Step(iteration=iteration, phase="local search")
     return search.incumbent.improved(replace(better, iteration=iteration))
-
-
-def _received(end: Connection) -> tuple[Step | None, bool]:
-    """Return what a process has found in its round, and whether its search goes on."""
-    try:
-        found: tuple[Step | None, bool] = end.recv()
-    except EOFError as reason:
-        raise AnatomyError(
-            "A process of the search has ended before its time",
-            expected="processes that run until the search ends",
-            remedy="Give it more memory, or fewer processes with --processes",
-        ) from reason
-    return found
 
 
 def _work(search: ParallelSearch, number: int, processes: int, end: Connection) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Iterable
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -11,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.base.child_process import end_with_parent
-from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.child_process import can_fork, end_with_parent, forked, received
+from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from lungaccess.planning.procedure.choices import scope_frames
@@ -165,23 +164,10 @@ class _Run:
         if self._policy.procedure.is_open_loop:
             return self._open_loop()
         parts = np.array_split(np.arange(self.samples), processes)
-        if processes == 1 or "fork" not in multiprocessing.get_all_start_methods():
+        if processes == 1 or not can_fork():
             return _joined(map(self._part, parts))
-        context = multiprocessing.get_context("fork")
-        pipes = [context.Pipe(duplex=False) for _ in parts]
-        workers = [
-            context.Process(target=self._send_part, args=(part, there), daemon=True)
-            for part, (_here, there) in zip(parts, pipes, strict=True)
-        ]
-        for worker, (_here, there) in zip(workers, pipes, strict=True):
-            worker.start()
-            there.close()
-        try:
-            return _joined([_received(here) for here, _there in pipes])
-        finally:
-            for worker in workers:
-                worker.terminate()
-                worker.join()
+        with forked(self._send_part, [(part,) for part in parts]) as ends:
+            return _joined([received(end, "simulation") for end in ends])
 
     def _send_part(self, numbers: Int, end: Connection) -> None:
         """Go through some procedures in a process of their own."""
@@ -336,19 +322,6 @@ class _Went:
 def _as_pieces(arcs: Float, radius_mm: float) -> Float:
     """Return arcs `(N, A, 3)` of needles as the kernel takes them, `(N, A, 4)`."""
     return np.concatenate([arcs, np.full((*arcs.shape[:2], 1), radius_mm)], axis=2)
-
-
-def _received(end: Connection) -> _Found:
-    """Return what a process has found."""
-    try:
-        found: _Found = end.recv()
-    except EOFError as reason:
-        raise AnatomyError(
-            "A process of the simulation has ended before its time",
-            expected="processes that run until the simulation ends",
-            remedy="Give it more memory, or fewer processes with --processes",
-        ) from reason
-    return found
 
 
 def _joined(parts: Iterable[_Found]) -> _Found:

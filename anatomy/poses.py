@@ -62,6 +62,14 @@ def _unit(vector: Float, name: str) -> Float:
     return vector / length
 
 
+def spread_directions(count: int) -> Float:
+    """Return unit vectors `(count, 3)`, evenly spread over the sphere on a golden spiral about +z."""
+    n = np.arange(count) + 0.5
+    z, angle = 1.0 - 2.0 * n / count, np.pi * (1.0 + np.sqrt(5.0)) * n
+    aside = np.sqrt(1.0 - z * z)
+    return np.stack([aside * np.cos(angle), aside * np.sin(angle), z], axis=1)
+
+
 def bending_directions(frame: Float, rotations_rad: ArrayLike) -> Float:
     """Return the unit vectors `(T, 3)` at angles about +z, counted from +x of a frame."""
     angles = np.atleast_1d(np.asarray(rotations_rad, dtype=np.float64))[:, None]

@@ -27,6 +27,12 @@ def values_checksum(values: Any) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
+def canonical_sha256(values: Any) -> str:
+    """Return the SHA-256 (hex) of plain values as JSON: ASCII, sorted keys, no spaces, finite numbers."""
+    canonical = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode("ascii")).hexdigest()
+
+
 def array_checksum(array: Array) -> list[Any]:
     """Return type, shape and CRC-32 of an array."""
     return [array.dtype.str, list(array.shape), _crc(np.ascontiguousarray(array).reshape(-1).view(np.uint8))]

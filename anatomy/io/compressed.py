@@ -18,8 +18,10 @@ def is_gzip(path: Path) -> bool:
         return stream.read(2) == _MAGIC_GZIP
 
 
-def pieces(path: Path) -> Iterator[bytes]:
-    """Yield the bytes of a plain or gzip file in pieces of a few MiB.
+def pieces(path: Path, offset: int = 0, *, compressed: bool | None = None) -> Iterator[bytes]:
+    """Yield the bytes of a plain or compressed file from an offset on, in pieces of a few MiB.
+
+    Whether they are compressed is found out at the beginning of the file if it is not stated.
 
     Raises
     ------
@@ -27,7 +29,9 @@ def pieces(path: Path) -> Iterator[bytes]:
         At the end of a compressed file whose checksum is wrong or that was cut short.
     """
     with path.open("rb") as stream:
-        yield from inflate(stream, path) if is_gzip(path) else plain_pieces(stream)
+        stream.seek(offset)
+        packed = is_gzip(path) if compressed is None else compressed
+        yield from inflate(stream, path) if packed else plain_pieces(stream)
 
 
 def plain_pieces(stream: BinaryIO) -> Iterator[bytes]:

@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
 from anatomy.io import image_header
-from anatomy.io.compressed import inflate, plain_pieces
+from anatomy.io.compressed import pieces
 
 _DTYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",
@@ -52,7 +52,7 @@ def open_metaimage(path: Path, components: int = 1) -> tuple[image_header.ImageH
         components=components,
         components_first=components > 1,
     )
-    return header, _stream(data_path, at, compressed)
+    return header, pieces(data_path, at, compressed=compressed)
 
 
 def _text(path: Path) -> tuple[dict[str, str], int]:
@@ -106,12 +106,6 @@ def _data_file(fields: Mapping[str, str], path: Path, offset: int) -> tuple[Path
             remedy="Copy that file, too",
         )
     return beside, 0
-
-
-def _stream(path: Path, offset: int, compressed: bool) -> Iterator[bytes]:
-    with path.open("rb") as stream:
-        stream.seek(offset)
-        yield from inflate(stream, path) if compressed else plain_pieces(stream)
 
 
 def _lps_from_ijk(fields: Mapping[str, str], path: Path) -> Float:

@@ -13,7 +13,7 @@ import numpy as np
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
 from anatomy.io import image_header
-from anatomy.io.compressed import inflate, plain_pieces
+from anatomy.io.compressed import pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
 
 _LPS_FROM_LAS = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -74,7 +74,7 @@ def open_nrrd(
         components=components,
         components_first=is_first,
     )
-    return header, _stream(path, offset, _encoding(fields, path))
+    return header, pieces(path, offset, compressed=_encoding(fields, path) != "raw")
 
 
 def _is_first_axis(fields: Mapping[str, str], sizes: tuple[int, ...], path: Path, components: int) -> bool:
@@ -147,12 +147,6 @@ def _encoding(fields: Mapping[str, str], path: Path) -> str:
             remedy="Save the image again, as 3D Slicer or ITK do",
         )
     return encoding
-
-
-def _stream(path: Path, offset: int, encoding: str) -> Iterator[bytes]:
-    with path.open("rb") as stream:
-        stream.seek(offset)
-        yield from plain_pieces(stream) if encoding == "raw" else inflate(stream, path)
 
 
 def _lps_from_ijk(fields: Mapping[str, str], path: Path, frame: Frame | None) -> Float:

@@ -14,7 +14,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Int16, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
 from anatomy.morphology import bounds, window
-from anatomy.segmentation.closing import distance_mm
+from anatomy.segmentation.closing import distance_mm, near
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.kernels.local_minima import depth_slice, smooth_slice
 
@@ -264,7 +264,4 @@ WALL_MM = 1.5
 
 def wall_around(lumen: Mask, grid: Grid) -> Mask:
     """Return the wall of airways that came without one: all within `WALL_MM` of the lumen."""
-    box = window(*bounds(lumen, np.ceil(WALL_MM / grid.spacing_mm).astype(np.int64) + 1))
-    wall = np.zeros(lumen.shape, dtype=np.bool_, order="F")
-    wall[box] = (distance_mm(~lumen[box], grid.spacing_mm) <= WALL_MM) & ~lumen[box]
-    return wall
+    return near(lumen, WALL_MM, grid.spacing_mm) & ~lumen

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.typed import Float32, Mask
+from anatomy.morphology import bounds, window
 
 _THREADS = 2
 
@@ -62,6 +63,15 @@ def largest_piece(mask: Mask) -> Mask:
     sizes[0] = 0
     largest: Mask = (pieces == int(np.argmax(sizes))).T
     return largest
+
+
+def near(mask: Mask, reach_mm: float, spacing_mm: ArrayLike) -> Mask:
+    """Mark what lies within a distance of a mask."""
+    box = window(*bounds(mask, np.ceil(reach_mm / np.asarray(spacing_mm)).astype(np.int64)))
+    found = np.zeros(mask.shape, dtype=np.bool_, order="F")
+    if mask.any():
+        found[box] = distance_mm(~mask[box], spacing_mm) <= reach_mm
+    return found
 
 
 def distance_mm(mask: Mask, spacing_mm: ArrayLike) -> Float32:

@@ -6,7 +6,7 @@ import numpy as np
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float32, Int, Mask
 from anatomy.morphology import bounds, window
-from anatomy.segmentation.closing import closed, distance_mm, without_holes
+from anatomy.segmentation.closing import closed, distance_mm, near, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 
 OUTSIDE_HU = -950.0
@@ -96,7 +96,7 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
     volumes_ml[0] = 0.0
     large = volumes_ml >= SMALLEST_LUNG_ML
     at_bronchi = np.zeros(count + 1, dtype=np.bool_)
-    at_bronchi[np.unique(pieces[near(airway, CONTACT_MM, coarse)])] = True
+    at_bronchi[np.unique(pieces[near(airway, CONTACT_MM, coarse.spacing_mm)])] = True
     lung = large & at_bronchi
     if not lung.any():
         largest = f"the largest piece of air inside has {volumes_ml.max():.0f} ml"
@@ -109,16 +109,6 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
         )
     lung &= volumes_ml >= SMALLER_SHARE * volumes_ml[lung].max()
     return np.asfortranarray(lung[pieces])
-
-
-def near(mask: Mask, reach_mm: float, coarse: CoarseCt) -> Mask:
-    """Mark what lies within a distance of a mask."""
-    pad = np.ceil(reach_mm / np.asarray(coarse.spacing_mm)).astype(np.int64)
-    box = window(*bounds(mask, pad))
-    found = np.zeros(mask.shape, dtype=np.bool_, order="F")
-    if mask.any():
-        found[box] = distance_mm(~mask[box], coarse.spacing_mm) <= reach_mm
-    return found
 
 
 def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> Mask:

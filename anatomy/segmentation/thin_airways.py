@@ -4,6 +4,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Int, Int16, Mask, UInt8
+from anatomy.poses import spread_directions
 from anatomy.segmentation.kernels import lumen_ends, tube_stretch
 from anatomy.segmentation.kernels import thin_airways as kernel
 from anatomy.segmentation.kernels.neighbours import box_offsets
@@ -61,7 +62,7 @@ def follow_thin_airways(
     """
     per_mm = 1.0 / spacing_mm
     voxel_mm = float(np.prod(spacing_mm) ** (1.0 / 3.0))
-    directions, radii_mm = _directions(), voxel_mm * np.array(RING_VOXELS)
+    directions, radii_mm = spread_directions(N_DIRECTIONS)[:, ::-1].copy(), voxel_mm * np.array(RING_VOXELS)
     starts = np.zeros((3, MOST_STARTS, 3))
     n_starts = _find_starts(state, lung, spacing_mm, lumen[:count], known, starts)
     if n_starts == 0:
@@ -107,14 +108,6 @@ def _false_contrast(
     np.maximum(contrast, 0.0, out=contrast)
     middle = float(np.median(contrast))
     return middle + DEVIATIONS * SPREAD_OF_MEDIAN * float(np.median(np.abs(contrast - middle)))
-
-
-def _directions() -> Float:
-    """Return unit vectors spread evenly over the sphere, `(N, 3)`."""
-    n = np.arange(N_DIRECTIONS) + 0.5
-    height, turn = 1.0 - 2.0 * n / N_DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * n
-    flat = np.sqrt(1.0 - height**2)
-    return np.column_stack([height, flat * np.sin(turn), flat * np.cos(turn)])
 
 
 def _find_starts(state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known: int, starts: Float) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -17,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from anatomy.base.checksums import canonical_sha256
 from anatomy.base.errors import PlanFileError, SettingsError
 from anatomy.base.files import DAMAGE, reason
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
@@ -44,9 +44,7 @@ def digest(plan: Record) -> str:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    kept = {key: value for key, value in content.items() if key not in ("timing", "digest")}
-    canonical = json.dumps(kept, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
-    return hashlib.sha256(canonical.encode("ascii")).hexdigest()
+    return canonical_sha256({key: value for key, value in content.items() if key not in ("timing", "digest")})
 
 
 def to_json(plan: Record) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
-import json
 import os
 import tomllib
 from dataclasses import replace
@@ -12,6 +10,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from anatomy.base.checksums import canonical_sha256
 from anatomy.base.errors import SettingsError
 from anatomy.base.settings import impossible, parse, settings, switch, text, to_mapping
 from anatomy.margins import Margins
@@ -294,7 +293,4 @@ def require_own_name(system: System, where: str = "The system") -> None:
 
 def system_fingerprint(system: System) -> str:
     """Return the SHA-256 (hex) of the canonical JSON of a system: equal settings, equal fingerprint."""
-    canonical = json.dumps(
-        to_mapping(system), sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False
-    )
-    return hashlib.sha256(canonical.encode("ascii")).hexdigest()
+    return canonical_sha256(to_mapping(system))

@@ -1,6 +1,5 @@
 """What is reached near a target that is not: the nearest point, and the share of points around it."""
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from anatomy.poses import spread_directions
 from anatomy.structures import obstacle_bits
 from lungaccess.judging.explanation.blocking import region_of
 from lungaccess.planning.coupled import DirectCandidates, reach_scan
@@ -91,7 +91,7 @@ class Surroundings:
         target = self._task.target.lps_mm
         before = 0.0
         for radius in RADII_MM:
-            for direction in _directions():
+            for direction in spread_directions(POINTS_A_SPHERE):
                 alive()
                 if self._free(target + radius * direction) and self.reached(target + radius * direction):
                     distance = self._nearer(direction, before, radius, alive)
@@ -165,12 +165,3 @@ def _drawn(free: Callable[[Float], bool], draw: Callable[[], Float]) -> list[Flo
             if len(found) == DRAWS:
                 break
     return found
-
-
-def _directions() -> Float:
-    """Return unit vectors (POINTS_A_SPHERE, 3), evenly spread on a golden spiral."""
-    n = np.arange(POINTS_A_SPHERE) + 0.5
-    z = 1.0 - 2.0 * n / POINTS_A_SPHERE
-    angle = math.pi * (1.0 + math.sqrt(5.0)) * n
-    aside = np.sqrt(1.0 - z * z)
-    return np.stack([aside * np.cos(angle), aside * np.sin(angle), z], axis=1)

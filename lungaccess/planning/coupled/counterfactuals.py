@@ -84,32 +84,18 @@ def find_counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]
 
 def needle_changes(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
     """Yield the changes of the needle alone: a tighter curvature, then a thinner needle."""
-    yield from _curvature(task, atlas)
-    yield from _needle_diameter(task, atlas)
-
-
-def _curvature(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
-    needle = task.system.require_needle("A change of the needle")
-    present = needle.min_radius_of_curvature_mm
-
-    def made(radius_mm: float) -> System:
-        tighter = replace(needle, max_curvature_per_mm=1.0 / radius_mm)
-        return _changed(task.system, needle=tighter)
-
-    name = "a needle with a radius of curvature"
-    yield from _least_change(task, atlas, name, present, TIGHTEST_RADIUS_MM, RADIUS_STEP_MM, made)
-
-
-def _needle_diameter(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
     needle = task.system.require_needle("A change of the needle")
 
-    def made(diameter_mm: float) -> System:
+    def tighter(radius_mm: float) -> System:
+        return _changed(task.system, needle=replace(needle, max_curvature_per_mm=1.0 / radius_mm))
+
+    def thinner(diameter_mm: float) -> System:
         return _changed(task.system, needle=replace(needle, diameter_mm=diameter_mm))
 
-    name = "a needle with a diameter"
-    yield from _least_change(
-        task, atlas, name, needle.diameter_mm, THINNEST_NEEDLE_MM, DIAMETER_STEP_MM, made
-    )
+    name, present = "a needle with a radius of curvature", needle.min_radius_of_curvature_mm
+    yield from _least_change(task, atlas, name, present, TIGHTEST_RADIUS_MM, RADIUS_STEP_MM, tighter)
+    name, present = "a needle with a diameter", needle.diameter_mm
+    yield from _least_change(task, atlas, name, present, THINNEST_NEEDLE_MM, DIAMETER_STEP_MM, thinner)
 
 
 def _least_change(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from anatomy.base.checksums import canonical_sha256
 from anatomy.base.errors import LungaccessError
 from anatomy.base.records import frozen_value
 from anatomy.base.settings import to_mapping
@@ -106,7 +106,7 @@ class Problem:
     @cached_property
     def key(self) -> str:
         """Hash (hex) of all that the answers depend on besides planner and seed."""
-        return _hash(self.to_mapping())
+        return canonical_sha256(self.to_mapping())
 
 
 @frozen_value
@@ -127,7 +127,7 @@ class Run:
     def key(self) -> str:
         """Hash (hex) of all that the answer depends on."""
         planner = to_mapping(self.planner)
-        return _hash({"problem": self.problem.key, "planner": planner, "seed": self.seed})
+        return canonical_sha256({"problem": self.problem.key, "planner": planner, "seed": self.seed})
 
     def to_json(self) -> str:
         """Return the run as JSON, for another process."""
@@ -246,8 +246,3 @@ def _stated(lung: Lung, words: str) -> tuple[Point, str]:
 def _point(values: Any) -> Point:
     x, y, z = (float(value) for value in values)
     return x, y, z
-
-
-def _hash(values: Mapping[str, Any]) -> str:
-    text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -54,9 +54,9 @@ def tips_near(atlas: Atlas, tip_lps: ArrayLike, within_mm: float = TIP_WITHIN_MM
 
 
 def _of_tips(atlas: Atlas, place: StatedPlace) -> Atlas:
-    tips = tips_near(atlas, place.lps_mm, place.within_mm)
+    distances = np.linalg.norm(atlas.motions.tips[:, :3] - place.lps_mm, axis=1)
+    tips = np.flatnonzero(distances <= place.within_mm)
     if not len(tips):
-        distances = np.linalg.norm(atlas.motions.tips[:, :3] - place.lps_mm, axis=1)
         nearest = f"the nearest is {distances.min():.1f} mm away" if len(distances) else "there is none"
         raise TargetError(
             f"No tip of the scope of {atlas.system.name} is within {place.within_mm:g} mm of the stated "

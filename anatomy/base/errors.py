@@ -57,4 +57,16 @@ class TargetError(LungaccessError):
 
 
 class PlanFileError(LungaccessError):
-    """A stored plan is damaged, of an unknown version or does not belong to this patient."""
+    """A stored plan is damaged, of an unknown version or does not belong to this patient.
+
+    The remedy is to plan again if no other is stated.
+    """
+
+    def __init__(
+        self,
+        found: str,
+        *,
+        expected: str = "",
+        remedy: str = "Run `lungaccess plan` again for the same patient, target and system",
+    ) -> None:
+        super().__init__(found, expected=expected, remedy=remedy)

@@ -64,5 +64,4 @@ class Chance(Record):
             raise PlanFileError(
                 f"The chance of a plan counts {self.successes} successes of {self.samples} procedures",
                 expected="counts from 0 to the number of procedures",
-                remedy="Run `lungaccess plan` again",
             )

@@ -35,7 +35,6 @@ ARRAY_TYPES = (np.ndarray, NDArray)
 """What `anatomy.base.typed` is made of: numpy resolves its name of arrays before 2.5, and keeps it since."""
 
 P = TypeVar("P", bound=Record)
-_REMEDY = "Run `lungaccess plan` again"
 
 
 def digest(plan: Record) -> str:
@@ -61,15 +60,11 @@ def from_json(cls: type[P], text: str) -> P:
         content = json.loads(text, object_pairs_hook=_unique, parse_constant=_not_finite)
     except DAMAGE as error:
         raise PlanFileError(
-            f"The plan is not JSON ({reason(error)})",
-            remedy=_REMEDY,
-            expected="a plan.json as `lungaccess plan` writes it",
+            f"The plan is not JSON ({reason(error)})", expected="a plan.json as `lungaccess plan` writes it"
         ) from error
     if not isinstance(content, dict):
         raise PlanFileError(
-            "The plan is not a JSON object",
-            remedy=_REMEDY,
-            expected="a plan.json as `lungaccess plan` writes it",
+            "The plan is not a JSON object", expected="a plan.json as `lungaccess plan` writes it"
         )
     _require_schema(content.get("schema"))
     stated = content.pop("digest", None)
@@ -79,14 +74,11 @@ def from_json(cls: type[P], text: str) -> P:
     except DAMAGE as error:
         raise PlanFileError(
             f"The plan holds values that no plan has ({reason(error)})",
-            remedy=_REMEDY,
             expected="a plan.json as `lungaccess plan` writes it",
         ) from error
     if stated != found:
         raise PlanFileError(
-            "The plan does not match its own digest: it was edited or damaged",
-            expected=str(stated),
-            remedy=_REMEDY,
+            "The plan does not match its own digest: it was edited or damaged", expected=str(stated)
         )
     return typing.cast(P, plan)
 
@@ -94,11 +86,10 @@ def from_json(cls: type[P], text: str) -> P:
 def _require_schema(schema: object) -> None:
     if schema in (SCHEMA, SHAPELESS):
         return
-    found, remedy = f"The plan has the schema {schema!r}", _REMEDY
+    found = f"The plan has the schema {schema!r}"
     if schema == LINES:
         found += ", in which the scope has a line but no motion: it does not say how the scope gets there"
-        remedy += " for the same patient, target and system"
-    raise PlanFileError(found, expected=SCHEMA, remedy=remedy)
+    raise PlanFileError(found, expected=SCHEMA)
 
 
 def _with_shape(content: dict[str, Any]) -> dict[str, Any]:
@@ -148,9 +139,7 @@ def load(cls: type[P], path: str | os.PathLike[str]) -> P:
         ) from error
     except UnicodeDecodeError as error:
         raise PlanFileError(
-            f"The plan {os.fspath(path)} is not text",
-            remedy=_REMEDY,
-            expected="a plan.json as `lungaccess plan` writes it",
+            f"The plan {os.fspath(path)} is not text", expected="a plan.json as `lungaccess plan` writes it"
         ) from error
     return from_json(cls, text)
 
@@ -158,12 +147,12 @@ def load(cls: type[P], path: str | os.PathLike[str]) -> P:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) != len(pairs):
-        raise PlanFileError("The plan states a value twice", remedy=_REMEDY, expected="each value once")
+        raise PlanFileError("The plan states a value twice", expected="each value once")
     return content
 
 
 def _not_finite(constant: str) -> float:
-    raise PlanFileError(f"The plan holds the number {constant}", expected="finite numbers", remedy=_REMEDY)
+    raise PlanFileError(f"The plan holds the number {constant}", expected="finite numbers")
 
 
 def _encode(value: Any, where: str) -> Any:
@@ -183,7 +172,7 @@ def _encode(value: Any, where: str) -> Any:
     if isinstance(value, tuple | list):
         return [_encode(inner, f"{where}[{n}]") for n, inner in enumerate(value)]
     if isinstance(value, float | np.floating) and not math.isfinite(value):
-        raise PlanFileError(f"{where} is {value}", expected="a finite number", remedy=_REMEDY)
+        raise PlanFileError(f"{where} is {value}", expected="a finite number")
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -226,7 +215,6 @@ def _record(cls: type, value: Any, where: str) -> Any:
         if keys:
             raise PlanFileError(
                 f"{where} {problem} {', '.join(sorted(keys))}",
-                remedy=_REMEDY,
                 expected="the keys that `lungaccess plan` writes",
             )
     present = names & content.keys()
@@ -238,7 +226,7 @@ def _system(value: Any, where: str) -> System:
         return parse(System, _is(dict, value, where), where)
     except SettingsError as error:
         raise PlanFileError(
-            f"The plan's system is not valid: {error}", remedy=_REMEDY, expected="a system that can be built"
+            f"The plan's system is not valid: {error}", expected="a system that can be built"
         ) from error
 
 
@@ -252,7 +240,5 @@ def _numbers(value: Any, where: str) -> Any:
 def _is(wanted: type, value: Any, where: str) -> Any:
     fits = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
     if not fits or isinstance(value, float) and not math.isfinite(value):
-        raise PlanFileError(
-            f"{where} is {value!r:.60}", expected=f"a value of type {wanted.__name__}", remedy=_REMEDY
-        )
+        raise PlanFileError(f"{where} is {value!r:.60}", expected=f"a value of type {wanted.__name__}")
     return value

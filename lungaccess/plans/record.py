@@ -39,9 +39,7 @@ def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: 
         array: Array = np.array(value, dtype=dtype)
     except (TypeError, ValueError) as error:
         raise PlanFileError(
-            f"{name} of a plan is not an array of numbers ({error})",
-            expected="an array of numbers",
-            remedy="Run `lungaccess plan` again",
+            f"{name} of a plan is not an array of numbers ({error})", expected="an array of numbers"
         ) from error
     if array.ndim == 1 and array.size == 0:
         array = array.reshape(tuple(n or 0 for n in shape))
@@ -50,7 +48,6 @@ def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: 
         raise PlanFileError(
             f"{name} of a plan has the shape {array.shape}",
             expected="(" + ", ".join("N" if n is None else str(n) for n in shape) + ")",
-            remedy="Run `lungaccess plan` again",
         )
     return read_only(array)
 

@@ -83,7 +83,6 @@ class BreathingAim(Record):
             raise PlanFileError(
                 f"The aim of a plan is made for the phases {self.phases.tolist()}",
                 expected="one stretch within 0 to 1, or none",
-                remedy="Run `lungaccess plan` again",
             )
 
 
@@ -141,7 +140,6 @@ class BreathingWindow(Record):
             raise PlanFileError(
                 f"The window of a plan has the phases {self.phases.tolist()}",
                 expected="stretches within 0 to 1, in order, that do not overlap",
-                remedy="Run `lungaccess plan` again",
             )
 
     def holds_all(self, phases: tuple[float, float]) -> bool:

@@ -20,7 +20,6 @@ from lungaccess.cli.options import (
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from anatomy.base.typed import Float
     from lungaccess.planning.reachability import OpenPlace, ReachVerdict
 
 SHOWN = 8
@@ -123,11 +122,9 @@ def _percent(share: float) -> str:
 
 
 def _words(place: OpenPlace) -> str:
+    from anatomy.display import point
+
     return (
-        f"branch {place.name}, generation {place.generation}, from {_point(place.tip_lps)} (LPS mm): "
+        f"branch {place.name}, generation {place.generation}, from {point(place.tip_lps)} (LPS mm): "
         f"{100.0 * place.share:.2g} % of the space"
     )
-
-
-def _point(point: Float) -> str:
-    return ", ".join(f"{value:.1f}" for value in point)

@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 
 from anatomy.base.records import frozen_value
-from anatomy.base.typed import Float
 from lungaccess.judging.explanation.explanation import Explanation
-from lungaccess.judging.explanation.record import point
+from lungaccess.planning.one_stage.obstruction import point_in_words
 
 Row = tuple[str, ...]
 
@@ -55,13 +54,6 @@ def sections(explanation: Explanation) -> tuple[Section, ...]:
     return tuple(section for section in made if section.rows)
 
 
-def place(lps_mm: Float) -> str:
-    """Return a point (3,) LPS mm in words, in both frames."""
-    frames = point(lps_mm)
-    lps, ras = (", ".join(f"{c:.1f}" for c in frames[key]) for key in ("lps_mm", "ras_mm"))
-    return f"LPS ({lps}), RAS ({ras}) mm"
-
-
 def _helps(e: Explanation) -> Iterator[Row]:
     for attempt in e.attempts:
         if attempt.succeeded:
@@ -97,12 +89,12 @@ def _misses(e: Explanation) -> Iterator[Row]:
         yield "path to the target that exceeds the needle's limits least", beyond.needs, "obstacles ignored"
     if neighbour is not None:
         near = f"ends {neighbour.from_target_mm:.1f} mm from the target; {_file(e, neighbour.plan)}"
-        yield f"nearest point found that {_by(e)}", near, place(neighbour.plan.target_lps)
+        yield f"nearest point found that {_by(e)}", near, point_in_words(neighbour.plan.target_lps)
 
 
 def _blocks(e: Explanation) -> Iterator[Row]:
     for each in e.blocking:
-        spot, near = each.place, f"{each.arcs_at_place} within 5 mm of {place(each.place.lps_mm)}"
+        spot, near = each.place, f"{each.arcs_at_place} within 5 mm of {point_in_words(each.place.lps_mm)}"
         yield (
             f"{spot.kind} {spot.name}",
             f"{each.arcs} of {each.of} ({100.0 * each.arcs / each.of:.0f} %)",

@@ -79,8 +79,7 @@ class Advice:
 
     def to_mapping(self) -> dict[str, object]:
         """Return plain JSON values."""
-        chance = {"probability": self.success.value, "interval_95": list(self.success.interval)}
-        return {"words": self.words, **chance, "options": list(self.options)}
+        return {"words": self.words, **self.success.to_mapping(), "options": list(self.options)}
 
 
 class Adviser:

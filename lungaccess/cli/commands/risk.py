@@ -92,10 +92,9 @@ def risk(
 
 def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]:
     """Return a report and tolerances as plain values."""
-    from lungaccess.judging.appraisal.headline import plain_share
 
     return _estimate_record(report) | {
-        "reaches": plain_share(report.reaches),
+        "reaches": report.reaches.to_mapping(),
         "forbidden": list(report.forbidden),
         "rare": {
             name: {
@@ -111,8 +110,8 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
                 "kind": each.kind,
                 "first_order": each.first_order,
                 "total": each.total,
-                "changes": plain_share(each.changes),
-                "succeeds_with_it_alone": plain_share(each.alone),
+                "changes": each.changes.to_mapping(),
+                "succeeds_with_it_alone": each.alone.to_mapping(),
             }
             for each in report.sensitivity
         ],
@@ -124,7 +123,7 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
                 "probability": each.probability,
                 "largest": each.largest,
                 "margin": list(each.margin),
-                "succeeds_with_it_alone": plain_share(report.alone[each.kind]),
+                "succeeds_with_it_alone": report.alone[each.kind].to_mapping(),
             }
             for each in kept
         ],
@@ -210,7 +209,6 @@ def share_row(name: str, share: Share) -> terminal.Row:
 def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
     """Return what estimates of single plans and of procedures have in common."""
     from anatomy.base.settings import to_mapping
-    from lungaccess.judging.appraisal.headline import plain_share
 
     return {
         "errors": {**to_mapping(report.model), "name": report.model.label},
@@ -218,8 +216,8 @@ def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
         "seed": report.seed,
         "radius_mm": report.radius_mm,
         "radius_origin": report.radius_origin,
-        "succeeds": plain_share(report.succeeds),
-        "touches": {name: plain_share(share) for name, share in report.touches.items()},
+        "succeeds": report.succeeds.to_mapping(),
+        "touches": {name: share.to_mapping() for name, share in report.touches.items()},
         "miss_mm": {f"{share:g}": miss for share, miss in report.miss_mm.items()},
     }
 
@@ -227,17 +225,16 @@ def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
 def procedure_record(report: ProcedureReport) -> dict[str, object]:
     """Return a report as plain values."""
     from anatomy.base.settings import to_mapping
-    from lungaccess.judging.appraisal.headline import plain_share
 
     return _estimate_record(report) | {
         "procedure": to_mapping(report.procedure),
-        "ends": {name: plain_share(share) for name, share in report.ends.items()},
+        "ends": {name: share.to_mapping() for name, share in report.ends.items()},
         "placements": report.placements,
         "stages": [
             {
                 "stage": each.stage,
                 "replans": each.replans,
-                "without_path": plain_share(each.without_path),
+                "without_path": each.without_path.to_mapping(),
                 "corrected_mm": None if math.isnan(each.corrected_mm) else each.corrected_mm,
             }
             for each in report.stages

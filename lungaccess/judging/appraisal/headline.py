@@ -238,7 +238,7 @@ class Headline:
         """Return the headline as plain JSON values; None where something was not computed."""
         chance, first = self.chance, self.failures[:1]
         open_loop = self.without_measuring
-        counted = {name: plain_share(share) for name, share in self.all_failures.items()}
+        counted = {name: share.to_mapping() for name, share in self.all_failures.items()}
         return {
             "text": self.text,
             "grade": self.grade.key,
@@ -246,10 +246,10 @@ class Headline:
             "geometry": str(self.geometry),
             "fissures_unknown": self.fissures_unknown,
             "needle_load": self.needle_load or None,
-            "success": None if self.success is None else plain_share(self.success),
-            "without_measuring": None if open_loop is None else plain_share(open_loop),
+            "success": None if self.success is None else self.success.to_mapping(),
+            "without_measuring": None if open_loop is None else open_loop.to_mapping(),
             "stated_by_plan": self.is_stated,
-            "most_frequent_failure": {"what": first[0][0], **plain_share(first[0][1])} if first else None,
+            "most_frequent_failure": {"what": first[0][0], **first[0][1].to_mapping()} if first else None,
             "failures": None if chance is None else counted,
             "draws": None if chance is None else chance.samples,
             "seed": None if chance is None else chance.seed,
@@ -268,11 +268,6 @@ def _errors(chance: Chance, estimate: Estimate | None) -> dict[str, object]:
     if estimate is None or isinstance(estimate, Chance):
         return {"name": chance.errors, "sizes": chance.sizes}
     return {**to_mapping(estimate.model), "name": chance.errors}
-
-
-def plain_share(share: Share) -> dict[str, object]:
-    """Return a share as plain values."""
-    return {"probability": share.value, "interval_95": list(share.interval)}
 
 
 def of_hundred(probability: float, *, up: bool = False) -> str:

@@ -128,7 +128,7 @@ class Summary:
         hits = [name for run in runs for name in run.touched]
         replans = [each for run in runs for each in run.replans]
         return {
-            "reached": {"probability": self.reached.value, "interval_95": list(self.reached.interval)},
+            "reached": self.reached.to_mapping(),
             "outcomes": {str(each): sum(run.outcome is each for run in runs) for each in Outcome},
             "hits": {name: hits.count(name) for name in sorted(set(hits))},
             "tip_error_median_mm": float(np.median(errors)),

@@ -34,6 +34,10 @@ class Share:
         half /= 1.0 + z2 / self.samples
         return max(middle - half, 0.0), min(middle + half, 1.0)
 
+    def to_mapping(self) -> dict[str, object]:
+        """Return plain JSON values."""
+        return {"probability": self.value, "interval_95": list(self.interval)}
+
 
 def share_of(hits: Bool) -> Share:
     """Return the share of the samples `(N,)` that are true."""

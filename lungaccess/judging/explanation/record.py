@@ -51,8 +51,10 @@ def explanation_record(explanation: Explanation) -> Record:
         "starts": None if e.starts is None else dict(e.starts.counts),
         "blocking": [_blocking(each) for each in e.blocking],
         "nearest_miss": {
-            "path_to_the_target": _blocked_arc(e.blocked_arc),
-            "path_beyond_the_limits": _beyond(e.arc_beyond_limits),
+            "path_to_the_target": None
+            if e.blocked_arc is None
+            else {**_numbers(e.blocked_arc), **_structure(e.blocked_arc.structure)},
+            "path_beyond_the_limits": None if e.arc_beyond_limits is None else _numbers(e.arc_beyond_limits),
             "nearest_point_reached": _neighbour(e),
         },
         "presets": [
@@ -85,37 +87,16 @@ def _structure(structure: Structure) -> Record:
     }
 
 
+def _numbers(arc: BlockedArc | ArcBeyondLimits) -> Record:
+    return {name: value for name, value in vars(arc).items() if isinstance(value, int | float)}
+
+
 def _blocking(blocking: Blocking) -> Record:
     return {
         **_structure(blocking.place),
         "arcs": blocking.arcs,
         "arcs_at_place": blocking.arcs_at_place,
         "of_arcs": blocking.of,
-    }
-
-
-def _blocked_arc(arc: BlockedArc | None) -> Record | None:
-    if arc is None:
-        return None
-    return {
-        "length_mm": arc.length_mm,
-        "required_mm": arc.required_mm,
-        "shortfall_mm": arc.shortfall_mm,
-        "blocked_mm": arc.blocked_mm,
-        **_structure(arc.structure),
-    }
-
-
-def _beyond(arc: ArcBeyondLimits | None) -> Record | None:
-    if arc is None:
-        return None
-    return {
-        "radius_mm": arc.radius_mm,
-        "least_radius_mm": arc.least_radius_mm,
-        "length_mm": arc.length_mm,
-        "most_length_mm": arc.most_length_mm,
-        "turn_deg": arc.turn_deg,
-        "most_turn_deg": arc.most_turn_deg,
     }
 
 

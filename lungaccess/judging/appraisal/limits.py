@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from anatomy.base.records import frozen_value
@@ -156,17 +157,9 @@ class Limit:
 
     def to_mapping(self) -> dict[str, object]:
         """Return the row as plain JSON values."""
-        return {
-            "what": self.what,
-            "finding": self.finding,
-            "value": self.value,
-            "side": self.side,
-            "bound": self.bound,
-            "unit": self.unit,
-            "used": self.used if math.isfinite(self.used) else None,
-            "stated": self.stated,
-            "ok": self.ok,
-        }
+        values = asdict(self) | {"used": self.used if math.isfinite(self.used) else None}
+        del values["digits"]
+        return values
 
 
 def limits_of(findings: Iterable[Finding], plan: Plan | None = None) -> tuple[Limit, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -88,10 +89,7 @@ class Measurements:
 
     def record(self) -> dict[str, Any]:
         """Return plain JSON values."""
-        return {
-            "scope": self.scope, "tubes": self.tubes, "needle": self.needle, "target_lps": self.target_lps,
-            "placements": self.placements,
-        }  # fmt: skip
+        return asdict(self)
 
 
 @frozen_record

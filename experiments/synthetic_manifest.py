@@ -9,12 +9,59 @@ did, and what is needed is a new version of the benchmark, not a new manifest of
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from anatomy.base.files import write_text
-from lungaccess.running.benchmark.synthetic.manifest import Entry, manifest_text, measured_entry
-from lungaccess.running.benchmark.synthetic.phantoms import benchmark_phantoms
+from anatomy.build import build_lung
+from anatomy.io.patients import load_patient
+from anatomy.phantom import write_phantom
+from lungaccess.problem.peripheral import peripheral_targets
+from lungaccess.running.benchmark.synthetic.manifest import Entry, masks_sha256, unproved_phantom
+from lungaccess.running.benchmark.synthetic.phantoms import (
+    TARGETS_A_LUNG,
+    VERSION,
+    BenchmarkPhantom,
+    benchmark_phantoms,
+)
+
+DIGITS = 3
+"""Targets are stated to a micrometre."""
+
+
+def measured_entry(case: BenchmarkPhantom, folder: Path) -> Entry:
+    """Make a phantom and return what a manifest says of it.
+
+    The phantom goes through files, as it does for every planner and every score: a NIfTI file keeps the grid
+    in single precision, and the targets are drawn from distances on the grid as it is read.
+
+    Parameters
+    ----------
+    folder : Path
+        Where its masks are written.
+
+    Raises
+    ------
+    FileError
+        If the folder cannot be written to.
+    TargetError
+        If one of its lungs has no place for a target.
+    """
+    write_phantom(unproved_phantom(case), folder, with_ct=False)
+    images = load_patient(folder)
+    points = peripheral_targets(build_lung(images), TARGETS_A_LUNG, case.seed).round(DIGITS).tolist()
+    return Entry(masks_sha256=masks_sha256(images), targets_lps=tuple((x, y, z) for x, y, z in points))
+
+
+def manifest_text(measured: Mapping[str, Entry]) -> str:
+    """Return the text of a manifest."""
+    phantoms = {
+        name: {"masks_sha256": entry.masks_sha256, "targets_lps": [list(p) for p in entry.targets_lps]}
+        for name, entry in measured.items()
+    }
+    return json.dumps({"benchmark": VERSION, "phantoms": phantoms}, indent=1) + "\n"
 
 
 def main() -> None:

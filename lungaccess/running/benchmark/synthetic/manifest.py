@@ -9,22 +9,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_value
 from anatomy.patient import PatientImages
-from anatomy.phantom import Phantom, make_phantom, write_phantom
-from lungaccess.problem.peripheral import peripheral_targets
-from lungaccess.running.benchmark.synthetic.phantoms import TARGETS_A_LUNG, VERSION, BenchmarkPhantom
+from anatomy.phantom import Phantom, make_phantom
+from lungaccess.running.benchmark.synthetic.phantoms import VERSION, BenchmarkPhantom
 
 MANIFEST = "manifest.json"
 MASKS = ("lumen", "wall", "vessels", "lung", "fissures")
 """An answer depends on these masks; CT, labels and lobes are for looking at."""
-DIGITS = 3
-"""Targets are stated to a micrometre."""
 Point = tuple[float, float, float]
 
 
@@ -102,39 +98,3 @@ def make_benchmark_phantom(case: BenchmarkPhantom) -> Phantom:
             remedy="Install the versions that constraints.txt names; a changed generator needs a new version",
         )
     return made
-
-
-def measured_entry(case: BenchmarkPhantom, folder: Path) -> Entry:
-    """Make a phantom and return what a manifest says of it.
-
-    The phantom goes through files, as it does for every planner and every score: a NIfTI file keeps the grid
-    in single precision, and the targets are drawn from distances on the grid as it is read.
-
-    Parameters
-    ----------
-    folder : Path
-        Where its masks are written.
-
-    Raises
-    ------
-    FileError
-        If the folder cannot be written to.
-    TargetError
-        If one of its lungs has no place for a target.
-    """
-    from anatomy.build import build_lung
-    from anatomy.io.patients import load_patient
-
-    write_phantom(unproved_phantom(case), folder, with_ct=False)
-    images = load_patient(folder)
-    points = peripheral_targets(build_lung(images), TARGETS_A_LUNG, case.seed).round(DIGITS).tolist()
-    return Entry(masks_sha256=masks_sha256(images), targets_lps=tuple((x, y, z) for x, y, z in points))
-
-
-def manifest_text(measured: Mapping[str, Entry]) -> str:
-    """Return the text of a manifest."""
-    phantoms = {
-        name: {"masks_sha256": entry.masks_sha256, "targets_lps": [list(p) for p in entry.targets_lps]}
-        for name, entry in measured.items()
-    }
-    return json.dumps({"benchmark": VERSION, "phantoms": phantoms}, indent=1) + "\n"

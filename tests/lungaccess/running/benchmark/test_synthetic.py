@@ -15,6 +15,7 @@ from anatomy.base.errors import AnatomyError, FileError, LungaccessError, Settin
 from anatomy.base.settings import to_mapping
 from anatomy.io.patients import load_patient as read_images
 from anatomy.phantom import write_phantom
+from experiments.synthetic_manifest import measured_entry
 from lungaccess.plans.plan import Plan
 from lungaccess.running.benchmark.synthetic import manifest
 from lungaccess.running.benchmark.synthetic.answers import answer_of_plan
@@ -23,7 +24,6 @@ from lungaccess.running.benchmark.synthetic.manifest import (
     entries,
     make_benchmark_phantom,
     masks_sha256,
-    measured_entry,
     unproved_phantom,
 )
 from lungaccess.running.benchmark.synthetic.phantoms import (

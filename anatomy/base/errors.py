@@ -27,6 +27,11 @@ class LungaccessError(Exception):
             parts.append(f"{remedy.rstrip('.')}.")
         super().__init__(" ".join(parts))
 
+    def to_mapping(self) -> dict[str, str]:
+        """Return its class and parts as plain JSON values."""
+        stated = {"found": self.found, "expected": self.expected, "remedy": self.remedy}
+        return {"kind": type(self).__name__, **stated}
+
 
 class FrameError(LungaccessError):
     """A coordinate frame is missing, ambiguous or not a rigid right-handed frame."""

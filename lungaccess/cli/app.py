@@ -222,7 +222,7 @@ def _explain(error: LungaccessError, as_json: bool) -> ExitCode:
         return ExitCode.NEGATIVE
     terminal.show_error(error)
     if as_json:
-        terminal.show_json(terminal.error_record(error))
+        terminal.show_json({"error": error.to_mapping()})
     return ExitCode.BAD_INPUT
 
 

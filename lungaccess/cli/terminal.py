@@ -197,18 +197,6 @@ def show_error(error: LungaccessError) -> None:
     error_console.print(Panel(styled(*parts), title="bad input", title_align="left", border_style="red"))
 
 
-def error_record(error: LungaccessError) -> dict[str, object]:
-    """Return an error as plain values: its kind, what was found, what was expected, what to do."""
-    return {
-        "error": {
-            "kind": type(error).__name__,
-            "found": error.found,
-            "expected": error.expected,
-            "remedy": error.remedy,
-        }
-    }
-
-
 def show_no_plan(failure: NoPlan) -> None:
     """Print why no plan was found: the counted reasons, and what would help."""
     console.print(Panel(failure.found, title="no plan", title_align="left", border_style="yellow"))

@@ -161,14 +161,12 @@ class Box:
         """Return lungs of the CT in the box; between slices their surface runs smoothly."""
         right = self._smooth(lungs.right)
         seed = np.floor((lungs.trachea_seed_ijk + 0.5) / self.ratio).astype(np.int64) - self.low
-        return Lungs(
+        return replace(
+            lungs,
             left=self._smooth(lungs.left) & ~right,
             right=right,
             trachea_seed_ijk=seed,
             central_airway=self._smooth(lungs.central_airway),
-            threshold_hu=lungs.threshold_hu,
-            offset_hu=lungs.offset_hu,
-            warnings=lungs.warnings,
         )
 
     def _smooth(self, mask: Mask) -> Mask:

@@ -49,18 +49,7 @@ TASK_LOOKS = 16384
 """Looks that a thread may take at a time."""
 
 
-NO_NEEDLE = Limits(
-    kappa=1.0,
-    max_length_mm=0.0,
-    max_angle_rad=0.0,
-    max_turn_rad=0.0,
-    required_mm=0.0,
-    radius_mm=0.0,
-    exempt_mm=0.0,
-    max_step_mm=0.0,
-    cost_step_mm=0.0,
-    goal_tolerance_mm=0.0,
-)
+NO_NEEDLE = Limits(**dict.fromkeys(Limits._fields, 0.0) | {"kappa": 1.0})
 """Limits of a needle of no length at the tip of the tubes."""
 
 

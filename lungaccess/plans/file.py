@@ -27,7 +27,8 @@ from lungaccess.problem.system import System
 SCHEMA = "lungaccess-plan-3"
 """Name and version of the file format; a reader takes SHAPELESS, too, and refuses any other."""
 SHAPELESS = "lungaccess-plan-2"
-"""The format whose plans state no shape of tubes that bend in one plane: it follows from their insertions."""
+"""The format whose plans state no shape of tubes that bend in one plane, which follows from their insertions,
+and one share of strain for the whole shaft of the needle."""
 LINES = "lungaccess-plan-1"
 """The format whose plans state a line for the scope."""
 
@@ -69,7 +70,7 @@ def from_json(cls: type[P], text: str) -> P:
     _require_schema(content.get("schema"))
     stated = content.pop("digest", None)
     try:
-        plan = _decode(cls, _with_shape(content), "plan")
+        plan = _decode(cls, _in_schema(content), "plan")
         found = digest(plan) if content["schema"] == SCHEMA else _digest(content)
     except DAMAGE as error:
         raise PlanFileError(
@@ -92,10 +93,19 @@ def _require_schema(schema: object) -> None:
     raise PlanFileError(found, expected=SCHEMA)
 
 
-def _with_shape(content: dict[str, Any]) -> dict[str, Any]:
+def _in_schema(content: dict[str, Any]) -> dict[str, Any]:
     """Return a plan of either format as one of SCHEMA; plans of SHAPELESS were made with this closed form."""
-    tube = content["tube"]
-    if content["schema"] == SCHEMA or "shape" in tube:
+    tube, needle = content["tube"], content["system"].get("needle")
+    if content["schema"] == SCHEMA:
+        return content
+    if needle is not None and "strain_factor" in needle:
+        needle = {**needle}
+        factor = needle.pop("strain_factor")
+        if factor != 1.0:
+            segment = {"length_mm": 2000.0, "stiffness_factor": 1.0, "strain_factor": factor}
+            needle["slotted_segments"] = [segment]
+        content = {**content, "system": {**content["system"], "needle": needle}}
+    if "shape" in tube:
         return {**content, "schema": SCHEMA}
     tubes = _system(content["system"], "plan.system").tubes
     outer, inner = float(tube["outer_insertion_mm"]), float(tube["inner_insertion_mm"])

@@ -278,10 +278,13 @@ def test_a_plan_with_a_line_for_the_scope_says_what_it_lacks() -> None:
     assert "again for the same patient, target and system" in str(refused.value)
 
 
-def test_a_plan_that_states_no_shape_gets_that_of_its_insertions(toy_plan: Plan) -> None:
+@pytest.mark.parametrize("factor", [1.0, 0.75])
+def test_a_plan_of_the_format_before_gets_shape_and_segment(toy_plan: Plan, factor: float) -> None:
+    """Its shape is that of its insertions; its needle has one share of strain for the whole shaft."""
     content = json.loads(toy_plan.to_json())
     content["schema"] = SHAPELESS
-    del content["digest"], content["tube"]["shape"]
+    del content["digest"], content["tube"]["shape"], content["system"]["needle"]["slotted_segments"]
+    content["system"]["needle"]["strain_factor"] = factor
     kept = {key: value for key, value in content.items() if key != "timing"}
     canonical = json.dumps(kept, sort_keys=True, separators=(",", ":")).encode()
     content["digest"] = hashlib.sha256(canonical).hexdigest()
@@ -289,7 +292,10 @@ def test_a_plan_that_states_no_shape_gets_that_of_its_insertions(toy_plan: Plan)
     wanted, found = toy_plan.tube.shape, read.tube.shape
     assert found.relative_rotations_rad == wanted.relative_rotations_rad
     np.testing.assert_allclose(found.arcs, wanted.arcs, atol=1e-9)
-    same = dataclasses.replace(read, tube=dataclasses.replace(read.tube, shape=wanted))
+    assert read.system.needle is not None and read.system.needle.strain_factor(1000.0) == factor
+    same = dataclasses.replace(
+        read, system=toy_plan.system, tube=dataclasses.replace(read.tube, shape=wanted)
+    )
     assert same.to_json() == toy_plan.to_json()
     content["tube"]["outer_insertion_mm"] += 1.0
     with pytest.raises(PlanFileError, match="edited or damaged"):

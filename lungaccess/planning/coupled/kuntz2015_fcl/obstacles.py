@@ -56,19 +56,19 @@ class Solid:
         ----------
         line_lps : (N, 3) float64, LPS mm
         """
-        if self._holds(self._lung.labels_at(line_lps)).any():
+        if self._holds(self._lung.grid.values_at(self._lung.labels, line_lps, OUTSIDE)).any():
             return True
         return self._surface.polyline_distance_mm(line_lps) <= distance_mm
 
     def distance_mm(self, point_lps: Float) -> float:
         """Return the distance of a point `(3,)` from the solid, 0 inside it."""
-        if self._holds(self._lung.labels_at(point_lps)):
+        if self._holds(self._lung.grid.values_at(self._lung.labels, point_lps, OUTSIDE)):
             return 0.0
         return self._surface.polyline_distance_mm(point_lps)
 
     def depth_mm(self, point_lps: Float) -> float:
         """Return how far inside the solid a point `(3,)` lies, 0 outside it."""
-        if not self._holds(self._lung.labels_at(point_lps)):
+        if not self._holds(self._lung.grid.values_at(self._lung.labels, point_lps, OUTSIDE)):
             return 0.0
         return self._surface.polyline_distance_mm(point_lps)
 

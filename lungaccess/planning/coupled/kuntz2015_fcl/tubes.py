@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from anatomy.base.typed import Bool, Float, Labels
-from anatomy.structures import AIRWAY, LUMEN
+from anatomy.structures import AIRWAY, LUMEN, OUTSIDE
 from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, branch_of, chord_mm
 from lungaccess.problem.system import System
 from stages.needle import ArcPath, arc_transform
@@ -36,7 +36,7 @@ class TubeValidator:
         """Return the deployment of a shape from a scope tip, or the reason why it is refused."""
         shape = path_of(lps_from_scope_tip, rotation_rad, made)
         points, at_mm = shape.sample(LABEL_STEP_MM)
-        labels = self._obstacles.lung.labels_at(points)
+        labels = self._obstacles.lung.grid.values_at(self._obstacles.lung.labels, points, OUTSIDE)
         first = self._first_outside(points, at_mm, (labels & LUMEN) != 0)
         if first == 0:
             return REASONS[kernels.NO_EXIT]
@@ -87,7 +87,8 @@ class TubeValidator:
         """Return the arc length at which the axis crosses the border of the lumen before a sample."""
         share = np.linspace(0.0, 1.0, EXIT_SAMPLES)
         begin, end = points[sample - 1 : sample + 1]
-        inside = (self._obstacles.lung.labels_at(begin + share[:, None] * (end - begin)) & LUMEN) != 0
+        lung, points = self._obstacles.lung, begin + share[:, None] * (end - begin)
+        inside = (lung.grid.values_at(lung.labels, points, OUTSIDE) & LUMEN) != 0
         last = int(np.argmax(inside != inside[0])) - 1
         return float(at_mm[sample - 1] + share[last] * (at_mm[sample] - at_mm[sample - 1]))
 

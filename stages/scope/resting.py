@@ -1,0 +1,298 @@
+"""The shaft of a bronchoscope at rest in the lumen: its shape, how it presses the wall, where its tip lies.
+
+A motion lays the shaft where the section led it, free of the wall.  A real shaft is elastic: it leans on the
+wall, and its tip lies and looks elsewhere.  Here the shaft takes the shape of least energy in the lumen, with
+the section bent as commanded, and the hand advances until the tip has the planned depth.
+"""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from anatomy import poses as frames
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float, Mask
+from anatomy.fields import corner_geometry, distance_corners
+from anatomy.grid import Grid, read_only
+from anatomy.kernels.field import UNITS_PER_MM
+from anatomy.lung import Lung
+from anatomy.structures import LUMEN
+from stages.scope.contact import WallContact
+from stages.scope.device import Bronchoscope, laid_pieces
+from stages.scope.kernels import resting as kernel
+from stages.scope.kernels.resting import Lumen
+from stages.scope.motion import BEND, TWIST, ScopeMotion
+
+SHAFT_STEP_MM = 2.0
+"""Length of the arcs of the shaft, at most: the wall is looked at where they end."""
+SECTION_STEP_MM = 1.0
+"""Length of the arcs of the bending section, at most, which is bent more tightly."""
+HEAD_STIFFER = 1e3
+"""The camera head is so many times as stiff as the section: it does not bend."""
+BESIDE_MM = 6.0
+"""The wall is known so far outside the lumen: farther than any shaft reaches into it."""
+ENOUGH_N_MM = 1e-7
+"""A step worth less energy is not taken: it would move a tip that hangs over by 50 mm by some micrometres."""
+MOST_STEPS = 300
+"""Ten to sixty steps bring a shaft to rest; one that needs more than this is not."""
+ROUNDS = 12
+"""The tip comes to its depth, and friction to what the wall presses, in so many rounds at most."""
+HAND_N_PER_MM = 10.0
+"""How stiffly the tip is held at its depth while the shaft settles at first: as good as fixed."""
+SOON_N_MM = 1e-3
+"""That is over when a step is worth less than this."""
+FARTHER_MM = 3.0
+"""The hand advances by no more in a round."""
+DEPTH_MM = 0.02
+"""The tip has its depth up to this, far less than anybody measures."""
+FRICTION_MM = 0.05
+"""Friction has settled where a round moves the tip by less than this."""
+PRESSED_MM = 10.0
+"""The force on the wall is stated as the largest on a stretch of this length, about that of one contact."""
+
+
+@frozen_value
+class Circumstances:
+    """One choice of what is not known of a shaft at rest; the defaults are the nominal one.
+
+    Parameters
+    ----------
+    stiffer, wall_stiffer : float
+        Factors of the bending stiffness of the scope and of the stiffness of the wall.
+    friction : float
+        Coefficient of friction between shaft and wall.
+    slid_rad : float
+        The way in which the shaft slid last, which friction resists: 0 is ahead, pi back, and pi / 2 and
+        -pi / 2 are about its axis, to either side.
+    """
+
+    stiffer: float = 1.0
+    wall_stiffer: float = 1.0
+    friction: float = 0.0
+    slid_rad: float = 0.0
+
+
+NOMINAL = Circumstances()
+"""Scope and wall are as stiff as stated, and there is no friction."""
+
+
+@frozen_record
+class RestingShape:
+    """A shaft at rest; N arcs.
+
+    Parameters
+    ----------
+    lps_from_scope_tip : (4, 4) float64
+        Frame of the working channel, as in `ScopeMotion.lps_from_tip`.
+    frames : (N + 1, 12) float64
+        Frames of the entry and of the ends of all arcs, as in `stages.scope.kernels.body`.
+    lengths_mm : (N,) float64
+    curvature : (N, 2) float64
+        Of each arc in its Bishop frame, 1/mm.
+    force_n, give_mm : (N,) float64
+        How the wall presses at the end of each arc, and how far it yields there.
+    farther_mm : float
+        How much farther than planned the shaft is advanced at the entry.
+    energy_n_mm : float
+    settled : bool
+        Whether it is at rest: no step lowers the energy any more, and the tip has its depth.
+    """
+
+    lps_from_scope_tip: Float
+    frames: Float
+    lengths_mm: Float
+    curvature: Float
+    force_n: Float
+    give_mm: Float
+    farther_mm: float
+    energy_n_mm: float
+    settled: bool
+
+    @property
+    def wall_force_n(self) -> float:
+        """Largest force on `PRESSED_MM` of wall."""
+        end = np.cumsum(self.lengths_mm)
+        total = np.append(0.0, np.cumsum(self.force_n))
+        first = np.searchsorted(end, end - PRESSED_MM, side="right")
+        return float((total[1:] - total[first]).max(initial=0.0))
+
+    @property
+    def most_give_mm(self) -> float:
+        """How far the wall yields at most."""
+        return float(self.give_mm.max(initial=0.0))
+
+    @property
+    def max_curvature_per_mm(self) -> float:
+        """Largest curvature of the body, which tubes in the channel pass."""
+        return float(np.linalg.norm(self.curvature, axis=1).max())
+
+
+class RestingShaft:
+    """Brings the shaft of a bronchoscope to rest in a lumen.
+
+    Parameters
+    ----------
+    lumen : Lumen
+        See `lumen_of`.
+    scope : Bronchoscope
+    contact : WallContact
+    """
+
+    def __init__(self, lumen: Lumen, scope: Bronchoscope, contact: WallContact) -> None:
+        self._lumen, self._scope, self._contact = lumen, scope, contact
+
+    def rest(
+        self,
+        motion: ScopeMotion,
+        chosen: Circumstances = NOMINAL,
+        *,
+        start: RestingShape | None = None,
+        as_advanced: bool = False,
+    ) -> RestingShape:
+        """Return the shape of the shaft at rest in the last state of a motion.
+
+        Parameters
+        ----------
+        start : RestingShape, optional
+            What to begin from, of a motion of the same length; by default the shape as it was laid.
+        as_advanced : bool
+            Leave the advance as planned; by default the hand advances more or less until the tip has the
+            planned depth, which cameras and trackers show.
+        """
+        planned, entry = motion.lps_from_tip, _row(motion.lps_from_entry)
+        shaft, curvature = self._shaft(motion, chosen)
+        farther = 0.0
+        if start is not None:
+            curvature, farther = start.curvature.copy(), start.farther_mm
+        count = len(curvature)
+        pull, laid = np.zeros((count, 3)), np.zeros((count + 1, 12))
+        give, force = np.zeros(count), np.zeros((count, 3))
+        before: tuple[float, float] | None = None
+        tip, settled = planned[:3, 3], False
+        if start is None and not as_advanced:
+            # The tip leaves its branch if the shaft settles before the hand follows.
+            held = shaft._replace(hand=HAND_N_PER_MM)
+            kernel.rest(self._lumen, held, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
+            farther = float((laid[0, 9:] - motion.lps_from_entry[:3, 3]) @ entry[6:9])
+        for _ in range(ROUNDS):
+            entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
+            energy, expected, _steps = kernel.rest(
+                self._lumen, shaft, entry, curvature, pull, laid, ENOUGH_N_MM, MOST_STEPS
+            )
+            kernel.press(self._lumen, shaft, laid, give, force)
+            moved, tip = float(np.linalg.norm(laid[-1, 9:] - tip)), laid[-1, 9:].copy()
+            beyond = 0.0 if as_advanced else float((tip - planned[:3, 3]) @ planned[:3, 2])
+            still = not chosen.friction or moved < FRICTION_MM
+            settled = expected <= ENOUGH_N_MM
+            if abs(beyond) < DEPTH_MM and still:
+                break
+            if chosen.friction:
+                pull = _friction(laid, force, chosen)
+            if not as_advanced:
+                slope = 1.0
+                if before is not None and abs(farther - before[0]) > 1e-6:
+                    slope = min(max((beyond - before[1]) / (farther - before[0]), 0.3), 3.0)
+                before = farther, beyond
+                farther -= min(max(beyond / slope, -FARTHER_MM), FARTHER_MM)
+        else:
+            settled = False
+        return RestingShape(
+            lps_from_scope_tip=_tip(laid[-1], float(motion.states[-1, TWIST])),
+            frames=read_only(laid),
+            lengths_mm=read_only(shaft.length),
+            curvature=read_only(curvature),
+            force_n=read_only(np.linalg.norm(force, axis=1)),
+            give_mm=read_only(give),
+            farther_mm=float((laid[0, 9:] - motion.lps_from_entry[:3, 3]) @ laid[0, 6:9]),
+            energy_n_mm=float(energy),
+            settled=bool(settled),
+        )
+
+    def _shaft(self, motion: ScopeMotion, chosen: Circumstances) -> tuple[kernel.Shaft, Float]:
+        """Return the shaft in the last state of a motion, and the curvature `(N, 2)` as it was laid."""
+        section, head = motion.bending_length_mm, self._contact.rigid_head_mm
+        behind = motion.length_mm - section
+        parts = [(behind, SHAFT_STEP_MM), (section - head, SECTION_STEP_MM), (head, SECTION_STEP_MM)]
+        arcs = [_equal(length, step) for length, step in parts]
+        length = np.concatenate(arcs)
+        laid = _laid(motion, length)
+        stiffness = np.full(len(length), chosen.stiffer * self._scope.bending_stiffness_n_mm2)
+        rest = np.zeros((len(length), 2))
+        begin, end = len(arcs[0]), len(arcs[0]) + len(arcs[1])
+        twist, bend = motion.states[-1, TWIST], motion.states[-1, BEND]
+        rest[begin:end] = bend / (section - head) * np.array([np.cos(twist), np.sin(twist)])
+        stiffness[end:] *= HEAD_STIFFER
+        laid[begin:] = rest[begin:]
+        stiff = chosen.wall_stiffer * self._contact.wall_stiffness_n_per_mm2
+        wall = stiff * 0.5 * (length + np.append(length[1:], 0.0))
+        yields, radius = self._contact.max_wall_give_mm, self._scope.radius_mm
+        tip = motion.lps_from_tip
+        shaft = kernel.Shaft(
+            length, stiffness, rest, wall, yields, radius, tip[:3, 3].copy(), tip[:3, 2].copy(), 0.0
+        )
+        return shaft, laid
+
+
+def _equal(length_mm: float, step_mm: float) -> Float:
+    """Return equal lengths, at most a step each, that make up a length; none for none."""
+    count = int(np.ceil(length_mm / step_mm - 1e-9))
+    return np.full(count, length_mm / max(count, 1))
+
+
+def _laid(motion: ScopeMotion, length: Float) -> Float:
+    """Return the mean curvature `(N, 2)` of the laid body along arcs of some lengths."""
+    pieces = laid_pieces(motion.states, motion.bending_length_mm)
+    ends = np.append(0.0, np.cumsum(pieces[:, 0]))
+    twist = np.cumsum(pieces[:, 1])
+    turned = pieces[:, :1] * pieces[:, 2:] * np.column_stack([np.cos(twist), np.sin(twist)])
+    total = np.concatenate([np.zeros((1, 2)), np.cumsum(turned, axis=0)])
+    at = np.append(0.0, np.cumsum(length))
+    along = np.column_stack([np.interp(at, ends, total[:, axis]) for axis in range(2)])
+    return np.asarray(np.diff(along, axis=0) / length[:, None])
+
+
+def _friction(laid: Float, force: Float, chosen: Circumstances) -> Float:
+    """Return the friction on the ends of all arcs `(N, 3)` in N, against the way in which the shaft slid."""
+    ahead, pressed = laid[1:, 6:9], np.linalg.norm(force, axis=1, keepdims=True)
+    way = np.cos(chosen.slid_rad) * pressed * ahead + np.sin(chosen.slid_rad) * np.cross(force, ahead)
+    return np.asarray(-chosen.friction * way)
+
+
+def _row(frame: Float) -> Float:
+    """Return a pose as a row of kernels: the columns +x, +y, +z, and the point."""
+    return np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
+
+
+def _tip(row: Float, twist_rad: float) -> Float:
+    """Return the frame of the working channel at the end of a body: its Bishop frame, rolled by the twist."""
+    sideways = np.cos(twist_rad) * row[:3] + np.sin(twist_rad) * row[3:6]
+    return frames.pose(row[9:], row[6:9], sideways)
+
+
+_LUMENS: WeakKeyDictionary[Lung, Lumen] = WeakKeyDictionary()
+"""The lumen of each lung: to measure it takes seconds, to bring a shaft to rest milliseconds."""
+
+
+def lumen_of(lung: Lung) -> Lumen:
+    """Return the signed depth of the lumen of a lung, made once."""
+    if lung not in _LUMENS:
+        _LUMENS[lung] = signed_depth((lung.labels & LUMEN) != 0, lung.grid)
+    return _LUMENS[lung]
+
+
+def signed_depth(inside: Mask, grid: Grid) -> Lumen:
+    """Return the signed depth in a lumen `(ni, nj, nk)` bool: voxels are boxes, and the border is at 0."""
+    wide = np.ceil(BESIDE_MM / grid.spacing_mm).astype(np.int64)
+    low, high = np.zeros(3, dtype=np.int64), np.array(grid.shape)
+    for axis in range(3):
+        filled = np.flatnonzero(inside.any(axis=tuple(k for k in range(3) if k != axis)))
+        if len(filled):
+            low[axis], high[axis] = filled[0] - wide[axis], filled[-1] + 1 + wide[axis]
+    low, high = np.maximum(low, 0), np.minimum(high, grid.shape)
+    part = inside[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    depth = distance_corners(~part, grid.spacing_mm).astype(np.float32)
+    depth -= distance_corners(part, grid.spacing_mm)
+    depth /= np.float32(UNITS_PER_MM)
+    return Lumen(read_only(np.asfortranarray(depth)), corner_geometry(grid.crop(low, high)))

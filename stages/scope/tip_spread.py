@@ -1,0 +1,137 @@
+"""Where the tip of a resting shaft lies and looks, over what is not known of scope, wall and friction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
+from stages.scope.contact import WallContact
+from stages.scope.motion import BEND, ScopeMotion
+from stages.scope.resting import Circumstances, RestingShaft, RestingShape
+
+PATIENTS, ATTEMPTS = 6, 6
+"""Choices of the stiffness of scope and wall, and of friction for each: 36 shapes take a fifth of a second."""
+SEED = 1
+"""The choices are the same for all motions: what differs between two of them is not luck."""
+SAME_MM, SAME_DEG = 0.5, 1.0
+"""Two shapes whose tips differ by less are one."""
+
+
+@frozen_record
+class TipSpread:
+    """The distribution of a resting tip about a pose, in the frame of that pose.
+
+    Parameters
+    ----------
+    nominal : RestingShape
+        Scope and wall as stiff as stated, and no friction.
+    other : RestingShape or None
+        Where the shaft rests if its section is bent only where it stands, and not on the way, if that differs.
+    bias_mm : (3,) float64
+        Mean of the tip's place less that of the pose, along its x, y and z.
+    bias_deg : (2,) float64
+        Mean of the turn of the tip's direction about the x and y of the pose.
+    patient_mm, patient_deg : float
+        Standard deviation along an axis, or about one, over the stiffness of scope and wall.
+    attempt_mm, attempt_deg : float
+        The same over friction.
+    wall_force_n, give_mm : (D,) float64
+        Largest force on the wall and how far it yields, of all choices that came to rest.
+    held_share : float
+        Share of the choices in which the shaft came to rest with its tip at its depth.
+    """
+
+    nominal: RestingShape
+    other: RestingShape | None
+    bias_mm: Float
+    bias_deg: Float
+    patient_mm: float
+    attempt_mm: float
+    patient_deg: float
+    attempt_deg: float
+    wall_force_n: Float
+    give_mm: Float
+    held_share: float
+
+
+def off_pose(lps_from_pose: Float, lps_from_tip: Float) -> Float:
+    """Return how a tip is off a pose, `(5,)`: along its x, y, z in mm, and turned about its x and y in degrees."""
+    place = lps_from_pose[:3, :3].T @ (lps_from_tip[:3, 3] - lps_from_pose[:3, 3])
+    x, y, z = lps_from_pose[:3, :3].T @ lps_from_tip[:3, 2]
+    aside = float(np.hypot(x, y))
+    angle = np.degrees(np.arctan2(aside, z)) / max(aside, 1e-12)
+    return np.array([*place, -y * angle, x * angle])
+
+
+def choices(contact: WallContact) -> list[list[Circumstances]]:
+    """Return what is not known, for each of some patients in each of some attempts, from the stated ranges."""
+    rng = np.random.Generator(np.random.PCG64(SEED))
+    wide = np.log([contact.scope_stiffness_range, contact.wall_stiffness_range])
+    made = []
+    for _ in range(PATIENTS):
+        stiffer, wall = np.exp(rng.uniform(-wide, wide)).tolist()
+        frictions = rng.uniform(0.0, contact.max_friction, ATTEMPTS).tolist()
+        slid = rng.uniform(-np.pi, np.pi, ATTEMPTS).tolist()
+        made.append(
+            [
+                Circumstances(stiffer=stiffer, wall_stiffer=wall, friction=friction, slid_rad=way)
+                for friction, way in zip(frictions, slid, strict=True)
+            ]
+        )
+    return made
+
+
+def tip_spread(
+    shaft: RestingShaft, motion: ScopeMotion, contact: WallContact, lps_from_pose: Float
+) -> TipSpread:
+    """Return the distribution of the resting tip of a motion about a pose, such as the planned one."""
+    nominal, other = two_starts(shaft, motion)
+    off, force, give, held = [], [], [], 0
+    for attempts in choices(contact):
+        start, group = nominal, []
+        for chosen in attempts:
+            shape = shaft.rest(motion, chosen, start=start)
+            if not shape.settled:
+                continue
+            group.append(off_pose(lps_from_pose, shape.lps_from_scope_tip))
+            force.append(shape.wall_force_n)
+            give.append(shape.most_give_mm)
+        held += len(group)
+        if len(group) > 1:
+            off.append(group)
+    if other is not None and other.settled:
+        off.append([off_pose(lps_from_pose, other.lps_from_scope_tip)])
+    means = np.array([np.mean(group, axis=0) for group in off] or [np.full(5, np.nan)])
+    within = np.array([np.var(group, axis=0, ddof=1) for group in off if len(group) > 1] or [np.zeros(5)])
+    within = within.mean(axis=0)
+    between = means.var(axis=0, ddof=1) if len(means) > 1 else np.zeros(5)
+    between = np.maximum(between - within / ATTEMPTS, 0.0)
+    bias = means.mean(axis=0)
+    return TipSpread(
+        nominal=nominal,
+        other=other,
+        bias_mm=bias[:3],
+        bias_deg=bias[3:],
+        patient_mm=float(np.sqrt(between[:3].mean())),
+        attempt_mm=float(np.sqrt(within[:3].mean())),
+        patient_deg=float(np.sqrt(between[3:].mean())),
+        attempt_deg=float(np.sqrt(within[3:].mean())),
+        wall_force_n=np.array(force),
+        give_mm=np.array(give),
+        held_share=held / (PATIENTS * ATTEMPTS),
+    )
+
+
+def two_starts(shaft: RestingShaft, motion: ScopeMotion) -> tuple[RestingShape, RestingShape | None]:
+    """Return the resting shape from that as it was laid, and the one from a relaxed section, if it differs."""
+    states = motion.states.copy()
+    states[-1, BEND] = 0.0
+    straight = ScopeMotion(
+        lps_from_entry=motion.lps_from_entry, states=states, bending_length_mm=motion.bending_length_mm
+    )
+    nominal = shaft.rest(motion)
+    other = shaft.rest(motion, start=shaft.rest(straight, as_advanced=True))
+    apart = off_pose(nominal.lps_from_scope_tip, other.lps_from_scope_tip)
+    same = np.linalg.norm(apart[:3]) < SAME_MM and np.linalg.norm(apart[3:]) < SAME_DEG
+    return nominal, None if same else other

@@ -18,7 +18,7 @@ from lungaccess.planning.success import chance_of, estimate_success
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
-from lungaccess.problem.errors import UNITS, ErrorModel, with_known
+from lungaccess.problem.errors import RESTING, UNITS, ErrorModel, with_known
 from lungaccess.problem.procedures import Procedure, load_procedure, procedure_names
 from lungaccess.problem.request import Limits, Request
 from lungaccess.problem.system import System
@@ -114,7 +114,8 @@ class Adviser:
 
     def _errors_known(self) -> Iterator[Advice]:
         for kind, size in KNOWN.items():
-            if self._errors.term(kind).size <= size:
+            term = self._errors.term(kind)
+            if term.size <= size and term.distribution != RESTING:
                 continue
             unit = UNITS[kind] if UNITS[kind] != "ln" else "as a logarithm"
             yield Advice(

@@ -11,6 +11,7 @@ from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings, text
 from anatomy.base.words import did_you_mean
 from anatomy.lobes import LOBES, lobe_named
+from stages.scope.contact import WallContact
 
 CURVATURE, BREATHING = "needle_curvature", "breathing"
 UNITS: dict[str, str] = {
@@ -41,11 +42,15 @@ OF_NEEDLE = (CURVATURE, "needle_roll", "needle_insertion")
 ASSUMPTION = "assumption"
 """What a source begins with where nobody has published a figure."""
 NORMAL, BOUNDED = "normal", "bounded"
+RESTING = "resting"
+"""Normal errors about where the shaft of the scope comes to rest on the wall, with the spread of that place."""
+OF_SHAFT = ("scope_position", "scope_direction")
+"""The kinds that may be about the resting shaft."""
 IN_WINDOW = "lognormal-in-window"
 """Breathing of which the phase is one of the plan's window."""
 
 _Source = Annotated[str, text(f"where the sizes come from, or a text that begins with {ASSUMPTION!r}")]
-_Distribution = Annotated[str, text(f"{NORMAL!r} or {BOUNDED!r}")]
+_Distribution = Annotated[str, text(f"{NORMAL!r}, {BOUNDED!r} or, of the scope's tip, {RESTING!r}")]
 
 
 def _size(whose: str, at_most: float) -> Any:
@@ -65,7 +70,7 @@ class _Term:
     """What terms with a part drawn once a patient and a part drawn once an attempt have in common."""
 
     unit: ClassVar[str]
-    distributions: ClassVar[tuple[str, ...]] = (NORMAL, BOUNDED)
+    distributions: ClassVar[tuple[str, ...]] = (NORMAL, BOUNDED, RESTING)
     distribution: str
     source: str
 
@@ -105,7 +110,12 @@ class _Term:
         return self.rms > 0.0 and self.source.startswith(ASSUMPTION)
 
     def sized(self, size: float) -> Self:
-        """Return the term scaled to a size of both parts together; a term of none gets one an attempt."""
+        """Return the term scaled to a size of both parts together; a term of none gets one an attempt.
+
+        An error of a known size is about the plan, wherever the shaft rests.
+        """
+        if self.distribution == RESTING:
+            return replace(self, distribution=NORMAL).sized(size)  # type: ignore[type-var]
         if not self.size:
             return replace(self, **{f"attempt_{self.unit}": size})  # type: ignore[type-var]
         return self.scaled(size / self.size)
@@ -129,6 +139,7 @@ class PositionError(_Term):
     ----------
     distribution : str
         "normal": the sizes are standard deviations.  "bounded": uniform, the sizes are the largest errors.
+        "resting", of the scope's tip: normal about where the shaft rests, whose spread adds to the sizes.
     patient_mm, attempt_mm : float
         Size of the part drawn once for each patient, and of that drawn once for each attempt; they add up.
     bias_mm : tuple of float
@@ -234,8 +245,10 @@ class BreathingError(_Term):
 Term = PositionError | AngleError | CurvatureError | BreathingError
 
 
-def _require_axes(kind: str, term: Term | None) -> None:
-    """Refuse a bias that has not as many numbers as its kind of error has axes."""
+def _require_fit(kind: str, term: Term | None) -> None:
+    """Refuse a bias that has not as many numbers as its kind has axes, and what only the scope's shaft does."""
+    if term and term.distribution == RESTING and kind not in OF_SHAFT:
+        raise impossible(f"{kind}.distribution", RESTING, f"{NORMAL} or {BOUNDED}: only the scope rests")
     bias = term.bias if term else ()
     if bias and len(bias) != AXES[kind]:
         raise impossible(f"{kind}.bias_{UNITS[kind]}", list(bias), f"{AXES[kind]} numbers")
@@ -276,7 +289,7 @@ class Place:
         if not self.terms:
             raise impossible("place", "no errors", f"a table of errors, such as [place.{next(iter(UNITS))}]")
         for kind, term in self.terms.items():
-            _require_axes(kind, term)
+            _require_fit(kind, term)
 
     @property
     def terms(self) -> dict[str, Any]:
@@ -317,13 +330,17 @@ class ErrorModel:
     target_position : PositionError
         Position of the target, along each axis.
     breathing : BreathingError
+    wall : WallContact, optional
+        What is known of the contact of shaft and wall, which errors of the distribution "resting" need; see
+        `lungaccess.uncertainty.risk.resting`.
     place : tuple of Place
         Other errors by the place of the scope's tip; of several that hold the last one counts.
 
     Raises
     ------
     SettingsError
-        If a value is not finite, negative or absurd, or a bias has not as many numbers as `AXES` says.
+        If a value is not finite, negative or absurd, a bias has not as many numbers as `AXES` says, or errors
+        are about the resting shaft and no wall is stated.
     """
 
     name: Annotated[str, text("what the model is called where its results are shown", may_be_empty=True)] = ""
@@ -337,11 +354,20 @@ class ErrorModel:
     needle_insertion: PositionError = PositionError()
     target_position: PositionError = PositionError()
     breathing: BreathingError = BreathingError()
+    wall: WallContact | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     place: tuple[Place, ...] = _optional()
 
     def __post_init__(self) -> None:
         for kind in UNITS:
-            _require_axes(kind, self.term(kind))
+            _require_fit(kind, self.term(kind))
+        if self.wall is None and self.rests:
+            raise impossible("wall", None, f"the table [wall], which errors of distribution {RESTING!r} need")
+
+    @property
+    def rests(self) -> bool:
+        """Whether errors are about where the scope's shaft rests, anywhere."""
+        stated = [*map(self.term, UNITS), *(term for each in self.place for term in each.terms.values())]
+        return any(term.distribution == RESTING for term in stated)
 
     def at(self, lobe: str, generation: int) -> ErrorModel:
         """Return the model of a place of the scope's tip: its lobe, "" if not known, and its generation."""
@@ -396,6 +422,7 @@ class ErrorModel:
             f"tubes {size['tube_insertion']:g} mm and {size['tube_rotation']:g}°, "
             f"{of_needle if with_needle else ''}target {size['target_position']:g} mm{breathing}"
             f"{f', bias of {means}' if means else ''}"
+            f"{', about where the shaft rests on the wall' if self.rests else ''}"
             f"{', others in some places' if self.place else ''}"
         )
 

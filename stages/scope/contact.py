@@ -2,14 +2,14 @@
 
 from typing import Annotated
 
-from anatomy.base.settings import quantity, settings
+from anatomy.base.settings import quantity, settings, text
 
 
 @settings
 class WallContact:
     """How the wall yields, how the shaft slides on it, and what it may bear.
 
-    The defaults hold where a device file says nothing; `docs/explanation/resting_scope.md` has their sources.
+    `docs/explanation/resting_scope.md` says where the defaults come from.
 
     Parameters
     ----------
@@ -20,12 +20,12 @@ class WallContact:
         Factors by which the stiffness of wall and scope may be less or more.
     max_friction : float
         Largest coefficient of friction; the least is 0.
-    rigid_head_mm : float
-        Length of the camera head, which ends the bending section and does not bend.
     max_wall_force_n : float
         Largest force on 10 mm of wall.
     max_wall_give_mm : float
         How far the wall may be pressed in; it is then twice as hard as at first, as soft tissue stiffens.
+    source : str
+        Where the numbers come from; what nobody has published begins with "assumption".
     """
 
     wall_stiffness_n_per_mm2: Annotated[
@@ -40,12 +40,12 @@ class WallContact:
     max_friction: Annotated[
         float, quantity("largest coefficient of friction on the wall", at_least=0.0, at_most=2.0)
     ] = 0.2
-    rigid_head_mm: Annotated[
-        float, quantity("length of the camera head, which does not bend", at_least=0.0, at_most=50.0)
-    ] = 0.0
     max_wall_force_n: Annotated[
         float, quantity("largest force on 10 mm of wall", above=0.0, at_most=100.0)
     ] = 1.0
     max_wall_give_mm: Annotated[
         float, quantity("how far the wall may be pressed in", above=0.0, at_most=10.0)
     ] = 1.0
+    source: Annotated[str, text("where the numbers come from, or a text that begins with 'assumption'")] = (
+        "assumption"
+    )

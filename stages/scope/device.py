@@ -1,10 +1,12 @@
 """What the planner has to know of a bronchoscope."""
 
 import math
+from dataclasses import field
 from typing import Annotated
 
 import numpy as np
 
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings, text
 from anatomy.base.typed import Float
 
@@ -43,8 +45,15 @@ class Bronchoscope:
     bending_stiffness_n_mm2: Annotated[
         float, quantity("bending stiffness of the bending section", above=0.0, at_most=1e7)
     ]
+    rigid_head_mm: Annotated[
+        float,
+        quantity("length of the camera head, which ends the section unbent", at_least=0.0, at_most=50.0),
+    ] = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def __post_init__(self) -> None:
+        if self.rigid_head_mm >= self.bending_length_mm:
+            allowed = f"less than bending_length_mm = {self.bending_length_mm:g}, of which it is a part"
+            raise impossible("rigid_head_mm", self.rigid_head_mm, allowed)
         if self.channel_diameter_mm >= self.outer_diameter_mm:
             raise impossible(
                 "channel_diameter_mm",

@@ -212,7 +212,7 @@ class RestingShaft:
 
     def _shaft(self, motion: ScopeMotion, chosen: Circumstances) -> tuple[kernel.Shaft, Float]:
         """Return the shaft in the last state of a motion, and the curvature `(N, 2)` as it was laid."""
-        section, head = motion.bending_length_mm, self._contact.rigid_head_mm
+        section, head = motion.bending_length_mm, self._scope.rigid_head_mm
         behind = motion.length_mm - section
         parts = [(behind, SHAFT_STEP_MM), (section - head, SECTION_STEP_MM), (head, SECTION_STEP_MM)]
         arcs = [_equal(length, step) for length, step in parts]

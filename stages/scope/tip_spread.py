@@ -39,7 +39,8 @@ class TipSpread:
     wall_force_n, give_mm : (D,) float64
         Largest force on the wall and how far it yields, of all choices that came to rest.
     held_share : float
-        Share of the choices in which the shaft came to rest with its tip at its depth.
+        Share of the choices in which the shaft came to rest with its tip at its depth; of none, the bias is
+        that of `nominal`.
     """
 
     nominal: RestingShape
@@ -102,7 +103,8 @@ def tip_spread(
             off.append(group)
     if other is not None and other.settled:
         off.append([off_pose(lps_from_pose, other.lps_from_scope_tip)])
-    means = np.array([np.mean(group, axis=0) for group in off] or [np.full(5, np.nan)])
+    lost = [off_pose(lps_from_pose, nominal.lps_from_scope_tip)]
+    means = np.array([np.mean(group, axis=0) for group in off] or lost)
     within = np.array([np.var(group, axis=0, ddof=1) for group in off if len(group) > 1] or [np.zeros(5)])
     within = within.mean(axis=0)
     between = means.var(axis=0, ddof=1) if len(means) > 1 else np.zeros(5)

@@ -21,6 +21,7 @@ from anatomy.motion.motion import LEFT, Motion
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import IN_WINDOW, BreathingError, ErrorModel
 from lungaccess.uncertainty.breathing.window import carrier
+from lungaccess.uncertainty.risk.resting import about_resting_tip
 
 EXHALE_POWER = 6
 """The phase in time is cos^6, the form that [Lujan1999] fits to quiet breathing: long at end-exhale."""
@@ -37,6 +38,8 @@ def phase(share_of_time: Float) -> Float:
 def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     """Return an error model at the place of a plan, with the patient's own breathing where that is known.
 
+    Errors about the resting shaft are stated about the plan.
+
     A model of free breathing keeps any phase of the breath, one without breathing is taken to insert in the
     plan's window, each with the patient's motion and the spread of amplitudes over breaths.
 
@@ -45,7 +48,7 @@ def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     SettingsError
         If the errors depend on the lobe and the patient came without lobes.
     """
-    model = _at_place(model, plan, lung)
+    model = about_resting_tip(_at_place(model, plan, lung), plan, lung)
     motion, window, stated = lung.motion, plan.window, model.breathing
     if motion is None or motion.warning_only:
         return model

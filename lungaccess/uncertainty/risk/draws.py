@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Float
-from lungaccess.problem.errors import BOUNDED, BREATHING, CURVATURE, IN_WINDOW, UNITS, ErrorModel
+from lungaccess.problem.errors import BOUNDED, BREATHING, CURVATURE, IN_WINDOW, RESTING, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.breathing import PatientMotion, phase
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, no_deviations
 
@@ -113,6 +113,11 @@ class Draws:
     def _error(
         self, kind: str, shape: tuple[int, ...], distribution: str, patient: float, attempt: float
     ) -> Float:
+        if distribution == RESTING:
+            raise SettingsError(
+                f"Errors of {kind} are about the resting shaft of a plan, which is not known here",
+                expected="an error model of `lungaccess.uncertainty.risk.breathing.model_for`",
+            )
         # One number for all arcs of a patient: what is wrong with tissue or drive stays wrong.
         shared = (len(shape) > 1) and kind.startswith("needle")
         total = np.zeros(shape)

@@ -234,7 +234,7 @@ class SystemOptions:
 ErrorsText = Annotated[
     str | None,
     Parameter(
-        help="Error model: a preset (breath-hold, expiratory-free, gated-ct, inspiratory-ct, "
+        help="Error model: a preset (breath-hold, expiratory-free, gated-ct, inspiratory-ct, resting, "
         "vision-only) or a TOML file; breath-hold if not given."
     ),
 ]

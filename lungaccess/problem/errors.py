@@ -43,7 +43,7 @@ ASSUMPTION = "assumption"
 """What a source begins with where nobody has published a figure."""
 NORMAL, BOUNDED = "normal", "bounded"
 RESTING = "resting"
-"""Normal errors about where the shaft of the scope comes to rest on the wall, with the spread of that place."""
+"""Normal errors about where the scope's shaft comes to rest on the wall, with the spread of that place."""
 OF_SHAFT = ("scope_position", "scope_direction")
 """The kinds that may be about the resting shaft."""
 IN_WINDOW = "lognormal-in-window"
@@ -246,7 +246,7 @@ Term = PositionError | AngleError | CurvatureError | BreathingError
 
 
 def _require_fit(kind: str, term: Term | None) -> None:
-    """Refuse a bias that has not as many numbers as its kind has axes, and what only the scope's shaft does."""
+    """Refuse a bias of not as many numbers as its kind has axes, and what only the scope's shaft does."""
     if term and term.distribution == RESTING and kind not in OF_SHAFT:
         raise impossible(f"{kind}.distribution", RESTING, f"{NORMAL} or {BOUNDED}: only the scope rests")
     bias = term.bias if term else ()

@@ -11,7 +11,7 @@ from stages.scope.motion import BEND, ScopeMotion
 from stages.scope.resting import Circumstances, RestingShaft, RestingShape
 
 PATIENTS, ATTEMPTS = 6, 6
-"""Choices of the stiffness of scope and wall, and of friction for each: 36 shapes take a fifth of a second."""
+"""Choices of the stiffness of scope and wall, and of friction for each of them."""
 SEED = 1
 """The choices are the same for all motions: what differs between two of them is not luck."""
 SAME_MM, SAME_DEG = 0.5, 1.0
@@ -26,8 +26,11 @@ class TipSpread:
     ----------
     nominal : RestingShape
         Scope and wall as stiff as stated, and no friction.
+    nominal_off : (5,) float64
+        How its tip is off the pose, see `off_pose`.
     other : RestingShape or None
-        Where the shaft rests if its section is bent only where it stands, and not on the way, if that differs.
+        Where the shaft rests if its section is bent only where it stands, and not on the way; None if
+        it is the same.
     bias_mm : (3,) float64
         Mean of the tip's place less that of the pose, along its x, y and z.
     bias_deg : (2,) float64
@@ -44,6 +47,7 @@ class TipSpread:
     """
 
     nominal: RestingShape
+    nominal_off: Float
     other: RestingShape | None
     bias_mm: Float
     bias_deg: Float
@@ -57,7 +61,7 @@ class TipSpread:
 
 
 def off_pose(lps_from_pose: Float, lps_from_tip: Float) -> Float:
-    """Return how a tip is off a pose, `(5,)`: along its x, y, z in mm, and turned about its x and y in degrees."""
+    """Return how a tip is off a pose, `(5,)`: along its x, y, z in mm, and about its x and y in degrees."""
     place = lps_from_pose[:3, :3].T @ (lps_from_tip[:3, 3] - lps_from_pose[:3, 3])
     x, y, z = lps_from_pose[:3, :3].T @ lps_from_tip[:3, 2]
     aside = float(np.hypot(x, y))
@@ -66,7 +70,7 @@ def off_pose(lps_from_pose: Float, lps_from_tip: Float) -> Float:
 
 
 def choices(contact: WallContact) -> list[list[Circumstances]]:
-    """Return what is not known, for each of some patients in each of some attempts, from the stated ranges."""
+    """Return what is not known, for some patients in some attempts each, from the stated ranges."""
     rng = np.random.Generator(np.random.PCG64(SEED))
     wide = np.log([contact.scope_stiffness_range, contact.wall_stiffness_range])
     made = []
@@ -103,8 +107,8 @@ def tip_spread(
             off.append(group)
     if other is not None and other.settled:
         off.append([off_pose(lps_from_pose, other.lps_from_scope_tip)])
-    lost = [off_pose(lps_from_pose, nominal.lps_from_scope_tip)]
-    means = np.array([np.mean(group, axis=0) for group in off] or lost)
+    lost = off_pose(lps_from_pose, nominal.lps_from_scope_tip)
+    means = np.array([np.mean(group, axis=0) for group in off] or [lost])
     within = np.array([np.var(group, axis=0, ddof=1) for group in off if len(group) > 1] or [np.zeros(5)])
     within = within.mean(axis=0)
     between = means.var(axis=0, ddof=1) if len(means) > 1 else np.zeros(5)
@@ -112,6 +116,7 @@ def tip_spread(
     bias = means.mean(axis=0)
     return TipSpread(
         nominal=nominal,
+        nominal_off=lost,
         other=other,
         bias_mm=bias[:3],
         bias_deg=bias[3:],
@@ -126,7 +131,7 @@ def tip_spread(
 
 
 def two_starts(shaft: RestingShaft, motion: ScopeMotion) -> tuple[RestingShape, RestingShape | None]:
-    """Return the resting shape from that as it was laid, and the one from a relaxed section, if it differs."""
+    """Return the resting shape from that as laid, and the one from a relaxed section if it differs."""
     states = motion.states.copy()
     states[-1, BEND] = 0.0
     straight = ScopeMotion(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lungaccess.planning.procedure import ProcedureReport
-    from lungaccess.uncertainty.risk import RareShare, RiskReport, Tolerance
+    from lungaccess.uncertainty.risk import RareShare, RestingRow, RiskReport, Tolerance
 
 
 def risk(
@@ -51,12 +52,16 @@ def risk(
     from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.procedures import Procedure
-    from lungaccess.uncertainty.risk import assess, find_tolerances
+    from lungaccess.uncertainty.risk import assess, find_tolerances, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.assessment import DEFAULT_SAMPLES
+    from stages.scope import WallContact
 
     model, followed = errors.load(), errors.given_procedure() or Procedure()
     stored = Plan.load(plan)
     lung = output.load(patient)
+    with progress("bringing the scope to rest on the wall"):
+        wall = model.wall or WallContact()
+        rested = resting_rows(resting_tip(stored, lung, wall), wall)
     if not followed.is_open_loop:
         with progress(f"simulating procedures '{followed.name}'"):
             found = simulate_procedure(
@@ -70,10 +75,10 @@ def risk(
                 processes=processes,
             )
         if output.json:
-            terminal.show_json(procedure_record(found))
+            terminal.show_json(procedure_record(found) | resting_record(rested))
         else:
             terminal.say(Headline.of(None, found).chance_text)
-            terminal.show(procedure_tables(found))
+            terminal.show([*procedure_tables(found), _resting_table(rested)])
         return ExitCode.OK
     samples = samples or DEFAULT_SAMPLES
     with progress("deviating the plan"):
@@ -83,10 +88,17 @@ def risk(
             stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius
         )
     if output.json:
-        terminal.show_json(record(report, kept))
+        terminal.show_json(record(report, kept) | resting_record(rested))
     else:
         terminal.say(Headline.of(None, report).chance_text)
-        terminal.show([_outcome_table(report), _sensitivity_table(report), _tolerance_table(kept)])
+        terminal.show(
+            [
+                _outcome_table(report),
+                _sensitivity_table(report),
+                _tolerance_table(kept),
+                _resting_table(rested),
+            ]
+        )
     return ExitCode.OK
 
 
@@ -128,6 +140,22 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
             for each in kept
         ],
     }
+
+
+def resting_record(rows: Sequence[RestingRow]) -> dict[str, object]:
+    """Return what the shaft at rest on the wall does to a plan, as plain values."""
+    found = [
+        {"name": each.name, "value": each.value, "unit": each.unit, "limit": each.limit} for each in rows
+    ]
+    return {"resting_scope": found}
+
+
+def _resting_table(rows: Sequence[RestingRow]) -> Table:
+    shown = [
+        (each.name, f"{each.value:.2f} {each.unit}", "" if each.limit is None else each.words)
+        for each in rows
+    ]
+    return terminal.table("The scope left to itself rests on the wall", ("", "found", "limit"), shown)
 
 
 def _outcome_table(report: RiskReport) -> Table:

@@ -9,16 +9,26 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import NORMAL, OF_SHAFT, RESTING, ErrorModel, Term
-from stages.scope import Bronchoscope, RestingShaft, ScopeMotion, TipSpread, WallContact, lumen_of, tip_spread
+from stages.scope import (
+    Bronchoscope,
+    RestingShaft,
+    ScopeMotion,
+    TipSpread,
+    WallContact,
+    lumen_of,
+    off_pose,
+    tip_spread,
+)
 
 DECIMALS = 3
-"""Sizes from the resting shaft are stated to a thousandth of a mm or degree: far finer than they are known."""
+"""Sizes from the resting shaft are stated to a thousandth of a mm or degree, far finer than known."""
 MOST = 50.0
-"""A tip that lies farther off than so many mm, or looks so many degrees aside, fails like one that does more."""
+"""A tip that is off by so many mm or degrees fails like one that is off by more."""
 _Asked = tuple[bytes, bytes, Bronchoscope, WallContact]
 _SPREADS: WeakKeyDictionary[Lung, dict[_Asked, TipSpread]] = WeakKeyDictionary()
 """What was found in a lung: plans with one motion of the scope, and all the errors of each, ask again."""
@@ -38,6 +48,60 @@ def resting_tip(plan: Plan, lung: Lung, wall: WallContact) -> TipSpread:
     return known[asked]
 
 
+@frozen_value
+class RestingRow:
+    """One finding of what the shaft at rest does to a plan, with its limit if it has one."""
+
+    name: str
+    value: float
+    unit: str
+    limit: float | None = None
+
+    @property
+    def words(self) -> str:
+        """The limit, and whether it is kept; "" without one."""
+        if self.limit is None:
+            return ""
+        return f"{self.limit:g} {self.unit}{'' if self.value <= self.limit else ', EXCEEDED'}"
+
+
+def resting_rows(spread: TipSpread, wall: WallContact) -> tuple[RestingRow, ...]:
+    """Return what the shaft at rest does to a plan, for people."""
+    off, nominal, other = spread.nominal_off, spread.nominal, spread.other
+    forces = [nominal.wall_force_n, *spread.wall_force_n.tolist()]
+    spread_mm, spread_deg = (
+        math.hypot(spread.patient_mm, spread.attempt_mm),
+        math.hypot(spread.patient_deg, spread.attempt_deg),
+    )
+    rows = [
+        RestingRow(name="tip off its planned place", value=_length(off[:3]), unit="mm"),
+        RestingRow(name="tip turned", value=_length(off[3:]), unit="deg"),
+        RestingRow(name="bias of the place", value=_length(spread.bias_mm), unit="mm"),
+        RestingRow(name="bias of the direction", value=_length(spread.bias_deg), unit="deg"),
+        RestingRow(name="spread of the place along an axis", value=spread_mm, unit="mm"),
+        RestingRow(name="spread of the direction about an axis", value=spread_deg, unit="deg"),
+        RestingRow(
+            name="force on 10 mm of wall", value=nominal.wall_force_n, unit="N", limit=wall.max_wall_force_n
+        ),
+        RestingRow(name="the same, at most", value=max(forces), unit="N", limit=wall.max_wall_force_n),
+        RestingRow(
+            name="wall pressed in", value=nominal.most_give_mm, unit="mm", limit=wall.max_wall_give_mm
+        ),
+        RestingRow(name="at rest with the tip at its depth", value=100.0 * spread.held_share, unit="%"),
+    ]
+    if other is not None:
+        apart = off_pose(nominal.lps_from_scope_tip, other.lps_from_scope_tip)
+        rows += [
+            RestingRow(name="another shape at rest: tip apart", value=_length(apart[:3]), unit="mm"),
+            RestingRow(name="another shape at rest: tip turned", value=_length(apart[3:]), unit="deg"),
+        ]
+    return tuple(rows)
+
+
+def _length(vector: Float) -> float:
+    return float(np.linalg.norm(vector))
+
+
 def about_resting_tip(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     """Return an error model in which what is about the resting shaft of a plan is stated about the plan."""
     kinds = [kind for kind in OF_SHAFT if model.term(kind).distribution == RESTING]
@@ -48,7 +112,9 @@ def about_resting_tip(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
         "scope_position": (spread.bias_mm, spread.patient_mm, spread.attempt_mm),
         "scope_direction": (spread.bias_deg, spread.patient_deg, spread.attempt_deg),
     }
-    about: dict[str, Any] = {kind: _about(model.term(kind), model.wall.source, *found[kind]) for kind in kinds}
+    about: dict[str, Any] = {
+        kind: _about(model.term(kind), model.wall.source, *found[kind]) for kind in kinds
+    }
     return replace(model, wall=None, place=(), **about)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -121,9 +123,9 @@ def test_friction_holds_the_shaft_within_its_cone() -> None:
 
 def test_a_camera_head_does_not_bend() -> None:
     motion = motion_of([(0.0, 0.0, 0.0), (40.0, 0.0, 0.0), (40.0, 0.0, 0.9)])
-    shape = RestingShaft(sampled(free, *WIDE, 4.0), scope_of(), WallContact(rigid_head_mm=4.0)).rest(
-        motion, as_advanced=True
-    )
+    shape = RestingShaft(
+        sampled(free, *WIDE, 4.0), replace(scope_of(), rigid_head_mm=4.0), WallContact()
+    ).rest(motion, as_advanced=True)
     assert np.abs(shape.curvature[-4:]).max() < 1e-9
     assert np.arccos(shape.lps_from_scope_tip[2, 2]) == pytest.approx(0.9)
 

@@ -52,7 +52,7 @@ class Wall(elastica.NoForces):  # type: ignore[misc]
 
 
 def at_rest(depth: Depth, length_mm: float, twist: float, bend: float, elements: int) -> np.ndarray:
-    """Return the place of the tip of a rod that begins at the origin along +z, and where its last element looks."""
+    """Return the place of the tip of a rod from the origin along +z, and where its last element looks."""
     world: Any = type("World", (elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing,
                                 elastica.Damping), {})()  # fmt: skip
     element = length_mm / elements

@@ -20,6 +20,6 @@ if TYPE_CHECKING:
     from stages.scope.passages import Passages, find_passages
     from stages.scope.resting import RestingShaft, RestingShape, lumen_of
     from stages.scope.shifting import TipRow, evenly, shifted
-    from stages.scope.tip_spread import TipSpread, off_pose, tip_spread
+    from stages.scope.tip_spread import TipSpread, off_pose, spread_of_tip
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

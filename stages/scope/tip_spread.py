@@ -87,7 +87,7 @@ def choices(contact: WallContact) -> list[list[Circumstances]]:
     return made
 
 
-def tip_spread(
+def spread_of_tip(
     shaft: RestingShaft, motion: ScopeMotion, contact: WallContact, lps_from_pose: Float
 ) -> TipSpread:
     """Return the distribution of the resting tip of a motion about a pose, such as the planned one."""

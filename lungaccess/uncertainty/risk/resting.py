@@ -22,7 +22,7 @@ from stages.scope import (
     WallContact,
     lumen_of,
     off_pose,
-    tip_spread,
+    spread_of_tip,
 )
 
 DECIMALS = 3
@@ -44,7 +44,7 @@ def resting_tip(plan: Plan, lung: Lung, wall: WallContact) -> TipSpread:
             lps_from_entry=entry, states=states, bending_length_mm=plan.system.scope.bending_length_mm
         )
         shaft = RestingShaft(lumen_of(lung), plan.system.scope, wall)
-        known[asked] = tip_spread(shaft, motion, wall, np.asarray(scope.lps_from_scope_tip))
+        known[asked] = spread_of_tip(shaft, motion, wall, np.asarray(scope.lps_from_scope_tip))
     return known[asked]
 
 

@@ -8,7 +8,7 @@ import pytest
 from anatomy import poses
 from stages.scope.contact import WallContact
 from stages.scope.resting import RestingShaft
-from stages.scope.tip_spread import choices, off_pose, tip_spread
+from stages.scope.tip_spread import choices, off_pose, spread_of_tip
 from tests.stages.scope.lumens import motion_of, sampled, scope_of, torus
 
 STATES = [(0.0, 0.0, 0.2), (65.0, 0.0, 0.2), (65.0, 1.0, 0.2)]
@@ -39,7 +39,7 @@ def test_choices_keep_the_stated_ranges() -> None:
 def test_without_ranges_the_tip_has_a_bias_and_no_spread(shaft: RestingShaft) -> None:
     motion = motion_of(STATES)
     known = WallContact(wall_stiffness_range=1.0, scope_stiffness_range=1.0, max_friction=0.0)
-    found = tip_spread(shaft, motion, known, motion.lps_from_tip)
+    found = spread_of_tip(shaft, motion, known, motion.lps_from_tip)
     off = off_pose(motion.lps_from_tip, found.nominal.lps_from_scope_tip)
     assert np.append(found.bias_mm, found.bias_deg) == pytest.approx(off, abs=0.05)
     assert max(found.patient_mm, found.attempt_mm, found.patient_deg, found.attempt_deg) < 0.05
@@ -48,8 +48,8 @@ def test_without_ranges_the_tip_has_a_bias_and_no_spread(shaft: RestingShaft) ->
 
 def test_about_its_own_pose_a_tip_has_spread_and_hardly_a_bias(shaft: RestingShaft) -> None:
     motion = motion_of(STATES)
-    free = tip_spread(shaft, motion, WallContact(), motion.lps_from_tip)
-    own = tip_spread(shaft, motion, WallContact(), free.nominal.lps_from_scope_tip)
+    free = spread_of_tip(shaft, motion, WallContact(), motion.lps_from_tip)
+    own = spread_of_tip(shaft, motion, WallContact(), free.nominal.lps_from_scope_tip)
     assert np.linalg.norm(own.bias_deg) < 0.5 * np.linalg.norm(free.bias_deg)
     assert own.patient_mm > 0.0
     assert own.attempt_mm > 0.0

@@ -38,7 +38,7 @@ DRAWS = {"quick": (10_000, 60), "full": (10_000, 300)}
 """A share of one half is then known to 1 % open loop, and measured to 13 or 6 %."""
 COUNT_SEED = 3 << 20
 """Added to the seed for the draws of the comparison, which no search sees."""
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D81B60", "#785EF0")
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D81B60", "#785EF0", "#000000")
 
 
 @frozen_value

@@ -385,7 +385,7 @@ class ErrorModel:
         """Return the model with errors of one kind only, scaled to a size if one is given."""
         term = self.term(kind)
         kept: dict[str, Any] = {kind: term if size is None else term.sized(size)}
-        return ErrorModel(**kept)
+        return ErrorModel(wall=self.wall, **kept)
 
     def scaled(self, factor: float) -> ErrorModel:
         """Return the model with all sizes multiplied by a factor."""

@@ -25,7 +25,7 @@ from lungaccess.showing.report.html import breathing, phase, tables, words
 from lungaccess.showing.report.html.deployment import device_points, packed_plan
 from lungaccess.showing.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import start_meshes, structure_meshes
-from lungaccess.showing.report.html.risk import risk_section
+from lungaccess.showing.report.html.risk import resting_section, risk_section
 from lungaccess.showing.report.html.trade_off import CAPTION, trade_off_svg
 from lungaccess.showing.report.html.volumes import image_words, page_image
 
@@ -138,10 +138,19 @@ def plan_page(
         "instructions": tables.instructions_section(plan, lung)
         if chosen.instructions
         else "<p>Left out.</p>",
-        "risk": risk_section(first.risk, told),
+        "risk": risk_section(first.risk, told) + (_resting(plan, lung, chosen) if first.accepted else ""),
         "provenance": tables.provenance_section(plan, lung),
     }
     return write_page(path, "plan.html", MODULES, data, parts)
+
+
+def _resting(plan: Plan, lung: Lung, options: PageOptions) -> str:
+    """Return what the resting shaft does to a plan, with the wall of the errors or else the usual one."""
+    from lungaccess.uncertainty.risk import resting_rows, resting_tip
+    from stages.scope import WallContact
+
+    wall = (options.errors.wall if options.errors else None) or WallContact()
+    return resting_section(resting_rows(resting_tip(plan, lung, wall), wall))
 
 
 def _plans_section(plans: Sequence[Plan], appraisals: Sequence[Appraisal]) -> str:

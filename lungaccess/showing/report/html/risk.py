@@ -13,7 +13,7 @@ from lungaccess.uncertainty.risk import Share
 
 if TYPE_CHECKING:
     from lungaccess.planning.success import Estimate
-    from lungaccess.uncertainty.risk import RiskReport, Sensitivity
+    from lungaccess.uncertainty.risk import RestingRow, RiskReport, Sensitivity
 
 FAILS = "Why procedures fail"
 
@@ -31,6 +31,15 @@ def risk_section(report: Estimate | None, start_words: str) -> str:
     if isinstance(report, ProcedureReport):
         return of_start + _of_procedures(report)
     return of_start + _of_deviations(report)
+
+
+def resting_section(rows: Sequence[RestingRow]) -> str:
+    """Return what the shaft of the scope does to the plan where it rests on the wall."""
+    found = [
+        (each.name, f"{each.value:.2f} {each.unit}{f' (limit {each.words})' if each.words else ''}")
+        for each in rows
+    ]
+    return words.pairs("The scope left to itself rests on the wall", found)
 
 
 def _of_chance(chance: Chance) -> str:

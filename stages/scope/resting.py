@@ -7,6 +7,7 @@ the section bent as commanded, and the hand advances until the tip has the plann
 
 from __future__ import annotations
 
+import math
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -39,10 +40,12 @@ MOST_STEPS = 300
 """Ten to sixty steps bring a shaft to rest; one that needs more than this is not."""
 ROUNDS = 12
 """The tip comes to its depth, and friction to what the wall presses, in so many rounds at most."""
-HAND_N_PER_MM = 10.0
-"""How stiffly the tip is held at its depth while the shaft settles at first: as good as fixed."""
-SOON_N_MM = 1e-3
-"""That is over when a step is worth less than this."""
+HOLD_N_PER_MM = 1.0
+"""How stiffly the tip is held at its depth while the shaft settles at first, lest it leaves its branch."""
+HELD_MM = 0.01
+"""The hand has followed where the tip, let go, moves the spring by less than this: a force of 0.01 N."""
+SOON_N_MM = 1e-4
+"""While the tip is held, a step is worth at least this."""
 FARTHER_MM = 3.0
 """The hand advances by no more in a round."""
 DEPTH_MM = 0.02
@@ -172,10 +175,7 @@ class RestingShaft:
         before: tuple[float, float] | None = None
         tip, settled = planned[:3, 3], False
         if start is None and not as_advanced:
-            # The tip leaves its branch if the shaft settles before the hand follows.
-            held = shaft._replace(hand=HAND_N_PER_MM)
-            kernel.rest(self._lumen, held, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
-            farther = float((laid[0, 9:] - motion.lps_from_entry[:3, 3]) @ entry[6:9])
+            farther = self._followed(motion, shaft, entry, curvature, pull, laid)
         for _ in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
             energy, expected, _steps = kernel.rest(
@@ -209,6 +209,35 @@ class RestingShaft:
             energy_n_mm=float(energy),
             settled=bool(settled),
         )
+
+    def _followed(
+        self,
+        motion: ScopeMotion,
+        shaft: kernel.Shaft,
+        entry: Float,
+        curvature: Float,
+        pull: Float,
+        laid: Float,
+    ) -> float:
+        """Return how far the hand follows while the shaft settles, until nothing needs to hold the tip.
+
+        The laid shaft is longer than one at rest: it would push the tip out of its branch, or, drawn back too
+        far, pull it out.
+        """
+        held = shaft._replace(hold=HOLD_N_PER_MM)
+        farther, before, slope = 0.0, (0.0, 0.0), 0.0
+        for count in range(ROUNDS):
+            entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
+            kernel.rest(self._lumen, held, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
+            beyond = float((laid[-1, 9:] - held.tip) @ held.ahead)
+            if abs(beyond) < HELD_MM:
+                break
+            if count and abs(farther - before[0]) > 1e-6:
+                slope = (beyond - before[1]) / (farther - before[0])
+            before = farther, beyond
+            step = beyond / slope if slope > 0.0 else math.copysign(1.0, beyond)
+            farther -= min(max(step, -FARTHER_MM), FARTHER_MM)
+        return farther
 
     def _shaft(self, motion: ScopeMotion, chosen: Circumstances) -> tuple[kernel.Shaft, Float]:
         """Return the shaft in the last state of a motion, and the curvature `(N, 2)` as it was laid."""

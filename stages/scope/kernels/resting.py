@@ -3,7 +3,7 @@
 The shaft is a row of arcs.  Frames are `(12,)`, and an arc's curvature vector `(u, v)` in 1/mm lies in a
 Bishop frame, as in `stages.scope.kernels.body`: the shaft may not twist.  The energy in N mm is that of
 bending against the curvature at rest, and of the wall that yields by what the body reaches into it, less the
-work of given forces.  A hand may hold the tip at its depth while the entry slides along itself.
+work of given forces.  The entry is clamped, and the tip may be held at its depth by a spring.
 
 Its minimum is a problem of optimal control: frames are states, curvatures are controls.  One step goes back
 from the tip with the gradient and the second derivatives of the energy of what lies ahead, as functions of
@@ -31,8 +31,6 @@ ENOUGH = 0.1
 DAMPING_LEAST, DAMPING_FIRST, DAMPING_MOST = 1e-6, 1e-2, 1e6
 """Damping of a step, as a share of the stiffness of an arc: the least that is kept, the first that is tried
 where a step fails, and that beyond which the shape is given up."""
-LEAST_N_PER_MM = 1e-9
-"""An entry that is softer along itself than this does not slide: nothing says how far."""
 WORK = 28
 """Room that a look at the wall needs: its gradient, and the weights of the spline along three axes."""
 
@@ -56,7 +54,7 @@ class Shaft(NamedTuple):
     much the wall presses at the end of an arc for each mm that the body reaches into it, at first; yields :
     mm, at which it presses twice as hard as that, for it stiffens with the square; radius : mm, of the body;
     tip, ahead : (3,) LPS mm, the place past which the tip shall not come, nor stay behind, along a direction;
-    hand : N/mm, how stiffly that is so, 0 for not at all, and the entry is held instead.
+    hold : N/mm, how stiffly that is so, 0 for not at all.
     """
 
     length: Float
@@ -67,7 +65,7 @@ class Shaft(NamedTuple):
     radius: float
     tip: Float
     ahead: Float
-    hand: float
+    hold: float
 
 
 @inner_kernel
@@ -143,7 +141,7 @@ def energy_of(lumen, shaft, frames, curvature, pull, slope):
     short = 0.0
     for k in range(3):
         short += (frames[-1, 9 + k] - shaft.tip[k]) * shaft.ahead[k]
-    return total + 0.5 * shaft.hand * short * short
+    return total + 0.5 * shaft.hold * short * short
 
 
 @inner_kernel
@@ -276,9 +274,9 @@ def _back_over_arc(shaft, frames, curvature, n, damping, work, grad, hess, step,
 
 @inner_kernel
 def _back(lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hess, step, gain):
-    """Find the step of every arc, from the tip to the entry, and of the entry along itself.
+    """Find the step of every arc, from the tip to the entry.
 
-    Returns the fall of the energy that is expected, -1 where the energy is not convex, and the entry's step.
+    Returns the fall of the energy that is expected, -1 where the energy is not convex.
     """
     last = curvature.shape[0]
     expected = short = 0.0
@@ -287,35 +285,26 @@ def _back(lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hes
     grad[:] = 0.0
     hess[:] = 0.0
     for a in range(3):
-        grad[a] = shaft.hand * short * shaft.ahead[a]
+        grad[a] = shaft.hold * short * shaft.ahead[a]
         for b in range(3):
-            hess[a, b] = shaft.hand * shaft.ahead[a] * shaft.ahead[b]
+            hess[a, b] = shaft.hold * shaft.ahead[a] * shaft.ahead[b]
     for back in range(last):
         n = last - 1 - back
         _add_end(lumen, shaft, frames, n + 1, pull, slope, grad, hess)
         worth = _back_over_arc(shaft, frames, curvature, n, damping, work, grad, hess, step, gain)
         if worth < 0.0:
-            return -1.0, 0.0
+            return -1.0
         expected += worth
-    push = stiff = 0.0
-    for a in range(3):
-        push += grad[a] * frames[0, 6 + a]
-        for b in range(3):
-            stiff += frames[0, 6 + a] * hess[a, b] * frames[0, 6 + b]
-    if shaft.hand == 0.0 or stiff < LEAST_N_PER_MM:
-        return expected, 0.0
-    return expected + 0.5 * push * push / stiff, -push / stiff
+    return expected
 
 
 @inner_kernel
-def _forth(shaft, slide, size, frames, curvature, step, gain, to_frames, to_curvature):
+def _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature):
     """Lay the shaft anew with steps of a size, each arc answering to how its begin has moved.
 
     Returns the longest way of the end of an arc, mm.
     """
     to_frames[0] = frames[0]
-    for k in range(3):
-        to_frames[0, 9 + k] += size * slide * frames[0, 6 + k]
     longest = 0.0
     for n in range(curvature.shape[0]):
         old, new = frames[n], to_frames[n]
@@ -371,14 +360,12 @@ def rest(lumen, shaft, entry, curvature, pull, frames, enough, most_steps):
     energy = energy_of(lumen, shaft, frames, curvature, pull, slope)
     damping, expected = 0.0, math.inf
     for taken in range(most_steps):
-        expected, slide = _back(
-            lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hess, step, gain
-        )
+        expected = _back(lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hess, step, gain)
         if 0.0 <= expected < enough:
             return energy, expected, taken
         size, found = 1.0, False
         for _ in range(HALVINGS if expected > 0.0 else 0):
-            longest = _forth(shaft, slide, size, frames, curvature, step, gain, to_frames, to_curvature)
+            longest = _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature)
             if longest > LONGEST_MM:
                 size *= max(0.9 * LONGEST_MM / longest, 0.1)
                 continue

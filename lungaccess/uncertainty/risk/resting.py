@@ -91,9 +91,10 @@ def resting_rows(spread: TipSpread, wall: WallContact) -> tuple[RestingRow, ...]
     ]
     if other is not None:
         apart = off_pose(nominal.lps_from_scope_tip, other.lps_from_scope_tip)
+        what = "another shape at rest" if other.settled else "slips if it came with a straight section"
         rows += [
-            RestingRow(name="another shape at rest: tip apart", value=_length(apart[:3]), unit="mm"),
-            RestingRow(name="another shape at rest: tip turned", value=_length(apart[3:]), unit="deg"),
+            RestingRow(name=f"{what}: tip apart", value=_length(apart[:3]), unit="mm"),
+            RestingRow(name=f"{what}: tip turned", value=_length(apart[3:]), unit="deg"),
         ]
     return tuple(rows)
 

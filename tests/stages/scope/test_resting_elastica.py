@@ -26,6 +26,8 @@ STRETCH_N = 500.0
 MASS_PER_MM = 1.0
 """With these units of mass and time, only the shape at rest has a meaning."""
 DURATION = 800.0
+CAP_MM = 1.5
+"""Farther in the wall a rod is pushed as from here: the straight one that it begins as would be torn."""
 CONTACT = WallContact(wall_stiffness_n_per_mm2=0.3)
 LOW, HIGH = (-12.0, -8.0, -5.0), (60.0, 8.0, 90.0)
 SECTION_MM = 12.0
@@ -40,7 +42,7 @@ class Wall(elastica.NoForces):  # type: ignore[misc]
 
     def apply_forces(self, system: Any, time: Any = 0.0) -> None:
         points, step = system.position_collection.T, 1e-4
-        over = np.maximum(self._radius - self._depth(points), 0.0)
+        over = np.clip(self._radius - self._depth(points), 0.0, CAP_MM)
         touching = np.flatnonzero(over > 0.0)
         if not len(touching):
             return
@@ -103,6 +105,6 @@ def test_a_rod_of_pyelastica_comes_to_rest_in_the_same_shape(depth: Depth, twist
         axis=0
     )  # The middle of the last element, which is as long as our last arc.
     assert ours.settled
-    assert ours.most_give_mm > 0.05  # It leans on the wall.
+    assert 0.05 < ours.most_give_mm < CAP_MM  # It leans on the wall.
     assert np.linalg.norm(theirs[:3] - ours.frames[-1, 9:]) < 0.5
     assert np.degrees(np.arccos(min(1.0, float(theirs[3:] @ ahead / np.linalg.norm(ahead))))) < 1.0

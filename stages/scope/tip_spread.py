@@ -94,9 +94,11 @@ def spread_of_tip(
     nominal, other = two_starts(shaft, motion)
     off, force, give, held = [], [], [], 0
     for attempts in choices(contact):
-        start, group = nominal, []
+        group = []
         for chosen in attempts:
-            shape = shaft.rest(motion, chosen, start=start)
+            shape = shaft.rest(motion, chosen, start=nominal)
+            if not shape.settled:
+                shape = shaft.rest(motion, chosen)
             if not shape.settled:
                 continue
             group.append(off_pose(lps_from_pose, shape.lps_from_scope_tip))

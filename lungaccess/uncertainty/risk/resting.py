@@ -122,7 +122,10 @@ def about_resting_tip(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
 def _about(term: Term, source: str, bias: Float, patient: float, attempt: float) -> Term:
     """Return an error about the plan: the bias and spread of the resting tip on top of what is stated."""
     stated = term.bias or (0.0,) * len(bias)
-    sizes = {
+    both = f"{term.source}; " if term.rms else ""
+    changed: dict[str, Any] = {
+        "distribution": NORMAL,
+        "source": f"{both}shaft at rest on the wall: {source}",
         f"patient_{term.unit}": round(math.hypot(term.patient, patient), DECIMALS),
         f"attempt_{term.unit}": round(math.hypot(term.attempt, attempt), DECIMALS),
         f"bias_{term.unit}": tuple(
@@ -130,6 +133,4 @@ def _about(term: Term, source: str, bias: Float, patient: float, attempt: float)
             for of_shaft, own in zip(bias, stated, strict=True)
         ),
     }
-    both = f"{term.source}; " if term.rms else ""
-    changed: dict[str, Any] = {"distribution": NORMAL, "source": f"{both}shaft at rest on the wall: {source}"}
-    return replace(term, **changed, **sizes)
+    return replace(term, **changed)

@@ -11,7 +11,7 @@ from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings, text
 from anatomy.base.words import did_you_mean
 from anatomy.lobes import LOBES, lobe_named
-from stages.scope.contact import WallContact
+from stages.scope import WallContact
 
 CURVATURE, BREATHING = "needle_curvature", "breathing"
 UNITS: dict[str, str] = {

@@ -44,6 +44,7 @@ def test_radius_is_half_the_diameter() -> None:
         ("min_bending_radius_mm", 2.1),
         ("min_shaft_radius_mm", 1.0),
         ("bending_stiffness_n_mm2", 0.0),
+        ("rigid_head_mm", 15.0),
         ("name", ""),
     ],
 )

@@ -412,6 +412,11 @@ def test_the_command(
     report = assess(plan, small_lung, model=stated, samples=200)
     assert written["succeeds"]["probability"] == report.succeeds.value
     assert [each["kind"] for each in written["tolerances"]] == [kind for kind in UNITS if kind != BREATHING]
+    rested = {each["name"]: each for each in written["resting_scope"]}
+    assert rested["tip turned"]["value"] > 0.0
+    assert rested["force on 10 mm of wall"]["limit"] == 1.0
     assert main(command) == ExitCode.OK
-    assert "succeeds" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "succeeds" in said
+    assert "rests on the wall" in said
     assert main([*command, "--radius", "-1"]) == ExitCode.BAD_INPUT

@@ -36,8 +36,8 @@ BESIDE_MM = 6.0
 """The wall is known so far outside the lumen: farther than any shaft reaches into it."""
 ENOUGH_N_MM = 1e-7
 """A step worth less energy is not taken: it would move a tip that hangs over by 50 mm by some micrometres."""
-MOST_STEPS = 300
-"""Ten to sixty steps bring a shaft to rest; one that needs more than this is not."""
+MOST_STEPS = 1000
+"""Ten to sixty steps bring a shaft to rest, some hundreds one that begins deep in the wall."""
 ROUNDS = 12
 """The tip comes to its depth, and friction to what the wall presses, in so many rounds at most."""
 HOLD_N_PER_MM = 1.0

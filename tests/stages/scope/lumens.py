@@ -56,7 +56,7 @@ def s_bend(bend_mm: float, radius_mm: float, angle_rad: float) -> Depth:
     turn = np.array([bend_mm * (1.0 - np.cos(angle_rad)), 0.0, bend_mm * np.sin(angle_rad)])
     ahead = np.array([np.sin(angle_rad), 0.0, np.cos(angle_rad)])
     out = np.array([np.cos(angle_rad), 0.0, -np.sin(angle_rad)])
-    centre = turn + bend_mm * out
+    centre = turn - bend_mm * out
 
     def depth(points: np.ndarray) -> np.ndarray:
         x, y, z = points.T

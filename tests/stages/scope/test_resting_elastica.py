@@ -25,7 +25,7 @@ TORSION_N_MM2 = 20.0 * BENDING_N_MM2
 STRETCH_N = 500.0
 MASS_PER_MM = 1.0
 """With these units of mass and time, only the shape at rest has a meaning."""
-DURATION = 800.0
+DURATION = 400.0
 CONTACT = WallContact(wall_stiffness_n_per_mm2=0.3)
 LOW, HIGH = (-12.0, -8.0, -5.0), (60.0, 8.0, 90.0)
 SECTION_MM = 12.0
@@ -94,7 +94,7 @@ def at_rest(
     shares = np.full(elements + 1, element)
     shares[[0, -1]] *= 0.5
     world.add_forcing_to(rod).using(Wall, depth, 1.5, shares)
-    world.dampen(rod).using(elastica.AnalyticalLinearDamper, uniform_damping_constant=0.05, time_step=step)
+    world.dampen(rod).using(elastica.AnalyticalLinearDamper, uniform_damping_constant=0.3, time_step=step)
     world.finalize()
     elastica.integrate(elastica.PositionVerlet(), world, DURATION, int(DURATION / step), progress_bar=False)
     assert float(np.abs(rod.velocity_collection).max()) < 1e-4  # At rest.

@@ -319,8 +319,10 @@ def signed_depth(inside: Mask, grid: Grid) -> Lumen:
         filled = np.flatnonzero(inside.any(axis=tuple(k for k in range(3) if k != axis)))
         if len(filled):
             low[axis], high[axis] = filled[0] - wide[axis], filled[-1] + 1 + wide[axis]
-    low, high = np.maximum(low, 0), np.minimum(high, grid.shape)
-    part = inside[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    first, last = np.maximum(low, 0), np.minimum(high, grid.shape)
+    part = inside[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
+    # An airway at the border of the image goes on beyond it, as the shaft does.
+    part = np.pad(part, np.column_stack([first - low, high - last]), mode="edge")
     depth = distance_corners(~part, grid.spacing_mm).astype(np.float32)
     depth -= distance_corners(part, grid.spacing_mm)
     depth /= np.float32(UNITS_PER_MM)

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from anatomy.grid import Grid
 from stages.scope.contact import WallContact
 from stages.scope.kernels import resting as kernel
-from stages.scope.resting import Circumstances, RestingShaft, RestingShape
+from stages.scope.resting import Circumstances, RestingShaft, RestingShape, signed_depth
 from tests.stages.scope.lumens import Depth, motion_of, s_bend, sampled, scope_of, torus
 
 STIFF = WallContact(wall_stiffness_n_per_mm2=100.0)
@@ -141,6 +142,16 @@ def test_a_load_at_the_tip_bends_a_free_shaft_as_it_bends_a_cantilever() -> None
     assert frames[-1, 9:11] == pytest.approx(aside, rel=1e-3)
     assert energy == pytest.approx(-0.5 * 0.0005 * np.linalg.norm(aside), rel=1e-3)
     assert 0.0 <= expected <= 1e-12
+
+
+def test_an_airway_at_the_border_of_the_image_goes_on_beyond_it() -> None:
+    inside = np.zeros((21, 21, 60), dtype=bool)
+    inside[6:15, 6:15] = True
+    grid = Grid.from_spacing(inside.shape, [1.0, 1.0, 1.0], [-10.0, -10.0, 2.0])
+    motion = motion_of([(0.0, 0.0, 0.0), (30.0, 0.0, 0.0)])
+    shape = RestingShaft(signed_depth(inside, grid), scope_of(), WallContact()).rest(motion)
+    assert shape.most_give_mm == 0.0
+    assert np.abs(shape.lps_from_scope_tip - motion.lps_from_tip).max() < 1e-9
 
 
 def test_force_is_that_on_ten_millimetres() -> None:

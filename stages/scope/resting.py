@@ -178,10 +178,11 @@ class RestingShaft:
             farther = self._followed(motion, shaft, entry, curvature, pull, laid)
         for _ in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
+            drawn = _drawn_back(shaft, farther)
             energy, expected, _steps = kernel.rest(
-                self._lumen, shaft, entry, curvature, pull, laid, ENOUGH_N_MM, MOST_STEPS
+                self._lumen, drawn, entry, curvature, pull, laid, ENOUGH_N_MM, MOST_STEPS
             )
-            kernel.press(self._lumen, shaft, laid, give, force)
+            kernel.press(self._lumen, drawn, laid, give, force)
             moved, tip = float(np.linalg.norm(laid[-1, 9:] - tip)), laid[-1, 9:].copy()
             beyond = 0.0 if as_advanced else float((tip - planned[:3, 3]) @ planned[:3, 2])
             still = not chosen.friction or moved < FRICTION_MM
@@ -228,7 +229,8 @@ class RestingShaft:
         farther, before, slope = 0.0, (0.0, 0.0), 0.0
         for count in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
-            kernel.rest(self._lumen, held, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
+            drawn = _drawn_back(held, farther)
+            kernel.rest(self._lumen, drawn, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
             beyond = float((laid[-1, 9:] - held.tip) @ held.ahead)
             if abs(beyond) < HELD_MM:
                 break
@@ -262,6 +264,12 @@ class RestingShaft:
             length, stiffness, rest, wall, yields, radius, tip[:3, 3].copy(), tip[:3, 2].copy(), 0.0
         )
         return shaft, laid
+
+
+def _drawn_back(shaft: kernel.Shaft, farther_mm: float) -> kernel.Shaft:
+    """Return a shaft that touches no wall behind the planned entry, where the image may end."""
+    behind = np.cumsum(shaft.length) + farther_mm < 0.0
+    return shaft._replace(wall=np.where(behind, 0.0, shaft.wall))
 
 
 def _equal(length_mm: float, step_mm: float) -> Float:

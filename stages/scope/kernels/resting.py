@@ -391,7 +391,8 @@ def press(lumen, shaft, frames, give, force):
     slope = np.zeros(WORK)
     for n in range(give.shape[0]):
         at = frames[n + 1]
-        give[n] = max(shaft.radius - depth_at(lumen, at[9], at[10], at[11], slope), 0.0)
+        over = shaft.radius - depth_at(lumen, at[9], at[10], at[11], slope)
+        give[n] = over if over > 0.0 and shaft.wall[n] > 0.0 else 0.0
         pressed = shaft.wall[n] * give[n] * (1.0 + (give[n] / shaft.yields) ** 2)
         for k in range(3):
             force[n, k] = pressed * slope[k]

@@ -14,8 +14,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from numba import types
-
 from anatomy.machine_code.folders import can_be_written, kernels_folder
 
 CALLS_FILE = Path(__file__).with_name("kernel_calls.json")
@@ -212,6 +210,8 @@ def encoded(kind: Any) -> Any:
     TypeError
         If it is a type that no kernel is called with from Python.
     """
+    from numba import types
+
     match kind:
         case types.Array():
             return ["array", encoded(kind.dtype), kind.ndim, kind.layout, kind.mutable]
@@ -239,6 +239,8 @@ def decoded(plain: Any) -> Any:
     ImportError, AttributeError, LookupError, TypeError, ValueError
         If there is none.
     """
+    from numba import types
+
     if isinstance(plain, str):
         return {"none": types.none, "bool": types.boolean}.get(plain) or getattr(types, plain)
     word, *rest = plain

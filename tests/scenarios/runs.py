@@ -55,7 +55,7 @@ def answer_for(scenes: Scenes, case: Case, target_lps: Sequence[float]) -> Answe
         return Answer(cost=None, digest=f"{refusal} {dict(refusal.reasons)}", faults=_faults_of(refusal))
     best = plans[-1]
     report = scenes.checker(case.anatomy).check(best, system, target_lps=target_lps)
-    faults = tuple(f"the check refuses {finding.name}" for finding in report.findings if not finding.ok)
+    faults = tuple(f"the check refuses {finding.name}" for finding in report.refusals)
     if not report.accepted and not faults:
         faults = ("the check refuses the plan",)
     return Answer(

@@ -86,13 +86,20 @@ def _check_arcs(plan: Plan, curve: Curve, derived: DerivedShape, found: Findings
 
 
 def _replay(plan: Plan, derived: DerivedShape, found: Findings) -> float:
-    """Compare every step of the way with the final place; return how far the tubes get from it."""
+    """Compare every step of the way with the final place; return how far the tubes get from it.
+
+    Tubes that bend in one plane state how far they get from the final shape, all others how far each place
+    gets from where it ends, which is not less.
+    """
     final, sweep, leader = derived.points_mm, 0.0, 0.0
     for body in derived.way:
         arc = np.linspace(0.0, body[-1, 0], max(int(np.ceil(body[-1, 0] / SPACING_MM)), 1) + 1)
         points = np.stack([np.interp(arc, body[:, 0], axis) for axis in body[:, 1:].T], axis=1)
-        sweep = max(sweep, float(np.linalg.norm(points - derived.at(arc), axis=1).max()))
-        leader = max(leader, float(distance_to_polyline(points, final).max()))
+        off = distance_to_polyline(points, final)
+        leader = max(leader, float(off.max()))
+        if not plan.system.tubes.planar:
+            off = np.linalg.norm(points - derived.at(arc), axis=1)
+        sweep = max(sweep, float(off.max()))
     return check_sweep(plan, sweep, leader, len(derived.way), found)
 
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from anatomy.shafts import SlottedSegment
     from stages.tube.arcs import TubeShape, pieces_of_arcs, points_on_arcs
     from stages.tube.casadi_model import CasadiTubes
     from stages.tube.casadi_shape import DerivedShape, derive_shape

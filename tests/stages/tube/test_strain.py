@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from anatomy.base.errors import SettingsError
-from stages.tube import SlottedSegment, straightening
+from anatomy.shafts import SlottedSegment
+from stages.tube import straightening
 from stages.tube.device import ConcentricTubes, Tube
 
 OUTER = Tube(outer_diameter_mm=1.9, inner_diameter_mm=1.65, length_mm=640.0)

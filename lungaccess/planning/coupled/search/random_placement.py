@@ -50,7 +50,8 @@ def random_placements(task: Task, atlas: Atlas, number: int = 0) -> Iterator[Pla
         tip = atlas.motions.tip(int(rng.choice(along)))
         rotation = float(rng.uniform(0.0, 2.0 * math.pi))
         inserted = np.sort(rng.uniform(0.0, most_mm, len(turned)))
-        relative = np.where(turned, rng.uniform(0.0, 2.0 * math.pi, len(turned)), 0.0)
+        relative = np.zeros(len(turned))
+        relative[turned] = rng.uniform(0.0, 2.0 * math.pi, turned.sum())
         yield Placement(
             tip=tip,
             rotation_rad=rotation,

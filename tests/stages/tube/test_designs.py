@@ -10,7 +10,8 @@ import pytest
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.settings import parse, to_mapping
-from stages.tube import BentPiece, ConcentricTubes, SlottedSegment, Tube, pieces_of_arcs, points_on_arcs
+from anatomy.shafts import SlottedSegment
+from stages.tube import BentPiece, ConcentricTubes, Tube, pieces_of_arcs, points_on_arcs
 
 INNER = Tube(
     outer_diameter_mm=0.9,

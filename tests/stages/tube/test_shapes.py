@@ -12,13 +12,13 @@ import pytest
 from anatomy.base.errors import SettingsError
 from anatomy.kernels.arcs import normal_on_arc, pose_on_arc
 from anatomy.margins import Margins
+from anatomy.shafts import SlottedSegment
 from stages.tube import (
     BentPiece,
     ConcentricTubes,
     Neighbourhood,
     ShapeGrid,
     ShapeLimits,
-    SlottedSegment,
     SnapError,
     Tube,
     TubeMechanics,

@@ -179,7 +179,7 @@ class RestingShaft:
         for _ in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
             drawn = _drawn_back(shaft, farther)
-            energy, expected, _steps = kernel.rest(
+            energy, expected, _steps = kernel.bring_to_rest(
                 self._lumen, drawn, entry, curvature, pull, laid, ENOUGH_N_MM, MOST_STEPS
             )
             kernel.press(self._lumen, drawn, laid, give, force)
@@ -230,7 +230,7 @@ class RestingShaft:
         for count in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
             drawn = _drawn_back(held, farther)
-            kernel.rest(self._lumen, drawn, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
+            kernel.bring_to_rest(self._lumen, drawn, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
             beyond = float((laid[-1, 9:] - held.tip) @ held.ahead)
             if abs(beyond) < HELD_MM:
                 break

@@ -334,7 +334,7 @@ def _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature):
 
 
 @kernel(nogil=True)
-def rest(lumen, shaft, entry, curvature, pull, frames, enough, most_steps):
+def bring_to_rest(lumen, shaft, entry, curvature, pull, frames, enough, most_steps):
     """Bring a shaft to rest: `curvature` (N, 2) becomes that of a shape of least energy.
 
     Parameters

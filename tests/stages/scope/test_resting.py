@@ -137,7 +137,7 @@ def test_a_load_at_the_tip_bends_a_free_shaft_as_it_bends_a_cantilever() -> None
     frames, pull = np.zeros((count + 1, 12)), np.zeros((count, 3))
     pull[-1] = (0.0004, 0.0003, 0.0)
     entry = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
-    energy, expected, _steps = kernel.rest(lumen, shaft, entry, laid, pull, frames, 1e-12, 50)
+    energy, expected, _steps = kernel.bring_to_rest(lumen, shaft, entry, laid, pull, frames, 1e-12, 50)
     aside = np.array([0.0004, 0.0003]) * 52.0**3 / (3.0 * 420.0)
     assert frames[-1, 9:11] == pytest.approx(aside, rel=1e-3)
     assert energy == pytest.approx(-0.5 * 0.0005 * np.linalg.norm(aside), rel=1e-3)

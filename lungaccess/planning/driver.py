@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Protocol
 
 from anatomy.base.kernel_clock import working_cpu_s, working_s
@@ -123,7 +124,7 @@ def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None
     last = finder.last(best, iteration, clock.elapsed_s) or best
     simplest = with_simplest_motion(last, request.lung)
     if simplest is not best:
-        yield simplest
+        yield replace(simplest, timing={**simplest.timing, "planning_s": clock.elapsed_s})
 
 
 def no_plan_beside(request: Request) -> NoPlan:

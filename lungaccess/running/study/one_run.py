@@ -136,7 +136,8 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:
     plans = plan(request, atlas=atlas, counterfactuals=not run.planner.without_counterfactuals)
     for best in plans:
         loss = request.goal.loss(best)
-        if np.isfinite(loss):
+        # The last plan has the cost of the best, and a simpler motion of the scope.
+        if np.isfinite(loss) and (not improvements or loss < improvements[-1].cost):
             improvements.append(
                 answers.Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
             )

@@ -194,7 +194,7 @@ def page(outcomes: dict[Cell, str]) -> str:
         "",
         "Goals, constraints and kinds of systems compose: "
         f"of {len(outcomes)} combinations on a small phantom that breathes {count} are done, "
-        "each with a plan that the check accepts, and the others are refused for the reasons below. "
+        "each with a plan that the check accepts, and the others are refused or find no plan, for the reasons below. "
         "The table is made by `python -m tests.lungaccess.planning.composition`, and a test runs it.",
         "",
         f"- Goals: {'; '.join(GOALS)}.",
@@ -202,7 +202,7 @@ def page(outcomes: dict[Cell, str]) -> str:
         f"- Systems: {'; '.join(SYSTEMS)}.",
         f"- Commands: {', '.join(COMMANDS)}. Studies, explorer, tour and reports hand over the same request.",
         "",
-        "| refused | with | of the systems | why |",
+        "| not done | with | of the systems | why |",
         "|---|---|---|---|",
     ]
     for reason, refused in reasons.items():

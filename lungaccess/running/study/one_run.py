@@ -129,7 +129,7 @@ def _measured(run: Run, cache: Path | None) -> answers.Answer:
 def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:
     """Search for plans and let the best be checked."""
     problem, best = run.problem, None
-    improvements = []
+    improvements: list[answers.Improvement] = []
     target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
     began, first_s = time.process_time(), 0.0
     request = _request(run, opened.lung, target)

@@ -194,7 +194,8 @@ def page(outcomes: dict[Cell, str]) -> str:
         "",
         "Goals, constraints and kinds of systems compose: "
         f"of {len(outcomes)} combinations on a small phantom that breathes {count} are done, "
-        "each with a plan that the check accepts, and the others are refused or find no plan, for the reasons below. "
+        "each with a plan that the check accepts, and the others are refused or find no plan, for the "
+        "reasons below. "
         "The table is made by `python -m tests.lungaccess.planning.composition`, and a test runs it.",
         "",
         f"- Goals: {'; '.join(GOALS)}.",

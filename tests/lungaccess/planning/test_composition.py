@@ -9,8 +9,8 @@ from anatomy.lung import Lung
 from tests.lungaccess.planning.composition import DONE, PAGE, Cell, Table, cells, page
 
 REASONS = ("needs a needle", "No plan to the target after 3000", "no bound of the best possible is known")
-"""The only reasons for which a cell may not be done: the method draws paths of a needle, its random draws find
-tubes that twist rarely, and nothing but a cost has a bound."""
+"""The only reasons for which a cell may not be done: the method draws paths of a needle, its random draws
+find tubes that twist rarely, and nothing but a cost has a bound."""
 SOME = 24
 
 

@@ -1,4 +1,4 @@
-"""What tubes and needles have in common: a round shaft of one material, softened by a laser's slots."""
+"""A tube and a needle are both a round shaft of one material, which a laser's slots may soften."""
 
 import math
 from collections.abc import Sequence

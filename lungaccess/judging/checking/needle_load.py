@@ -12,7 +12,7 @@ from lungaccess.judging.checking.poses import angle_between
 from lungaccess.plans.plan import Plan
 
 FINDING = "tube.needle_load"
-"""What no plan counts has this name among the findings."""
+"""The finding has this name: it states the needle's load on the tubes, which no plan counts."""
 STILL_MM = 1e-3
 """A tip that moves less is where the plan states it."""
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import distance_estimate
+from anatomy.kernels.linear import solve_in_place
 from stages.scope.kernels.body import BLOCKED, change_room, move_along, point_along, room_along
 
 EQUATIONS = 6
@@ -137,34 +138,6 @@ def _look(walls, section, entry, group, counts, x, bounds, target, base, moved, 
 
 
 @inner_kernel
-def _eliminate(matrix, right):
-    """Solve a linear system in place; tell whether it has a solution."""
-    n = right.shape[0]
-    for c in range(n):
-        pivot = c
-        for r in range(c + 1, n):
-            if abs(matrix[r, c]) > abs(matrix[pivot, c]):
-                pivot = r
-        if matrix[pivot, c] == 0.0:
-            return False
-        if pivot != c:
-            right[c], right[pivot] = right[pivot], right[c]
-            for m in range(c, n):
-                matrix[c, m], matrix[pivot, m] = matrix[pivot, m], matrix[c, m]
-        for r in range(c + 1, n):
-            factor = matrix[r, c] / matrix[c, c]
-            if factor != 0.0:
-                right[r] -= factor * right[c]
-                for m in range(c, n):
-                    matrix[r, m] -= factor * matrix[c, m]
-    for r in range(n - 1, -1, -1):
-        for m in range(r + 1, n):
-            right[r] -= matrix[r, m] * right[m]
-        right[r] /= matrix[r, r]
-    return True
-
-
-@inner_kernel
 def _step(slopes, residuals, scale, damping, matrix, right):
     """Fill `right` with the step of the linearised problem and its multipliers; tell whether there is one.
 
@@ -191,7 +164,7 @@ def _step(slopes, residuals, scale, damping, matrix, right):
             matrix[n + e, i] = slopes[i, rows + e]
     for e in range(EQUATIONS):
         right[n + e] = -residuals[rows + e]
-    return _eliminate(matrix, right)
+    return solve_in_place(matrix, right) != 0.0
 
 
 @inner_kernel

@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.linear import solve_in_place
 from stages.tube.kernels.assembly import PIECE_COLUMNS, cut
 from stages.tube.kernels.pose import lay, turned
 from stages.tube.kernels.torsion import twist
@@ -36,36 +37,6 @@ SHARES = 8
 
 # Columns of a result: converged, stable, least determinant, residual (rad), then the tip frame as a pose.
 CONVERGED, STABLE, LEAST_DETERMINANT, RESIDUAL, TIP, RESULT_COLUMNS = 0, 1, 2, 3, 4, 16
-
-
-@inner_kernel
-def _solve(matrix, right):
-    """Solve a small linear system in place; return the determinant, 0 if it is singular."""
-    n = right.shape[0]
-    determinant = 1.0
-    for c in range(n):
-        pivot = c
-        for r in range(c + 1, n):
-            if abs(matrix[r, c]) > abs(matrix[pivot, c]):
-                pivot = r
-        if matrix[pivot, c] == 0.0:
-            return 0.0
-        if pivot != c:
-            determinant = -determinant
-            right[c], right[pivot] = right[pivot], right[c]
-            for m in range(n):
-                matrix[c, m], matrix[pivot, m] = matrix[pivot, m], matrix[c, m]
-        determinant *= matrix[c, c]
-        for r in range(c + 1, n):
-            factor = matrix[r, c] / matrix[c, c]
-            right[r] -= factor * right[c]
-            for m in range(c, n):
-                matrix[r, m] -= factor * matrix[c, m]
-    for r in range(n - 1, -1, -1):
-        for m in range(r + 1, n):
-            right[r] -= matrix[r, m] * right[m]
-        right[r] /= matrix[r, r]
-    return determinant
 
 
 @inner_kernel
@@ -94,7 +65,7 @@ def determinant_at(dpsi, drate, at, beta, s, matrix, right):
     if matrix.shape[0] == 2:
         return matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     right[:] = 0.0
-    return _solve(matrix, right)
+    return solve_in_place(matrix, right)
 
 
 @merged_kernel
@@ -153,7 +124,7 @@ def _turns_back(dpsi, drate, beta, at, matrix, before, right):
             right[m] = matrix[c, m]
             for k in range(m + 1, last):
                 before[m, k], before[k, m] = before[k, m], before[m, k]
-        _solve(before, right)
+        solve_in_place(before, right)
         trace += right[c]
     return trace <= 0.0
 
@@ -189,7 +160,7 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
         for i in range(last):
             right[i] = base_angles[i] - psi[0, i] - beta[i] * rate[0, i] - error
         _relative(dpsi, drate, _FIRST_NODE, beta, beta[: last + 1].min(), matrix)
-        _solve(matrix, right)
+        solve_in_place(matrix, right)
         size = np.abs(right).max()
         if not size < LARGEST_TURN:
             factor = LARGEST_TURN / size if size < math.inf else 0.0

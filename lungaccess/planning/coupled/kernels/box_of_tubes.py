@@ -1,4 +1,4 @@
-"""What the deployments of a box have in common: the one in the middle, and by how much the others differ.
+"""A box of deployments is bounded by the one in its middle, and by how much the others differ from it.
 
 A box is a row of float64 with a range of each value of a deployment: its middles, and HALF columns further on
 its half widths.  Every box has a rotation of the tubes (rad) and two insertions (mm); where their scope tips
@@ -28,7 +28,7 @@ SPARE = 1e-6
 """For rounding, mm and rad."""
 
 BENT_THROUGHOUT, STRAIGHT_FIRST, OUTER_STRAIGHT, MIXED = range(4)
-"""What the shapes of a box have in common; see `_shape_of`."""
+"""All shapes of a box have one of these kinds in common, or it is MIXED; see `_shape_of`."""
 
 
 class BoxTubes(NamedTuple):

@@ -36,7 +36,7 @@ TUBES_ONLY = 0.3
 NEEDLE_ONLY = 0.6
 """Below the first share of the other changes only the tubes are changed, between both only the needle."""
 OTHER_SHAPE = 0.05
-"""Of so many samples the shape of tubes that twist each other is another one, which takes long."""
+"""This share of the samples takes another shape of tubes that twist each other, which is slow to compute."""
 EACH_SHARE = 0.6
 """The probability with which each number is changed, so that most changes leave some numbers as they are."""
 

@@ -1,5 +1,8 @@
-"""The lung among all the air of a chest: pieces of air at the bronchi, without the gas beside them and the
-air outside, and with the notches of nodules that lie on the chest wall, too wide for a closing of the lung."""
+"""The lung among all the air of a chest: pieces of air at the bronchi.
+
+The gas beside them and the air outside are left out, and the notches of nodules that lie on the chest wall,
+too wide for a closing of the lung, are filled.
+"""
 
 import numpy as np
 

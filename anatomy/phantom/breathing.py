@@ -15,12 +15,8 @@ from anatomy.grid import Grid
 from anatomy.motion.source import MotionSource
 from anatomy.phantom.patient import SCALES, Phantom
 
-MOTION_MM = 16.0
-"""Motion of the base of an adult's right lung, about the median of the population's."""
 LEFT_SHARE = 0.85
 """The heart hinders the left lung."""
-FORWARD_SHARE = 0.25
-"""The front of the chest rises by some millimetres."""
 FIELD_MM = 4.0
 """Voxels of the field that is written."""
 BORDER_MM = 12.0
@@ -48,7 +44,8 @@ class PhantomBreathing:
     def of(cls, phantom: Phantom) -> Self:
         """Return the breathing of a phantom."""
         z = phantom.grid.lps(np.argwhere(phantom.images.lung.array))[:, 2]
-        motion = MOTION_MM * SCALES[phantom.size] * phantom.traits.stature
+        # Motion of the base of an adult's right lung, about the median of the population's.
+        motion = 16.0 * SCALES[phantom.size] * phantom.traits.stature
         apex, base = float(z.max()), float(z.min())
         # At end-inhale, which the masks show, the height is longer by A.
         return cls(
@@ -60,7 +57,8 @@ class PhantomBreathing:
 
     def _vectors(self, motion_mm: Float, depth: Float) -> Float:
         down = motion_mm * np.maximum(depth, 0.0) ** 2
-        return np.stack([np.zeros_like(down), -FORWARD_SHARE * down, -down], axis=1)
+        # The front of the chest rises by some millimetres.
+        return np.stack([np.zeros_like(down), -0.25 * down, -down], axis=1)
 
     def from_exhale(self, points_lps: Float) -> Float:
         """Return the displacements `(N, 3)` to end-inhale of places `(N, 3)` at end-exhale."""

@@ -21,24 +21,12 @@ from anatomy.phantom.growth import STEP_MM, GrowthRule, grow, limit_turn
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
 
-TRACHEA_DIAMETER_MM = 18.0
-"""This is the diameter in an adult [Weibel1963]."""
 TRACHEA_LENGTH_MM = 110.0
 """This is the part that lies in the chest of an adult [Weibel1963]."""
-SMALLEST_GROWN_MM = 1.25
-"""Below what any CT shows, so that the drawing decides where airways end."""
 MIDDLE_WEIGHT = 0.4
 """Segmental bronchi turn partly towards what they supply: wholly would lose the template."""
-GREATEST_SLENDERNESS = 4.2 / 3.0
-"""Branches are at most so many times as long as is aimed at."""
 STUMP_SHARE, STUMP_DIAMETER_MM = 0.45, 7.0
 """An operation leaves this share and diameter of a lobar bronchus."""
-BALANCE_ROUNDS = 25
-"""Shares need only be about equal: each round moves the weights half-way."""
-DIRECTION_JITTER = 0.07
-"""Four degrees or so: patients differ, and segments keep their place."""
-LENGTH_JITTER = 0.08
-"""Lengths of bronchi differ about this much between patients [Horsfield1971]."""
 
 
 @frozen_value
@@ -120,10 +108,12 @@ def _skeleton(
     top = scale * TRACHEA_LENGTH_MM * np.array([rng.uniform(-0.02, 0.02), -0.12, 1.0])
     ends = {"trachea": (top, np.zeros(3))}
     for bronchus in TEMPLATE:
-        jitter = rng.normal(0, DIRECTION_JITTER, 3).clip(-0.15, 0.15)
+        # Four degrees or so: patients differ, and segments keep their place.
+        jitter = rng.normal(0, 0.07, 3).clip(-0.15, 0.15)
         direction = unit(unit(np.array(bronchus.direction)) + jitter)
         start = ends[bronchus.parent][1]
-        length = scale * bronchus.length_mm * (1 + LENGTH_JITTER * rng.uniform(-1, 1))
+        # Lengths of bronchi differ about this much between patients [Horsfield1971].
+        length = scale * bronchus.length_mm * (1 + 0.08 * rng.uniform(-1, 1))
         length *= central_length if bronchus.name in CENTRAL else 1.0
         ends[bronchus.name] = (start, start + length * direction)
     return ends
@@ -135,7 +125,8 @@ def _share_out(cloud: Float, starts: Float, directions: Float) -> Int:
     cosine = np.einsum("nsa,sa->ns", rays, directions)
     weights = np.zeros(len(starts))
     owner = cosine.argmax(axis=1)
-    for _ in range(BALANCE_ROUNDS):
+    # Shares need only be about equal: each round moves the weights half-way.
+    for _ in range(25):
         share = np.bincount(owner, minlength=len(starts)) / len(cloud)
         weights -= 0.5 * (share - 1 / len(starts))
         owner = (cosine + weights).argmax(axis=1)
@@ -178,12 +169,15 @@ def grow_airways(
     clouds = _segment_clouds(ends, territory, resected)
     counts = _supplied(clouds)
     rule = GrowthRule(
-        root_diameter_mm=scale * TRACHEA_DIAMETER_MM * (1 + 0.05 * rng.uniform(-1, 1)),
+        # This is the diameter in an adult [Weibel1963].
+        root_diameter_mm=scale * 18.0 * (1 + 0.05 * rng.uniform(-1, 1)),
         total_points=len(territory.points_lps),
-        smallest_diameter_mm=scale * SMALLEST_GROWN_MM / traits.vessel_calibre,
+        # Below what any CT shows, so that the drawing decides where airways end.
+        smallest_diameter_mm=scale * 1.25 / traits.vessel_calibre,
         flow_exponent=traits.flow_exponent,
         length_per_diameter=traits.slenderness,
-        greatest_length_per_diameter=traits.slenderness * GREATEST_SLENDERNESS,
+        # Branches are at most so many times as long as is aimed at.
+        greatest_length_per_diameter=traits.slenderness * (4.2 / 3.0),
     )
     sprouts, index = Sprouts(), {"trachea": 0}
     trachea = np.linspace(*ends["trachea"], int(scale * TRACHEA_LENGTH_MM / STEP_MM))

@@ -21,8 +21,6 @@ EDGE_ROUNDING_MM = 9.0
 """Lungs have no sharp edges; rounder ones would lose the recesses beside the heart."""
 EMPHYSEMA_DEPTH, EMPHYSEMA_DESCENT, EMPHYSEMA_FLATTENING = 0.06, 14.0, 0.4
 """Severe emphysema: a barrel chest and a low, flat diaphragm; within what the imaged box holds."""
-RESECTION_RISE = 18.0
-"""After a lobectomy the diaphragm stands higher on that side."""
 LEFT_LOBES = (LEFT_UPPER, LEFT_LOWER)
 
 
@@ -183,7 +181,8 @@ def make_chest(
             dome_z=dome
             - (8 if sign > 0 else 0)
             - EMPHYSEMA_DESCENT * emphysema
-            + (RESECTION_RISE if sign == operated else 0),
+            # After a lobectomy the diaphragm stands higher on that side.
+            + (18.0 if sign == operated else 0),
             dome_curve=DOME_CURVE * (1 - EMPHYSEMA_FLATTENING * emphysema),
             hilum_width=10.0 if sign > 0 else 5.0,
             oblique_z=-63 + rng.uniform(-4, 4),

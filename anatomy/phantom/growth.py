@@ -26,10 +26,6 @@ STEP_MM = 1.5
 DIAMETER_WEIGHT, DISTANCE_WEIGHT = 0.42, 0.22
 """A branch's length is a mean of what its diameter and the distance ask for, set so that lengths are about
 three diameters."""
-PLEURA_MARGIN_MM = 1.0
-"""Tubes keep this far from the border of their lobe: a voxel of the usual CT."""
-ASIDE_RAD = (0.25, 0.5, 0.75)
-"""Turns that are tried in order around an obstacle, up to 43 degrees."""
 
 
 @frozen_value
@@ -137,7 +133,8 @@ def _free_line(
 ) -> Float | None:
     """Return the curve of a new branch along about `chord` `(3,)`, or None if it leaves the lobe."""
     start, heading = sprouts.points[parent][-1], sprouts.direction(parent)
-    margin = 0.5 * diameter_mm + PLEURA_MARGIN_MM
+    # Tubes keep this far from the border of their lobe: a voxel of the usual CT.
+    margin = 0.5 * diameter_mm + 1.0
     best, least = None, np.inf
     for turned, penalty in _variants(chord) if clearance is not None else [(chord, 0.0)]:
         for shrink in (1.0, 0.75, 0.5):
@@ -161,7 +158,8 @@ def _variants(chord: Float) -> Iterator[tuple[Float, float]]:
     first = unit(np.cross(chord, np.eye(3)[np.argmin(np.abs(chord))]))
     second = unit(np.cross(chord, first))
     length = float(np.linalg.norm(chord))
-    for angle in ASIDE_RAD:
+    # Turns that are tried in order around an obstacle, up to 43 degrees.
+    for angle in (0.25, 0.5, 0.75):
         for azimuth in np.arange(6) * (np.pi / 3):
             side = np.cos(azimuth) * first + np.sin(azimuth) * second
             yield np.cos(angle) * chord + np.sin(angle) * length * side, 0.3 * angle

@@ -13,12 +13,6 @@ LEAST_PLEURA_MM, GREATEST_PLEURA_MM = 5.0, 30.0
 """Nodules of the outer third of the lung, which a bronchoscope cannot reach by itself."""
 LEAST_RADIUS_MM, GREATEST_RADIUS_MM = 3.0, 8.0
 """From 6 mm across, where a nodule is followed up, to 16 mm."""
-TUBE_GAP_MM = 2.0
-"""A needle passes between a nodule and the next tube."""
-NODULE_GAP_MM = 25.0
-"""Nodules are far enough from each other to be targets of their own."""
-TUBES_LOOKED_AT = 8
-"""The tube with the nearest surface is among so many of the nearest centres, as radii differ little."""
 
 
 @frozen_record
@@ -56,7 +50,8 @@ def place_nodules(
 
     wanted = int(rng.integers(3, 7))
     points = territory.points_lps
-    distance, nearest = cKDTree(tube_points).query(points, k=TUBES_LOOKED_AT)
+    # The tube with the nearest surface is among so many of the nearest centres, as radii differ little.
+    distance, nearest = cKDTree(tube_points).query(points, k=8)
     clearance_mm = (distance - tube_radius_mm[nearest]).min(axis=1)
     found: list[Nodule] = []
     map_error = territory.spacing_mm
@@ -68,8 +63,10 @@ def place_nodules(
         fits = (
             radius + scale * LEAST_PLEURA_MM + map_error < pleura < scale * GREATEST_PLEURA_MM - map_error
             and territory.holds(centre, lobe, radius + 2 * map_error)
-            and clearance_mm[index] > radius + scale * TUBE_GAP_MM
-            and all(np.linalg.norm(n.centre_lps - centre) > scale * NODULE_GAP_MM for n in found)
+            # A needle passes between a nodule and the next tube.
+            and clearance_mm[index] > radius + scale * 2.0
+            # Nodules are far enough from each other to be targets of their own.
+            and all(np.linalg.norm(n.centre_lps - centre) > scale * 25.0 for n in found)
             and all(
                 np.linalg.norm(b.centre_lps - centre) > b.radius_mm + radius + scale * LEAST_PLEURA_MM
                 for b in bullae

@@ -16,22 +16,10 @@ from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_w
 
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
 GAPLESS_RADIUS = 0.87
-AIRWAY_LIMIT_MM = 1.8
-"""Thinner lumens are not to be seen in a usual CT."""
 EMPHYSEMA_VESSEL_SHARE = 0.5
 """Severe emphysema destroys vessels up to half as thick again."""
-THINNEST_WALL_MM = 0.5
-"""About the wall of a bronchus of 2 mm."""
-CENTRAL_ARTERY_RADII_MM = (12.5, 9.5, 9.5)
-"""Pulmonary trunk, right and left pulmonary artery of an adult."""
 CENTRAL_BRANCHES = 3
 """The trunk and the two main branches come first in the list."""
-CENTRAL_VEIN_MM = 6.0
-"""Veins from this diameter on lie outside the lung and may be drawn there."""
-VESSEL_GAP_MM = 0.3
-"""Tissue between a vessel and what it passes: thinner than a voxel, so that some touch, as in a CT."""
-NODULE_NEIGHBOUR_MM = 1.4
-"""Only tubes of a larger radius keep nodules away: thin ones run into them in patients, too."""
 
 
 @frozen_record
@@ -97,7 +85,8 @@ def plan_patient(
     rim_mm = scale * traits.vessel_rim_mm
     arteries = _below_rim(_plan_arteries(sprouts, scale, vessels), territory, rim_mm)
     tubes = _obstacles(airways, arteries)
-    large = tubes.radii > NODULE_NEIGHBOUR_MM * scale
+    # Only tubes of a larger radius keep nodules away: thin ones run into them in patients, too.
+    large = tubes.radii > 1.4 * scale
     nodules = place_nodules(territory, tubes.centres[large], tubes.radii[large], scale, rng, bullae)
     obstacles = Obstacles(
         centres=np.vstack([tubes.centres, *(n.centre_lps for n in nodules)]),
@@ -113,7 +102,8 @@ def plan_patient(
 
 def wall_thickness_mm(diameter_mm: Float) -> Float:
     """Return the wall thickness for lumen diameters: about 20 % of thin airways, 10 % of wide ones."""
-    return np.asarray(np.maximum(THINNEST_WALL_MM, diameter_mm * (0.1 + 0.1 * np.exp(-diameter_mm / 6.0))))
+    # About the wall of a bronchus of 2 mm.
+    return np.asarray(np.maximum(0.5, diameter_mm * (0.1 + 0.1 * np.exp(-diameter_mm / 6.0))))
 
 
 def _freedom(sprouts: Sprouts) -> UInt8:
@@ -124,7 +114,8 @@ def _freedom(sprouts: Sprouts) -> UInt8:
 
 
 def _plan_airways(sprouts: Sprouts, spacing_mm: float) -> PlannedTree:
-    limit = max(AIRWAY_LIMIT_MM, 2 * GAPLESS_RADIUS * spacing_mm)
+    # Thinner lumens are not to be seen in a usual CT.
+    limit = max(1.8, 2 * GAPLESS_RADIUS * spacing_mm)
     drawn = sprouts.pruned(np.array(sprouts.diameter_mm) >= limit)
     diameter = np.repeat(drawn.diameter_mm, drawn.counts)
     outer = 0.5 * diameter + wall_thickness_mm(diameter)
@@ -142,14 +133,16 @@ def _vessels(
     sprouts: Sprouts, radius_mm: Float, obstacles: Obstacles, spacing_mm: float, fixed: int, freedom: UInt8
 ) -> PlannedTree:
     """Lead vessels around obstacles; they become thinner in narrow places, but never too thin to draw."""
-    radius = make_way(sprouts, radius_mm, obstacles, VESSEL_GAP_MM, fixed)
+    # Tissue between a vessel and what it passes: thinner than a voxel, so that some touch, as in a CT.
+    radius = make_way(sprouts, radius_mm, obstacles, 0.3, fixed)
     radius = np.maximum(radius, GAPLESS_RADIUS * spacing_mm)
     return PlannedTree(sprouts=sprouts, inner_mm=radius, outer_mm=radius, freedom=freedom)
 
 
 def _plan_arteries(sprouts: Sprouts, scale: float, rule: VesselRule) -> PlannedTree:
     airways, radius = _vessel_part(sprouts, rule)
-    radius[:CENTRAL_BRANCHES] = scale * np.array(CENTRAL_ARTERY_RADII_MM)
+    # Pulmonary trunk, right and left pulmonary artery of an adult.
+    radius[:CENTRAL_BRANCHES] = scale * np.array((12.5, 9.5, 9.5))
     diameter = np.array(airways.diameter_mm)
     outer = 0.5 * diameter + wall_thickness_mm(diameter)
     arteries = copy_arteries(airways, outer, radius, scale)
@@ -160,7 +153,8 @@ def _plan_arteries(sprouts: Sprouts, scale: float, rule: VesselRule) -> PlannedT
 
 def _plan_veins(grown: Sprouts, obstacles: Obstacles, scale: float, rule: VesselRule) -> PlannedTree:
     veins, radius = _vessel_part(grown, rule)
-    freedom = (np.array(veins.diameter_mm) > CENTRAL_VEIN_MM * scale).astype(np.uint8)
+    # Veins from this diameter on lie outside the lung and may be drawn there.
+    freedom = (np.array(veins.diameter_mm) > 6.0 * scale).astype(np.uint8)
     freedom[0] = 2
     return _vessels(veins, radius, obstacles, rule.spacing_mm, len(veins.points[0]), freedom)
 

@@ -29,8 +29,6 @@ SLAB = 4
 """Planes that are drawn at once: the arrays of a slab fit into the processor's cache."""
 HILUM_LPS = {-1.0: (-20.0, 5.0, -32.0), 1.0: (36.0, 8.0, -32.0)}
 """Where bronchi and vessels enter the lungs of an adult, by the sign of x."""
-HILUM_WITHOUT_FISSURE_MM = 26.0
-"""Fissures end at the hilum, where the lobes hang together."""
 RIB_DISTANCE_MM, RIB_HEIGHT_MM, RIB_SLOPE = 25.0, 9.0, 0.45
 """Distance, height and slope of ribs, about those of an adult."""
 
@@ -148,7 +146,8 @@ def _draw_fissures(canvas: Canvas, scale: float, open_share: float) -> None:
     lps = canvas.grid.lps(ijk)
     hila = np.where(lps[:, :1] > 0, np.array(HILUM_LPS[1.0]), np.array(HILUM_LPS[-1.0])) * scale
     distance = np.linalg.norm(lps - hila, axis=1)
-    closed = distance > HILUM_WITHOUT_FISSURE_MM * scale
+    # Fissures end at the hilum, where the lobes hang together.
+    closed = distance > 26.0 * scale
     if open_share:
         for side in (lps[:, 0] > 0, lps[:, 0] <= 0):
             if (closed & side).any():

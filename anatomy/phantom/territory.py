@@ -9,8 +9,6 @@ from anatomy.phantom.chest import LOBES, Chest
 
 MAP_SPACING_MM = 3.0
 """Fine enough for the borders of lobes, whose exact place the drawing decides."""
-TISSUE_PER_POINT_MM = 6.6
-"""Side of the cube that a point stands for: about as large as what a terminal branch of the tree supplies."""
 
 
 @frozen_record
@@ -66,7 +64,8 @@ def _spread_points(
     lobes: UInt8, origin: Float, spacing_mm: float, rng: np.random.Generator
 ) -> tuple[Float, UInt8]:
     """Spread points `(N, 3)` LPS mm evenly over the lobes; return them and their lobes `(N,)`."""
-    step = TISSUE_PER_POINT_MM / MAP_SPACING_MM
+    # Side of the cube that a point stands for: about as large as what a terminal branch of the tree supplies.
+    step = 6.6 / MAP_SPACING_MM
     axes = [np.arange(0, n - 1, step) for n in lobes.shape]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     lattice += rng.uniform(0, step, lattice.shape)

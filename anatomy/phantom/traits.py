@@ -17,8 +17,6 @@ LEAST_STATURE, GREATEST_STATURE = 0.85, 1.2
 """The model has the proportions of an adult: farther away its fixed sizes, such as walls, mislead."""
 LEAST_EXPONENT, GREATEST_EXPONENT = 1.5, 3.2
 """Below, segments would have no airway; above, twigs are nearly as wide as bronchi."""
-GREATEST_VESSEL_LIMIT_MM = 4.0
-"""Above, hardly a vessel is left."""
 LEAST_BRONCHUS_LENGTH, GREATEST_BRONCHUS_LENGTH = 0.8, 1.5
 """Beyond, lobar bronchi leave their lobes."""
 GREATEST_RIM_MM, GREATEST_HILAR_VESSEL_MM = 10.0, 25.0
@@ -84,7 +82,8 @@ class Traits:
             ("flow_exponent", LEAST_EXPONENT, GREATEST_EXPONENT),
             ("slenderness", 1.0, 10.0),
             ("vessel_calibre", 1.0, 3.0),
-            ("vessel_limit_mm", 0.5, GREATEST_VESSEL_LIMIT_MM),
+            # Above, hardly a vessel is left.
+            ("vessel_limit_mm", 0.5, 4.0),
             ("bronchus_length", LEAST_BRONCHUS_LENGTH, GREATEST_BRONCHUS_LENGTH),
             ("vessel_rim_mm", 0.0, GREATEST_RIM_MM),
             ("hilar_vessel_mm", 0.0, GREATEST_HILAR_VESSEL_MM),

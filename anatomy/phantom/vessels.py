@@ -11,16 +11,10 @@ from anatomy.phantom.branching import Sprouts, smooth_line, unit
 from anatomy.phantom.growth import STEP_MM, Clearance, GrowthRule, grow, overlap_mm
 from anatomy.phantom.territory import Territory
 
-SHEATH_MM = 0.5
-"""Arteries and airways share a sheath: about this much tissue lies between them."""
-OTHER_SIDE_SHARE = 0.3
-"""An artery changes sides only where this share of its radius is gained: they rarely do."""
 TRUNK_KNOTS = ((14.0, -46.0, -58.0), (10.0, -40.0, -40.0), (6.0, -31.0, -23.0))
 """Points of the central vessels of an adult, LPS mm from the carina, as in atlases."""
 RIGHT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (-6.0, -22.0, -24.0))
 LEFT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (18.0, -17.0, -2.0), (30.0, 2.0, 3.0))
-LEFT_ARTERY_SIDE = (0.3, 0.7, 0.65)
-"""The left artery runs above and behind its bronchus, the right one in front."""
 RIGHT_ARTERY_SIDE = (0.0, -1.0, 0.0)
 RIGHT_MAIN, LEFT_MAIN = 1, 2
 CENTRAL_ARTERIES = ("pulmonary trunk", "right pulmonary artery", "left pulmonary artery")
@@ -36,14 +30,8 @@ LOBAR_VEINS = {
 ATRIUM_LPS = (5.0, 8.0, -60.0)
 FAR_SHARE = 0.5
 """Veins grow in the half of a lobe that is farther from airways: they run between segments."""
-RELAX_ROUNDS = 60
-"""Where vessels still touch after so many rounds, they become thinner instead."""
 NEIGHBOURS = 12
 """Enough of the nearest balls that the one whose surface is nearest is among them."""
-WATCHED_NEIGHBOURS = 6
-"""Points that may be pushed by their neighbours in the next round."""
-SQUEEZE = 0.5
-"""A vessel keeps at least half of its radius where it must pass between others."""
 
 
 @frozen_record
@@ -104,11 +92,13 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
     clearance = Obstacles(
         centres=np.vstack(airways.points), radii=np.repeat(outer_radius_mm, airways.counts)
     ).clearance()
-    distance = outer_radius_mm + radius_mm + SHEATH_MM
+    # Arteries and airways share a sheath: about this much tissue lies between them.
+    distance = outer_radius_mm + radius_mm + 0.5
     central = {0: TRUNK_KNOTS, RIGHT_MAIN: RIGHT_ARTERY_KNOTS, LEFT_MAIN: LEFT_ARTERY_KNOTS}
     children = airways.children()
     side = np.tile(np.array(RIGHT_ARTERY_SIDE), (len(children), 1))
-    side[LEFT_MAIN] = LEFT_ARTERY_SIDE
+    # The left artery runs above and behind its bronchus, the right one in front.
+    side[LEFT_MAIN] = (0.3, 0.7, 0.65)
     arteries = Sprouts()
     for branch, line in enumerate(airways.points):
         parent = airways.parent[branch]
@@ -123,7 +113,8 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
             signs = (1, -1) if airways.name[branch] else (1,)
             lines = [_beside(line, start, sign * side[branch] * distance[branch]) for sign in signs]
             lacks = [overlap_mm(line_beside[1:], radius_mm[branch], clearance) for line_beside in lines]
-            other = lacks[0] > lacks[-1] + OTHER_SIDE_SHARE * radius_mm[branch]
+            # An artery changes sides only where this share of its radius is gained: they rarely do.
+            other = lacks[0] > lacks[-1] + 0.3 * radius_mm[branch]
             side[branch] *= signs[-1] if other else 1
             line = lines[-1] if other else lines[0]
             line[0] = arteries.points[parent][-1]
@@ -184,7 +175,8 @@ def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: floa
     owners = np.where(parents >= 0, start[parents + 1] - 1, 0)
     finder = cKDTree(obstacles.centres)
     watched = np.arange(fixed, len(position))
-    for _ in range(RELAX_ROUNDS):
+    # Where vessels still touch after so many rounds, they become thinner instead.
+    for _ in range(60):
         distance, nearest = finder.query(position[watched], k=NEIGHBOURS)
         free = distance - obstacles.radii[nearest] - gap_mm
         worst = free.argmin(axis=1)
@@ -197,13 +189,15 @@ def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: floa
         shift[watched] = lack[:, None] * away
         trouble = np.asarray(np.abs(shift).sum(axis=1) > 0)
         _settle(position, shift, start, owners, fixed)
-        watched = np.flatnonzero(_spread(trouble, WATCHED_NEIGHBOURS))
+        # Points that may be pushed by their neighbours in the next round.
+        watched = np.flatnonzero(_spread(trouble, 6))
         watched = watched[watched >= fixed]
     distance, nearest = finder.query(position, k=NEIGHBOURS)
     clearance = (distance - obstacles.radii[nearest]).min(axis=1) - 0.5 * gap_mm
     for branch in range(len(counts)):
         tree.points[branch] = position[start[branch] : start[branch + 1]].copy()
-    return np.asarray(np.clip(clearance, SQUEEZE * radius, radius))
+    # A vessel keeps at least half of its radius where it must pass between others.
+    return np.asarray(np.clip(clearance, 0.5 * radius, radius))
 
 
 def _spread(flags: Bool, steps: int) -> Bool:

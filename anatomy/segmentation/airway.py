@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from anatomy.segmentation.lungs import Lungs
 
 
-BOX_MARGIN_MM = 3.0
-"""The wall reaches less far beyond the lumen."""
 EDGE_MM = 3.0
 """How far the wall may lie from the rough central airway."""
 IN_PLANE = np.array([0, 1, 0])[:, None, None]
@@ -31,12 +29,8 @@ IN_PLANE = np.array([0, 1, 0])[:, None, None]
 AROUND_MM, WIDE_MM = 15.0, 2.0
 """So near to it, air in which a ball of this radius fits belongs to it: the middle of a trachea has no walls
 around it to be seen by, and the tissue of the lung is nowhere so dark."""
-SMOOTH_MM = 0.6
-"""Standard deviation of the smoothing that tells a dark voxel from noise."""
 NOISE_PERCENTILE = 97.0
 """This percentage of the lung lies below the shallowest minimum that is followed."""
-LEAST_DEPTH_HU = 20.0
-"""Below it the map holds only the noise of a low-dose CT."""
 SAMPLE_STEP = 7
 """Every so many voxels of the lung are looked at to learn its noise."""
 GREATEST_HU = 16_383
@@ -90,7 +84,8 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
             expected="lungs segmented in this CT",
         )
     tell("airway: map of local minima")
-    margin = np.ceil(BOX_MARGIN_MM / ct.grid.spacing_mm).astype(np.int64)
+    # The wall reaches less far beyond the lumen.
+    margin = np.ceil(3.0 / ct.grid.spacing_mm).astype(np.int64)
     box = window(*bounds(inside | lungs.central_airway, margin))
     hu = _hounsfield(ct.array[box])
     lung = np.ascontiguousarray(inside[box].T)
@@ -109,7 +104,8 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
         dark_hu=dark_hu,
         smooth=smooth,
         depth=depth,
-        least_depth=max(noise, LEAST_DEPTH_HU),
+        # Below it the map holds only the noise of a low-dose CT.
+        least_depth=max(noise, 20.0),
         lung=lung,
         spacing_mm=spacing_mm,
     )
@@ -134,7 +130,8 @@ def _smoothed(hu: Int16, spacing_mm: Float) -> Int16:
     from scipy.ndimage import gaussian_filter
 
     smooth = hu.astype(np.float32)
-    gaussian_filter(smooth, SMOOTH_MM / spacing_mm, output=smooth, truncate=2.0, mode="nearest")
+    # Standard deviation of the smoothing that tells a dark voxel from noise.
+    gaussian_filter(smooth, 0.6 / spacing_mm, output=smooth, truncate=2.0, mode="nearest")
     return np.asarray(np.rint(smooth, out=smooth), dtype=np.int16)
 
 
@@ -185,12 +182,8 @@ def _filled(lumen: Mask) -> Mask:
     return lumen
 
 
-LARGEST_SCALE = 12
-"""N: the largest structuring element of the paper reaches this many pixels."""
 LARGEST_SCALE_MM = 8.0
 """... but not farther than this: larger elements would close small lungs."""
-SQUARE_RATIO = 1.5
-"""Slices are used in the directions in which their pixels are squarer than this."""
 
 _THREADS = 2
 
@@ -220,7 +213,8 @@ def local_minima_map(hu: Int16, spacing_mm: Float, upright: int) -> Int16:
     The paper takes the maximum over the scales 1 to N.  A closing with a larger diamond is nowhere lower,
     nor is what is reconstructed from it: the largest scale alone gives that maximum.
     """
-    if spacing_mm.max() > SQUARE_RATIO * spacing_mm.min():
+    # Slices are used in the directions in which their pixels are squarer than this.
+    if spacing_mm.max() > 1.5 * spacing_mm.min():
         return _sliced(hu, upright, spacing_mm)
     first, second, third = (_sliced(hu, axis, spacing_mm) for axis in range(3))
     low = np.minimum(first, second)
@@ -231,7 +225,8 @@ def local_minima_map(hu: Int16, spacing_mm: Float, upright: int) -> Int16:
 
 def scale_of(pixel_mm: Float) -> int:
     """Return the reach of the largest structuring element in pixels, for pixels of two sides in mm."""
-    return int(np.clip(round(LARGEST_SCALE_MM / float(np.sqrt(pixel_mm.prod()))), 1, LARGEST_SCALE))
+    # N: the largest structuring element of the paper reaches this many pixels.
+    return int(np.clip(round(LARGEST_SCALE_MM / float(np.sqrt(pixel_mm.prod()))), 1, 12))
 
 
 def _sliced(hu: Int16, axis: int, spacing_mm: Float) -> Int16:

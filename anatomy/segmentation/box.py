@@ -20,8 +20,6 @@ from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.folder import onto_grid
 from anatomy.segmentation.lungs import Lungs
 
-BOX_PAD_MM = 10.0
-"""No filter of the segmentation looks farther beyond a voxel of the lung."""
 VOXEL_MM = 0.75
 """About the pixel of a chest CT and its blur: finer voxels show no more, and take more memory."""
 VOXEL_RANGE_MM = (0.3, 3.0)
@@ -64,7 +62,8 @@ class Box:
     def around(self, lungs: Lungs) -> Self:
         """Return the box of lungs of the CT and central airway, 10 mm wider where the image allows."""
         parts = [bounds(mask) for mask in (lungs.left, lungs.right, lungs.central_airway) if mask.any()]
-        shape, pad = self.ct_grid.shape, np.ceil(BOX_PAD_MM / self.ct_grid.spacing_mm).astype(np.int64)
+        # No filter of the segmentation looks farther beyond a voxel of the lung.
+        shape, pad = self.ct_grid.shape, np.ceil(10.0 / self.ct_grid.spacing_mm).astype(np.int64)
         low = np.maximum(np.min([low for low, _ in parts], axis=0) - pad, 0)
         high = np.minimum(np.max([high for _, high in parts], axis=0) + pad, shape)
         return self.part(np.floor(low * self.counts / shape), np.ceil(high * self.counts / shape))

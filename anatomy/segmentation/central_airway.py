@@ -17,29 +17,13 @@ COLUMN_HU = -850.0
 """The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`."""
 COLUMN_MEDIAN_HU = -920.0
 """The middle of a trachea is nearly pure air; lung is above this."""
-COLUMN_AREA_MM2 = (40.0, 800.0)
-"""Cross-sections of a trachea, up to where it widens to the carina."""
-GREATEST_ELONGATION = 2.5
-"""A trachea that is flattened by breathing out is still rounder than this."""
-FROM_MIDLINE_MM = 50.0
-"""A trachea that is pushed aside stays within this distance of the middle of the image."""
 SHORTEST_COLUMN_MM = 20.0
 """Bowel and emphysema hold shorter columns of air as wide as a trachea."""
-MOST_COLUMNS = 4
-"""Trachea, throat, stomach and bowel: so many columns are tried until one leads into lungs."""
-SEED_SHARE = 0.3
-"""How far down the column the seed lies."""
 
 GROWTH_HU = tuple(float(t) for t in range(-960, -699, 20))
 """Thresholds of the growth, from pure air to where every airway would leak into the lung."""
 GREATEST_STEP_SHARE, GREATEST_STEP_ML = 0.5, 12.0
 """Growing by more than both from one threshold to the next is a leak into the lung."""
-GREATEST_ML = 180.0
-"""Lumen of a large trachea and the bronchi that coarse voxels show."""
-SMOOTHING_VOXELS = 1.0
-"""Standard deviation of the filter for images too noisy to follow the trachea in."""
-WIDE_SHARE = 0.35
-"""Airways narrower than this share of the trachea's radius are left to the segmentation of the airways."""
 
 
 @frozen_record
@@ -109,7 +93,8 @@ def _smoothed(ct: CoarseCt) -> CoarseCt:
     """Return the image with less noise, in which a low-dose trachea is air throughout."""
     from scipy.ndimage import gaussian_filter
 
-    return replace(ct, hu=np.asfortranarray(gaussian_filter(ct.hu, SMOOTHING_VOXELS, mode="nearest")))
+    # Standard deviation of the filter for images too noisy to follow the trachea in.
+    return replace(ct, hu=np.asfortranarray(gaussian_filter(ct.hu, 1.0, mode="nearest")))
 
 
 def _long_enough(ct: CoarseCt, found: CentralAirway) -> CentralAirway:
@@ -173,9 +158,11 @@ def _trachea_seeds(ct: CoarseCt, outside: Mask) -> list[Float]:
             remedy="Give a point in the trachea with --seed, if the image shows it",
         )
     seeds = []
-    for piece in np.argsort(-(sizes * tall), kind="stable")[: min(MOST_COLUMNS, int(tall.sum()))]:
+    # Trachea, throat, stomach and bowel: so many columns are tried until one leads into lungs.
+    for piece in np.argsort(-(sizes * tall), kind="stable")[: min(4, int(tall.sum()))]:
         levels = boxes[piece][2]
-        level = levels.stop - 1 - int(SEED_SHARE * (levels.stop - 1 - levels.start))
+        # How far down the column the seed lies.
+        level = levels.stop - 1 - int(0.3 * (levels.stop - 1 - levels.start))
         inside = ndimage.distance_transform_edt(pieces[:, :, level] == piece + 1, sampling=ct.spacing_mm[:2])
         i, j = np.unravel_index(int(np.argmax(inside)), inside.shape)
         seeds.append(ct.grid.lps((i, j, level)))
@@ -187,7 +174,8 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
     from scipy import ndimage
 
     dx, dy, _ = ct.spacing_mm
-    least, most = (area / (dx * dy) for area in COLUMN_AREA_MM2)
+    # Cross-sections of a trachea, up to where it widens to the carina.
+    least, most = (area / (dx * dy) for area in (40.0, 800.0))
     chosen = np.zeros(ct.hu.shape, dtype=np.bool_)
     # The middle of the body along the axis from right to left, as an index.
     body = np.count_nonzero(~outside, axis=(1, 2)).astype(np.float64)
@@ -199,8 +187,10 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
         for piece, box in enumerate(ndimage.find_objects(pieces), start=1):
             width, depth = (s.stop - s.start for s in box)
             centre = 0.5 * (box[0].start + box[0].stop - 1)
-            fits = least <= sizes[piece] <= most and abs(centre - middle) * dx <= FROM_MIDLINE_MM
-            if not fits or max(width * dx, depth * dy) > GREATEST_ELONGATION * min(width * dx, depth * dy):
+            # A trachea that is pushed aside stays within this distance of the middle of the image.
+            fits = least <= sizes[piece] <= most and abs(centre - middle) * dx <= 50.0
+            # A trachea that is flattened by breathing out is still rounder than this.
+            if not fits or max(width * dx, depth * dy) > 2.5 * min(width * dx, depth * dy):
                 continue
             inside = pieces[box] == piece
             if np.median(plane[box][inside]) <= COLUMN_MEDIAN_HU:
@@ -230,7 +220,8 @@ def grow(ct: CoarseCt, seed: Int, outside: Mask) -> Mask:
         candidate_ml = np.count_nonzero(candidate) * ct.voxel_ml
         step_ml = candidate_ml - volume_ml
         leaks = volume_ml > 0 and step_ml > max(GREATEST_STEP_SHARE * volume_ml, GREATEST_STEP_ML)
-        if leaks or candidate_ml > GREATEST_ML:
+        # Lumen of a large trachea and the bronchi that coarse voxels show.
+        if leaks or candidate_ml > 180.0:
             break
         grown, volume_ml = candidate, candidate_ml
     if not volume_ml:
@@ -255,7 +246,8 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
     box = window(low, high)
     part = np.asfortranarray(grown[box])
     depth = edt.edt(part, anisotropy=ct.spacing_mm, black_border=True)
-    wide_mm = WIDE_SHARE * float(np.percentile(depth[depth > 0], 99))
+    # Airways narrower than this share of the trachea's radius are left to the segmentation of the airways.
+    wide_mm = 0.35 * float(np.percentile(depth[depth > 0], 99))
     core = depth >= wide_mm
     near = edt.edt(np.asfortranarray(~core), anisotropy=ct.spacing_mm) <= wide_mm
     wide = part & near
@@ -275,12 +267,6 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
     chosen = voxels[first] + low
     main[tuple(chosen.T)] = True
     return main, ()
-
-
-NARROW_SHARE = 0.6
-"""An upper end below this share of the trachea's cross-section is larynx or a partial slice."""
-TRACHEA_MM = 20.0
-"""The cross-section is the median over this length above and below the seed."""
 
 
 def without_larynx(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]:
@@ -307,9 +293,11 @@ def without_larynx(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]
     up = 1 if grid.lps_from_ijk[2, axis] > 0 else -1
     areas = np.count_nonzero(lumen, axis=tuple(a for a in range(3) if a != axis))[::up]
     seed = int(seed_ijk[axis]) if up == 1 else len(areas) - 1 - int(seed_ijk[axis])
-    reach = max(1, round(TRACHEA_MM / float(grid.spacing_mm[axis])))
+    # The cross-section is the median over this length above and below the seed.
+    reach = max(1, round(20.0 / float(grid.spacing_mm[axis])))
     around = areas[max(seed - reach, 0) : seed + reach + 1]
-    least = NARROW_SHARE * float(np.median(around[around > 0])) if around.any() else 0.0
+    # An upper end below this share of the trachea's cross-section is larynx or a partial slice.
+    least = 0.6 * float(np.median(around[around > 0])) if around.any() else 0.0
     top = int(np.flatnonzero(areas)[-1]) if areas.any() else 0
     wide = np.flatnonzero(areas[seed : top + 1] >= least)
     if not wide.size or seed + int(wide[-1]) == top:

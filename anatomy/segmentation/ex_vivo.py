@@ -11,12 +11,8 @@ from anatomy.segmentation.labels import RIGHT, sides_from_right
 
 GREATEST_LUNG_HU = -200.0
 """Denser than any inflated lung: trays, clamps, the heart."""
-LUNG_FROM_AIR_HU = 40.0
-"""Lung is at least this much above the air around it: several times the noise."""
 SMALLEST_LUNG_ML = 150.0
 """As for lungs in a chest."""
-AIRWAY_CLOSING_MM = 15.0
-"""Airways open to the outside of the lung are closed over this width before its hull is filled."""
 AIRWAY_BELOW_HU = -920.0
 """Only air of a wide airway is below it; inflated lung is above."""
 LEAST_AIRWAY_RADIUS_MM = 2.5
@@ -60,7 +56,8 @@ def coarse_lung_ex_vivo(
             expected=f"a lung of at least {SMALLEST_LUNG_ML:g} ml surrounded by air",
             remedy="For a CT of a patient leave out --ex-vivo",
         )
-    hull = without_holes(closed(lung, AIRWAY_CLOSING_MM, ct.spacing_mm))
+    # Airways open to the outside of the lung are closed over this width before its hull is filled.
+    hull = without_holes(closed(lung, 15.0, ct.spacing_mm))
     airway = _airway(ct, hull, seed_lps)
     sides = sides_from_right(lung & ~airway.main, ct)
     if sides is not None:
@@ -75,7 +72,8 @@ def _background(ct: CoarseCt) -> Mask:
 
     faces = [ct.hu[0], ct.hu[-1], ct.hu[:, 0], ct.hu[:, -1], ct.hu[:, :, 0], ct.hu[:, :, -1]]
     air = float(np.median(np.concatenate([face.ravel() for face in faces])))
-    body = ct.hu[(ct.hu > air + LUNG_FROM_AIR_HU) & (ct.hu < GREATEST_LUNG_HU)]
+    # Lung is at least this much above the air around it: several times the noise.
+    body = ct.hu[(ct.hu > air + 40.0) & (ct.hu < GREATEST_LUNG_HU)]
     if air > AIRWAY_BELOW_HU or not body.size:
         raise AnatomyError(
             f"The edge of the image has a median of {air:.0f} HU, and lung was not found in it",

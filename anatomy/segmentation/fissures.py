@@ -10,28 +10,14 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float32, Mask
 
-SIGMA_MM = 1.0
-"""A fissure is thinner than the blur of a CT: about as wide as this in the image."""
 BRIGHTEST_HU = 350.0
 """Above the lung's median; a fissure is below, and vessels are cut to this so that their edges are small."""
 AGREEMENT_MM = 3.0
 """Sigma of the neighbourhood in which normals are compared: wider than a vessel, narrower than folds."""
-SURFACE_VOXELS = 3
-"""A plate this near to the surface of the lung may be the pleura."""
 BLOCK = 2
 """Normals are compared over blocks of so many voxels."""
 NOISE_PERCENTILE = 90.0
 """Fissures fill about 2 % of a lung: below this percentile there is noise alone."""
-LEAST_NOISE = 0.1
-"""An image without noise has rounding errors of about this."""
-SHEET_NOISES = 2.0
-"""A sheet goes on where the response is so many times the noise: 2 % of a lung's voxels are by chance."""
-SHEET_COSINE = 0.9
-"""Neighbours in a sheet turn by at most 26 degrees: 20 mm of radius at 1 mm voxels would turn by 3."""
-LEAST_SHEET_VOXELS = 500
-"""About 200 mm^2 of a sheet of 2 to 3 voxels: what hangs together by chance is smaller."""
-EVEN_NOISES = 3.0
-"""Likelihood is one half at so many times the noise."""
 
 
 @frozen_record
@@ -76,18 +62,25 @@ def fissureness(hu: Float32, lung: Mask, barred: Mask) -> Fissureness:
     inner = ndimage.binary_erosion(lung)
     typical = np.median(hu[inner]) if inner.any() else 0.0
     filled = np.where(inner, np.minimum(hu, typical + BRIGHTEST_HU), typical).astype(np.float32)
-    smooth = ndimage.gaussian_filter(filled, SIGMA_MM, truncate=3.0)
-    where = ndimage.binary_erosion(lung, iterations=SURFACE_VOXELS) & ~ndimage.binary_dilation(barred)
+    # A fissure is thinner than the blur of a CT: about as wide as this in the image.
+    smooth = ndimage.gaussian_filter(filled, 1.0, truncate=3.0)
+    # A plate this near to the surface of the lung may be the pleura.
+    where = ndimage.binary_erosion(lung, iterations=3) & ~ndimage.binary_dilation(barred)
     strength = np.zeros(hu.shape, dtype=np.float32)
     normal = np.zeros((3, *hu.shape), dtype=np.float32)
     plate_responses(smooth, where, strength, normal)
     response = _in_agreement(strength, normal)
-    noise = max(float(np.percentile(response[where], NOISE_PERCENTILE)) if where.any() else 0.0, LEAST_NOISE)
-    sheet, least = np.zeros(hu.shape, dtype=np.int32), SHEET_NOISES * noise
+    # An image without noise has rounding errors of about this.
+    noise = max(float(np.percentile(response[where], NOISE_PERCENTILE)) if where.any() else 0.0, 0.1)
+    # A sheet goes on where the response is so many times the noise: 2 % of a lung's voxels are by chance.
+    sheet, least = np.zeros(hu.shape, dtype=np.int32), 2.0 * noise
     stack = np.zeros(np.count_nonzero(response >= least) + 1, dtype=np.int64)
-    sizes = grow_sheets(response, normal, least, SHEET_COSINE, sheet, stack)
-    large = (sizes >= LEAST_SHEET_VOXELS)[sheet]
-    likelihood = np.where(large, response / (response + EVEN_NOISES * noise), np.float32(0.0))
+    # Neighbours in a sheet turn by at most 26 degrees: 20 mm of radius at 1 mm voxels would turn by 3.
+    sizes = grow_sheets(response, normal, least, 0.9, sheet, stack)
+    # About 200 mm^2 of a sheet of 2 to 3 voxels: what hangs together by chance is smaller.
+    large = (sizes >= 500)[sheet]
+    # Likelihood is one half at so many times the noise.
+    likelihood = np.where(large, response / (response + 3.0 * noise), np.float32(0.0))
     return Fissureness(likelihood=likelihood.astype(np.float32), looked=where, noise=noise)
 
 

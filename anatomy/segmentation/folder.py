@@ -31,8 +31,6 @@ NOTES = {
     "fissures": "1 border of lobes without a fissure to be seen, 2 fissure seen",
 }
 """The headers of images that are no masks say this."""
-_SHIFT_TOLERANCE = 0.05
-"""Largest deviation from a whole number of voxels, in voxels."""
 
 
 class SegmentationFolder:
@@ -208,7 +206,8 @@ def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
     shift = np.rint(start).astype(np.int64)
     axes = grid.ijk_from_lps[:3, :3] @ volume.grid.lps_from_ijk[:3, :3]
     steps = np.abs(axes - np.eye(3)).max() * max(volume.grid.shape)
-    if max(float(np.abs(start - shift).max()), float(steps)) > _SHIFT_TOLERANCE:
+    # Largest deviation from a whole number of voxels, in voxels.
+    if max(float(np.abs(start - shift).max()), float(steps)) > 0.05:
         raise GridMismatchError(
             f"The voxels of {name} are not those of the CT: {volume.grid.describe()}",
             expected=f"a box of voxels of {grid.describe()}",

@@ -205,24 +205,8 @@ SAMPLE_MM = 3.0
 """Lungs are looked at in steps of this: their shape is known to a step."""
 LEAST_TRACHEA_MM = 15.0
 """From a shorter trachea no direction can be told."""
-LEAST_UP = 0.5
-"""The trachea runs upwards within 60 degrees even in a bent patient."""
-LEAST_TILT = 0.05
-"""The trachea runs backwards on its way down, by 8 to 40 degrees; less than 3 degrees say nothing."""
-LOWEST_SHARE = 0.15
-"""This share of each lung is its base, which lies behind, where the diaphragm slopes down."""
-LEAST_BACK_MM = 3.0
-"""The base lies 9 to 30 mm behind the rest; less says nothing."""
-LEAST_RATIO = 1.2
-"""The left main bronchus is about twice as long as the right one, 5 against 2.5 cm."""
 HEART_MM = (70.0, 120.0)
 """The heart is looked for so far in front of the carina, and so far below it."""
-BELOW_CARINA_MM = 30.0
-"""Above this lie vessels that are as wide on both sides."""
-LEAST_HEART_MM = 4.0
-"""Two thirds of the heart lie on the left: 10 to 30 mm on the average; less says nothing."""
-LEAST_LINES = 20
-"""From fewer lines across the chest no place of the heart is told."""
 
 
 @frozen_value
@@ -246,11 +230,14 @@ def landmarks(tree: AirwayTree, left: Mask, right: Mask, grid: Grid) -> Landmark
     length = float(np.linalg.norm(along))
     up, front = [], []
     if length >= LEAST_TRACHEA_MM:
-        up.append(1 if along[2] >= LEAST_UP * length else -1)
-        front.append(_sign(-along[1] / length, LEAST_TILT))
+        # The trachea runs upwards within 60 degrees even in a bent patient.
+        up.append(1 if along[2] >= 0.5 * length else -1)
+        # The trachea runs backwards on its way down, by 8 to 40 degrees; less than 3 degrees say nothing.
+        front.append(_sign(-along[1] / length, 0.05))
     bases = [_base(points) for points, mask in zip(lungs, (left, right), strict=True) if _whole(mask)]
     if bases:
-        front.append(_sign(float(np.mean(bases)), LEAST_BACK_MM))
+        # The base lies 9 to 30 mm behind the rest; less says nothing.
+        front.append(_sign(float(np.mean(bases)), 3.0))
     return Landmarks(up=tuple(up), front=tuple(front), left=_left(tree, lungs, carina))
 
 
@@ -260,10 +247,12 @@ def _left(tree: AirwayTree, lungs: list[Float], carina: Float) -> tuple[int, ...
     signs = []
     lengths = _main_bronchi(tree, lungs)
     if lengths is not None:
-        signs.append(_sign(float(np.log(lengths[0] / lengths[1])), float(np.log(LEAST_RATIO))))
+        # The left main bronchus is about twice as long as the right one, 5 against 2.5 cm.
+        signs.append(_sign(float(np.log(lengths[0] / lengths[1])), float(np.log(1.2))))
     heart = _heart_mm(lungs, carina)
     if heart is not None:
-        signs.append(_sign(heart, LEAST_HEART_MM))
+        # Two thirds of the heart lie on the left: 10 to 30 mm on the average; less says nothing.
+        signs.append(_sign(heart, 4.0))
     return tuple(signs)
 
 
@@ -278,7 +267,8 @@ def _whole(mask: Mask) -> bool:
 
 def _base(points: Float) -> float:
     """Return how far the base of a lung lies behind the rest, mm."""
-    low = points[:, 2] <= np.quantile(points[:, 2], LOWEST_SHARE)
+    # This share of each lung is its base, which lies behind, where the diaphragm slopes down.
+    low = points[:, 2] <= np.quantile(points[:, 2], 0.15)
     return float(points[low, 1].mean() - points[~low, 1].mean())
 
 
@@ -312,7 +302,8 @@ def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
         at = points[
             (points[:, 1] <= carina[1])
             & (points[:, 1] >= carina[1] - HEART_MM[0])
-            & (points[:, 2] <= carina[2] - BELOW_CARINA_MM)
+            # Above this lie vessels that are as wide on both sides.
+            & (points[:, 2] <= carina[2] - 30.0)
             & (points[:, 2] >= low)
         ]
         lines = np.floor((at[:, 1:] - carina[1:]) / (2.0 * SAMPLE_MM)).astype(np.int64)
@@ -327,7 +318,8 @@ def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
             nearest[line] = max(known, value) if towards_plus else min(known, value)
         inner.append(nearest)
     shared = inner[0].keys() & inner[1].keys()
-    if len(shared) < LEAST_LINES:
+    # From fewer lines across the chest no place of the heart is told.
+    if len(shared) < 20:
         return None
     middle = np.mean([0.5 * (inner[0][line] + inner[1][line]) for line in sorted(shared)])
     return float(middle - carina[0])

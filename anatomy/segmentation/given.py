@@ -31,8 +31,6 @@ LABELLED = ("lungs", "lobes", "fissures")
 """Images whose values mean something."""
 GREATEST_LOSS = 0.02
 """Share of a mask that may lie outside the CT: more is another patient, or another frame."""
-GREATEST_TURN = 0.01
-"""An axis may turn by so many radians: over 300 mm a mask is then 3 mm off."""
 
 
 @frozen_record
@@ -216,7 +214,8 @@ def _onto_ct(volume: Volume, grid: Grid, name: str, *, solid: bool) -> tuple[Vol
     turned = float(np.abs(axes[0].T @ axes[1] - np.eye(3)).max())
     placed = place(volume.array, volume.grid, grid, solid=solid)
     lost = placed.n_lost / max(placed.n_voxels, 1)
-    if turned > GREATEST_TURN or lost > GREATEST_LOSS:
+    # An axis may turn by so many radians: over 300 mm a mask is then 3 mm off.
+    if turned > 0.01 or lost > GREATEST_LOSS:
         why = f"{lost:.0%} of it lie outside the CT" if lost > GREATEST_LOSS else "its axes are turned"
         raise GridMismatchError(
             f"{name} lies in another frame than the CT: {why}. It has {volume.grid.describe()}",

@@ -12,22 +12,16 @@ from anatomy.segmentation.thin_airways import follow_thin_airways
 
 AIR_HU = -1024
 """Around the image is air, which is neither wall nor, for want of depth, lumen."""
-GREATEST_LUMEN_ML = 400.0
-"""No patient's airways hold as much; what would make more is a leak."""
 FIRST_LEVEL_HU = 600.0
 """Only the trachea and main bronchi are darker than their walls by this much."""
 LEVEL_RATIO = 0.92
 """Each level of the growth lies this much below the one before."""
-LEAST_LAYERS = 4
-"""A piece of fewer layers is too short to tell a leak from a fork."""
 FRONT_FACTOR, FRONT_SLACK_MM2 = 3.0, 200.0
 """A piece has burst whose front is this much larger than where it began."""
 WIDE_MM2 = 20.0
 """A bronchus of this cross-section or more is dark inside."""
 RIM_MM = 1.5
 """A place that is not dark, and this near to a wider one, is its rim."""
-SKIN_SHARE = 0.5
-"""The edge of a lumen is where the map is half as deep as inside."""
 
 EDGE_MM = 1.2
 """The edge of a lumen is blurred over about so much."""
@@ -35,8 +29,6 @@ EDGE_MM = 1.2
 GAP_MM = 3.0
 """Gaps in the open lumen are as thick as a slice: none accepted without a word is thicker."""
 
-WALL_LEAST_HU = -600.0
-"""T_abs of the paper: what is darker is lung or air, not wall."""
 WALL_DIFFERENCE_HU = 10.0
 """T_dif of the paper: from one layer of the wall to the next the CT falls by more than noise."""
 WALL_MM = 2.0
@@ -95,7 +87,8 @@ def grow(ground: Ground, start: Mask) -> Grown:
     flat = state.reshape(-1)
     seeds = np.flatnonzero(flat)
     count = len(seeds)
-    most = min(flat.size, 2 * count + int(1000.0 * GREATEST_LUMEN_ML / float(np.prod(ground.spacing_mm))))
+    # No patient's airways hold as much; what would make more is a leak.
+    most = min(flat.size, 2 * count + int(1000.0 * 400.0 / float(np.prod(ground.spacing_mm))))
     lumen = np.zeros(most, dtype=np.int64)
     lumen[:count] = seeds
     pixel_mm2 = float(np.prod(ground.spacing_mm) ** (2 / 3))
@@ -111,13 +104,15 @@ def grow(ground: Ground, start: Mask) -> Grown:
         lumen,
         count,
         levels(ground.least_depth),
-        LEAST_LAYERS,
+        # A piece of fewer layers is too short to tell a leak from a fork.
+        4,
         FRONT_FACTOR,
         FRONT_SLACK_MM2 / pixel_mm2,
         max(WIDE_MM2 / pixel_mm2, 2.0),
         max(round(RIM_MM / float(np.sqrt(pixel_mm2))), 1),
         ground.dark_hu,
-        SKIN_SHARE,
+        # The edge of a lumen is where the map is half as deep as inside.
+        0.5,
         queue,
         parent,
         behind,
@@ -165,7 +160,8 @@ def _join_and_wall(
     count = lumen_edge.join_corners(hu, state, shape, lumen, count)
     layers = int(np.ceil(WALL_MM / ground.spacing_mm.mean()))
     near, wall = box_offsets(shape, 1), np.zeros(state.size, dtype=np.int64)
-    lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, WALL_LEAST_HU, WALL_DIFFERENCE_HU, wall)
+    # T_abs of the paper: what is darker is lung or air, not wall.
+    lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, -600.0, WALL_DIFFERENCE_HU, wall)
 
 
 def levels(least_depth: float) -> Int:

@@ -9,29 +9,25 @@ from anatomy.segmentation.coarse import CoarseCt
 
 AIR_HU = -1000.0
 """The scale defines air so."""
-CORE_SHARE = 0.6
-"""At this share of the airway's greatest depth nothing but air is measured."""
 GREATEST_OFFSET_HU = 25.0
 """Scanners keep air around the patient within 10 HU; more is another scale."""
 GREATEST_SCATTER_HU = 45.0
 """Scatter and contrast medium raise the air in the trachea by up to 40 HU, so it tells less where it is
 alone."""
-LEAST_SCATTER_HU = -10.0
-"""Noise of the difference: scatter only ever raises the air in the trachea."""
 AROUND_HU = (-1099.0, -880.0)
 """Air around the patient, shifted or not: lower values are padding, higher ones table and clothes."""
-LEAST_AROUND_SHARE = 0.01
-"""Air over less than this share of the image's sides may be lung that the image cuts off."""
 
 
 def air_offset_hu(coarse: CoarseCt, airway: Mask) -> float:
     """Return by how much air, in the airway and around the patient, differs from -1000 HU; 0 if as usual."""
     depth = distance_mm(np.asfortranarray(airway), coarse.spacing_mm)
-    inside = float(np.median(coarse.hu[depth >= CORE_SHARE * depth.max()])) - AIR_HU
+    # At this share of the airway's greatest depth nothing but air is measured.
+    inside = float(np.median(coarse.hu[depth >= 0.6 * depth.max()])) - AIR_HU
     around = offset_around_hu(coarse)
     if around is None:
         return inside if abs(inside) > GREATEST_SCATTER_HU else 0.0
-    if LEAST_SCATTER_HU <= inside - around <= GREATEST_SCATTER_HU:
+    # Noise of the difference: scatter only ever raises the air in the trachea.
+    if -10.0 <= inside - around <= GREATEST_SCATTER_HU:
         return around if abs(around) > GREATEST_OFFSET_HU else 0.0
     smaller = inside if abs(inside) < abs(around) else around
     return smaller if inside * around > 0.0 and abs(smaller) > GREATEST_OFFSET_HU else 0.0
@@ -42,7 +38,8 @@ def offset_around_hu(coarse: CoarseCt) -> float | None:
     hu = coarse.hu
     sides = np.concatenate([side.ravel() for side in (hu[0], hu[-1], hu[:, 0], hu[:, -1])])
     air = sides[(sides > AROUND_HU[0]) & (sides < AROUND_HU[1])]
-    return float(np.median(air)) - AIR_HU if air.size >= LEAST_AROUND_SHARE * sides.size else None
+    # Air over less than this share of the image's sides may be lung that the image cuts off.
+    return float(np.median(air)) - AIR_HU if air.size >= 0.01 * sides.size else None
 
 
 def without_offset(ct: Volume, offset_hu: float) -> Volume:

@@ -10,8 +10,6 @@ AIR_HU, TISSUE_HU = -700.0, (-200.0, 200.0)
 """Air of lungs and outside lies below, and soft tissue between the two others."""
 LEAST_SHARE = 0.002
 """Air and soft tissue each fill at least this share of a CT of the chest."""
-LEAST_PRESENT_HU = -400.0
-"""The lowest value of an image whose offset of -1000 is missing is about 0, and above this."""
 LEAST_SIZE_MM = 100.0
 """The lung of a small child is about so large."""
 SPACING_MM = (0.2, 2.5)
@@ -20,8 +18,6 @@ THICK_SLICE_MM = 3.0
 """Segmental bronchi are 3 to 4 mm wide: thicker slices lose them."""
 THICKEST_SLICE_MM = 10.0
 """Slices of routine scans end here; beyond, not even lobar bronchi are to be seen."""
-ODD_HU = 5000.0
-"""Metal reaches the 3071 HU of most scanners; more than this is another scale."""
 
 
 def slice_mm(ct: Volume) -> float:
@@ -79,7 +75,8 @@ def _require_hounsfield(values: Array) -> None:
             expected="a CT in Hounsfield units",
             remedy="Export the image again",
         )
-    if least > LEAST_PRESENT_HU:
+    # The lowest value of an image whose offset of -1000 is missing is about 0, and above this.
+    if least > -400.0:
         raise AnatomyError(
             f"The lowest value of the image is {least:g}: its offset of about -1000 HU seems to be missing",
             expected="Hounsfield units, where air is about -1000 and water 0",
@@ -131,6 +128,7 @@ def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
 
 def _odd_values(values: Array) -> tuple[str, ...]:
     greatest = float(values.max())
-    if greatest <= ODD_HU:
+    # Metal reaches the 3071 HU of most scanners; more than this is another scale.
+    if greatest <= 5000.0:
         return ()
     return (f"The image reaches {greatest:g} HU: metal, or not Hounsfield units.",)

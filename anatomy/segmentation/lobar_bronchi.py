@@ -20,12 +20,8 @@ USUAL_SHARES: Mapping[int, tuple[float, float]] = MappingProxyType(
     }
 )
 """Mean share of each lobe in its lung, and twice the spread of the healthy, as lobes shrink and swell."""
-LEAST_LIKELIHOOD = 0.15
-"""A border counts against a parting if less of it than this is like a fissure: segments have no sheet."""
 WEIGHT_OF_SHARES = 0.05
 """One spread off the usual share weighs as much as a fissure over a twentieth of the lung's cross-section."""
-COST_OF_BRONCHUS = 0.02
-"""Most lobes have one bronchus: each further one must be worth as much as a fissure over a fiftieth."""
 LEAST_SHARE = 0.03
 """No lobe is smaller, unless it has collapsed."""
 TRUNK_SHARE = 0.9
@@ -64,7 +60,8 @@ class Regions:
     @property
     def support(self) -> Float:
         """How much a border between two regions speaks for a fissure, `(B, B)`."""
-        return self.likelihood - LEAST_LIKELIHOOD * self.faces
+        # A border counts against a parting if less of it than this is like a fissure: segments have no sheet.
+        return self.likelihood - 0.15 * self.faces
 
     def means(self, parts: list[Bool]) -> Float:
         """Return the middles of some parts, LPS mm, `(P, 3)`."""
@@ -158,7 +155,8 @@ def _value(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> float:
     for part, number in zip(parts, lobes, strict=True):
         usual, spread = USUAL_SHARES[number]
         value -= WEIGHT_OF_SHARES * ((regions.volume[part].sum() / whole - usual) / spread) ** 2
-    return value - COST_OF_BRONCHUS * (_bronchi(regions, lobe) - len(lobes))
+    # Most lobes have one bronchus: each further one must be worth as much as a fissure over a fiftieth.
+    return value - 0.02 * (_bronchi(regions, lobe) - len(lobes))
 
 
 def _bronchi(regions: Regions, lobe: Int) -> int:

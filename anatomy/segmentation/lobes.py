@@ -35,16 +35,10 @@ SEEN_WITHIN_VOXELS = 3
 """A sheet so near to a border is the border's fissure: about twice the error of either."""
 FISSURE_COST = 100.0
 """Crossing a fissure costs as much as going round it through 100 mm of lung."""
-FISSURE_RESISTANCE = 200.0
-"""Times that of lung: a fissure then outweighs the whole way from a bronchus to it."""
 HOLE_MM, HOLE_LIKELIHOOD = 6.0, np.float32(0.5)
 """Vessels, their blur and the pleura hide so much of a fissure to each side, which is likely there."""
-VESSEL_REACH_MM = 6.0
-"""Vessels are so far apart within a lobe; farther from them, where fissures run, lung resists more."""
 ROUNDS, RELAXATION = 120, np.float32(1.8)
 """Diffusion starts near to its end, and then changes less than one voxel in a thousand."""
-BAND_BLOCKS = 5
-"""In blocks, 10 mm: so far from the border of the diffusion the fissure itself is looked for."""
 LEAST_SEEN = 0.5
 """Below this share a fissure's course is mostly a guess, and an oblique one says nothing of the lobes."""
 OUTER_VOXELS = 2
@@ -221,8 +215,10 @@ class _LungParts:
         seeds = self._seeded(lobe_of_branch)
         likelihood = _without_holes(self._coarse, self._mask)
         start = np.pad(self._flooded(seeds, likelihood), 1)
-        far = ndimage.distance_transform_edt(~self._vessels, sampling=BLOCK * EDGE_MM) / VESSEL_REACH_MM
-        resistance = (1.0 + far**2) * (1.0 + FISSURE_RESISTANCE * likelihood)
+        # Vessels are so far apart within a lobe; farther from them, where fissures run, lung resists more.
+        far = ndimage.distance_transform_edt(~self._vessels, sampling=BLOCK * EDGE_MM) / 6.0
+        # Times that of lung: a fissure then outweighs the whole way from a bronchus to it.
+        resistance = (1.0 + far**2) * (1.0 + 200.0 * likelihood)
         along = _conductance(
             np.pad(resistance.astype(np.float32), 1, constant_values=1.0), np.pad(self._mask, 1)
         )
@@ -243,7 +239,8 @@ class _LungParts:
 
         nearest = ndimage.distance_transform_edt(coarse == 0, return_distances=False, return_indices=True)
         whole = coarse[tuple(nearest)]
-        band = _grown(_borders(whole), BAND_BLOCKS)
+        # In blocks, 10 mm: so far from the border of the diffusion the fissure itself is looked for.
+        band = _grown(_borders(whole), 5)
         labels = self._on_cubic(np.where(band, 0, whole))
         labels[~_grown(self._fine, OUTER_VOXELS)] = -1
         cost = 1.0 + np.float32(FISSURE_COST) * self._likelihood

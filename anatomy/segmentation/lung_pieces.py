@@ -12,32 +12,15 @@ from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import closed, distance_mm, near, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 
-OUTSIDE_HU = -950.0
-"""Air that touches the edge of a slice and has a median below this is not lung."""
 SMALLEST_LUNG_ML = 150.0
 """The smallest lung of a child after breathing out is about this large."""
-SMALLER_SHARE = 0.1
-"""A lung has at least this share of the other's volume; a smaller piece of air is something else."""
-CONTACT_MM = 10.0
-"""Wall of a main bronchus and the tissue around it: lung begins within this distance of the bronchi."""
-GAS_ABOVE_AIR_HU = 25.0
-"""Gas outside the lung is as thin as air; lung with severe emphysema, at -950 HU, is denser than this."""
 GAS_RADIUS_MM = 4.0
 """A ball of this radius fits into a pocket of gas that matters, but into no airway beyond the main
 bronchi."""
-SMALLEST_GAS_ML = 20.0
-"""Holes of emphysema are smaller; a layer of gas over half a lung, 4 mm thick, is larger."""
 NOTCH_MM = 12.0
 """Ball of the wider closing: notches of up to about 24 mm across become lung."""
-BELOW_HULL_MM = 15.0
-"""Half the diameter of the largest nodule that is not called a mass, 30 mm."""
-FROM_OTHER_LUNG_MM = 40.0
-"""A notch of the chest wall lies near the convex hull of both lungs and far from the other lung; what does
-not may be the heart, the aorta or the hilum, and stays outside."""
 LEAST_HALF_THICKNESS_MM = 2.0
 """Ribs indent the lung less than this."""
-SOFT_HU = 150.0
-"""Bone is denser on coarse voxels."""
 
 
 def outside_air(hu: Float32, air: Mask) -> Mask:
@@ -69,7 +52,8 @@ def outside_air(hu: Float32, air: Mask) -> Mask:
         edge = np.concatenate([pieces[0], pieces[-1], pieces[:, 0], pieces[:, -1]])
         touching = np.unique(edge[edge > 0])
         sizes = np.bincount(pieces.ravel(), minlength=count + 1)
-        thin = np.bincount(pieces[hu[:, :, k] < OUTSIDE_HU], minlength=count + 1)
+        # Air that touches the edge of a slice and has a median below this is not lung.
+        thin = np.bincount(pieces[hu[:, :, k] < -950.0], minlength=count + 1)
         chosen = np.zeros(count + 1, dtype=np.bool_)
         chosen[touching] = 2 * thin[touching] > sizes[touching]
         outside[:, :, k] = chosen[pieces]
@@ -99,7 +83,8 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
     volumes_ml[0] = 0.0
     large = volumes_ml >= SMALLEST_LUNG_ML
     at_bronchi = np.zeros(count + 1, dtype=np.bool_)
-    at_bronchi[np.unique(pieces[near(airway, CONTACT_MM, coarse.spacing_mm)])] = True
+    # Wall of a main bronchus and the tissue around it: lung begins within this distance of the bronchi.
+    at_bronchi[np.unique(pieces[near(airway, 10.0, coarse.spacing_mm)])] = True
     lung = large & at_bronchi
     if not lung.any():
         largest = f"the largest piece of air inside has {volumes_ml.max():.0f} ml"
@@ -110,7 +95,8 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
             expected="a CT of the chest with trachea, bronchi and lungs",
             remedy="Choose the series of the chest; for an inflated lung outside a body use --ex-vivo",
         )
-    lung &= volumes_ml >= SMALLER_SHARE * volumes_ml[lung].max()
+    # A lung has at least this share of the other's volume; a smaller piece of air is something else.
+    lung &= volumes_ml >= 0.1 * volumes_ml[lung].max()
     return np.asfortranarray(lung[pieces])
 
 
@@ -129,7 +115,8 @@ def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> Mask:
 
     found = np.zeros(lung.shape, dtype=np.bool_, order="F")
     box = window(*bounds(lung, 1))
-    thin = ndimage.uniform_filter(coarse.hu[box], 3, mode="nearest") < air_hu + GAS_ABOVE_AIR_HU
+    # Gas outside the lung is as thin as air; lung with severe emphysema, at -950 HU, is denser than this.
+    thin = ndimage.uniform_filter(coarse.hu[box], 3, mode="nearest") < air_hu + 25.0
     thin &= lung[box]
     core = distance_mm(np.asfortranarray(thin), coarse.spacing_mm) > GAS_RADIUS_MM
     if not core.any():
@@ -138,7 +125,8 @@ def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> Mask:
     pieces, count = ndimage.label(pocket)
     volumes_ml = np.bincount(pieces.ravel(), minlength=count + 1) * coarse.voxel_ml
     volumes_ml[0] = 0.0
-    found[box] = (volumes_ml >= SMALLEST_GAS_ML)[pieces]
+    # Holes of emphysema are smaller; a layer of gas over half a lung, 4 mm thick, is larger.
+    found[box] = (volumes_ml >= 20.0)[pieces]
     return found
 
 
@@ -157,10 +145,13 @@ def _notches_of(ct: CoarseCt, side: Mask, other: Mask, hull: Mask, closing_mm: f
     pad = np.ceil(2.0 * NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64)
     box = window(*bounds(side, pad))
     filled = without_holes(closed(np.asfortranarray(side[box]), closing_mm, ct.spacing_mm))
-    added = closed(filled, NOTCH_MM, ct.spacing_mm) & ~filled & (ct.hu[box] < SOFT_HU) & hull[box]
+    # Bone is denser on coarse voxels.
+    added = closed(filled, NOTCH_MM, ct.spacing_mm) & ~filled & (ct.hu[box] < 150.0) & hull[box]
     core = distance_mm(added, ct.spacing_mm) > LEAST_HALF_THICKNESS_MM
     if core.any() and other.any():
-        core &= distance_mm(~other, ct.spacing_mm)[box] > FROM_OTHER_LUNG_MM
+        # A notch of the chest wall lies near the convex hull of both lungs and far from the other lung; what
+        # does not may be the heart, the aorta or the hilum, and stays outside.
+        core &= distance_mm(~other, ct.spacing_mm)[box] > 40.0
     if core.any():
         found[box] = added & (distance_mm(~core, ct.spacing_mm) <= 2.0 * LEAST_HALF_THICKNESS_MM)
     return found
@@ -175,7 +166,8 @@ def _near_hull(lungs: Mask, ct: CoarseCt) -> Mask:
     for k in np.flatnonzero(lungs.any(axis=(0, 1))):
         hull = np.asfortranarray(convex_hull_image(lungs[:, :, k]))
         depth = edt.edt(hull, anisotropy=ct.spacing_mm[:2], order="F", black_border=True)
-        near[:, :, k] = hull & (depth <= BELOW_HULL_MM)
+        # Half the diameter of the largest nodule that is not called a mass, 30 mm.
+        near[:, :, k] = hull & (depth <= 15.0)
     _clear_edge(near, np.ceil(NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64))
     return near
 

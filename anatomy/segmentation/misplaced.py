@@ -17,8 +17,6 @@ SAMPLES = 200_000
 """The mean of so many voxels of a mask is known to 1 HU."""
 CLIPPED_HU = (-1100.0, 200.0)
 """Bone, metal and contrast medium count as tissue."""
-LEAST_INSIDE = 0.7
-"""Share of lobes and fissures that lies in the lungs: half the lungs lie in the mirrored ones."""
 LEAST_COVERED = 0.8
 """Share of the lungs that lobes cover: with less, one of them is missing."""
 WALL_MM, LEAST_AT_LUMEN = 4.0, 0.5
@@ -95,7 +93,8 @@ def misplaced(
                 )
         if name in ("lobes", "fissures"):
             share = _share(mask & lungs, mask)
-            if share < LEAST_INSIDE:
+            # Share of lobes and fissures that lies in the lungs: half the lungs lie in the mirrored ones.
+            if share < 0.7:
                 failed.append(_failure(name, f"only {share:.0%} of it lie in the lungs"))
         if name == "lobes":
             share = _share(mask & lungs, lungs)

@@ -12,10 +12,6 @@ from anatomy.segmentation.closing import distance_mm
 
 SAMPLE_MM = 4.0
 """The shape of the chest is looked at on voxels of this size."""
-LEAST_FILLED = 0.6
-"""Half-way between the zones of healthy phantoms, 0.92 up, and those with a solid lobe, up to 0.2."""
-FROM_MIDDLE_SHARE = 0.4
-"""Within this share of the half width lie heart, spine and large vessels."""
 TOP_SHARE, BASE_SHARE = 0.1, 0.3
 """At these shares of the height the shoulders narrow the chest, and the diaphragm rises."""
 ABOVE_CARINA_MM = -10.0
@@ -53,7 +49,8 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
         f"airways and vessels are not seen, it counts as outside the lung, and reach in the {name} is "
         "understated."
         for name, share, lost_ml in _zones(chest, first, carina_lps)
-        if share < LEAST_FILLED
+        # Half-way between the zones of healthy phantoms, 0.92 up, and those with a solid lobe, up to 0.2.
+        if share < 0.6
     )
     return zones or tuple(_short(left, right, grid, carina_lps))
 
@@ -88,7 +85,8 @@ def _zones(chest: Mask, first: Float, carina_lps: Float) -> Iterator[tuple[str, 
 
     n = chest.shape
     across = SAMPLE_MM * (np.arange(n[0]) - 0.5 * (n[0] - 1))
-    beside = np.abs(across) > FROM_MIDDLE_SHARE * np.abs(across).max()
+    # Within this share of the half width lie heart, spine and large vessels.
+    beside = np.abs(across) > 0.4 * np.abs(across).max()
     behind = first[1] + SAMPLE_MM * np.arange(n[1]) > carina_lps[1]
     heights = first[2] + SAMPLE_MM * np.arange(n[2])
     levels = np.flatnonzero(chest.any(axis=(0, 1)))

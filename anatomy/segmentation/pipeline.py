@@ -29,8 +29,6 @@ Progress = Callable[[str], None]
 
 BYTES_PER_CT_VOXEL, BYTES_PER_VOXEL = 12, 30
 """Peak memory over the voxels of the CT, and over those of the box."""
-LARGEST_BOX_MM3 = 30e6
-"""The box of the lungs of a very tall man: 350 x 260 x 330 mm."""
 
 
 @frozen_record
@@ -59,7 +57,8 @@ class Segmentation:
 def memory_estimate_gib(grid: Grid, voxel_mm: float = VOXEL_MM) -> float:
     """Return about how much memory the segmentation of a CT on this grid needs at most, in GiB."""
     finer = Box.whole(grid, voxel_mm).lattice
-    voxels = min(float(np.prod(finer.shape)), LARGEST_BOX_MM3 / finer.voxel_volume_mm3)
+    # The box of the lungs of a very tall man: 350 x 260 x 330 mm.
+    voxels = min(float(np.prod(finer.shape)), 30e6 / finer.voxel_volume_mm3)
     return (float(np.prod(grid.shape)) * BYTES_PER_CT_VOXEL + voxels * BYTES_PER_VOXEL) / 2**30
 
 

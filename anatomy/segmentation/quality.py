@@ -9,12 +9,8 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.segmentation.parts import Parts
 
-WIDENING = 1.6
-"""A bronchus is never so much wider than its parent; a leak is."""
 LEAST_WIDE_MM = 2.5
 """A branch this much wider than its parent, and at least so wide, looks like a leak into the lung."""
-USUAL_LUNGS_L = (1.5, 9.0)
-"""From a child to a large adult after breathing in."""
 
 
 @frozen_record
@@ -68,7 +64,8 @@ def quality_of(parts: Parts) -> Quality:
 
 def _volume_warnings(volumes: dict[str, float]) -> list[str]:
     both = volumes["right lung"] + volumes["left lung"]
-    least, most = USUAL_LUNGS_L
+    # From a child to a large adult after breathing in.
+    least, most = (1.5, 9.0)
     if least <= both <= most:
         return []
     return [f"The lungs have {both:.2f} l in all; {least:g} to {most:g} l are usual in adults."]
@@ -78,7 +75,8 @@ def _leaks(tree: AirwayTree) -> list[str]:
     """Warn of branches that are much wider than what they grow from."""
     radius = np.asarray(tree.branch_mean_radius_mm)
     parent = np.asarray(tree.branch_parent)
-    wide = (parent >= 0) & (radius >= LEAST_WIDE_MM) & (radius > WIDENING * radius[np.maximum(parent, 0)])
+    # A bronchus is never so much wider than its parent; a leak is.
+    wide = (parent >= 0) & (radius >= LEAST_WIDE_MM) & (radius > 1.6 * radius[np.maximum(parent, 0)])
     found = []
     for branch in np.flatnonzero(wide):
         place = ", ".join(f"{x:.0f}" for x in tree.points_lps[tree.branch_start[branch + 1] - 1])

@@ -17,8 +17,6 @@ from anatomy.morphology import Window, bounds, window
 SIGMAS_MM = (1.0, math.sqrt(2.0), 2.0, 2.0 * math.sqrt(2.0), 4.0)
 DEEPER_THAN_MM = (0.0, 1.0, 1.0, 2.0, 2.0 * math.sqrt(2.0))
 """How deep below the lung's surface a voxel must lie for each scale to apply [Fu2018, eq. 4]."""
-REACH_SIGMAS = 3.0
-"""How many of the greatest sigma the image around the lung is kept."""
 LEAST_HU = -1024
 """Scanners write lower values where they measured nothing."""
 LOST_WEIGHT = 1e-5
@@ -82,7 +80,8 @@ class ScaleSpace:
         spacing = np.asarray(spacing_mm, dtype=np.float64)
         if not lung.any():
             raise AnatomyError("The lung mask is empty", expected="at least one voxel of lung")
-        box = window(*bounds(lung, np.ceil(REACH_SIGMAS * SIGMAS_MM[-1] / spacing).astype(np.int64)))
+        # How many of the greatest sigma the image around the lung is kept.
+        box = window(*bounds(lung, np.ceil(3.0 * SIGMAS_MM[-1] / spacing).astype(np.int64)))
         kind = np.float32 if hu.dtype.kind == "f" else np.int16
         image = np.maximum(np.asfortranarray(hu[box]).T, LEAST_HU).astype(kind, copy=False)
         return cls(

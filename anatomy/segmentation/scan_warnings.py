@@ -11,20 +11,10 @@ from anatomy.segmentation.input import slice_mm
 
 TISSUE_HU = (-50.0, 150.0)
 """Muscle and blood, whose own texture is weak."""
-PATCH_MM = 6.0
-"""Noise is measured in cubes of this side."""
-MOST_PATCHES = 20_000
-"""A tenth of them lie in soft tissue: the spread of the quietest is then known to a few per cent."""
 QUIET_SHARE = 0.2
 """This share of the cubes is taken as quiet: the others hold the edge of something."""
-LEAST_PATCHES = 20
-"""From fewer no noise is told."""
-LOUD_HU = 30.0
-"""Diagnostic CT of the chest has 10 to 30 HU."""
 LOSS_PER_HU = 0.004
 """Share of the airway tree that each HU of noise above 20 costs in phantoms: 8 % at 40 HU, 20 % at 70 HU."""
-COARSE_SLICES_MM = 1.5
-"""Thinner slices show segmental bronchi nearly as wide as they are."""
 METAL_HU, LEAST_METAL_ML = 2500.0, 0.1
 """Compact bone ends at 2000 HU; a screw has more than the volume, as has a vein while contrast medium
 enters."""
@@ -40,14 +30,16 @@ def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
             "vessels in the slices around it, so a path that looks free there may not be."
         )
     noise = noise_hu(ct, near)
-    if noise > LOUD_HU:
+    # Diagnostic CT of the chest has 10 to 30 HU.
+    if noise > 30.0:
         loss = 100.0 * LOSS_PER_HU * (noise - 20.0)
         warnings.append(
             f"The noise is {noise:.0f} HU: {loss:.0f} % of the airways or more, the thin ones, are not "
             "found, and reach is understated by what they lead to. A reconstruction with a smoother "
             "kernel or thicker slices (up to 1.5 mm) shows more."
         )
-    if slice_mm(ct) > COARSE_SLICES_MM:
+    # Thinner slices show segmental bronchi nearly as wide as they are.
+    if slice_mm(ct) > 1.5:
         warnings.append(
             f"The slices are {slice_mm(ct):.1f} mm apart: bronchi look narrower than they are, and thin "
             "ones are missing, so that reach is understated, most in the upper and lower lobes. Slices of "
@@ -64,11 +56,13 @@ def noise_hu(ct: Volume, near: Mask) -> float:
     deviation tells.
     """
     box = window(*bounds(near))
-    side = np.maximum(2, np.rint(PATCH_MM / ct.grid.spacing_mm)).astype(np.int64)
+    # Noise is measured in cubes of this side.
+    side = np.maximum(2, np.rint(6.0 / ct.grid.spacing_mm)).astype(np.int64)
     patches = _cubes(ct.array[box], side)
     middles = patches.mean(axis=(1, 2, 3))
     patches = patches[(middles > TISSUE_HU[0]) & (middles < TISSUE_HU[1])]
-    if len(patches) < LEAST_PATCHES or side[:2].min() < 3:
+    # From fewer no noise is told.
+    if len(patches) < 20 or side[:2].min() < 3:
         return 0.0
     deviation = float(np.quantile(patches.std(axis=(1, 2, 3)), QUIET_SHARE))
     inner = patches[:, 1:-1, 1:-1]
@@ -82,7 +76,8 @@ def _cubes(values: Array, side: Array) -> Array:
     """Return cubes spread evenly over an image, `(N, *side)` float32."""
     counts = np.array(values.shape) // side
     total = int(counts.prod())
-    chosen = np.unique(np.linspace(0, total - 1, min(total, MOST_PATCHES)).astype(np.int64))
+    # A tenth of them lie in soft tissue: the spread of the quietest is then known to a few per cent.
+    chosen = np.unique(np.linspace(0, total - 1, min(total, 20_000)).astype(np.int64))
     low = np.stack(np.unravel_index(chosen, tuple(counts)), axis=1) * side
     inside = np.stack(np.meshgrid(*(np.arange(n) for n in side), indexing="ij"), axis=-1).reshape(-1, 3)
     at = low[:, None, :] + inside[None]
@@ -92,12 +87,8 @@ def _cubes(values: Array, side: Array) -> Array:
 
 LEAST_TRACHEA_MM = 25.0
 """A chest CT shows at least a quarter of the trachea, which is about 100 mm long."""
-LEAST_ENDS = 4
-"""A lung has three lobes or two, and some segments of each are always seen."""
 LEAST_SHARE = 0.2
 """A lung with fewer ends than this share of the other's has lost most of its airways."""
-GREATEST_LOOPS_SHARE = 0.25
-"""An airway with so many rings per end has grown into lung."""
 
 
 def tree_or_error(lumen: Volume) -> AirwayTree | AnatomyError:
@@ -129,13 +120,15 @@ def airway_warnings(tree: AirwayTree | AnatomyError, left: Mask, right: Mask, gr
     lungs = {"left": left, "right": right}
     counts = {side: int(grid.values_at(lung, tips, False).sum()) for side, lung in lungs.items()}
     for side, count in counts.items():
-        if count < max(LEAST_ENDS, LEAST_SHARE * max(counts.values())):
+        # A lung has three lobes or two, and some segments of each are always seen.
+        if count < max(4, LEAST_SHARE * max(counts.values())):
             warnings.append(
                 f"The airway stops early in the {side} lung: it has {count} ends there. Reach in that lung "
                 "is understated."
             )
     loops = len(tree.report.loops_opened)
-    if loops > max(GREATEST_LOOPS_SHARE * len(ends), 2):
+    # An airway with so many rings per end has grown into lung.
+    if loops > max(0.25 * len(ends), 2):
         warnings.append(
             f"Leak suspected: the airway has {loops} rings. A branch may be lung that no scope can "
             "enter: look at the branches of a plan."

@@ -9,20 +9,12 @@ from anatomy.segmentation.kernels import lumen_ends, tube_stretch
 from anatomy.segmentation.kernels import thin_airways as kernel
 from anatomy.segmentation.kernels.neighbours import box_offsets
 
-N_DIRECTIONS = 260
-"""Over the sphere: one every 13 degrees, 1.1 mm at the end of a stretch."""
 RING_VOXELS = (1.4, 2.0)
 """Radii of the ring about a line.  A wall thinner than a voxel appears so far from its middle."""
 N_PLACES = 400
 """In so many places of the lung it is learnt how much of a tube appears where there is none."""
-LEAST_PLACES = 50
-"""From fewer places no spread can be told."""
 LOOKED_AT = 100
 """This many voxels are looked at for each place."""
-WAY_STEP = 7
-"""The direction at each place lies so far behind that of the last in the list of all."""
-SPREAD_OF_MEDIAN = 1.4826
-"""The standard deviation of normal values over their median distance from the median."""
 FAR_MM = 4.0
 """They lie so far from the lumen."""
 BRIGHT_HU = 80.0
@@ -31,10 +23,6 @@ DEVIATIONS = 3.0
 """An airway has a contrast so many standard deviations above that of such places."""
 WALL_HU = 60.0
 """The wall of an airway is this much brighter than the lung."""
-END_REACH_MM = 2.0
-"""No lumen so near to an end is farther from the trachea."""
-MOST_STARTS = 4096
-"""An airway has some hundred ends, each with six places behind it."""
 
 
 @frozen_value
@@ -62,8 +50,10 @@ def follow_thin_airways(
     """
     per_mm = 1.0 / spacing_mm
     voxel_mm = float(np.prod(spacing_mm) ** (1.0 / 3.0))
-    directions, radii_mm = spread_directions(N_DIRECTIONS)[:, ::-1].copy(), voxel_mm * np.array(RING_VOXELS)
-    starts = np.zeros((3, MOST_STARTS, 3))
+    # Over the sphere: one every 13 degrees, 1.1 mm at the end of a stretch.
+    directions, radii_mm = spread_directions(260)[:, ::-1].copy(), voxel_mm * np.array(RING_VOXELS)
+    # An airway has some hundred ends, each with six places behind it.
+    starts = np.zeros((3, 4096, 3))
     n_starts = _find_starts(state, lung, spacing_mm, lumen[:count], known, starts)
     if n_starts == 0:
         return Tubes(count=count, n_tubes=0)
@@ -97,17 +87,20 @@ def _false_contrast(
     stride = max(int(np.count_nonzero(lung)) // (LOOKED_AT * N_PLACES), 1)
     places = np.zeros((LOOKED_AT * N_PLACES, 3), dtype=np.int64)
     count = tube_stretch.places_beside_bright(smooth, state, lung, stride, distance, bright_hu, places)
-    if count < LEAST_PLACES:
+    # From fewer places no spread can be told.
+    if count < 50:
         return 0.0
     places = places[np.linspace(0, count - 1, min(count, N_PLACES)).astype(np.int64)]
     contrast = np.zeros(len(places))
-    about = directions[(WAY_STEP * np.arange(len(places))) % len(directions)]
+    # The direction at each place lies so far behind that of the last in the list of all.
+    about = directions[(7 * np.arange(len(places))) % len(directions)]
     tube_stretch.best_contrasts(
         hu, state, lung, 1.0 / spacing_mm, places * spacing_mm, about, directions, radii_mm, contrast
     )
     np.maximum(contrast, 0.0, out=contrast)
     middle = float(np.median(contrast))
-    return middle + DEVIATIONS * SPREAD_OF_MEDIAN * float(np.median(np.abs(contrast - middle)))
+    # The standard deviation of normal values over their median distance from the median.
+    return middle + DEVIATIONS * 1.4826 * float(np.median(np.abs(contrast - middle)))
 
 
 def _find_starts(state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known: int, starts: Float) -> int:
@@ -117,7 +110,8 @@ def _find_starts(state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known:
     queue, parent = lumen.copy(), np.zeros(len(lumen), dtype=np.int64)
     near = box_offsets(shape, 1)
     count = lumen_ends.walk_lumen(state.reshape(-1), near, queue, known, parent, far.reshape(-1))
-    reach = np.ceil(END_REACH_MM / spacing_mm).astype(np.int64)
+    # No lumen so near to an end is farther from the trachea.
+    reach = np.ceil(2.0 / spacing_mm).astype(np.int64)
     return int(
         lumen_ends.find_ends(
             far, lung, queue, known, count, parent, reach, spacing_mm, starts[0], starts[1], starts[2]

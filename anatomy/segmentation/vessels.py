@@ -32,19 +32,11 @@ HILUM_STEP = 2
 """It lies outside the lung, where voxels are obstacles anyway: every other one tells enough."""
 REFERENCE_HU, BRIGHTEST_HU = 300.0, 200.0
 """I_ref and I_max of R_L."""
-LARGE_RESPONSE = 0.3
-"""R_T for R_L with min(I, I_max), calibrated on made cylinders."""
-LEAST_LARGE_MM3 = 350.0
-"""1000 voxels of 0.7 mm."""
-SIGMA_TOLERANCE_MM = 1e-6
-"""Rounding of scales that are given as decimals."""
 BLOOD_HU = 40.0
 """Blood without contrast medium."""
 SOLID_SHARE, EDGE_SHARE = 0.5, 0.25
 """Way from the lung's median to blood: where a voxel counts as solid, and as the edge of a vessel.  A vessel
 of half a voxel's radius gives no more; chosen on phantoms."""
-EDGE_VOXELS = 2
-"""How far the response of a vessel's core carries to its edge."""
 
 
 @frozen_record
@@ -114,7 +106,8 @@ def segment_vessels(
     large |= _hilum(space, solid, airways)
     best[airway] = 0.0
     edges = (space.hu >= towards_blood(lung_hu, EDGE_SHARE)) & ~airway & (space.n_scales > 0)
-    for _ in range(EDGE_VOXELS):
+    # How far the response of a vessel's core carries to its edge.
+    for _ in range(2):
         best = _raised_at_edges(space, best, edges)
     best[large] = 1.0
     found = space.whole(best, shape)
@@ -207,14 +200,17 @@ def _large(
     through vessels, and masks of walls reach into the vessels beside them.
     """
     tissue = (space.n_scales > 0) & ~airway
-    first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= radius_mm - SIGMA_TOLERANCE_MM)
+    # Rounding of scales that are given as decimals.
+    first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= radius_mm - 1e-6)
     sides, h = space.spacing_mm[::-1], float(space.spacing_mm.mean())
-    inside = (response >= LARGE_RESPONSE) & (at_scale >= first)
+    # R_T for R_L with min(I, I_max), calibrated on made cylinders.
+    inside = (response >= 0.3) & (at_scale >= first)
     inside |= tissue & (_distance_mm(solid, sides, space.threads) >= radius_mm + 0.5 * h)
     if not inside.any():
         return inside
     found = solid & tissue & (_distance_mm(~inside, sides, space.threads) <= radius_mm)
-    return _without_small(found, LEAST_LARGE_MM3 / float(np.prod(sides)))
+    # 1000 voxels of 0.7 mm.
+    return _without_small(found, 350.0 / float(np.prod(sides)))
 
 
 def _without_small(mask: Mask, least_voxels: float) -> Mask:

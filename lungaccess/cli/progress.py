@@ -8,8 +8,6 @@ from rich.text import Text
 
 from lungaccess.cli.terminal import progress_console, safe
 
-BAR_WIDTH = 24
-"""Leaves room for the description and the times on a line of 80 characters."""
 LEAST_SHARE = 0.02
 """From less than this share no time is extrapolated: its error would be larger than the time itself."""
 
@@ -48,7 +46,8 @@ def _bar(*more: ProgressColumn) -> Progress:
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=BAR_WIDTH),
+        # Leaves room for the description and the times on a line of 80 characters.
+        BarColumn(bar_width=24),
         _Times(),
         *more,
         console=progress_console,

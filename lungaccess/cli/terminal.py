@@ -44,9 +44,6 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-WIDEST = 400
-"""Characters that the widest table may take on a line."""
-
 console = _Console()
 error_console = _Console(stderr=True)
 progress_console = _Console(stderr=True)
@@ -178,7 +175,8 @@ def show_wide(tables: Iterable[Table]) -> None:
     """Print tables of many columns as wide as they are: a terminal breaks their lines, a pager scrolls."""
     width = console.width
     for made in tables:
-        natural = console.measure(made, options=console.options.update(max_width=WIDEST)).maximum
+        # Characters that the widest table may take on a line.
+        natural = console.measure(made, options=console.options.update(max_width=400)).maximum
         try:
             console.width = max(natural, width)
             console.print(made)

@@ -19,9 +19,6 @@ from stages.needle.path import ArcPath, kernel_arcs
 
 SAMPLE_MM = 0.1
 """Greatest step of the trapezoid rule, as long as the least clearance that counts."""
-EXACT_BELOW_VOXELS = 8.0
-"""Nearer than so many of the longest voxel sides, distances are exact; farther, the clearance field's lower
-bound is less than 0.6 % off."""
 
 
 def obstacle_clearance_mm(obstacles: Obstacles, points: Float) -> Float:
@@ -36,7 +33,9 @@ def obstacle_clearance_mm(obstacles: Obstacles, points: Float) -> Float:
     places = np.array(points, dtype=np.float64, order="C")
     clearance = np.zeros(len(places))
     field_kernel.bounds_at(field, geometry, places, clearance)
-    exact_below_mm = EXACT_BELOW_VOXELS * math.sqrt(geometry[:, 4].max())
+    # Nearer than so many of the longest voxel sides, distances are exact; farther, the clearance field's
+    # lower bound is less than 0.6 % off.
+    exact_below_mm = 8.0 * math.sqrt(geometry[:, 4].max())
     near = np.flatnonzero(clearance < exact_below_mm)
     found = np.zeros(len(near))
     field_kernel.exact_at(labels, geometry, places[near], bits, -1, 1.2 * exact_below_mm, found)

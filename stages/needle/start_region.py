@@ -235,12 +235,6 @@ def _down(value: float) -> str:
     return f"{math.floor(10.0 * value) / 10.0:.1f}"
 
 
-OFFSETS = 25
-"""Offsets for which the largest proved tilt is computed: steps of 4 % of the largest."""
-MOST_VIAS = 4
-"""Ends of arcs of the plan that the proved family may go through: plans have one to three arcs."""
-
-
 def prove_starts(environment: NeedleEnvironment, query: Query, path: ArcPath) -> ProvedStarts:
     """Prove for a ball of places times a cone of directions that every start in it has a clear path.
 
@@ -259,7 +253,8 @@ def prove_starts(environment: NeedleEnvironment, query: Query, path: ArcPath) ->
     )
     if not any(each.count for each in families):
         return ProvedStarts(offsets_mm=np.zeros(0), tilts_rad=np.zeros(0), vias=())
-    offsets = np.linspace(0.0, most, OFFSETS) if most > 0.0 else np.zeros(1)
+    # Offsets for which the largest proved tilt is computed: steps of 4 % of the largest.
+    offsets = np.linspace(0.0, most, 25) if most > 0.0 else np.zeros(1)
     tilts = np.stack([each.largest_tilts(limits, branch, offsets) for each in families])
     chosen = np.argmax(tilts, axis=0)
     kept = np.flatnonzero(tilts.max(axis=0) >= 0.0)
@@ -320,5 +315,6 @@ class _Family:
 
 def _vias_of(path: ArcPath, target: Float) -> list[Float]:
     """Return the sets of via points `(V, 3)` that the proved paths may go through."""
-    corners = path.frames()[1:-1, :3, 3][-MOST_VIAS:]
+    # Ends of arcs of the plan that the proved family may go through: plans have one to three arcs.
+    corners = path.frames()[1:-1, :3, 3][-4:]
     return [corners[first:] for first in range(len(corners) + 1)]

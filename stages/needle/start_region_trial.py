@@ -25,8 +25,6 @@ GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
 TURNS = (0.6180339887498949, 0.7548776662466927)
 """From place to place the directions are shifted by these shares of a step and of a turn: together the
 places try many more: multiples of these numbers fall evenly between 0 and 1."""
-RING_MM = (0.0, 3.0, 6.0)
-"""How far beside the planned path via points lie: enough to pass a vessel of a few mm on its other side."""
 RING_SHARES = (0.25, 0.5, 0.75)
 RING_POINTS = 6
 FAR_MM, FAR_RAD = 20.0, math.radians(60.0)
@@ -171,7 +169,8 @@ def _vias_around(path: ArcPath) -> Float:
     points, lengths = path.sample(0.5)
     places = [path.frames()[1:-1, :3, 3]]
     x, y = path.lps_from_start[:3, 0], path.lps_from_start[:3, 1]
-    for radius in RING_MM:
+    # How far beside the planned path via points lie: enough to pass a vessel of a few mm on its other side.
+    for radius in (0.0, 3.0, 6.0):
         for share in RING_SHARES:
             centre = points[int(np.argmin(np.abs(lengths - share * lengths[-1])))]
             angles = 2.0 * math.pi * np.arange(RING_POINTS if radius else 1) / RING_POINTS

@@ -15,12 +15,8 @@ from stages.scope.kernels.growth import Device, Route
 
 STEP_MM = 1.0
 """Advance from layer to layer: about a voxel and a half, far shorter than a bending section."""
-BEAMS = (24, 96)
-"""States kept in a layer, and those kept where fewer did not get as far as the scope passes the axis."""
 RINGS_PER_MM = (0.003, 0.01, 0.03)
 """Curvatures beside that which leads to the route ahead: at a tip of 15 mm they move it by 0.3 to 3 mm."""
-SPOKES = 8
-"""Directions of a ring: 45 degrees apart."""
 TANGENT_MM = 3.0
 """The direction of a route is that of its chord so far each way: several voxels, less than a branch."""
 LEAST_ROOM_MM = 0.3
@@ -96,7 +92,8 @@ class Growth:
     def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, passable: Bool, device: Device) -> None:
         self._walls, self._tree, self._device = walls, tree, device
         self._tried, self._passable = tried, passable
-        self._offsets = np.vstack([np.zeros((1, 2)), rings(RINGS_PER_MM, SPOKES)])
+        # Directions of a ring: 45 degrees apart.
+        self._offsets = np.vstack([np.zeros((1, 2)), rings(RINGS_PER_MM, 8)])
         self._rows: list[Float] = []
         self._parents: list[Int] = []
         self._straight: list[Bool] = []
@@ -118,7 +115,8 @@ class Growth:
         route = self._route(points)
         if branch == 0 and not self._begin(route):
             return
-        for beam, lengths in zip(BEAMS, FROM_FORK, strict=True):
+        # States kept in a layer, and those kept where fewer did not get as far as the scope passes the axis.
+        for beam, lengths in zip((24, 96), FROM_FORK, strict=True):
             layers = self._follow(branch, points, route, beam, lengths * self._device.length)
             known = self._layers.get(branch, [])
             if not known or (layers and layers[-1][1] > known[-1][1]):

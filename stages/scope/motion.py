@@ -20,8 +20,6 @@ from stages.scope.device import laid_pieces
 
 ADVANCE, TWIST, BEND = range(3)
 """Columns of a motion's states: advance in mm, twist and bend in rad."""
-NEARLY_WHOLE = 1e-6
-"""A number that misses a whole one by less is whole: it went through radians."""
 
 
 @frozen_record
@@ -116,6 +114,7 @@ class ScopeMotion:
         """
         scale = 10.0**decimals
         advance, (twist, bend) = self.states[:, ADVANCE], np.degrees(self.states[:, 1:]).T
-        cut = np.sign(bend) * np.floor(np.abs(bend) * scale + NEARLY_WHOLE) / scale
+        # A number that misses a whole one by less is whole: it went through radians.
+        cut = np.sign(bend) * np.floor(np.abs(bend) * scale + 1e-6) / scale
         angles = np.radians(np.stack([np.round(twist, decimals), cut], axis=1))
         return replace(self, states=np.column_stack([np.round(advance, decimals), angles]))

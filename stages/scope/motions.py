@@ -22,9 +22,6 @@ from stages.scope.motion_proof import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD, kern
 from stages.scope.passages import Passages, find_passages
 from stages.scope.shifting import State, slide, turn
 
-BESIDE_AXIS_MM = 0.5
-"""The lumen may be wider by so much, half a voxel or more, beside the axis than on it."""
-
 
 @frozen_record
 class ScopeTip:
@@ -209,7 +206,8 @@ def _entry(states: StateTree) -> Float:
 
 def _worth_a_try(tree: AirwayTree, radius_mm: float) -> Bool:
     """Tell which tree points are not too narrow on the way to them, nor would be a little beside the axis."""
-    wide = tree.radius_mm >= radius_mm - BESIDE_AXIS_MM
+    # The lumen may be wider by so much, half a voxel or more, beside the axis than on it.
+    wide = tree.radius_mm >= radius_mm - 0.5
     for point in range(1, tree.n_points):
         wide[point] &= wide[tree.parent_point[point]]
     return wide

@@ -26,14 +26,8 @@ from stages.scope.kernels import resting as kernel
 from stages.scope.kernels.resting import Lumen
 from stages.scope.motion import BEND, TWIST, ScopeMotion
 
-SHAFT_STEP_MM = 2.0
-"""Length of the arcs of the shaft, at most: the wall is looked at where they end."""
 SECTION_STEP_MM = 1.0
 """Length of the arcs of the bending section, at most, which is bent more tightly."""
-HEAD_STIFFER = 1e3
-"""The camera head is so many times as stiff as the section: it does not bend."""
-BESIDE_MM = 6.0
-"""The wall is known so far outside the lumen: farther than any shaft reaches into it."""
 ENOUGH_N_MM = 1e-7
 """A step worth less energy is not taken: it would move a tip that hangs over by 50 mm by some micrometres."""
 MOST_STEPS = 1000
@@ -44,14 +38,10 @@ HOLD_N_PER_MM = 1.0
 """How stiffly the tip is held at its depth while the shaft settles at first, lest it leaves its branch."""
 HELD_MM = 0.01
 """The hand has followed where the tip, let go, moves the spring by less than this: a force of 0.01 N."""
-SOON_N_MM = 1e-4
-"""While the tip is held, a step is worth at least this."""
 FARTHER_MM = 3.0
 """The hand advances by no more in a round."""
 DEPTH_MM = 0.02
 """The tip has its depth up to this, far less than anybody measures."""
-FRICTION_MM = 0.05
-"""Friction has settled where a round moves the tip by less than this."""
 PRESSED_MM = 10.0
 """The force on the wall is stated as the largest on a stretch of this length, about that of one contact."""
 
@@ -185,7 +175,8 @@ class RestingShaft:
             kernel.press(self._lumen, drawn, laid, give, force)
             moved, tip = float(np.linalg.norm(laid[-1, 9:] - tip)), laid[-1, 9:].copy()
             beyond = 0.0 if as_advanced else float((tip - planned[:3, 3]) @ planned[:3, 2])
-            still = not chosen.friction or moved < FRICTION_MM
+            # Friction has settled where a round moves the tip by less than this.
+            still = not chosen.friction or moved < 0.05
             settled = expected <= ENOUGH_N_MM
             if abs(beyond) < DEPTH_MM and still:
                 break
@@ -230,7 +221,8 @@ class RestingShaft:
         for count in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
             drawn = _drawn_back(held, farther)
-            kernel.bring_to_rest(self._lumen, drawn, entry, curvature, pull, laid, SOON_N_MM, MOST_STEPS)
+            # While the tip is held, a step is worth at least this.
+            kernel.bring_to_rest(self._lumen, drawn, entry, curvature, pull, laid, 1e-4, MOST_STEPS)
             beyond = float((laid[-1, 9:] - held.tip) @ held.ahead)
             if abs(beyond) < HELD_MM:
                 break
@@ -245,7 +237,8 @@ class RestingShaft:
         """Return the shaft in the last state of a motion, and the curvature `(N, 2)` as it was laid."""
         section, head = motion.bending_length_mm, self._scope.rigid_head_mm
         behind = motion.length_mm - section
-        parts = [(behind, SHAFT_STEP_MM), (section - head, SECTION_STEP_MM), (head, SECTION_STEP_MM)]
+        # Length of the arcs of the shaft, at most: the wall is looked at where they end.
+        parts = [(behind, 2.0), (section - head, SECTION_STEP_MM), (head, SECTION_STEP_MM)]
         arcs = [_equal(length, step) for length, step in parts]
         length = np.concatenate(arcs)
         laid = _laid(motion, length)
@@ -254,7 +247,8 @@ class RestingShaft:
         begin, end = len(arcs[0]), len(arcs[0]) + len(arcs[1])
         twist, bend = motion.states[-1, TWIST], motion.states[-1, BEND]
         rest[begin:end] = bend / (section - head) * np.array([np.cos(twist), np.sin(twist)])
-        stiffness[end:] *= HEAD_STIFFER
+        # The camera head is so many times as stiff as the section: it does not bend.
+        stiffness[end:] *= 1e3
         laid[begin:] = rest[begin:]
         stiff = chosen.wall_stiffer * self._contact.wall_stiffness_n_per_mm2
         wall = stiff * 0.5 * (length + np.append(length[1:], 0.0))
@@ -321,7 +315,8 @@ def lumen_of(lung: Lung) -> Lumen:
 
 def signed_depth(inside: Mask, grid: Grid) -> Lumen:
     """Return the signed depth in a lumen `(ni, nj, nk)` bool: voxels are boxes, and the border is at 0."""
-    wide = np.ceil(BESIDE_MM / grid.spacing_mm).astype(np.int64)
+    # The wall is known so far outside the lumen: farther than any shaft reaches into it.
+    wide = np.ceil(6.0 / grid.spacing_mm).astype(np.int64)
     low, high = np.zeros(3, dtype=np.int64), np.array(grid.shape)
     for axis in range(3):
         filled = np.flatnonzero(inside.any(axis=tuple(k for k in range(3) if k != axis)))

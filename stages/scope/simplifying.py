@@ -27,8 +27,6 @@ TURN_MM, STEP_MM = 0.2, 0.1
 """Longest parts of changes in place and longest steps along the body in which room is measured."""
 STEPS, GAIN = 40, 0.005
 """A fit ends after so many steps, or where a step gains less than this share."""
-GRIDS = (1.0, 0.1)
-"""Twists, bends and advances become multiples of so many degrees and mm, of the first that is proved."""
 FREE = (2, 4, 3)
 """So many of the last twists, bends and advances stay as they are: the six numbers of a pose need some."""
 MOST_TRIES = 60
@@ -164,7 +162,8 @@ class Simplifier:
 
     def _rounded(self, legs: Legs) -> Legs:
         """Return legs with round twists, bends and advances but for the last ones, which make up for it."""
-        for grid in GRIDS:
+        # Twists, bends and advances become multiples of so many degrees and mm, of the first that is proved.
+        for grid in (1.0, 0.1):
             bounds = self._bounds(legs)
             units = np.full(len(bounds), math.radians(grid))
             units[-legs.count :] = grid

@@ -18,12 +18,8 @@ FIRST_MARK = 5
 
 There is room for 125 levels in uint8.
 """
-SETTLED_LAYERS = 3
-"""The front of a piece is compared with the widest of its first layers."""
 DARK_SHARE = 0.1
 """Where more than this of what lies behind a cross-section is dark, it is a narrow of an airway."""
-POCKET_SHARE = 0.2
-"""A piece of which more than this lies in or behind pockets is one."""
 MOST_RINGS = 5
 """A piece with more rings is lung between vessels: bronchi have none, and their noise makes a few."""
 REPEATS = 8
@@ -82,7 +78,8 @@ def flood(depth, state, near, start, level, mark, front_factor, front_slack, que
             layer_ends[layer - 1] = layer_end
             layer += 1
             layer_end = tail
-            if layer <= SETTLED_LAYERS:
+            # The front of a piece is compared with the widest of its first layers.
+            if layer <= 3:
                 widest = max(widest, front)
             elif front > front_factor * widest + front_slack:
                 return tail, layer, True
@@ -190,7 +187,8 @@ def ban_pockets(hu, state, near, size, mark, wide, rim, dark_hu, queue, parent, 
         if state[queue[parent[q]]] == BANNED:
             state[queue[q]] = BANNED
             banned += 1
-    if banned > POCKET_SHARE * size:
+    # A piece of which more than this lies in or behind pockets is one.
+    if banned > 0.2 * size:
         for q in range(size):
             state[queue[q]] = BANNED
         return size

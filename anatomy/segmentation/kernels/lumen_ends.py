@@ -13,13 +13,9 @@ from anatomy.segmentation.kernels.states import LUMEN
 BACK_MM = np.array([3.0, 6.0])
 """The direction of an end is that from the middle of the lumen so far behind it: beyond the last voxels,
 which are ragged, and before the next fork."""
-SIDE_MM = 1.5
-"""Thin branches part farther from each other than this: none is missed between two places."""
 SIDES = 6
 """So many places, so far apart, behind an end are searched for the other branch of a fork: over 9 mm, as long
 as a thin branch."""
-THIN_REACH = 2
-"""The section is measured in a box of five voxels: it holds the whole of a lumen that is thin."""
 THIN_MM2 = 5.0
 """Only where the lumen has no larger section: beside wide airways lie corridors between vessels."""
 
@@ -73,7 +69,8 @@ def is_farthest(far, at, reach):
 @merged_kernel
 def section_mm2(far, point, spacing_mm):
     """Return about the cross-section of the lumen at a point: its volume in a box over the box's side."""
-    reach = THIN_REACH
+    # The section is measured in a box of five voxels: it holds the whole of a lumen that is thin.
+    reach = 2
     low = np.zeros(3, dtype=np.int64)
     for n in range(3):
         low[n] = max(int(np.rint(point[n] / spacing_mm[n])) - reach, 0)
@@ -147,7 +144,8 @@ def find_ends(far, lung, queue, known, count, parent, reach, spacing_mm, starts,
             position_of(queue[p], far.shape, spacing_mm, here)
             walked += np.sqrt(((here - old) ** 2).sum())
             old[:] = here
-            if walked >= (sides + 1) * SIDE_MM:
+            # Thin branches part farther from each other than this: none is missed between two places.
+            if walked >= (sides + 1) * 1.5:
                 sides += 1
                 starts[size] = here
                 thin = section_mm2(far, here, spacing_mm) <= THIN_MM2

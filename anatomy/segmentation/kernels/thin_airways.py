@@ -14,22 +14,12 @@ from anatomy.segmentation.kernels.tube_stretch import ANGLES, END_COS, NOTHING, 
 
 TURN_COS = np.cos(np.radians(30.0))
 """A tube turns by 30 degrees at most from one stretch to the next: more would be a fork."""
-ADVANCE_MM = 1.5
-"""The next stretch begins so far along the one before: most of each is seen again."""
-TAIL_MM = 4.0
-"""This much of the last stretch is airway: its end may lie beyond the end of the tube."""
-HALF_SHARE = 0.3
-"""Each half of the last stretch has this share of the contrast asked of a tube: no end is half a tube."""
 DRIFT = 0.6
 """A place without a tube has about half of the contrast asked of one, and a tube as thin as a voxel 0.8."""
-GREATEST = 1.5
-"""No stretch alone, however dark, counts for more."""
 EVIDENCE = 1.3
 """Between three and four stretches of the contrast asked give so much, 9 mm; fewer may be chance."""
 DEBT = 1.0
 """A gap may cost so much: where mucus, noise or a narrow place hides some mm of a tube."""
-LEAST_STRETCHES = 2
-"""A tube that is followed is longer than one stretch."""
 MOST_STRETCHES = 60
 """90 mm: longer than any airway goes on behind the lumen that is seen well."""
 
@@ -60,20 +50,25 @@ def trace(
         )  # fmt: skip
         if contrast == NOTHING or mean < least_ring_hu:
             break
-        evidence += min(contrast / least_contrast, GREATEST) - DRIFT
+        # No stretch alone, however dark, counts for more.
+        evidence += min(contrast / least_contrast, 1.5) - DRIFT
         greatest = max(greatest, contrast)
         for k in range(3):
-            path[size, k] = begin[k] + ADVANCE_MM * heading[k]
-        if evidence > most and half >= HALF_SHARE * least_contrast:
+            # The next stretch begins so far along the one before: most of each is seen again.
+            path[size, k] = begin[k] + 1.5 * heading[k]
+        # Each half of the last stretch has this share of the contrast asked of a tube: no end is half a tube.
+        if evidence > most and half >= 0.3 * least_contrast:
             most, found = evidence, size
             for k in range(3):
-                tail[k] = begin[k] + TAIL_MM * heading[k]
+                # This much of the last stretch is airway: its end may lie beyond the end of the tube.
+                tail[k] = begin[k] + 4.0 * heading[k]
         point[:] = path[size]
         along[:] = heading
         size += 1
         other = np.zeros(3)
         least_cos = TURN_COS
-    if found < LEAST_STRETCHES or most < EVIDENCE or greatest < least_contrast:
+    # A tube that is followed is longer than one stretch.
+    if found < 2 or most < EVIDENCE or greatest < least_contrast:
         return 0
     path[found + 1] = tail
     return found + 2

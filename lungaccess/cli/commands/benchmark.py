@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from lungaccess.running.benchmark.runs import Pose
 
 Rules = Literal["ours", "unc"]
-UNC_RADII_MM = "50,100,121"
-"""The radii of the peer's recorded runs."""
 DEFAULT_PLANNERS = "rrt,optimal,resolution,decide,control.RRT"
 
 benchmark = App(
@@ -182,7 +180,8 @@ def _radii(text: str | None, rules: Rules, device: System) -> tuple[float, ...]:
     if text is None and rules == "ours":
         return (device.require_needle("The benchmark of needles").min_radius_of_curvature_mm,)
     try:
-        radii = tuple(float(part) for part in (UNC_RADII_MM if text is None else text).split(","))
+        # The radii of the peer's recorded runs.
+        radii = tuple(float(part) for part in ("50,100,121" if text is None else text).split(","))
     except ValueError:
         radii = ()
     if not radii or not all(5.0 <= mm < float("inf") for mm in radii):

@@ -22,21 +22,16 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from anatomy.lung import Lung
 
-DEMO_SEED = 1
-"""The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps."""
-DEMO_BUDGET_S = 3.0
-"""The cost has settled by then, and a first visitor does not wait long."""
-DEMO_SPACING_MM = 1.25
-"""Coarse enough that the patient is made within seconds, fine enough for the airways of the plan."""
-
 
 def demo(
     *,
     out: Annotated[Path, Parameter(help="Folder for plan.json, the pictures and report.html.")] = Path(
         "demo-output"
     ),
-    budget: Annotated[Seconds, Parameter(help="Planning time in seconds.")] = DEMO_BUDGET_S,
-    seed: Annotated[Seed, Parameter(help="Seed of the patient and of the search.")] = DEMO_SEED,
+    # The cost has settled by then, and a first visitor does not wait long.
+    budget: Annotated[Seconds, Parameter(help="Planning time in seconds.")] = 3.0,
+    # The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps.
+    seed: Annotated[Seed, Parameter(help="Seed of the patient and of the search.")] = 1,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it."""
@@ -67,7 +62,8 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
     from anatomy.phantom import make_phantom
     from anatomy.store import open_lung
 
-    images = make_phantom(seed=seed, size="adult", spacing_mm=DEMO_SPACING_MM).images
+    # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
+    images = make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
     return open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
 
 

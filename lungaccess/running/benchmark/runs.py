@@ -21,8 +21,6 @@ SLICE = 200
 SAMPLE_MM = 0.05
 """Clearance is measured at points so far apart: a tenth of a voxel."""
 THERE_IS_ONE = "nothing found in the time given, though another planner found a path"
-BEFORE_PLANNING = ""
-"""The planner of rows that hold for all planners: what is ruled out before any of them begins."""
 
 
 @frozen_value
@@ -56,7 +54,8 @@ class BenchmarkRow:
     start: int | None = None
     target: int | None = None
     radius_mm: float | None = None
-    planner: str = BEFORE_PLANNING
+    # The planner of rows that hold for all planners: what is ruled out before any of them begins.
+    planner: str = ""
     seed: int | None = None
     solved: bool = False
     first_cpu_ms: float | None = None

@@ -22,8 +22,6 @@ from lungaccess.running.study.driver import Progress, RunMaker, open_results
 from lungaccess.running.study.runs import Run, beside, runs_of
 from lungaccess.running.study.settings import StudyError
 
-MOST_REFUSED = 64
-"""For one device so many may be refused: a round in narrow limits ends, with fewer devices."""
 _OUTCOME = """
 SELECT r.correct_solution, 1.0 * json_extract(p.plan, '$.chance.successes')
     / json_extract(p.plan, '$.chance.samples')
@@ -157,7 +155,8 @@ class _Search:
         """Return the devices of a round: anywhere in the ranges first, then nearer and nearer to the best."""
         design, found = self._design, list[Contender]()
         centres = chosen(counted, min(len(counted), math.ceil(design.designs / design.reduction)))
-        for _ in range(MOST_REFUSED * design.designs):
+        # For one device so many may be refused: a round in narrow limits ends, with fewer devices.
+        for _ in range(64 * design.designs):
             point = self._even.random(1)[0].tolist()
             if number:
                 centre = centres[len(found) % len(centres)].system

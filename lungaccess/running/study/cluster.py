@@ -20,12 +20,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 RETRIES = 2
 """How often dask tries a run again at once: workers and disks may fail for a moment."""
-RUNS_A_WORKER = 3
-"""One run is made, and two are waiting where they are needed next: so no worker is ever idle."""
 LEAST_RUNS = 4
 """Runs are also handed over while the workers are still starting."""
-COUNT_WORKERS_EVERY_S = 5.0
-"""Asking takes a round trip to the scheduler; workers seldom come or go."""
 CONNECT_S = 20.0
 """A scheduler that does not answer for so long is taken to be absent."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -185,7 +181,9 @@ class Backlog:
 
     def limit(self) -> int:
         """Return the largest number of runs that may be under way."""
-        if time.monotonic() - self._asked_s > COUNT_WORKERS_EVERY_S:
-            self._limit = max(LEAST_RUNS, RUNS_A_WORKER * len(self._client.nthreads()))
+        # Asking takes a round trip to the scheduler; workers seldom come or go.
+        if time.monotonic() - self._asked_s > 5.0:
+            # One run is made, and two are waiting where they are needed next: so no worker is ever idle.
+            self._limit = max(LEAST_RUNS, 3 * len(self._client.nthreads()))
             self._asked_s = time.monotonic()
         return self._limit

@@ -29,10 +29,6 @@ from lungaccess.showing.report.html.deployment import packed_plan
 from lungaccess.uncertainty.breathing.window import with_window
 from stages.tube import exit_points, shapes_digest
 
-KEPT_ATLASES = 3
-"""In memory; others come from the cache within a second."""
-ADVICE_S = 3.0
-"""Seconds for what would lift the chance of success."""
 TELL_EVERY_S = 0.25
 """Exits and plans that become better are sent so often: more often, nobody sees the difference."""
 
@@ -87,7 +83,8 @@ class Answers:
         if key not in self._atlases:
             self._atlases[key] = open_atlas(self.lung, system, cache=self._source.cache, progress=progress)
         self._atlases.move_to_end(key)
-        while len(self._atlases) > KEPT_ATLASES:
+        # In memory; others come from the cache within a second.
+        while len(self._atlases) > 3:
             self._atlases.popitem(last=False)
         return replace(self._atlases[key], system=system)
 
@@ -270,7 +267,8 @@ class Answers:
                 "answer": "appraisal", "digest": found.digest, **appraisal.to_mapping(),
                 "window": window or motion, "breathing_known": window is not None,
                 "findings": len(appraisal.check.findings), "refusals": len(appraisal.check.refusals),
-                "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=ADVICE_S)],
+                # Seconds for what would lift the chance of success.
+                "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=3.0)],
             }
         )  # fmt: skip
 

@@ -20,9 +20,6 @@ from lungaccess.problem.goals import SUCCESS
 from lungaccess.problem.request import StatedPlace
 from lungaccess.showing.explorer.questions import PlanQuestion, WhatIf
 
-SYSTEM_FILE = "system.toml"
-"""The name under which a changed system is saved for the command line."""
-
 
 def system_of(what_if: WhatIf, own: Mapping[str, System]) -> System:
     """Return the system of a question.
@@ -120,7 +117,8 @@ def plan_command(
     ):
         device = [what_if.system, "--allow-fissures" if what_if.fissures_allowed else "--no-allow-fissures"]
     else:
-        device = [SYSTEM_FILE]
+        # The name under which a changed system is saved for the command line.
+        device = ["system.toml"]
     kind, _, number = question.target.partition(" ")
     target = ["--nodule", number] if kind == "nodule" else ["--target", question.target]
     through = [] if place is None else place.words

@@ -16,8 +16,6 @@ from lungaccess.showing.explorer.questions import ANSWERS, CLICKS, PLANS, REACH
 from lungaccess.showing.explorer.worker import Asked, Ended, Given, PatientSource, Worker
 
 NAMES = (CLICKS, PLANS, REACH, ANSWERS)
-ENDS_WITHIN_S = 5.0
-"""A process that does not end by itself within this time is ended."""
 
 
 def _work(connection: Connection, source: PatientSource, folder: Path) -> None:
@@ -105,7 +103,8 @@ class Process:
             connection.close()
         if process is not None:
             process.terminate()
-            process.join(ENDS_WITHIN_S)
+            # A process that does not end by itself within this time is ended.
+            process.join(5.0)
             if process.is_alive():
                 process.kill()
                 process.join()

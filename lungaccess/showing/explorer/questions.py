@@ -13,7 +13,6 @@ from lungaccess.problem.goals import SUCCESS
 
 MOST_CHARACTERS = 20_000
 """A message of the page is shorter by far."""
-MOST_ITERATIONS = 20_000
 CLICKS, PLANS, REACH, ANSWERS = "clicks", "plans", "reach", "answers"
 """The processes that answer: what a click shows at once, the search for a plan, the reach of the system, and
 what takes seconds.  The first never waits for a step of a search."""
@@ -141,7 +140,7 @@ class PlanQuestion(_Question):
     target: Annotated[str, Len(1, 200)]
     what_if: WhatIf = WhatIf()
     goal: Annotated[str, Len(1, 200)] = SUCCESS.name
-    iterations: Annotated[int, Field(strict=True, ge=0, le=MOST_ITERATIONS)] = 20
+    iterations: Annotated[int, Field(strict=True, ge=0, le=20_000)] = 20
     seed: Number = 0
     scope_tip: Number | None = None
     entry: Number | None = None

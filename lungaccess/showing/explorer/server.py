@@ -24,8 +24,6 @@ from lungaccess.showing.report.html.document import filled, scene_figure, slice_
 
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24
-MOST_PLANS = 200
-"""Plans of a page that can still be appraised and exported; older ones are forgotten."""
 MOST_FILES = 20
 MOST_OPEN = 64
 """Questions of one page that may wait for answers: a page asks a handful at a time."""
@@ -79,7 +77,8 @@ class Page:
         """Keep a plan, and forget the oldest of too many."""
         self.plans[plan.digest] = plan
         self.plans.move_to_end(plan.digest)
-        while len(self.plans) > MOST_PLANS:
+        # Plans of a page that can still be appraised and exported; older ones are forgotten.
+        while len(self.plans) > 200:
             self.plans.popitem(last=False)
 
 

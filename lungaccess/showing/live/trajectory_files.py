@@ -17,8 +17,6 @@ from lungaccess.showing.live.trajectory import NEEDLE, SCOPE, TUBES, Trajectory
 
 TABLE_FILE, JOINTS_FILE = "trajectory.csv", "joint_trajectory.yaml"
 PATH_FILES = {SCOPE: "scope_path.yaml", TUBES: "tubes_path.yaml", NEEDLE: "needle_path.yaml"}
-FRAME_ID = "patient_lps"
-"""Frame of all positions: x to the patient's left, y to the back, z to the head; in ROS 2 in metres."""
 M_PER_MM = 1e-3
 DIGITS = 10
 """Significant digits of a number: far below a nanometre."""
@@ -114,7 +112,8 @@ def _unit(name: str) -> str:
 
 
 def _header(time_s: float) -> dict[str, Any]:
-    return {"stamp": _time(time_s), "frame_id": FRAME_ID}
+    # Frame of all positions: x to the patient's left, y to the back, z to the head; in ROS 2 in metres.
+    return {"stamp": _time(time_s), "frame_id": "patient_lps"}
 
 
 def _time(time_s: float) -> dict[str, int]:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 PROJECTIONS_VERSION = 2
 SEEN_THROUGH = ("lung", "fissure", "vessel", "airway", "lumen", "nodule")
 """The masks that pictures show from a standard view, or count."""
-LUNG_POINTS = 3_000_000
-"""A mask of more voxels is thinned out evenly: the picture has fewer pixels."""
 
 
 @frozen_record
@@ -106,7 +104,8 @@ class Layers:
 
 def _unfold(mask: Array, grid: Grid) -> tuple[Float, int]:
     """List the voxel centres of a mask, thinned out evenly where there are very many."""
-    stride = max(1, int(np.ceil((np.count_nonzero(mask) / LUNG_POINTS) ** (1 / 3))))
+    # A mask of more voxels is thinned out evenly: the picture has fewer pixels.
+    stride = max(1, int(np.ceil((np.count_nonzero(mask) / 3_000_000) ** (1 / 3))))
     thin = mask[::stride, ::stride, ::stride]
     return grid.lps(np.argwhere(thin) * stride), stride
 

@@ -28,8 +28,6 @@ PANELS_IN = ((0.5, 1.0, 5.0, 5.3), (5.9, 1.0, 5.0, 5.3), (11.4, 1.0, 5.3, 5.3))
 """Left, bottom, width and height of the panels."""
 HEADLINE_LETTERS = 150
 MARGIN_MM = 12.0
-LEAST_CUT_MM = 25.0
-"""The cut shows at least so much around what it is about."""
 BLOCKED_AT = "#D32F2F"
 """Colour of the cross where a path is blocked first."""
 
@@ -97,7 +95,8 @@ def _cut_panel(axes: Axes, explanation: Explanation, layers: Layers) -> None:
         shown.append(explanation.neighbour.plan.target_lps)
     uv = view.project(np.array(shown))
     middle = 0.5 * (uv.min(axis=0) + uv.max(axis=0))
-    half = np.maximum(0.5 * np.ptp(uv, axis=0) + MARGIN_MM, LEAST_CUT_MM)
+    # The cut shows at least so much around what it is about.
+    half = np.maximum(0.5 * np.ptp(uv, axis=0) + MARGIN_MM, 25.0)
     drawing.fit(axes, middle - half, middle + half)
     paint_cut(axes, layers, view, target)
     _paths(axes, explanation, view)

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 WIDTH_IN, HEIGHT_IN = 18.0, 11.9
 HEADLINE_TOP_IN = 0.47
-HEADLINE_CHARACTERS = 240
-"""This many letters of the headline's size fill the width of the picture."""
 # left, bottom, width, height of each panel, inches
 PROJECTIONS_IN = ((0.55, 6.0, 4.75, 4.7), (5.85, 6.0, 4.75, 4.7), (11.15, 6.0, 3.35, 4.7))
 EXIT_IN, NEEDLE_IN = (0.3, 0.75, 4.3, 4.3), (4.8, 0.75, 4.3, 4.3)
@@ -96,7 +94,8 @@ def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
     figure.text(
         0.3 / WIDTH_IN,
         1 - HEADLINE_TOP_IN / HEIGHT_IN,
-        textwrap.fill(words, HEADLINE_CHARACTERS),
+        # This many letters of the headline's size fill the width of the picture.
+        textwrap.fill(words, 240),
         va="top",
         fontsize=10,
         color=headline.grade.colour,

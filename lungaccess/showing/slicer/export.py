@@ -26,7 +26,6 @@ from lungaccess.uncertainty.risk import proved_body, safe_start_region, tried_bo
 
 SCENE_FILE, README_FILE, ROUTE_FILE, PLAN_FILE = "scene.mrml", "README.txt", "route_custusx.txt", "plan.json"
 SEGMENTATION_FILE, TREE_FILE, POINTS_FILE = "anatomy.seg.nrrd", "airway_tree.vtp", "points.mrk.json"
-AIM_FILE = "aim.mrk.json"
 
 STRUCTURES: dict[str, tuple[tuple[float, float, float], float]] = {
     "lung": ((0.77, 0.64, 0.58), 0.12),
@@ -42,9 +41,6 @@ PROVED_COLOUR, TRIED_COLOUR = (0.0, 0.45, 0.7), (0.94, 0.89, 0.26)
 
 STEP_MM = 1.0
 """Spacing of the control points of tubes and needle: fine enough to measure, few enough to read."""
-
-BREATHING_SHARE = 0.9
-"""The work before it takes this share of the time."""
 
 Progress = Callable[[str, float], None]
 
@@ -108,7 +104,8 @@ def export_slicer(
     write_text(target / SCENE_FILE, scene(items))
     write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
     plan.save(target / PLAN_FILE)
-    tell("breathing", BREATHING_SHARE)
+    # The work before it takes this share of the time.
+    tell("breathing", 0.9)
     moving = write_breathing(plan, lung, items, target) if lung.motion is not None else ()
     files = (SCENE_FILE, *moving, *(item.file for item in items), ROUTE_FILE, PLAN_FILE, README_FILE)
     write_text(target / README_FILE, readme(plan, report, files, why_none))
@@ -129,7 +126,7 @@ def _write_devices(plan: Plan, devices: DeviceCurves, folder: Path, *, refused: 
         items.append(Item(kind="Model", name=f"{name} surface", file=model_file, colour=curve.colour))
     fiducials = {"points": (POINTS_FILE, points_of_interest(plan))}
     if plan.aim is not None:
-        fiducials["aim"] = (AIM_FILE, aim_point(plan.aim))
+        fiducials["aim"] = ("aim.mrk.json", aim_point(plan.aim))
     for name, (file, content) in fiducials.items():
         _write_json(folder / file, _named(content, prefix))
         items.append(Item(kind="MarkupsFiducial", name=f"{prefix}{name}", file=file, colour=TARGET_COLOUR))

@@ -27,8 +27,6 @@ from stages.needle.obstruction import blocked_end
 from stages.needle.query import Query
 
 # None of these numbers can make the proof wrong: they trade time and memory for how much is proved.
-CUBES_MM = (0.5, 0.25)
-"""Sides of the cubes, the faster ones first."""
 FIRST_CELL_MM, LARGEST_SLOPE_CELL = 0.5, 0.17
 """Largest sides of the first cells: of the size of a voxel, and of about 10 degrees."""
 ALL_CUBES = 1 << 31
@@ -37,19 +35,13 @@ LEVELS = 9
 """How often cells are halved at most: then positions are known to 2 um."""
 CELLS_PER_BOW = 16.0
 """Planes are moved nearer to each other where curvature times their distance squared is more."""
-DEPTH_SHARE = 0.1
-"""Distance of the planes as a share of the radius of curvature."""
 SLOPE_CHANGE_EDGES = np.array([0.5, 0.75, 0.92, 1.0])
 """Classes of slope change, see `step_sets`: finer where the bound on the position falls fast."""
 PROBES_PER_DEPTH = 8
 """Depths of a slab at which clearance is looked at."""
-SLACK_RATIO = 1.08
-"""Amounts of missing clearance that are told apart differ by this factor."""
 SLACKS = 48
 LARGEST_DEPTH_MM = 12.5
 """Greatest distance of the planes, however little the needle bends."""
-LEAST_KAPPA = 1e-5
-"""In 1/mm; what bends less is taken to bend so much, for the sake of rounding."""
 LEAST_DISTANCE_MM = 1e-3
 """Nearer targets are left undecided; targets outside the workspace by less are not ruled out at once."""
 STEEPEST = 0.995
@@ -107,7 +99,8 @@ class NoPathProof:
         self._environment = environment
         self._query = query
         self._max_bytes = max_bytes
-        self._kappa = max(environment.limits.kappa * (1.0 + ROUNDING), LEAST_KAPPA)
+        # In 1/mm; what bends less is taken to bend so much, for the sake of rounding.
+        self._kappa = max(environment.limits.kappa * (1.0 + ROUNDING), 1e-5)
         self._tolerance = environment.goal_tolerance_mm + bounds.SPARE
         self._chord = query.target - query.lps_from_start[:3, 3]
         self._length = environment.limits.max_length_mm - query.inserted_mm + bounds.SPARE
@@ -146,7 +139,8 @@ class NoPathProof:
             return
         yield
         self._measure()
-        for side in CUBES_MM:
+        # Sides of the cubes, the faster ones first.
+        for side in (0.5, 0.25):
             if (yield from self._parted(side)):
                 self._end("no path", f"blocked, whatever the curvature, by cubes of {side:g} mm")
                 return
@@ -226,7 +220,8 @@ class NoPathProof:
     def _aim_planes(self) -> None:
         """Choose the planes and the direction from which the limit of the angle counts."""
         last = float(self._paths.ends[bounds.TOTAL]) - self._tolerance
-        self._count = math.ceil(last / min(DEPTH_SHARE / self._kappa, LARGEST_DEPTH_MM))
+        # Distance of the planes as a share of the radius of curvature.
+        self._count = math.ceil(last / min(0.1 / self._kappa, LARGEST_DEPTH_MM))
         self._depth = last / self._count
         self._proved_steepest = self._paths.steepest <= STEEPEST
         sine = self._paths.steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
@@ -392,7 +387,8 @@ class NoPathProof:
         probes = probes[(here + probes > -1e-9) & (here + probes < last + 1e-9)]
         corners, shape = plane.probed_cells(np.asarray(probes * self.slope_cell / self.cell_mm))
         rows, words = int(shape[:, 0].max()), -(-int(shape[:, 1].max()) // 64)
-        slacks = bounds.HALF_DIAGONAL * self.cell_mm * SLACK_RATIO ** np.arange(SLACKS)
+        # Amounts of missing clearance that are told apart differ by this factor.
+        slacks = bounds.HALF_DIAGONAL * self.cell_mm * 1.08 ** np.arange(SLACKS)
         self._require(len(probes) * rows * words * (8 + 64 + 8 * SLACKS))
         probed = np.zeros((len(probes), rows, words), dtype=np.uint64)
         blocked.mark_probed(plane.bits, plane.window, self._scale, probes, probed, corners)

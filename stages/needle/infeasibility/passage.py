@@ -8,9 +8,6 @@ from anatomy.base.typed import Float
 from stages.needle.infeasibility.path_bounds import PathBounds
 from stages.needle.infeasibility.plane import Plane
 
-NEAR_AN_END = 4.0
-"""Cells; where paths are no wider without obstacles, the states say little."""
-
 
 @frozen_value
 class Passage:
@@ -62,7 +59,8 @@ def tightest(
     least, found = math.inf, None
     for number, plane in enumerate(planes):
         free_mm = paths.width_mm(number * depth_mm, kappa)
-        if free_mm < NEAR_AN_END * cell_mm:
+        # Cells; where paths are no wider without obstacles, the states say little.
+        if free_mm < 4.0 * cell_mm:
             continue
         cells = plane.places
         width_mm = 2.0 * cell_mm * math.sqrt(len(cells) / math.pi)

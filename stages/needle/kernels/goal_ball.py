@@ -12,9 +12,6 @@ from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, two_arcs
 from stages.needle.kernels.limits import MIN_ARC_MM, TINY
 
-CONE_ROUNDING = 1e-6
-"""Share of a distance: the limit of the angle itself is kept up to a cosine of TINY."""
-
 
 @inner_kernel
 def turn_into_ball(rho, h, kappa, tolerance):
@@ -123,7 +120,8 @@ def least_length_from(pose, goal, limits, reference, turn_left):
         far = math.hypot(rho, h)
         beyond = math.atan2(math.sqrt(max(far * far - ahead * ahead, 0.0)), ahead) - limits.max_angle_rad
         from_cone = far if beyond >= 0.5 * math.pi else far * math.sin(beyond)
-        if from_cone > limits.goal_tolerance_mm + far * CONE_ROUNDING:
+        # Share of a distance: the limit of the angle itself is kept up to a cosine of TINY.
+        if from_cone > limits.goal_tolerance_mm + far * 1e-6:
             return math.inf
     return least_length(rho, h, limits, cosine, turn_left)
 

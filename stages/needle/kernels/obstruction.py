@@ -16,10 +16,6 @@ from stages.needle.kernels.rrt import sample_between
 X, Y, Z, INSERTED, DISTANCE, NEEDED, FOUND_SIZE = range(7)
 SPARE_MM = 1e-6
 """Rounding that is allowed for before a place is called blocked."""
-START_STEP_MM = 0.05
-"""Steps along the tangent at the start; a step that is left out proves less, never something wrong."""
-TRIAL_STEP_MM = 0.25
-"""Trial paths are looked at in steps of half a voxel: they prove nothing."""
 
 
 @inner_kernel
@@ -47,14 +43,16 @@ def blocked_start(obstacles, limits, pose, inserted, longest, branch, found):
             if distance + aside < needed - SPARE_MM:
                 _put(found, x, y, z, inserted + s, distance, needed)
                 return label
-        s += START_STEP_MM
+        # Steps along the tangent at the start; a step that is left out proves less, never something wrong.
+        s += 0.05
     return 0
 
 
 @inner_kernel
 def _walk(obstacles, limits, pose, bend, length, inserted, branch, least, least_label, found, best):
     """Follow an arc; return the least clearance to spare and its label, early if it is not above `best`."""
-    count = max(int(math.ceil(length / TRIAL_STEP_MM)), 1)
+    # Trial paths are looked at in steps of half a voxel: they prove nothing.
+    count = max(int(math.ceil(length / 0.25)), 1)
     for m in range(count + 1):
         s = length * m / count
         x, y, z = point_on_arc(pose, bend, s)

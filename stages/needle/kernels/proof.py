@@ -15,9 +15,6 @@ from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, ex
 from anatomy.kernels.labels import LUMEN
 from stages.needle.kernels.limits import TINY
 
-PROBE_SPACING_MM = 1.5
-"""Before the proof, arcs are looked at in points at most so far apart: most obstacles are met there."""
-
 WALL_ZONE_MM = 1.0
 """Needle that is spent on piercing the wall, as of a tube: more than the wall of a small bronchus."""
 
@@ -52,7 +49,8 @@ def _early_blocker(obstacles, required, pose, bend, begin, length):
     """Look for an obstacle at a few points of an arc, the middle first; 0 if none is met."""
     clearance, labels, geometry, bits = obstacles
     count = 1
-    while (length - begin) / count > PROBE_SPACING_MM:
+    # Before the proof, arcs are looked at in points at most so far apart: most obstacles are met there.
+    while (length - begin) / count > 1.5:
         for m in range(count):
             x, y, z = point_on_arc(pose, bend, begin + (length - begin) * (m + 0.5) / count)
             if distance_bound(clearance, geometry, x, y, z) < required:

@@ -24,8 +24,6 @@ DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = range(1, 5)
 COST = 0
 CLEARANCE = 1
 
-CLEARANCE_STEP_MM = 0.5
-"""Step of the clearance that is stated; half of it is what the bound may be too low."""
 LONGEST_JUMP = 256
 JUMP_GROWTH = 4
 """Neighbours of the best start pose are tried 1, 4, 16, ... places away in the list, up to the longest."""
@@ -40,7 +38,8 @@ _NOBODY = np.int64(-1)
 def least_clearance(obstacles, limits, pose, bend, length, s0, least):
     """Return a clearance that an arc is never below beyond the exempt length, at most `least`."""
     begin = min(max(limits.exempt_mm - s0, 0.0), length)
-    count = max(int(math.ceil((length - begin) / CLEARANCE_STEP_MM)), 1)
+    # Step of the clearance that is stated; half of it is what the bound may be too low.
+    count = max(int(math.ceil((length - begin) / 0.5)), 1)
     half = 0.5 * (length - begin) / count
     clearance, geometry = obstacles.clearance, obstacles.geometry
     for m in range(count + 1):

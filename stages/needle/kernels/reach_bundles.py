@@ -11,13 +11,6 @@ from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import UNITS_PER_MM, exact_distance, interpolate_squared
 from stages.needle.kernels.limits import TINY
 
-LOOK_SPACING_MM = 3.0
-"""Before their proof, arcs are looked at in places at most so far apart."""
-BUNDLE_SHARE = 0.7
-"""Arcs of a bundle are looked at together up to where they are about this share of the clearance apart."""
-STEEPEST_SINE = 0.9
-"""Lean of a chord beyond which arcs of a bundle are not looked at together."""
-
 # A typed number: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)
 
@@ -70,7 +63,8 @@ def _greatest_spread(aside, spread, c):
     `aside` is that of one of the arcs, and that of the others differs from it by at most `spread`.
     """
     sine = c * (math.sqrt(aside[0] ** 2 + aside[1] ** 2 + aside[2] ** 2) + spread)
-    return c * c * spread / math.sqrt(1.0 - sine * sine) if sine < STEEPEST_SINE else math.inf
+    # Lean of a chord beyond which arcs of a bundle are not looked at together.
+    return c * c * spread / math.sqrt(1.0 - sine * sine) if sine < 0.9 else math.inf
 
 
 @inner_kernel
@@ -109,7 +103,8 @@ def blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
     if hint >= begin and hint < end and _is_blocked_at(obstacles, limits, start, aside, spread, hint):
         return hint
     count = 1
-    while (end - begin) / count > LOOK_SPACING_MM:
+    # Before their proof, arcs are looked at in places at most so far apart.
+    while (end - begin) / count > 3.0:
         for m in range(count):
             c = begin + (end - begin) * (m + 0.5) / count
             if _is_blocked_at(obstacles, limits, start, aside, spread, c):
@@ -126,7 +121,8 @@ def is_blocked_bundle(obstacles, limits, start, q, radius, hints, entry):
     spread = _spread(chord, radius)
     if spread == math.inf:
         return False
-    end = min(math.sqrt(BUNDLE_SHARE * limits.required_mm / max(spread, TINY)), chord - radius)
+    # Arcs of a bundle are looked at together up to where they are about this share of the clearance apart.
+    end = min(math.sqrt(0.7 * limits.required_mm / max(spread, TINY)), chord - radius)
     c = blocked_at(obstacles, limits, start, aside, spread, limits.exempt_mm, end, hints[entry])
     if c >= 0.0:
         hints[entry] = c

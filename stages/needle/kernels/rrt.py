@@ -12,9 +12,6 @@ from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.limits import MIN_ARC_MM
 
-SAMPLE_TRIES = 50
-"""At most this many points are drawn in search of one in the workspace; then the iteration draws none."""
-
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _ROOT = np.int64(0)
 
@@ -36,7 +33,8 @@ def sample_between(start, goal, limits, state):
     bx, by, bz = any_normal(ax, ay, az)
     cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     half = 0.5 * distance
-    for _ in range(SAMPLE_TRIES):
+    # At most this many points are drawn in search of one in the workspace; then the iteration draws none.
+    for _ in range(50):
         along = uniform(state) * distance
         widest = radius
         if half < radius:

@@ -21,8 +21,6 @@ CHORD, HALF_TURN, ARC_LENGTH, ARC_COLUMNS = 0, 1, 2, 3
 ARC, BEGIN, END, HALF_CELL, FREE, FREE_AT_EXIT, LUMEN_DISTANCE, STATION_COLUMNS = 0, 1, 2, 3, 4, 5, 6, 7
 
 MOST_STATIONS = 4096
-CELL_SHARE = 0.1
-"""Length of a cell as a share of what is free around it: half of that, 5 %, is lost in the proof."""
 SHORTEST_CELL_MM, LONGEST_CELL_MM = 0.05, 1.0
 SEARCHED_MM = 5.0
 """At the exit obstacles are looked for so far beyond the required clearance: no proved offset is larger."""
@@ -31,10 +29,6 @@ NEAR_MM = 3.0
 SPARE_MM = 2.0 * MIN_GAP_MM
 """The proof of a single arc gives up at `MIN_GAP_MM`; with this to spare it never has to."""
 WIDEST_TILT_RAD = math.radians(60.0)
-TILT_STEPS = 14
-"""Halvings of the widest tilt: the largest is known to 0.004 degrees."""
-FACTOR_STEPS = 12
-"""Halvings of a factor: an offset of at most 5 mm is known to 0.002 mm."""
 
 _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
@@ -79,7 +73,8 @@ def lay_stations(obstacles, limits, branch, start, points, arcs, stations):
                 return 0, 0.0
             x, y, z = point_on_arc(pose, bend, s)
             free = distance_bound(obstacles.clearance, obstacles.geometry, x, y, z) - limits.required_mm
-            cell = min(max(CELL_SHARE * free, SHORTEST_CELL_MM), LONGEST_CELL_MM, length - s)
+            # Length of a cell as a share of what is free around it: half of that, 5 %, is lost in the proof.
+            cell = min(max(0.1 * free, SHORTEST_CELL_MM), LONGEST_CELL_MM, length - s)
             if length - s - cell < 0.5 * SHORTEST_CELL_MM:
                 cell = length - s
             _look(obstacles, limits, branch, pose, bend, s, s + cell, length, before, k, stations[count])
@@ -228,7 +223,8 @@ def largest_factor(limits, branch, arcs, stations, count, angle, offset, tilt):
     if region_kept(limits, branch, arcs, stations, count, angle, offset, tilt, worst):
         return 1.0
     low, high = 0.0, 1.0
-    for _ in range(FACTOR_STEPS):
+    # Halvings of a factor: an offset of at most 5 mm is known to 0.002 mm.
+    for _ in range(12):
         middle = 0.5 * (low + high)
         if region_kept(limits, branch, arcs, stations, count, angle, middle * offset, middle * tilt, worst):
             low = middle
@@ -250,7 +246,8 @@ def largest_tilts(limits, branch, arcs, stations, count, angle, offsets, tilts):
             before = -1.0
             continue
         low, high = 0.0, before
-        for _ in range(TILT_STEPS):
+        # Halvings of the widest tilt: the largest is known to 0.004 degrees.
+        for _ in range(14):
             middle = 0.5 * (low + high)
             if region_kept(limits, branch, arcs, stations, count, angle, offsets[n], middle, worst):
                 low = middle

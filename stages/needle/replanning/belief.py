@@ -19,8 +19,6 @@ from stages.needle.query import Query
 
 DRIFT_RAD = math.radians(0.1)
 """Standard deviation of what the direction drifts in 1 mm beside all that is modelled [assumption]."""
-WANDER = 0.05
-"""Share of the factor's own uncertainty by which it changes in 1 mm, as tissue differs [assumption]."""
 LEAST = 1e-5
 """A measurement is taken to be no better than this, mm or rad, so that exact ones can be weighed as well."""
 _TINY = 1e-9
@@ -124,7 +122,8 @@ class Belief:
         moves[PLACE, TURN] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
         self._covariance = moves @ self._covariance @ moves.T
         self._covariance[TURN, TURN] += DRIFT_RAD**2 * length * np.eye(3)
-        self._covariance[BEND, BEND] += (WANDER * self._unknown.factor_ln) ** 2 * length
+        # Share of the factor's own uncertainty by which it changes in 1 mm, as tissue differs [assumption].
+        self._covariance[BEND, BEND] += (0.05 * self._unknown.factor_ln) ** 2 * length
         self._at_mm[-1] += length
 
     def correct(self, seen: Float, target: Float | None = None) -> None:

@@ -21,9 +21,6 @@ from stages.needle.path import LENGTH, ArcPath, arc_transform, path_from_tree
 from stages.needle.query import Query
 from stages.needle.search.base import RestartingRRT, root_of
 
-LOOK_AHEADS_MM = (5.0, 10.0, 20.0, 40.0)
-"""How far ahead the plan that is being followed is met again."""
-
 LEAST_GAIN = 0.1
 """A path is given up for another one only if that is cheaper by this share: a needle that changes its mind
 at every measurement wears out the tissue."""
@@ -94,7 +91,8 @@ def plan_ahead(plan: ArcPath, begin_mm: float) -> tuple[float, list[Ahead], list
     corners, meetings = [], []
     for frame, (length, roll, curvature) in zip(plan.frames(), plan.arcs, strict=False):
         turned += curvature * min(max(begin_mm - at, 0.0), length)
-        for away in LOOK_AHEADS_MM:
+        # How far ahead the plan that is being followed is met again.
+        for away in (5.0, 10.0, 20.0, 40.0):
             if at < begin_mm + away < at + length:
                 meetings.append((away, (frame @ arc_transform(begin_mm + away - at, roll, curvature))[:3, 3]))
         at += length

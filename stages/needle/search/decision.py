@@ -22,9 +22,6 @@ FIRST_ITERATIONS = 400
 """The tree goes first: nearly all paths that it finds sooner than the resolution search are found by then."""
 PIECE = 200
 """Iterations between two steps of the proof, a few tenths of a millisecond."""
-RESOLUTION_SHARE = 5 / 6
-"""Share of the iterations without a path: in narrow passages it is nearly always the first, and so it is at
-most a fifth later than alone."""
 BETTER_SHARE = 1 / 3
 """The same with a path: the portfolio has the rest, as each refined path ends at the cheapest near it."""
 PATIENCE = 1600
@@ -32,15 +29,9 @@ PATIENCE = 1600
 afterwards most of it while it fills cubes."""
 CUBES, MORE_CUBES = 2, 300
 """Cubes that the proof fills for an iteration, before and afterwards; an iteration takes as long as ten."""
-PLANES_FROM = 3000
-"""Iterations before the proof goes on with planes."""
-FEW_STATES = 1000
-"""With fewer on a plane, a step takes about a millisecond, and so no thread."""
 STATES_PER_ITERATION = 100
 """States on a plane of the proof for one iteration of the searches; these take a third of the time of so many
 iterations, so that the searches wait only where the proof has no core of its own."""
-STEP_ITERATIONS = 300
-"""Iterations for a step of the proof on top."""
 
 
 class Decision:
@@ -115,7 +106,9 @@ class Decision:
             self._prove()
         yield self.search, FIRST_ITERATIONS - ENDS_FROM
         while True:
-            share = RESOLUTION_SHARE if self.path is None else BETTER_SHARE
+            # Share of the iterations without a path: in narrow passages it is nearly always the first, and so
+            # it is at most a fifth later than alone.
+            share = (5 / 6) if self.path is None else BETTER_SHARE
             words = 0 if self.resolution.finished else round(share * PIECE)
             yield self.resolution, words
             yield self.search, PIECE - words
@@ -138,9 +131,11 @@ class Decision:
         if self._proof is None:
             environment, query, _objective = self._asked
             self._proof = NoPathProof(environment, query)
-        if self._proof.states > 0 and self.iterations < PLANES_FROM:
+        # Iterations before the proof goes on with planes.
+        if self._proof.states > 0 and self.iterations < 3000:
             return
-        if self._proof.states < FEW_STATES:
+        # With fewer on a plane, a step takes about a millisecond, and so no thread.
+        if self._proof.states < 1000:
             spent = self.iterations - self._looked
             self._looked = self.iterations
             self._proof.advance(spent * (CUBES if self.iterations < PATIENCE else MORE_CUBES))
@@ -167,6 +162,7 @@ class _PlanesInThread:
             self._step = None
         if self._step is not None or self._proof.outcome != "running":
             return self._proof.outcome if self._step is None else "running"
-        self._due = iterations + STEP_ITERATIONS + self._proof.states // STATES_PER_ITERATION
+        # Iterations for a step of the proof on top.
+        self._due = iterations + 300 + self._proof.states // STATES_PER_ITERATION
         self._step = self._pool.submit(self._proof.advance)
         return "running"

@@ -30,8 +30,6 @@ LEAST_GAIN = 0.01
 ARCS_PER_BEGINNING = 1 << 16
 """Before each search but the first, lattices are searched until so many arcs were tried.  That takes less
 time than to refine the guide path, and cheap guide paths lead to cheaper ones."""
-MOST_COST = 2.0
-"""A guide path that costs more than so many times the best path is refined only once."""
 SPARE_COST = 1.5
 """A guide path near a path may at first cost so many times as much, since it is not quite that path."""
 ROUNDING = 1e-9
@@ -119,7 +117,8 @@ class GuidePathFinder:
                     controls, bound = guide.controls, guide.cost * (1.0 + ROUNDING)
                     found = search.follow(via_points(controls))
                 yield _iterations(guide.arcs), found
-            if bound > (1.0 - LEAST_GAIN) * before or bound > MOST_COST * best:
+            # A guide path that costs more than so many times the best path is refined only once.
+            if bound > (1.0 - LEAST_GAIN) * before or bound > 2.0 * best:
                 return
 
 
@@ -131,15 +130,8 @@ MOST_STATES = 1 << 15
 """States of a lattice, in 2 MB; so many are searched in 0.1 s."""
 CURVATURE_SHARE = 0.97
 """Share of the greatest curvature that guide paths take; arcs laid along them bend a little more."""
-LEAST_COSINE = 0.3
-"""Least cosine of the angle between a start and the line to the target.  From steeper starts, paths may turn
-back across the layers."""
 SKEWS = 6
 """Number of turns of a lattice about the line to the target."""
-REACH_CELLS = 9
-"""How many cells from a guide path the lattice around it goes."""
-ANYWHERE_CELLS = 1 << 14
-"""No lattice over all of the space has as many cells."""
 SAMPLE_MM = 0.05
 """Distance of the points of a path between which its controls are interpolated."""
 
@@ -180,7 +172,9 @@ class StateLatticeSearch:
         self._cosine = float(self._tangent @ self._axis)
         length = workspace_lengths(environment, self._start[None], self._tangent[None], query.target)[0]
         self.is_possible = bool(
-            self._distance > index.MIN_ARC_MM and self._cosine > LEAST_COSINE and np.isfinite(length)
+            # Least cosine of the angle between a start and the line to the target. From steeper starts, paths
+            # may turn back across the layers.
+            self._distance > index.MIN_ARC_MM and self._cosine > 0.3 and np.isfinite(length)
         )
         """Whether there may be guide paths: the target is in the workspace, and the start not too steep."""
         self._states = np.zeros((MOST_STATES, kernel.STATE_COLUMNS), dtype=np.int64)
@@ -200,7 +194,8 @@ class StateLatticeSearch:
             Turns the lattice, less than SKEWS.
         """
         base, axes, goal_cells = self._straight(layers, skew)
-        return self._explore(base, axes, goal_cells, ANYWHERE_CELLS, math.inf)
+        # No lattice over all of the space has as many cells.
+        return self._explore(base, axes, goal_cells, 1 << 14, math.inf)
 
     def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> GuidePath:
         """Return the cheapest guide path near another one, if it costs less than `bound`.
@@ -215,7 +210,8 @@ class StateLatticeSearch:
             Of the lattice about the line to the target.
         """
         axes = self._axes(cells * self._largest_cell(len(controls) - 2), _beside(self._axis), turn_rad)
-        return self._explore(controls, axes, np.zeros(2, dtype=np.int64), REACH_CELLS, bound)
+        # How many cells from a guide path the lattice around it goes.
+        return self._explore(controls, axes, np.zeros(2, dtype=np.int64), 9, bound)
 
     def controls_of(self, path: ArcPath, layers: int) -> Float | None:
         """Return controls `(L + 2, 3)` of a spline near a path; None if that does not always lead ahead.

@@ -14,8 +14,6 @@ from stages.needle.search.kernels import optimal
 
 MAX_VIAS = 64
 """A path of more arcs is not varied: none that is worth it has so many."""
-REFINE_SHARE = 0.7
-"""Share of the iterations, once there is a path, that vary it instead of growing trees."""
 IMPROVEMENT = 1e-6
 """A path counts as better if its cost is less by this share."""
 
@@ -45,7 +43,8 @@ class OptimalSearch(RestartingRRT):
         if self.path is None:
             found = super().advance(iterations)
         else:
-            tries = round(REFINE_SHARE * iterations)
+            # Share of the iterations, once there is a path, that vary it instead of growing trees.
+            tries = round(0.7 * iterations)
             better = self._refine(tries)
             found = super().advance(iterations - tries)
             if not found:

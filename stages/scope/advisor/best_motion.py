@@ -20,8 +20,6 @@ from stages.scope.advisor.kinematics import ScopeState
 
 VERDICTS = ("out of range", "leads away", "collides", "valid")
 CANDIDATES = kernel.CANDIDATES
-SUM_TOLERANCE = 1e-9
-"""Weights may add up to 1 but for rounding."""
 
 
 @settings
@@ -37,7 +35,8 @@ class Weights:
 
     def __post_init__(self) -> None:
         total = self.nf1 + self.clearance + self.twist
-        if abs(total - 1.0) > SUM_TOLERANCE:
+        # Weights may add up to 1 but for rounding.
+        if abs(total - 1.0) > 1e-9:
             raise impossible("nf1", self.nf1, f"the three weights add up to {total:g}, not 1")
 
     @property

@@ -19,8 +19,6 @@ from stages.scope.device import Bronchoscope
 
 FREEST_TWIST_DEG = 90.0
 """A device is turned so far to either side; as it bends up and down, it then bends in every direction."""
-TIGHTEST_BEND_DEG_PER_MM = 12.0
-"""The tip of a device is bent at most so much for each mm of its chain, as that of [Rosell2012]."""
 
 TIP_FROM_TOOL = np.diag([1.0, -1.0, -1.0, 1.0])
 """The tool frame looks along its -z, a tip frame along its +z."""
@@ -69,7 +67,8 @@ def model_of(scope: Bronchoscope, *, links: int = 10, link_mm: float = 1.0) -> S
     Its bends are those of its whole bending section; a shorter chain bends at most as tightly as that of
     [Rosell2012], 120 degrees in 10 mm.
     """
-    most = TIGHTEST_BEND_DEG_PER_MM * links * link_mm
+    # The tip of a device is bent at most so much for each mm of its chain, as that of [Rosell2012].
+    most = 12.0 * links * link_mm
     return ScopeModel(
         links=links,
         link_mm=link_mm,

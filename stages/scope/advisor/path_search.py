@@ -50,8 +50,6 @@ LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
 """For a retry one of these shares of the look-ahead is drawn: a shorter one fits into a tighter turn."""
 LOOKS_PER_MM = 4
 """Collision is tested this often a mm of advance: the body moves by less than a voxel between two poses."""
-SAME_POTENTIAL = 1e-9
-"""Potentials nearer than this are equal: rounding of sums of steps."""
 
 
 class PathSearch:
@@ -88,7 +86,8 @@ class PathSearch:
             return self._path(states, info, end == kernel.REACHED, 0)
         states, info = _cut(states, info)
         used = 0
-        enough = self._lowest_that_fits(states[0]) + SAME_POTENTIAL
+        # Potentials nearer than this are equal: rounding of sums of steps.
+        enough = self._lowest_that_fits(states[0]) + 1e-9
         while end != kernel.REACHED and info[-1, 3] > enough and used < options.retreats:
             kept = self._retreat(info, used)
             ahead = max(options.look_ahead_mm * float(self._rng.choice(LOOK_AHEADS)), options.sub_step_mm)

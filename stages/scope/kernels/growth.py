@@ -17,16 +17,10 @@ TIP_MM, TIP_RAD = 0.15, 0.06
 """States whose tips and bases are nearer than this together count as the same."""
 MEMORY = 0.5
 """Share of the cost of the state before that is added: a good state does not make up for a bad way."""
-CHANGE_COST = 0.3
-"""Cost of a change in place for each mm that the tip moves: as bad as half the room off the axis."""
 HOLD_COST = 6.0
 """Cost of any change: more than most places cost, so that hands turn and bend only where they must."""
 PROBES = 4
 """Before an arc is walked along it is looked at in so many places: most blocked ones are blocked there."""
-TWIST_COST = 2.0
-"""Cost of a twist by 1 rad: half a turn costs as much as a change of the handle alone."""
-WIDE_ANGLE = 0.06
-"""1 - cos of 20 degrees: a tip that looks so far aside costs as much as one that is at the wall."""
 
 
 class Device(NamedTuple):
@@ -102,7 +96,8 @@ def settle(route, length, state, scratch):
         state[HEADING + k] = scratch[6 + k]
         cosine += scratch[6 + k] * route.tangents[near, k]
     state[NEAR] = near
-    cost = 2.0 * d2 / route.room[near] ** 2 + (1.0 - cosine) / WIDE_ANGLE
+    # 1 - cos of 20 degrees: a tip that looks so far aside costs as much as one that is at the wall.
+    cost = 2.0 * d2 / route.room[near] ** 2 + (1.0 - cosine) / 0.06
     for n in range(1, 3):
         x, y, z = point_along(state, u, v, length * (1.0 - n / 3.0))
         near, d2 = nearest_on_route(route.points, near, x, y, z)
@@ -181,8 +176,10 @@ def candidates(device, route, states, offsets, step, found, by_straight):
             state[CURVATURE] = max(before[CURVATURE], math.hypot(u, v))
             change = 0.5 * math.hypot(u - before[U], v - before[V]) * device.length**2
             state[COST] = settle(route, device.length, state, scratch)
-            state[COST] += MEMORY * before[COST] + CHANGE_COST * change + (HOLD_COST if c > 0 else 0.0)
-            state[COST] += TWIST_COST * abs(twist - before[TWIST])
+            # Cost of a change in place for each mm that the tip moves: as bad as half the room off the axis.
+            state[COST] += MEMORY * before[COST] + 0.3 * change + (HOLD_COST if c > 0 else 0.0)
+            # Cost of a twist by 1 rad: half a turn costs as much as a change of the handle alone.
+            state[COST] += 2.0 * abs(twist - before[TWIST])
             if not math.isfinite(bend):
                 state[COST] = math.inf
             by_straight[n * count + c] = straight

@@ -20,8 +20,6 @@ from anatomy.base.typed import Float, Float32
 from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.scope.kernels.body import STRAIGHT_RAD, arc_parts, move_along
 
-DEEP_MM = -1e3
-"""The depth off the grid: no shape of least energy goes there."""
 LONGEST_MM = 1.0
 """No place of the shaft moves farther in a step: a longer step could pass the wall between two airways."""
 HALVINGS = 12
@@ -91,7 +89,8 @@ def depth_at(lumen, x, y, z, work):
     ni, nj, nk = field.shape
     if not (1.0 <= u < ni - 2 and 1.0 <= v < nj - 2 and 1.0 <= w < nk - 2):
         work[0] = work[1] = work[2] = 0.0
-        return DEEP_MM
+        # The depth off the grid: no shape of least energy goes there.
+        return -1e3
     i, j, k = int(u), int(v), int(w)
     a, b, c = work[4:12], work[12:20], work[20:28]
     _weights(u - i, a)

@@ -30,8 +30,6 @@ TURN_SAMPLES, SECTION_SAMPLES = 2, 6
 """A change in place is looked at in so many settings of its twist and of its bend, each in so many places."""
 TWIST_WEIGHT, BEND_WEIGHT = 0.3, 0.03
 """A twist by 1 rad and a change of the bend by 1 rad cost as much as so many mm too near to the wall."""
-LIMIT_WEIGHT = 20.0
-"""An unknown 1 rad or 1 mm beyond its bound costs as much as so many mm too near to the wall."""
 DIFFERENCE = 1e-6
 """Step of the differences that stand for derivatives, in mm and rad: small beside a voxel."""
 TWIST_SCALE_RAD, BEND_SCALE_RAD, ADVANCE_SCALE_MM = 0.3, 0.1, 3.0
@@ -40,14 +38,8 @@ FROZEN = 1e-12
 """The scale of an unknown that stays as it is."""
 FIRST_DAMPING, RAISE, LOWER, MOST_DAMPING = 0.03, 8.0, 0.3, 1e4
 """Damping in units of the scales above, and its factors after a failure and a success."""
-CLOSURE_WEIGHT = 20.0
-"""A tip 1 mm or 0.1 rad off costs as much as so many mm too near to the wall."""
-RAD_AS_MM = 10.0
-"""A tip turned by 1 rad counts as much as one so many mm away."""
 CLOSED = 1e-11
 """The tip is there where it is so near, mm and rad: far below what a check of poses tells apart."""
-CLOSING_STEPS = 8
-"""Newton's method on the equations alone converges in fewer steps from nearby."""
 TOGETHER, TWIST_FIRST, BEND_FIRST, BY_STRAIGHT = 0, 1, 2, 3
 """Orders of a change of twist and bend: both at once, one after the other, or with the section straightened
 for the twist."""
@@ -118,7 +110,8 @@ def _look(walls, section, entry, group, counts, x, bounds, target, base, moved, 
             move_along(base, kappa * math.cos(twist), kappa * math.sin(twist), advance, moved)
             base[:] = moved
     for i in range(x.shape[0]):
-        out[row] = LIMIT_WEIGHT * (max(0.0, bounds[i, 0] - x[i]) + max(0.0, x[i] - bounds[i, 1]))
+        # An unknown 1 rad or 1 mm beyond its bound costs as much as so many mm too near to the wall.
+        out[row] = 20.0 * (max(0.0, bounds[i, 0] - x[i]) + max(0.0, x[i] - bounds[i, 1]))
         row += 1
     kappa = bend_before / section.length
     move_along(base, kappa * math.cos(twist_before), kappa * math.sin(twist_before), section.length, moved)
@@ -134,7 +127,8 @@ def _look(walls, section, entry, group, counts, x, bounds, target, base, moved, 
         turned = 0.0
         for m in range(3):
             turned += moved[3 * a + m] * target[3 * b + m] - moved[3 * b + m] * target[3 * a + m]
-        out[row + 3 + k] = 0.5 * RAD_AS_MM * turned
+        # A tip turned by 1 rad counts as much as one so many mm away.
+        out[row + 3 + k] = 0.5 * 10.0 * turned
 
 
 @inner_kernel
@@ -175,7 +169,8 @@ def _merit(residuals):
     for r in range(rows):
         total += residuals[r] ** 2
     for r in range(rows, rows + EQUATIONS):
-        total += CLOSURE_WEIGHT * abs(residuals[r])
+        # A tip 1 mm or 0.1 rad off costs as much as so many mm too near to the wall.
+        total += 20.0 * abs(residuals[r])
     return total
 
 
@@ -219,7 +214,8 @@ def fit_legs(walls, section, entry, target, group, counts, x, bounds, steps, gai
     _look(walls, section, entry, group, counts, x, bounds, target, base, moved, residuals)
     merit = _merit(residuals)
     damping = FIRST_DAMPING
-    for step in range(steps + CLOSING_STEPS):
+    # Newton's method on the equations alone converges in fewer steps from nearby.
+    for step in range(steps + 8):
         closing = step >= steps or damping > MOST_DAMPING
         if closing:
             # What is at a bound stays there.

@@ -19,21 +19,13 @@ from stages.scope.route.kernels import lumen as kernel
 
 LONGEST_EDGE_MM = 0.75
 """The longest edge is about a voxel of a CT, so that radii follow the wall."""
-MIN_CELL_MM = 1.0
-"""Smallest cell of the grid of cones: smaller ones hold the same cones and only cost memory."""
 SAME_POINT_MM = 1e-3
 """Points of a file that are nearer are one point, written twice with rounding."""
-MAX_CELLS = 2_000_000
-"""A larger number of cells would cost more memory than it saves time."""
 THIN_VOXELS = 6.0
 """Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to half."""
-FINE_MM = 0.05
-"""Spacing of the places at which a cone is compared with the mask."""
 TINY_MM = 1e-9
 """The rounding of lengths is less."""
 SMOOTHING_ROUNDS = 30
-KEPT_DEPTH = 0.9
-"""Smoothing never takes a point of a skeleton to less than this share of the depth it had."""
 
 
 @frozen_record
@@ -94,10 +86,12 @@ class Centreline:
         """A grid of cells with the cones that touch each: origin, size and shape (7,); starts; cones."""
         margin = self.radius_mm[:, None]
         low, high = (self.nodes_mm - margin).min(axis=0), (self.nodes_mm + margin).max(axis=0)
-        size = max(2.0 * float(np.median(self.radius_mm)), MIN_CELL_MM)
+        # Smallest cell of the grid of cones: smaller ones hold the same cones and only cost memory.
+        size = max(2.0 * float(np.median(self.radius_mm)), 1.0)
         while True:
             shape = np.floor((high - low) / size) + 1.0
-            if shape.prod() <= MAX_CELLS:
+            # A larger number of cells would cost more memory than it saves time.
+            if shape.prod() <= 2_000_000:
                 break
             size *= 1.5
         index = np.concatenate((low, (size,), shape))
@@ -292,7 +286,8 @@ def _refined(nodes: Float, edges: Int) -> tuple[Float, Int]:
 
 def _smoothed(nodes: Float, edges: Int, walls: _Walls) -> Float:
     """Draw each node towards the middle of its neighbours as long as it stays about as deep."""
-    floor = KEPT_DEPTH * walls.depth_mm(nodes)
+    # Smoothing never takes a point of a skeleton to less than this share of the depth it had.
+    floor = 0.9 * walls.depth_mm(nodes)
     degree = np.bincount(edges.ravel(), minlength=len(nodes))
     free = degree == 2
     current = nodes.copy()
@@ -317,7 +312,8 @@ def _proved(nodes: Float, edges: Int, walls: _Walls) -> Centreline:
     radius = np.maximum(walls.depth_mm(nodes), 0.0)
     begin, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
     length = np.linalg.norm(end - begin, axis=1)
-    count = max(1, int(np.ceil(float(length.max()) / FINE_MM)))
+    # Spacing of the places at which a cone is compared with the mask.
+    count = max(1, int(np.ceil(float(length.max()) / 0.05)))
     step, places = length / count, np.arange(count + 1)[:, None] / count
     depth = np.stack([walls.depth_mm(begin * (1.0 - share) + end * share) for share in places])
     crossing = np.clip(0.5 * (depth[:-1] - depth[1:] + step), 0.0, step)

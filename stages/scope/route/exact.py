@@ -24,12 +24,6 @@ BENDING = 0.02
 ROUNDS, STEPS = 12, 30
 SOLVED = 2e-3
 """Violation that counts as none; the spares are larger, so that the limits themselves hold."""
-HOPELESS = 0.02
-"""With a larger violation, finer samples do not help; a wider segment may."""
-LEAST_SPANS = 8
-"""A segment is widened by at least so many spans on both sides: a bend needs length."""
-MARGIN_SHARE = 0.05
-"""Share of all spans by which a segment is widened on both sides, as in [Li2021]."""
 ANY_CURVATURE = 1e9
 
 Stage = tuple[float, float, int, int]
@@ -191,7 +185,8 @@ def repair_exact(tentative: Curve, problem: Problem, executor: Executor | None =
     (Curve, Proof)
         If nothing worked, the curve with the fewest spans that fail.
     """
-    curve, proof = _by_segments(tentative, problem, MARGIN_SHARE, SMOOTH, executor)
+    # Share of all spans by which a segment is widened on both sides, as in [Li2021].
+    curve, proof = _by_segments(tentative, problem, 0.05, SMOOTH, executor)
     for spacing, start in FURTHER_STARTS:
         if proof.holds:
             break
@@ -212,7 +207,8 @@ def _by_segments(
     proof = problem.prove(curve)
     if proof.holds:
         return curve, proof
-    margin = max(LEAST_SPANS, round(share * curve.n_spans))
+    # A segment is widened by at least so many spans on both sides: a bend needs length.
+    margin = max(8, round(share * curve.n_spans))
     ends_free = problem.limits.end_tolerance_mm > 0
     parts = segments(proof, len(curve.control_mm), margin, ends_free=ends_free)
     work = partial(_repaired_segment, curve, problem, start)
@@ -234,6 +230,7 @@ def _repaired_segment(curve: Curve, problem: Problem, start: Sequence[Stage], fr
         failed = np.count_nonzero(problem.prove(new).verdicts[spans])
         if failed < fewest:
             best, fewest = new, failed
-        if worst > HOPELESS or failed == 0:
+        # With a larger violation, finer samples do not help; a wider segment may.
+        if worst > 0.02 or failed == 0:
             break
     return best.control_mm[low:high]

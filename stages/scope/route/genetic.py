@@ -30,10 +30,6 @@ BROKEN = 1e4
 """Cost of a broken limit, the paper's 10000."""
 FEASIBLE = 1e3
 """Costs below this break no limit: the other terms stay far below it."""
-NO_WEIGHT = 1e-6
-"""Weight of points that count for nothing in the fit; 0 would make its equations singular."""
-HELD = 1e3
-"""Weight of the ends of a segment that must stay where they are."""
 POINT_SPACING_MM = 1.0
 """Spacing of the path points that are fitted and tested, about a voxel of a CT."""
 AROUND_MM = 10.0
@@ -206,10 +202,12 @@ class _Evaluator:
         ignored = round(float(genes[0]) * (n - 2))
         weight = np.ones(n)
         first = (n - ignored) // 2
-        weight[first : first + ignored] = NO_WEIGHT
+        # Weight of points that count for nothing in the fit; 0 would make its equations singular.
+        weight[first : first + ignored] = 1e-6
         for end, held in zip((0, -1), self._segment.held, strict=True):
             if held:
-                weight[end] = HELD
+                # Weight of the ends of a segment that must stay where they are.
+                weight[end] = 1e3
         smoothing = float(genes[1]) ** 2 * self._most
         spline, _u = splprep(points.T, w=weight, u=self._u, s=smoothing, k=DEGREE, quiet=1)
         c, d1, d2 = (np.stack(splev(self._u, spline, der=d), axis=1) for d in range(3))

@@ -9,9 +9,6 @@ from anatomy.grid import read_only
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
 
-SAME_PLACE_MM = 1e-6
-"""Points nearer than this coincide: rounding, far below a voxel."""
-
 WAYPOINT_SPACING_MM = 3.0
 """Denser points give the spline the kinks of a voxel skeleton; sparser ones cut the bends of airways."""
 
@@ -72,7 +69,8 @@ def guide_path_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_m
     radius = np.concatenate(
         (centreline.radius_mm[nodes[:1]], centreline.radius_mm[inner], centreline.radius_mm[nodes[-1:]])
     )
-    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > SAME_PLACE_MM
+    # Points nearer than this coincide: rounding, far below a voxel.
+    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6
     kept = np.concatenate(((True,), apart))
     if kept.sum() < 2:
         raise SettingsError(

@@ -251,17 +251,14 @@ class Replanner:
         return point
 
 
-CORRIDOR_MM = 3.0
-"""A tube counts for replanning if it comes so near to one that the route runs through."""
-
-
 def _corridor(centreline: Centreline, nodes: Int) -> tuple[Int, Int]:
     """Return the nodes near those of a route, and the edges among them."""
     from scipy.spatial import KDTree
 
     here, radius = centreline.nodes_mm, centreline.radius_mm
     distance, nearest = KDTree(here[nodes]).query(here)
-    near = distance <= radius + radius[nodes[nearest]] + CORRIDOR_MM
+    # A tube counts for replanning if it comes so near to one that the route runs through.
+    near = distance <= radius + radius[nodes[nearest]] + 3.0
     near[nodes] = True
     edges = centreline.edges[near[centreline.edges].all(axis=1)]
     return np.flatnonzero(near), edges

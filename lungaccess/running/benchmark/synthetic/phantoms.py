@@ -12,8 +12,6 @@ VERSION = "synthetic-v1"
 Family = Literal["adult", "child", "resected", "emphysematous", "breathing"]
 FAMILIES: tuple[Family, ...] = ("adult", "child", "resected", "emphysematous", "breathing")
 OF_A_FAMILY = 10
-FIRST_SEED = 28_000
-"""Seeds run on from here, so that no phantom of the tests or of the documentation is among them."""
 SYSTEMS = ("lung-default", "ultrathin", "therapeutic-scope")
 """The three devices: presets, as `lungaccess presets NAME` prints them."""
 TARGETS_A_LUNG = 10
@@ -21,8 +19,6 @@ ADULT_MM, CHILD_MM = 1.0, 0.8
 """Edges of the voxels: those of a usual reconstruction, finer for the narrower airways of a child."""
 BRONCHUS_LENGTH, VESSEL_LIMIT_MM, VESSEL_RIM_MM, HILAR_VESSEL_MM = 1.35, 0.9, 5.0, 9.0
 """Set so that the medians of a phantom come near those of two patients' masks, see the measurements."""
-OPEN_SHARES = (0.0, 0.45)
-"""These shares of the fissures are open in turn: every second phantom has complete ones."""
 LOBES = ("right upper", "left upper", "right lower", "left lower", "right middle")
 
 
@@ -90,7 +86,8 @@ def _phantom(family: Family, number: int) -> BenchmarkPhantom:
         vessel_limit_mm=VESSEL_LIMIT_MM,
         vessel_rim_mm=VESSEL_RIM_MM,
         hilar_vessel_mm=HILAR_VESSEL_MM,
-        open_fissures=OPEN_SHARES[number % 2],
+        # These shares of the fissures are open in turn: every second phantom has complete ones.
+        open_fissures=(0.0, 0.45)[number % 2],
         resected=LOBES[(number - 1) % len(LOBES)] if family == "resected" else "",
         emphysema=_spread(0.3, 1.0, number, 9) if family == "emphysematous" else 0.0,
     )
@@ -98,7 +95,8 @@ def _phantom(family: Family, number: int) -> BenchmarkPhantom:
         name=f"{family}-{number:02d}",
         family=family,
         number=number,
-        seed=FIRST_SEED + 100 * FAMILIES.index(family) + number,
+        # Seeds run on from here, so that no phantom of the tests or of the documentation is among them.
+        seed=28_000 + 100 * FAMILIES.index(family) + number,
         size="small" if child else "adult",
         spacing_mm=CHILD_MM if child else ADULT_MM,
         traits=traits,

@@ -22,7 +22,6 @@ from lungaccess.running.study.settings import AtlasGrid, Budget, Case, PlannerCh
 
 ITERATIONS = 100
 """Beyond the direct arcs: about a tenth of a second."""
-DEFAULT_METHOD = "atlas"
 JOINT = "+"
 """Between a method and the planner of the needle that it is to use."""
 _QUERY = """
@@ -48,7 +47,7 @@ def method_choice(words: str, iterations: int | None) -> PlannerChoice:
 
 def benchmark_study(
     folder: Path,
-    methods: Sequence[str] = (DEFAULT_METHOD,),
+    methods: Sequence[str] = ("atlas",),
     *,
     phantoms: Iterable[str] = (),
     systems: Sequence[str] = SYSTEMS,

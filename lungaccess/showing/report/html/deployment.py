@@ -31,12 +31,8 @@ TUBE_STEP_MM = 1.0
 """Insertion between two stored shapes of the tubes; the page interpolates, and the bend opens slowly."""
 TUBE_POINTS = 40
 """Points of a stored shape: 1 to 2 mm apart on tubes of a usual length, too near to see the corners."""
-SCOPE_SHOWN_MM = 15.0
-"""Length of the scope behind its tip that a view of the devices shows: about its bending section."""
 MM_PER_STEP = 0.01
 """A distance across the lumen is stored in steps of this."""
-SECTION_POINTS = 12
-"""Points of a stored bending section: 1 to 2 mm apart."""
 CAP_MM = 15.0
 """Clearances are measured up to this distance: farther than any margin, and where the plot ends."""
 NOT_MEASURED = -1.0
@@ -45,8 +41,6 @@ DIRECTIONS = 90
 """Rays around the tip, every 4 degrees."""
 RAY_STEP_MM, FARTHEST_MM = 0.05, 20.0
 """The border of the lumen is found to one step along each ray, as far as the radius of a wide trachea."""
-FLOOR_MM = 0.1
-"""1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1]."""
 
 
 def packed_plan(plan: Plan, lung: Lung, name: str, *, cross_sections: bool = True) -> Packed:
@@ -79,7 +73,8 @@ def packed_plan(plan: Plan, lung: Lung, name: str, *, cross_sections: bool = Tru
 def device_points(plan: Plan) -> Float:
     """Return points `(N, 3)`, LPS mm, of the last part of the scope, the tubes and the needle."""
     scope, *others = plan.curves()
-    near = scope.arc_length_mm >= scope.arc_length_mm[-1] - SCOPE_SHOWN_MM
+    # Length of the scope behind its tip that a view of the devices shows: about its bending section.
+    near = scope.arc_length_mm >= scope.arc_length_mm[-1] - 15.0
     return np.concatenate([scope.points_lps[near], *(curve.points_lps for curve in others)])
 
 
@@ -90,7 +85,8 @@ def _scope(plan: Plan, lung: Lung) -> Packed:
     """
     moving = shown_motion(plan)
     tips, length = moving.tips, moving.bending_length_mm
-    back = np.linspace(-length, 0.0, SECTION_POINTS)
+    # Points of a stored bending section: 1 to 2 mm apart.
+    back = np.linspace(-length, 0.0, 12)
     bends = moving.states[:, 2] / length
     sections = [poses_on_arc(tip, 0.0, bend, back)[:, :3, 3] for tip, bend in zip(tips, bends, strict=True)]
     shaft, shaft_mm = poses_on_pieces(moving.lps_from_entry, moving.pieces[:-1], SHOWN_STEP_MM)
@@ -253,7 +249,8 @@ def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
     poses, lengths_mm = plan.costed_poses()
     points = poses[:, :3, 3]
     clearance = obstacle_clearance_mm(lung, points, with_fissures=plan.fissures_are_obstacles)
-    rates = {"inverse_clearance": 1.0 / np.maximum(clearance, FLOOR_MM)}
+    # 1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1].
+    rates = {"inverse_clearance": 1.0 / np.maximum(clearance, 0.1)}
     if lung.cost is not None:
         values = lung.cost.at(points, np.inf).astype(np.float64)
         if np.isfinite(values).all():

@@ -22,12 +22,8 @@ if TYPE_CHECKING:
 PIXELS, FRAMES, FRAME_MS, LAST_MS = 240, 72, 90, 1500
 HALF_ANGLE_RAD = np.deg2rad(48.0)
 MARCHES, FARTHEST_MM, LEAST_STEP_MM = 120, 160.0, 0.2
-NEAR_WALL_MM = 2.5
-"""The smooth wall is looked for only where the voxels' wall is so near."""
 AROUND_MM = 45.0
 """Border of the box around the route in which the lumen is drawn."""
-BLUR_VOXELS = 0.9
-"""Smoothing of the mask: its voxels do not show as steps on the wall."""
 HALF = 0.5
 NORMAL_MM = 0.7
 """Step of the differences from which the direction of the wall is taken: about a voxel."""
@@ -98,7 +94,8 @@ class SmoothLumen:
         stop = np.minimum(np.ceil(places.max(axis=0) + around) + 1, grid.shape).astype(int)
         part = lung.labels[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
         filled = ((part & LUMEN) != 0).astype(np.float32)
-        self._share = gaussian_filter(filled, BLUR_VOXELS * grid.spacing_mm.max() / grid.spacing_mm)
+        # Smoothing of the mask: its voxels do not show as steps on the wall.
+        self._share = gaussian_filter(filled, 0.9 * grid.spacing_mm.max() / grid.spacing_mm)
         self._grid = grid.crop(start, stop)
         self._depth = lung.lumen_depth
 
@@ -124,7 +121,8 @@ class SmoothLumen:
         for _ in range(MARCHES):
             points = eye_lps + away[going, None] * rays[going]
             depth = self._depth.lower_bound_mm(points)
-            near = depth < NEAR_WALL_MM
+            # The smooth wall is looked for only where the voxels' wall is so near.
+            near = depth < 2.5
             at_wall = np.zeros(len(going), dtype=np.bool_)
             at_wall[near] = self.share(points[near]) < HALF
             going, depth = going[~at_wall], depth[~at_wall]

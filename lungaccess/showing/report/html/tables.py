@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from lungaccess.planning import Alternative
     from lungaccess.plans.plan import Plan
 
-TIGHT_FROM = 0.9
-"""From so much of a limit on its bar is coloured."""
 AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
 
@@ -36,7 +34,8 @@ def limits_section(appraisal: Appraisal) -> str:
 def _bar(limit: Limit) -> str:
     """Return how much of a limit is used, as a bar and in words."""
     width = 100.0 * min(limit.used, 1.0)
-    kind = "bar" if limit.used < TIGHT_FROM else "bar tight"
+    # From so much of a limit on its bar is coloured.
+    kind = "bar" if limit.used < 0.9 else "bar tight"
     said = limit.used_words if limit.ok else "BROKEN"
     return (
         f'<span class="{kind}" aria-hidden="true"><span style="width:{width:.0f}%"></span></span> '

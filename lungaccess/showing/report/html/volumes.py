@@ -24,8 +24,6 @@ CODES = {"outside": 0, "lung": 1, "airway wall": 2, "lumen": 3, "vessel": 4, "fi
 LABELS_VERSION = 2
 COARSE_VOXELS, FINE_VOXELS = 3_000_000, 3_000_000
 """Voxels at most of the coarse and the fine volume, so that the page stays small."""
-LEAST_COARSE_MM = 1.5
-"""Finest voxels of the whole lung on a page, so that the page stays small."""
 AROUND_MM = 28.0
 """Border around the devices that is shown in fine voxels."""
 HU_RANGES = ((-1024, 8), (-200, 5), (300, 24))
@@ -34,8 +32,6 @@ HU_OF_BYTE: Int = np.concatenate(
     [np.arange(low, stop, step) for (low, step), stop in zip(HU_RANGES, (-200, 300, 1548 + 1), strict=True)]
 )
 """The HU for which each byte of a stored CT stands, `(256,)`, from -1024 to 1548."""
-MOST_CT_CHARACTERS = 8_500_000
-"""Text of a stored CT at most: a page of 10 MB still opens at once and can be sent."""
 STORED_CT = ("ct.nii.gz", "ct.nii", "ct.nrrd", "ct.mha")
 
 
@@ -151,7 +147,8 @@ def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
             _packed(grid, _ct_bytes(ct, grid), differences=True)
             for grid in page_grids(lung.grid, device_lps, factor)
         ]
-        if sum(len(each["voxels"]["data"]) for each in found) <= MOST_CT_CHARACTERS:
+        # Text of a stored CT at most: a page of 10 MB still opens at once and can be sent.
+        if sum(len(each["voxels"]["data"]) for each in found) <= 8_500_000:
             return found
         factor *= 1.2
 
@@ -172,7 +169,8 @@ def page_grids(grid: Grid, device_lps: Float, factor: float = 1.0) -> tuple[Grid
     near_high = np.minimum(device_lps.max(axis=0) + AROUND_MM, high)
     least = float(grid.spacing_mm.min())
     return (
-        _grid(low, high, max(least, LEAST_COARSE_MM) * factor, COARSE_VOXELS),
+        # Finest voxels of the whole lung on a page, so that the page stays small.
+        _grid(low, high, max(least, 1.5) * factor, COARSE_VOXELS),
         _grid(near_low, near_high, max(least, 0.6) * factor, FINE_VOXELS),
     )
 

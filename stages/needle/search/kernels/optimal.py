@@ -19,9 +19,6 @@ ARC, LEGS = 0, 1
 VIA_COLUMNS = 4
 SPREADS_MM = (6.0, 2.0, 0.6, 0.2, 0.05, 0.01)
 """Radii of the balls in which a via point is drawn anew, from the size of vessels down."""
-LEAST_NEW_SPREAD_MM = 2.0
-"""A new first via point is drawn from a ball of this radius at least: its centre lies between the next one
-and the goal, not near the start."""
 DROP_SHARE, ADD_SHARE, OTHER_LEG_SHARE, ALL_SHARE = 0.12, 0.27, 0.37, 0.9
 """Below the first share of all variations a via point is dropped, below the second one is added, below the
 third one is reached by the other kind of leg; above the fourth all points are moved, and else a single one.
@@ -191,7 +188,9 @@ def _mutate(vias, trial, count, goal, limits, state):
         trial[m, 3] = ARC if uniform(state) < 0.5 else LEGS
         count += 1
         if m == 0:
-            spread = max(spread, LEAST_NEW_SPREAD_MM)
+            # A new first via point is drawn from a ball of this radius at least: its centre lies between the
+            # next one and the goal, not near the start.
+            spread = max(spread, 2.0)
     elif kind < OTHER_LEG_SHARE:
         trial[m, 3] = LEGS if trial[m, 3] == ARC else ARC
         return count

@@ -23,8 +23,6 @@ BAND = 12
 """Half the bandwidth of the normal equations: four control points of three coordinates."""
 STALL = 1e-4
 """Relative gain below which the least-squares steps of a round end; the next round moves the multipliers."""
-MAX_DAMPING = 1e10
-"""No step gains anything where the damping is larger: steps are then rounding."""
 LEAST_DAMPING, FIRST_DAMPING = 1e-9, 1e-3
 RAISE, LOWER = 6.0, 0.2
 """Levenberg-Marquardt damping, relative to the diagonal, and its factors after a failure and a success."""
@@ -78,7 +76,8 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
         normal_equations(program, control, multipliers, penalty, hints, band, slope)
         improved = False
         before = value
-        while damping < MAX_DAMPING:
+        # No step gains anything where the damping is larger: steps are then rounding.
+        while damping < 1e10:
             if _solve(band, slope, damping, factor, step):
                 for a in range(lo, hi):
                     for axis in range(3):

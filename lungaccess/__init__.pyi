@@ -34,7 +34,6 @@ from lungaccess.planning.procedure import simulate_procedure as simulate_procedu
 from lungaccess.planning.reachability import UnreachableProof as UnreachableProof
 from lungaccess.planning.reachability import compare_reach as compare_reach
 from lungaccess.planning.reachability import map_reach as map_reach
-from lungaccess.planning.reachability import plan_to_voxel as plan_to_voxel
 from lungaccess.plans.no_plan import NoPlan as NoPlan
 from lungaccess.plans.plan import Plan as Plan
 from lungaccess.plans.window import BreathingWindow as BreathingWindow

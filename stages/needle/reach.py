@@ -9,7 +9,6 @@ from anatomy.base.typed import Float, Int, UInt8, UInt64
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import reach_arcs, reach_search, tree
 from stages.needle.objective import Objective
-from stages.needle.path import ArcPath, path_from_tree
 from stages.needle.search.base import RANDOM_SHARE
 
 DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
@@ -124,45 +123,19 @@ class ReachScan:
             np.zeros(len(self._starts)), kinds, found, entries,
         )  # fmt: skip
         if self.trees:
-            self._search(places, seeds, kinds, found, entries)
+            rows = RRT_ITERATIONS * tree.ROWS_PER_STEP
+            reach_search.reach_by_search(
+                environment.obstacles, environment.limits, self._objective, self._starts, self._branches,
+                self._order, places, self.trees, RRT_ITERATIONS, RANDOM_SHARE,
+                np.array(seeds, dtype=np.uint64), np.zeros((rows, tree.NODE_COLUMNS)),
+                np.zeros(rows, dtype=np.int64), np.zeros(self.trees, dtype=np.int64), kinds, found, entries,
+            )  # fmt: skip
         return Reached(
             kinds=kinds.astype(np.uint8),
             cost=found[:, reach_arcs.COST],
             clearance_mm=found[:, reach_arcs.CLEARANCE],
             entries=entries,
         )
-
-    def _search(
-        self, places: Float, seeds: UInt64, kinds: Int, found: Float, entries: Int
-    ) -> tuple[Float, Int, int]:
-        """Search paths to the points not reached; return the tree to the last one, and its row there."""
-        rows = RRT_ITERATIONS * tree.ROWS_PER_STEP
-        nodes, parents = np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64)
-        last = reach_search.reach_by_search(
-            self.environment.obstacles, self.environment.limits, self._objective, self._starts,
-            self._branches, self._order, places, self.trees, RRT_ITERATIONS, RANDOM_SHARE,
-            np.array(seeds, dtype=np.uint64), nodes, parents, np.zeros(self.trees, dtype=np.int64), kinds,
-            found, entries,
-        )  # fmt: skip
-        return nodes, parents, last
-
-    def searched_path(self, point: ArrayLike, seed: int, lps_from_start: Float) -> ArcPath | None:
-        """Return again the path that the search found to a point, None if it finds none.
-
-        Parameters
-        ----------
-        point : (3,) float64, LPS mm
-        seed : int
-            That of the point in `reach`.
-        lps_from_start : (4, 4) float64
-            The start pose that was found for it.
-        """
-        places = np.array(point, dtype=np.float64).reshape(1, 3)
-        kinds = np.full(1, UNREACHED, dtype=np.int64)
-        nodes, parents, last = self._search(
-            places, np.array([seed], dtype=np.uint64), kinds, np.zeros((1, 2)), np.full(1, -1)
-        )
-        return path_from_tree(lps_from_start, nodes, parents, last) if last else None
 
 
 def _cubes(points: Float) -> tuple[Int, Int]:

@@ -8,7 +8,6 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.planning.coupled.atlas import Atlas, atlas_part, build_atlas
-    from lungaccess.planning.coupled.atlas_measures import tip_clearances_mm, tube_stability
     from lungaccess.planning.coupled.atlas_store import atlas_is_kept, open_atlas
     from lungaccess.planning.coupled.counterfactuals import (
         Counterfactual,

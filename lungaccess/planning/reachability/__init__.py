@@ -22,6 +22,5 @@ if TYPE_CHECKING:
     from lungaccess.planning.reachability.reach_stream import STREAM_SPACING_MM, ReachPart, ReachStream
     from lungaccess.planning.reachability.regions import Regions, lung_regions
     from lungaccess.planning.reachability.unreachable import MOST_BOXES, ReachVerdict, UnreachableProof
-    from lungaccess.planning.reachability.voxel_plan import plan_to_voxel
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import field
 from types import MappingProxyType
 
@@ -156,30 +156,3 @@ def rare_touch(
     luck = Luck(lambda count: assessor.draws(count, seed), model)
     happens = luck.event(lambda draws: (assessor.outcomes(draws.deviations(model)).touched & flag) != 0)
     return rare_share(happens, luck.dimensions, samples, seed)
-
-
-def safest(
-    plans: Iterable[Plan],
-    lung: Lung,
-    *,
-    model: ErrorModel | None = None,
-    samples: int = DEFAULT_SAMPLES,
-    seed: int = 0,
-    radius_mm: float | None = None,
-) -> tuple[tuple[Plan, Share], ...]:
-    """Return plans with their shares of successes, the safest first; equal ones keep their order.
-
-    Parameters
-    ----------
-    plans : iterable of Plan
-        All for one lung, such as those that `plan` yields.
-    lung, model, samples, seed, radius_mm
-        See `assess`.
-    """
-    stated = model or load_errors()
-    assessed = []
-    for each in plans:
-        assessor = RiskAssessor(each, lung, radius_mm=radius_mm)
-        draws = assessor.draws(samples, seed)
-        assessed.append((each, assessor.success(draws, model_for(stated, each, lung))))
-    return tuple(sorted(assessed, key=lambda pair: -pair[1].value))

@@ -2,23 +2,18 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from ompl import base, control
 
-from anatomy import poses
 from anatomy.base.errors import FileError
-from anatomy.base.files import atomic_write
 from anatomy.base.typed import Float
-from stages.needle.kernels import states, tree
-from stages.needle.ompl.states import numbers_of, put_numbers, write_state
+from stages.needle.kernels import states
+from stages.needle.ompl.states import numbers_of, put_numbers
 from stages.needle.path import ArcPath, arc_transform
 from stages.needle.query import Query
-from stages.needle.search.base import Search, TreeSearch, in_slices
-from stages.needle.violations import SAME_MM
+from stages.needle.search.base import Search, in_slices
 
 ROUNDING_MM = 1e-6
 """Every goal tolerance is larger by this for OMPL, whose states are rounded."""
@@ -166,68 +161,6 @@ class NeedlePlanner(base.Planner):
         state = self._si.allocState()
         put_numbers(state, states.rolled(states.state_of(frame), -roll))
         return state
-
-    def search_tree(self) -> Any:
-        """Return the last search's tree as `base.PlannerData`; an edge weighs its length in mm.
-
-        Holds what the search holds now, and the best path if that is not part of it: some searches drop
-        a tree that has succeeded, some grow none.
-        """
-        vertices = [] if self.search is None or self.query is None else _vertices(self.search, self.query)
-        data = base.PlannerData(self._si)
-        kept = []
-        for n, vertex in enumerate(vertices):
-            state = self._si.allocState()
-            write_state(state, vertex.frame)
-            kept.append(state)
-            add = data.addGoalVertex if vertex.ends_path else data.addVertex
-            (data.addStartVertex if n == 0 else add)(base.PlannerDataVertex(state))
-        for n, vertex in enumerate(vertices[1:], start=1):
-            data.addEdge(vertex.parent, n, base.PlannerDataEdge(), base.Cost(vertex.length_mm))
-        # Until here the vertices point to the states in `kept`; now they get their own.
-        data.decoupleFromPlanner()
-        return data
-
-    def save_search_tree(self, file: str | Path) -> None:
-        """Write the tree as text where the name ends in .graphml, else as OMPL's binary file.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written.
-        """
-        data = self.search_tree()
-        with atomic_write(file) as temporary:
-            if temporary.suffix == ".graphml":
-                temporary.write_text(data.printGraphML(), encoding="utf-8")
-            elif not base.PlannerDataStorage().store(data, str(temporary)):
-                raise not_written(file)
-
-
-@dataclass(frozen=True)
-class _Vertex:
-    frame: Float
-    parent: int = 0
-    length_mm: float = 0.0
-    ends_path: bool = False
-
-
-def _vertices(search: Search, query: Query) -> list[_Vertex]:
-    """List the start, the nodes of the tree and, unless it is among them, the best path."""
-    vertices = [_Vertex(query.lps_from_start)]
-    path = search.path
-    end = np.full(3, np.nan) if path is None else path.frames()[-1][:3, 3]
-    if isinstance(search, TreeSearch):
-        for row, parent in zip(search.nodes[1 : search.count], search.parents[1 : search.count], strict=True):
-            ends_path = float(np.abs(row[:3] - end).max()) < SAME_MM
-            frame = poses.pose(row[:3], row[3:6])
-            vertices.append(_Vertex(frame, int(parent), float(row[tree.ARC_LENGTH]), ends_path))
-    if path is not None and not any(vertex.ends_path for vertex in vertices):
-        parent = 0
-        for n, frame in enumerate(path.frames()[1:]):
-            vertices.append(_Vertex(frame, parent, float(path.arcs[n, 0]), n == len(path.arcs) - 1))
-            parent = len(vertices) - 1
-    return vertices
 
 
 def not_written(file: str | Path) -> FileError:

@@ -11,7 +11,6 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
-from lungaccess.planning.coupled import tip_clearances_mm, tube_stability
 from stages.tube import DEFAULT_ROTATIONS, REASONS, coarser_shapes, enumerate_deployments, kernels, shapes_of
 from tests.lungaccess.planning.coupled.planning import SYSTEM
 from tests.stages.scenes import brute_clearance
@@ -179,22 +178,12 @@ def test_further_rotations_lie_between_unlike_ones_and_only_there(atlas: la.Atla
     assert added > 10
 
 
-def test_exits_are_as_clear_as_every_voxel_says(atlas: la.Atlas, small_lung: Lung) -> None:
-    clear = tip_clearances_mm(atlas)
-    assert clear.shape == (atlas.deployments.count,)
+def test_exits_are_clear_by_every_voxel(atlas: la.Atlas, small_lung: Lung) -> None:
+    tips = atlas.deployments.positions
     bits = FISSURE | VESSEL | OUTSIDE if atlas.with_fissures else VESSEL | OUTSIDE
-    some = np.random.default_rng(0).choice(len(clear), 60, replace=False)
+    some = np.random.default_rng(0).choice(len(tips), 60, replace=False)
     required = SYSTEM.tubes.inner.radius_mm + SYSTEM.margins.total_mm
     for entry in some:
-        tip = atlas.deployments.positions[entry : entry + 1]
-        true = float(brute_clearance(small_lung.labels, small_lung.grid, tip, bits, 12.0)[0])
-        assert required <= true
-        stated = min(float(clear[entry]) + required, 12.0)
-        assert stated <= true + 1e-9
-        assert true - stated < np.linalg.norm(small_lung.grid.spacing_mm) + 0.01
-
-
-def test_tubes_of_which_one_is_straight_are_stable(atlas: la.Atlas) -> None:
-    stability = tube_stability(atlas)
-    assert stability.shape == (atlas.deployments.count,)
-    assert stability == pytest.approx(1.0)
+        assert required <= float(
+            brute_clearance(small_lung.labels, small_lung.grid, tips[[entry]], bits, 12.0)[0]
+        )

@@ -14,7 +14,6 @@ from anatomy.lung import Lung
 from experiments.support.mutants import twisted
 from experiments.support.mutants.mutant import Case
 from lungaccess.planning.coupled import AtlasSearch
-from lungaccess.planning.coupled.atlas_measures import tube_stability
 from lungaccess.planning.coupled.search.local_search import LocalSearch
 from lungaccess.planning.coupled.search.random_placement import random_placements
 from lungaccess.planning.one_stage.replan import replan_from_scope
@@ -106,7 +105,7 @@ def test_the_atlas_holds_what_the_validator_accepts(
         assert found.lps_from_tip[:3, 3] == pytest.approx(entries.positions[entry], abs=0.02)
     # The exit and its corner are those of a shape within 0.1 mm; clearances are larger by that.
     assert refused <= 6
-    assert (tube_stability(atlas) > 0.0).all()
+    assert (shapes_of(atlas.system.tubes).least_determinant[entries.shape] > 0.0).all()
 
 
 @pytest.mark.parametrize("mutation", twisted.MUTATIONS, ids=lambda mutation: mutation.__name__)

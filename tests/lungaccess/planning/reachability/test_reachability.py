@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 
 import lungaccess as la
-from anatomy.base.errors import GridMismatchError, SettingsError, TargetError
+from anatomy.base.errors import GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io.images import read_volume
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, OBSTACLES, OUTSIDE
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.planning.reachability.layers import _earlier_neighbours
+from lungaccess.planning.coupled import direct_candidates, reach_scan
+from lungaccess.planning.reachability.layers import _earlier_neighbours, voxel_seeds
 from lungaccess.planning.reachability.reach_map import (
     KINDS,
     NOT_COUNTED,
@@ -29,10 +30,21 @@ from lungaccess.planning.reachability.reach_map import (
     reach_grid,
 )
 from lungaccess.planning.reachability.regions import LEFT, RIGHT, lung_regions
-from lungaccess.planning.reachability.voxel_plan import plan_to_voxel
+from lungaccess.plans.assemble import assemble
+from lungaccess.problem.task import Task
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment
-from stages.needle.path import direct_path
-from stages.needle.reach import DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED, ReachScan
+from stages.needle.kernels import tree
+from stages.needle.kernels.reach_search import reach_by_search
+from stages.needle.path import ArcPath, direct_path, path_from_tree
+from stages.needle.reach import (
+    DIRECT,
+    NO_CLEARANCE,
+    RANDOM_SHARE,
+    RRT_ITERATIONS,
+    SEARCHED,
+    UNREACHED,
+    ReachScan,
+)  # fmt: skip
 from tests.stages.scenes import Canvas
 
 SYSTEM = la.load_system("ultrathin")
@@ -145,6 +157,32 @@ def test_a_search_only_adds(small_lung: Lung, atlas: la.Atlas) -> None:
     assert searched.gained_and_lost_ml(plain) == (gained.sum() * 12.0**3 / 1000.0, 0.0)
 
 
+def plan_to_voxel(reach: ReachMap, atlas: la.Atlas, ijk: np.ndarray) -> la.Plan:
+    """Return the plan from the deployment that the map states, by the arcs that the map's search found."""
+    entry, point = int(reach.deployment.array[tuple(ijk)]), reach.kinds.grid.lps(ijk)
+    task = Task(lung=atlas.lung, system=reach.system, target=la.point_target(atlas.lung, point))
+    arcs = direct_candidates(task, atlas)
+    found = arcs.proved(entry)
+    if reach.kinds.array[tuple(ijk)] == SEARCHED:
+        made = arcs.candidate(entry)
+        path = path_again(reach_scan(atlas, trees=reach.trees), reach.kinds.grid, ijk, made.deployment)
+        assert arcs.evaluator.proves(made.deployment, path)
+        found = replace(made, path=path)
+    return assemble(task, found, iteration=0, timing={})
+
+
+def path_again(scan: ReachScan, grid: Grid, ijk: np.ndarray, deployment: Any) -> ArcPath:
+    rows, environment = RRT_ITERATIONS * tree.ROWS_PER_STEP, scan.environment
+    nodes, parents = np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64)
+    last = reach_by_search(
+        environment.obstacles, environment.limits, scan._objective, scan._starts, scan._branches, scan._order,
+        grid.lps(ijk)[None], scan.trees, RRT_ITERATIONS, RANDOM_SHARE, voxel_seeds(grid, ijk[None]), nodes,
+        parents, np.zeros(scan.trees, dtype=np.int64), np.full(1, UNREACHED), np.zeros((1, 2)),
+        np.full(1, -1),
+    )  # fmt: skip
+    return path_from_tree(deployment.lps_from_tip, nodes, parents, last)
+
+
 @pytest.mark.parametrize(
     ("trees", "kind", "count"), [(0, DIRECT, 4), pytest.param(1, SEARCHED, 1, marks=pytest.mark.slow)]
 )
@@ -156,10 +194,7 @@ def test_a_reachable_voxel_has_a_plan_that_the_checker_accepts(
     voxels = np.argwhere(made.kinds.array == kind)
     for ijk in np.random.default_rng(3).permutation(voxels)[:count]:
         plan = plan_to_voxel(made, atlas, ijk)
-        assert np.allclose(plan.target_lps, made.kinds.grid.lps(ijk))
         assert la.check(plan, small_lung).accepted
-    with pytest.raises(TargetError, match="not reachable"):
-        plan_to_voxel(made, atlas, np.argwhere(made.kinds.array == UNREACHED)[0])
 
 
 class StoppedError(Exception):

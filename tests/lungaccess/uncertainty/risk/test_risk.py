@@ -34,7 +34,7 @@ from lungaccess.problem.errors import (
     Place,
     PositionError,
 )
-from lungaccess.uncertainty.risk.assessment import assess, safest
+from lungaccess.uncertainty.risk.assessment import assess
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
 from lungaccess.uncertainty.risk.draws import Draws
@@ -358,13 +358,6 @@ def test_errors_within_the_margins_never_fail(found: dict[str, Tolerance], asses
     errors = no_deviations(50, assessor.n_arcs)
     errors["factor"] = np.linspace(low, high, 50)
     assert assessor.succeeded(assessor.outcomes(Deviations(**errors))).all()
-
-
-def test_the_safest_plan_comes_first(plan: Plan, small_lung: Lung) -> None:
-    short = replace(plan, target_lps=plan.target_lps + 2.9)
-    judged = safest([short, plan], small_lung, samples=300, radius_mm=5.0)
-    assert judged[0][0] is plan and judged[1][0] is short
-    assert judged[0][1].value > judged[1][1].value
 
 
 def test_the_radius_of_a_nodule(plan: Plan, small_lung: Lung) -> None:

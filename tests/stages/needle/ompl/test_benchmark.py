@@ -1,31 +1,17 @@
-"""OMPL's benchmark and planner data of our searches."""
+"""OMPL's benchmark of our searches."""
 
 from __future__ import annotations
 
-import gc
 from pathlib import Path
 
-import numpy as np
 import pytest
-from ompl import base
 from ompl.tools import readBenchmarkLog
 
 from anatomy.base.errors import FileError, SettingsError
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.ompl import NeedlePlanner, NeedleProblem, benchmark, read_state
-from stages.needle.search.base import RestartingRRT
+from stages.needle.ompl import NeedleProblem, benchmark
 from stages.needle.search.planners import searches
-from tests.stages.needle.ompl.problems import (
-    GOAL,
-    LONG_S,
-    NEAR,
-    OMPL_PLANNERS,
-    arcs_of,
-    ask,
-    given,
-    query,
-    require,
-)
+from tests.stages.needle.ompl.problems import LONG_S, NEAR, OMPL_PLANNERS, arcs_of, ask, given, query, require
 
 
 @pytest.mark.slow
@@ -88,58 +74,3 @@ def test_a_benchmark_refuses_what_it_cannot_run(
             problem, query(), time_s=1.0, runs=1, planners=["rrt"], file=tmp_path / "no folder" / "x.log"
         )
     assert [file.name for file in tmp_path.iterdir()] == ["no folder"]
-
-
-def unsolved(problem: NeedleProblem) -> NeedlePlanner:
-    assert problem.plan(query(np.zeros(3)), seed=0, iterations=150) is None
-    return problem.own()
-
-
-def test_the_search_tree_is_planner_data(problem: NeedleProblem) -> None:
-    planner = unsolved(problem)
-    search = planner.search
-    assert isinstance(search, RestartingRRT) and search.count > 10
-    data = planner.search_tree()
-    gc.collect()
-    assert data.numVertices() == search.count and data.numEdges() == search.count - 1
-    assert data.numStartVertices() == 1 and data.numGoalVertices() == 0
-    for node in range(search.count):
-        frame = read_state(data.getVertex(node).getState())
-        assert np.abs(frame[:3, 3] - search.nodes[node, :3]).max() < 1e-9
-        assert np.abs(frame[:3, 2] - search.nodes[node, 3:6]).max() < 1e-9
-        assert node == 0 or data.edgeExists(int(search.parents[node]), node)
-    assert data.getStartIndex(0) == 0
-
-
-def test_the_search_tree_holds_the_path(problem: NeedleProblem) -> None:
-    path = require(ask(problem))
-    data = problem.own().search_tree()
-    assert data.numGoalVertices() == 1
-    at = data.getGoalIndex(0)
-    assert np.abs(read_state(data.getVertex(at).getState())[:3, 3] - GOAL).max() < 1e-6
-    arcs = 0
-    while at != data.getStartIndex(0):
-        (at,) = data.getIncomingEdges(at)
-        arcs += 1
-    assert arcs == len(path.arcs)
-    assert NeedleProblem(problem.environment).planner.search_tree().numVertices() == 0
-
-
-def test_the_search_tree_is_written_and_read_again(problem: NeedleProblem, tmp_path: Path) -> None:
-    planner = unsolved(problem)
-    count = planner.search_tree().numVertices()
-    planner.save_search_tree(tmp_path / "tree.graphml")
-    text = (tmp_path / "tree.graphml").read_text(encoding="utf-8")
-    assert text.count("<node") == count and text.count("<edge") == count - 1
-    assert isinstance(planner.search, RestartingRRT)
-    assert f'<data key="key1">{planner.search.nodes[1, 6]:.3f}'[:-1] in text
-    planner.save_search_tree(tmp_path / "tree.ompl")
-    again = base.PlannerData(problem.si)
-    assert base.PlannerDataStorage().load(str(tmp_path / "tree.ompl"), again)
-    assert again.numVertices() == count and again.numEdges() == count - 1
-    assert np.abs(read_state(again.getVertex(3).getState())[:3, 3] - planner.search.nodes[3, :3]).max() < 1e-9
-    with pytest.raises(FileError):
-        planner.save_search_tree(tmp_path / "no" / "tree.graphml")
-    with pytest.raises(FileError):
-        planner.save_search_tree(tmp_path / "no" / "tree.ompl")
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["tree.graphml", "tree.ompl"]

@@ -71,7 +71,7 @@ def test_the_adapter_calls_and_overrides_nothing_that_crashes() -> None:
     }  # fmt: skip
     used = names_in(tree)
     assert not used & crashing
-    assert {"nextStart", "search_tree", "addSolutionPath"} <= used
+    assert {"nextStart", "addSolutionPath"} <= used
     requests = [
         node for node in ast.walk(tree)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "Request"

@@ -16,8 +16,6 @@ ORTHONORMAL_TOLERANCE = 1e-4
 """Headers store directions in single precision with six digits or so; grids have the nearest rotation."""
 ROUNDING = 1e-12
 """Axes that differ by less are perpendicular up to the rounding of double precision."""
-AFFINE_TOLERANCE = 1e-9
-"""The last row of a homogeneous matrix is exact in every format."""
 
 
 def read_only(array: Array) -> Array:
@@ -68,7 +66,8 @@ class Grid:
                 expected="lps_from_ijk, which maps voxel indices to LPS mm",
                 remedy="Check the image header",
             )
-        if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > AFFINE_TOLERANCE:
+        # The last row of a homogeneous matrix is exact in every format.
+        if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
             raise FrameError(
                 f"The last row of a grid matrix is {matrix[3].tolist()}",
                 expected="[0, 0, 0, 1]",

@@ -11,9 +11,6 @@ from anatomy.grid import read_only
 
 ANTERIOR = np.array([0.0, -1.0, 0.0])
 SUPERIOR = np.array([0.0, 0.0, 1.0])
-NEARLY_PARALLEL = 0.9
-"""Within 26 degrees of the anterior axis the superior one is taken, so that the cross product is never
-small."""
 SHORTEST = 1e-9
 """A shorter vector has no direction in double precision."""
 
@@ -41,7 +38,9 @@ def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = 
     """
     z = _unit(np.asarray(forward, dtype=np.float64), "forward")
     if sideways is None:
-        sideways = ANTERIOR if abs(float(z @ ANTERIOR)) < NEARLY_PARALLEL else SUPERIOR
+        # Within 26 degrees of the anterior axis the superior one is taken, so that the cross product is never
+        # small.
+        sideways = ANTERIOR if abs(float(z @ ANTERIOR)) < 0.9 else SUPERIOR
     x = np.asarray(sideways, dtype=np.float64)
     x = _unit(x - (x @ z) * z, "sideways")
     frame = np.eye(4)

@@ -9,15 +9,11 @@ import numpy as np
 from anatomy.base.typed import Array, Float, Int32, Mask
 from anatomy.grid import Grid
 
-COARSE_VOXEL_MM = 2.4
-"""The lungs are told apart on voxels of about this side: fast, and finer than any gap that matters."""
 NECK_WIDTHS_MM = (0.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
 """Erosions that are tried in turn: none if the lungs do not touch, up to the width of a broad bridge."""
 
 SMALLER_LUNG_SHARE = 0.1
 """The smaller of two lungs holds at least this share of the larger one."""
-SMALLEST_REST_SHARE = 0.01
-"""What erosion leaves of the smaller lung is at least this share of all tissue, else it is a crumb."""
 
 
 def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
@@ -40,7 +36,8 @@ def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
     (ni, nj, nk) bool or None
         None if two lungs could not be told apart.
     """
-    step = tuple(max(1, round(COARSE_VOXEL_MM / float(s))) for s in grid.spacing_mm)
+    # The lungs are told apart on voxels of about this side: fast, and finer than any gap that matters.
+    step = tuple(max(1, round(2.4 / float(s))) for s in grid.spacing_mm)
     tissue = lung & ~airway
     core = ~_pooled(~tissue, step)
     sides = grow_sides(core, _pooled(tissue, step), grid.lps_from_ijk[:3, :3] * step)
@@ -67,7 +64,8 @@ def grow_sides(core: Mask, tissue: Mask, axes: Float) -> Int32 | None:
 
     spacing = tuple(map(float, np.linalg.norm(axes, axis=0)))
     depth = edt.edt(core, anisotropy=spacing, order="F", black_border=True)
-    least = SMALLEST_REST_SHARE * float(np.count_nonzero(core))
+    # What erosion leaves of the smaller lung is at least this share of all tissue, else it is a crumb.
+    least = 0.01 * float(np.count_nonzero(core))
     for neck in NECK_WIDTHS_MM:
         markers = _two_largest(depth > neck / 2, axes, least)
         if markers is not None:

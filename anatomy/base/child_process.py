@@ -13,9 +13,6 @@ from typing import Any
 
 from anatomy.base.errors import AnatomyError
 
-LOOK_EVERY_S = 0.5
-"""A process that outlives its parent by less is no nuisance, and looking takes microseconds."""
-
 
 def end_with_parent() -> None:
     """Make this process leave Ctrl-C to its parent, end at once on SIGTERM, and end when its parent is gone.
@@ -35,7 +32,8 @@ def _watch(parent: int) -> None:
         forked.join()  # A number of a process says nothing there: it stays, and may become that of another.
         os._exit(1)
     while os.getppid() == parent:
-        time.sleep(LOOK_EVERY_S)
+        # A process that outlives its parent by less is no nuisance, and looking takes microseconds.
+        time.sleep(0.5)
     os._exit(1)
 
 

@@ -25,8 +25,6 @@ DAMAGE = (
 """These errors are raised by code that reads a damaged file."""
 REPLACE_TRIES = 20 if sys.platform == "win32" else 1
 """For a second: readers and scanners of viruses have a file open no longer."""
-MOST_REASON = 300
-"""Letters of a reason that are shown: a damaged file can be quoted without end."""
 
 
 def sha256(path: str | Path) -> str:
@@ -100,7 +98,8 @@ def read_json(path: str | Path, *, expected: str, remedy: str) -> Any:
 def reason(error: Exception) -> str:
     """Return the last line of what an error says, of bounded length."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[-1][:MOST_REASON]
+    # Letters of a reason that are shown: a damaged file can be quoted without end.
+    return lines[-1][:300]
 
 
 @contextmanager

@@ -11,8 +11,6 @@ from filelock import FileLock, SoftFileLock, Timeout
 
 from anatomy.base.cache import BUILDING
 
-ABANDONED_AFTER_DAYS = 1.0
-"""No anatomy takes so long to prepare: what is older and bears no lock was left behind."""
 SECONDS_PER_DAY = 24 * 3600.0
 LOCK, CONTENT = "lock", "content"
 """The lock of a folder, and what is filled beside it: Windows renames no folder in which a file is open."""
@@ -81,7 +79,8 @@ def is_abandoned(path: Path) -> bool:
 
     Of a folder the lock tells.  Files are abandoned after a day, as are folders where there are no locks.
     """
-    aged = time.time() - path.stat().st_mtime > ABANDONED_AFTER_DAYS * SECONDS_PER_DAY
+    # No anatomy takes so long to prepare: what is older and bears no lock was left behind.
+    aged = time.time() - path.stat().st_mtime > SECONDS_PER_DAY
     if not path.is_dir():
         return aged
     if not (path / LOCK).exists():

@@ -11,9 +11,6 @@ from pathlib import Path
 from anatomy.base.cache import user_cache
 from anatomy.machine_code.sources import version_of
 
-PREBUILT = "lungaccess_kernels"
-"""Package with machine code that was made beforehand."""
-
 
 class KernelsNotKeptWarning(UserWarning):
     """Machine code cannot be kept, or what was made beforehand does not fit: kernels are compiled."""
@@ -34,7 +31,8 @@ def generation() -> str:
 @cache
 def prebuilt_folder() -> Path | None:
     """Return the folder of code that was made beforehand for this numba and Python, if there is one."""
-    spec = util.find_spec(PREBUILT)
+    # Package with machine code that was made beforehand.
+    spec = util.find_spec("lungaccess_kernels")
     for root in (spec.submodule_search_locations or ()) if spec else ():
         made = Path(root)
         if (made / generation()).is_dir():

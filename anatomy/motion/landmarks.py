@@ -10,8 +10,6 @@ from anatomy.base.typed import Bool, Float
 
 SMOOTHINGS = (1e2, 1e3, 1e4, 1e5)
 """From a spline that passes its pairs by a tenth of a mm to one that is nearly affine over a lung."""
-AS_GOOD = 1.1
-"""The smoothest spline is taken whose prediction is worse than the best by no more than this factor."""
 LEAST_PAIRS = 20
 """In a lung: twice as many as a quadratic field has coefficients, so that either half determines one."""
 
@@ -66,7 +64,8 @@ def _fitted(points: Float, vectors: Float) -> Fitted:
     halves = np.arange(len(points)) % 2 == 0
     errors = [_left_out(points, vectors, halves, smoothing) for smoothing in SMOOTHINGS]
     means = np.array([error.mean() for error in errors])
-    chosen = int(np.flatnonzero(means <= AS_GOOD * means.min())[-1])
+    # The smoothest spline is taken whose prediction is worse than the best by no more than this factor.
+    chosen = int(np.flatnonzero(means <= 1.1 * means.min())[-1])
     at = _spline(points, vectors, SMOOTHINGS[chosen])
     residual = np.linalg.norm(at(points) - vectors, axis=1)
     return Fitted(at=at, residual_mm=residual, left_out_mm=errors[chosen])

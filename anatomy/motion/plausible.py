@@ -11,14 +11,8 @@ from anatomy.grid import Grid, Volume
 from anatomy.motion.motion import LEFT, RIGHT, Motion
 from anatomy.structures import OUTSIDE
 
-BASAL_SHARE = 1.0 / 3.0
-"""The third of the height next to the diaphragm, which moves most."""
 SEEN_MM = 1.0
 """A motion of the bases below this has no direction that could be wrong."""
-UNLIKE_FACTOR = 3.0
-"""One lung that moves so much more than the other is unusual; in ten patients none did twice."""
-MENDED_SHARE = 0.05
-"""A field that is split where the lungs touch is mended in 1 % of a lung."""
 GREATEST_MM = 60.0
 """Twice the greatest motion of landmarks in quiet breathing: more is a wrong unit or frame."""
 
@@ -50,12 +44,14 @@ def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
         for side, name in ((RIGHT, "right"), (LEFT, "left"))
         if down[side] < -SEEN_MM
     ]
-    if max(far.values()) > UNLIKE_FACTOR * max(min(far.values()), SEEN_MM):
+    # One lung that moves so much more than the other is unusual; in ten patients none did twice.
+    if max(far.values()) > 3.0 * max(min(far.values()), SEEN_MM):
         warnings.append(
             f"The right lung moves by {far[RIGHT]:.1f} mm and the left one by {far[LEFT]:.1f} mm: look "
             "whether the motion is that of this patient, and not mirrored."
         )
-    if motion.figures.get("mended_share", 0.0) > MENDED_SHARE:
+    # A field that is split where the lungs touch is mended in 1 % of a lung.
+    if motion.figures.get("mended_share", 0.0) > 0.05:
         warnings.append(
             f"The motion slides or folds in {100.0 * motion.figures['mended_share']:.0f} % of a lung; there "
             "it is continued from elsewhere, which leaves what the residual says."
@@ -79,7 +75,8 @@ def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
 
 def _basal_mm(places: Float, moved: Float) -> float:
     base, apex = places[:, 2].min(), places[:, 2].max()
-    return float(-moved[places[:, 2] < base + BASAL_SHARE * (apex - base), 2].mean())
+    # The third of the height next to the diaphragm, which moves most.
+    return float(-moved[places[:, 2] < base + (1.0 / 3.0) * (apex - base), 2].mean())
 
 
 def _require_invertible(motion: Motion) -> float:
@@ -127,8 +124,6 @@ SAMPLE_MM = 4.0
 """Distance of the places that are compared: a lung has some fifty thousand."""
 LEAST_DICE = 0.8
 """Less is a border that is 5 mm off everywhere: what breathing itself moves the middle of a lung by."""
-SAME_DICE = 0.005
-"""Two Dice scores of samples that differ by less are equal."""
 
 
 def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume) -> dict[str, float]:
@@ -158,7 +153,8 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
     for side, chosen in ((RIGHT, ~is_left), (LEFT, is_left)):
         moved[chosen] = grid.values_at(lungs, motion.pulled_back(points[chosen], phase, side), False)
     dice, unmoved = _dice(moved, there), _dice(still, there)
-    if dice < max(LEAST_DICE, unmoved - SAME_DICE):
+    # Two Dice scores of samples that differ by less are equal.
+    if dice < max(LEAST_DICE, unmoved - 0.005):
         raise AnatomyError(
             f"The motion leads the lungs onto the other lungs with a Dice of {dice:.3f}; without it they "
             f"have {unmoved:.3f}",

@@ -24,12 +24,6 @@ LEAST_COVERED = 0.99
 """Share of the lungs that a field must cover: a field in a wrong frame covers far less."""
 SAMPLE_MM = 4.0
 """Distance of the places in the lungs at which a motion is looked at."""
-FITTED_NODES = 2
-"""A fit is evaluated so many nodes beyond its lung, which is slow; farther out it is continued."""
-INVERSE_STEPS = 60
-"""The fixed point that brings a field to the masks' phase converges, as a lung's motion contracts."""
-LEAST_EMPTY = 0.01
-"""A larger share of displacements of exactly 0 is not measured but left out."""
 SIDES = {RIGHT: "right", LEFT: "left"}
 
 At = Callable[[Float], Float]
@@ -115,7 +109,8 @@ def _of_landmarks(
     nodes = np.zeros((2, *at.shape))
     for side, fit in fits.items():
         inside = _near_lung(labels, grid, nodes_grid, side, middle_x_mm)
-        known = ndimage.binary_dilation(inside, iterations=FITTED_NODES)
+        # A fit is evaluated so many nodes beyond its lung, which is slow; farther out it is continued.
+        known = ndimage.binary_dilation(inside, iterations=2)
         nodes[side][known.ravel()] = fit.at(at[known.ravel()])
         nodes[side] = continued(nodes[side].reshape(*nodes_grid.shape, 3), known).reshape(-1, 3)
     return nodes, figures
@@ -188,7 +183,8 @@ def _filled(source: MotionSource) -> MotionSource:
     if vectors is None:
         return source
     empty = ~vectors.any(axis=-1)
-    if not LEAST_EMPTY < float(empty.mean()) < 1.0:
+    # A larger share of displacements of exactly 0 is not measured but left out.
+    if not 0.01 < float(empty.mean()) < 1.0:
         return source
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     return replace(source, vectors=vectors[tuple(nearest)])
@@ -220,7 +216,8 @@ def _at_masks(source: MotionSource, field: At, places: Float) -> tuple[Float, fl
     backwards = source.maps_from == "end-inhale"
     share = 1.0 - source.masks_phase if backwards else source.masks_phase
     found, rest = places, 0.0
-    for _ in range(INVERSE_STEPS if share else 0):
+    # The fixed point that brings a field to the masks' phase converges, as a lung's motion contracts.
+    for _ in range(60 if share else 0):
         nearer = places - share * field(found)
         rest = float(np.abs(nearer - found).max())
         found = nearer
@@ -253,9 +250,6 @@ def _sliding(labels: Labels, grid: Grid, field: At) -> float:
     points = grid.lps(at * steps)
     return float(np.linalg.norm(field(points + 5.0 * n) - field(points - 5.0 * n), axis=1).mean())
 
-
-RELAXATIONS = 60
-"""Steps that even out what the continuation begins with, over the width of some ten cells."""
 
 STEEP = 0.5
 """Tissue that would be squeezed or sheared by half within one cell: a field slides there, or is noise."""
@@ -298,7 +292,8 @@ def continued(values: Float, known: Mask) -> Float:
     """
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     out = values[tuple(nearest)]
-    for _ in range(RELAXATIONS):
+    # Steps that even out what the continuation begins with, over the width of some ten cells.
+    for _ in range(60):
         mean = np.zeros_like(out)
         for axis in range(3):
             for beside in (_shifted(out, axis, 1), _shifted(out, axis, -1)):

@@ -33,8 +33,6 @@ DRAWS, SIMULATED = 2000, 250
 """Draws of each trial in open loop, and procedures of one that measures: a half is known to 1 and 3 %."""
 MOST = 5
 """So many pieces of advice are given, the best first."""
-TIME_S = 5.0
-"""Seconds that all trials may take."""
 KNOWN = {
     "scope_position": 0.5,
     "scope_direction": 0.5,
@@ -48,10 +46,6 @@ KNOWN = {
 }
 """Sizes of errors that careful calibration or tracking is taken to reach, an assumption of each kind, in mm,
 degrees or, of the curvature, its logarithm."""
-PLANNED_S = 0.6
-"""Seconds of the search with another device or to another point."""
-OF_A_NODULE = 0.5
-"""Other points of a nodule lie so far from its centre, as a share of its radius."""
 
 
 @frozen_value
@@ -143,7 +137,8 @@ class Adviser:
         chance = plan.chance
         radius_mm = 5.0 if chance is None else chance.radius_mm
         for offset in np.concatenate([np.eye(3), -np.eye(3)]):
-            point = plan.target_lps + OF_A_NODULE * radius_mm * offset
+            # Other points of a nodule lie so far from its centre, as a share of its radius.
+            point = plan.target_lps + 0.5 * radius_mm * offset
             if not nodules.at(point, False):
                 continue
             found = self._planned(plan.system, Target(lps_mm=point, origin=plan.target_origin))
@@ -173,7 +168,8 @@ class Adviser:
             return None
         request = Request(
             lung=self._lung, target=target, systems=(system,), errors=self._errors,
-            procedure=load_procedure(), seed=self._plan.seed, limits=Limits(time_s=PLANNED_S),
+            # Seconds of the search with another device or to another point.
+            procedure=load_procedure(), seed=self._plan.seed, limits=Limits(time_s=0.6),
         )  # fmt: skip
         try:
             *_, best = run(request, atlas=atlas, counterfactuals=False)
@@ -191,7 +187,8 @@ def advise(
     procedure: Procedure | None = None,
     atlas_of: Callable[[System], Atlas | None] = lambda _system: None,
     systems: tuple[System, ...] = (),
-    time_s: float = TIME_S,
+    # Seconds that all trials may take.
+    time_s: float = 5.0,
 ) -> tuple[Advice, ...]:
     """Return what lifts the chance of success of a plan most, the best first; nothing for a good plan.
 

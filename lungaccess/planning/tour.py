@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 
 FARTHEST_MM = 200.0
 """No exit farther from a lesion is of use: a lung is not wider."""
-PROOFS_PER_SITE = 3
-"""How many deployments of a site are tried in full before the site counts as refused."""
 ITERATIONS = 100
 """Of the coupled planner for a lesion that no direct arc reaches: some seconds."""
 
@@ -261,7 +259,8 @@ def _points_of_arcs(atlas: Atlas, target: Target) -> frozenset[int]:
     good: set[int] = set()
     tried: dict[int, int] = {}
     for entry, point in zip(clear.tolist(), points.tolist(), strict=True):
-        if point in good or tried.get(point, 0) >= PROOFS_PER_SITE:
+        # How many deployments of a site are tried in full before the site counts as refused.
+        if point in good or tried.get(point, 0) >= 3:
             continue
         tried[point] = tried.get(point, 0) + 1
         if direct.proved(entry) is not None:

@@ -10,8 +10,6 @@ from lungaccess.plans.curves import DeviceCurves
 
 TARGET_COLOUR, EXIT_COLOUR = "#2ca02c", "#d62728"
 """The colours of target and exit in 3D Slicer's scene and in the drawings."""
-LEAST_WIDTH_MM = 1.5
-"""A thinner device is drawn this wide, so that it can be seen."""
 
 
 def plan_html(
@@ -34,7 +32,8 @@ def _drawing(view: str, curves: DeviceCurves, exit_lps: Float, target_lps: Float
     drawing = Drawing(view)
     for curve in curves.present:
         red, green, blue = (round(255 * c) for c in curve.colour)
-        width_mm = max(2.0 * float(curve.radius_mm.max()), LEAST_WIDTH_MM)
+        # A thinner device is drawn this wide, so that it can be seen.
+        width_mm = max(2.0 * float(curve.radius_mm.max()), 1.5)
         drawing.line(curve.points_lps, f"#{red:02x}{green:02x}{blue:02x}", width_mm)
     drawing.mark(exit_lps, EXIT_COLOUR)
     drawing.mark(target_lps, TARGET_COLOUR)

@@ -14,9 +14,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bends_with_tubes_rad
 from stages.scope import ScopeMotion, prover_of
 
-PASSING_STEP_MM = 0.25
-"""Spacing of the points of a body that are taken as a polyline to find where it passes a place."""
-
 SHOWN_STEP_MM, SHOWN_TURN_RAD = 1.0, 0.06
 """Largest advance and turn between two states of a motion that is shown or told."""
 
@@ -98,7 +95,8 @@ def _branches_to(tree: AirwayTree, branch: int) -> list[int]:
 
 def _passes_mm(motion: ScopeMotion, point_lps: Float) -> float:
     """Return the length of the body in the last state up to where it is nearest to a point."""
-    points = motion.body(PASSING_STEP_MM)[:, :3, 3]
+    # Spacing of the points of a body that are taken as a polyline to find where it passes a place.
+    points = motion.body(0.25)[:, :3, 3]
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     along = ((point_lps - points[:-1]) * steps).sum(axis=1) / np.maximum(lengths, 1e-12) ** 2

@@ -12,9 +12,6 @@ from anatomy.base.records import frozen_value
 if TYPE_CHECKING:
     from lungaccess.problem.system import System
 
-NOTED_MM = 0.1
-"""A needle that moves the tubes' tip by less is not worth a warning: a tenth of a mm is far below errors."""
-
 
 @frozen_value
 class NeedleLoad:
@@ -96,4 +93,5 @@ def needle_load(system: System) -> NeedleLoad | None:
 def system_warnings(system: System) -> tuple[str, ...]:
     """Return what no plan with a system counts, in sentences with numbers."""
     load = needle_load(system)
-    return () if load is None or load.shift_mm < NOTED_MM else (load.words,)
+    # A needle that moves the tubes' tip by less is not worth a warning: a tenth of a mm is far below errors.
+    return () if load is None or load.shift_mm < 0.1 else (load.words,)

@@ -18,8 +18,6 @@ MOST_ARCS = 4000
 """Arcs that are looked along, evenly chosen: enough for shares of a few percent, in about half a second."""
 NEAR_MM = 5.0
 """Points that are so near to each other belong to one place of a structure."""
-SAME_SHORTFALL_MM = 0.05
-"""Shortfalls that differ by less count as equal, and the shorter blocked length decides."""
 
 
 @frozen_record
@@ -166,7 +164,8 @@ def look_along(arcs: DirectArcs) -> tuple[tuple[Blocking, ...], BlockedArc | Non
     if not len(blocked):
         return (), None
     rank = np.lexsort(
-        (found[blocked, kernels.BLOCKED], np.floor(found[blocked, kernels.SHORTFALL] / SAME_SHORTFALL_MM))
+        # Shortfalls that differ by less count as equal, and the shorter blocked length decides.
+        (found[blocked, kernels.BLOCKED], np.floor(found[blocked, kernels.SHORTFALL] / 0.05))
     )
     best = int(blocked[rank[0]])
     return (

@@ -21,8 +21,6 @@ from stages.needle import DIRECT
 
 RADII_MM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 22.0, 30.0, 40.0)
 """Radii of the spheres on which points are tried; beyond the last, a point is no neighbour."""
-POINTS_A_SPHERE = 64
-"""Points of a sphere, about 25 degrees apart."""
 HALVINGS = 4
 """The distance between the sphere that is reached and the one before it is halved this often."""
 AROUND_MM = 20.0
@@ -91,7 +89,8 @@ class Surroundings:
         target = self._task.target.lps_mm
         before = 0.0
         for radius in RADII_MM:
-            for direction in spread_directions(POINTS_A_SPHERE):
+            # Points of a sphere, about 25 degrees apart.
+            for direction in spread_directions(64):
                 alive()
                 if self._free(target + radius * direction) and self.reached(target + radius * direction):
                     distance = self._nearer(direction, before, radius, alive)

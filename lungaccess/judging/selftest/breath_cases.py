@@ -26,8 +26,6 @@ SHARES = np.linspace(0.0, 1.0, 3)
 """Phases of a stretch that are looked at."""
 STEPS = 20
 """To the place of a moved voxel that is nearest to a device: the rest shrinks to a third or less in each."""
-FOUND_MM = 0.05
-"""How much farther than the nearest place of a voxel what these steps find may be."""
 FAR_MM = 4.0
 """Voxels farther from the devices in the masks come near in no phase."""
 
@@ -62,7 +60,8 @@ def windows(rng: scenes.Random) -> scenes.Case:
         for begin, end, state, _reason, _at in wide:
             for phase in begin + SHARES * (end - begin):
                 spare = spare_mm(lung.labels, grid, motion, rigid, points, target, float(phase) - MASKS_PHASE)
-                if spare < -1e-3 if state == rules.CLEAR else state == rules.BLOCKED and spare > FOUND_MM:
+                # How much farther than the nearest place of a voxel what these steps find may be.
+                if spare < -1e-3 if state == rules.CLEAR else state == rules.BLOCKED and spare > 0.05:
                     said = f"phases {begin:.4f} to {end:.4f} in state {state:.0f}"
                     return f"{said}; {spare:.4f} mm spare at {phase:.4f}"
         return ""

@@ -160,7 +160,8 @@ def no_path(rng: scenes.Random) -> scenes.Case:
     environment = _corridor(path, kappa, walled)
     target = path.frames()[-1][:3, 3]
     proof = NoPathProof(environment, Query(lps_from_start=path.lps_from_start, target=target))
-    for _ in range(PROOF_STEPS):
+    # The cubes, and the planes of the first one or two levels.
+    for _ in range(25):
         if proof.advance() or proof.states > MOST_STATES:
             break
     denied = proof.outcome == "no path"
@@ -172,7 +173,6 @@ def no_path(rng: scenes.Random) -> scenes.Case:
     return scenes.Case(answers=np.array([denied, proof.states, proof.cell_mm]), contradiction=contradiction)
 
 
-PROOF_STEPS = 25
 """The cubes, and the planes of the first one or two levels."""
 MOST_STATES = 800
 """Where there are more, the next planes take seconds in Python."""

@@ -32,8 +32,6 @@ STEADY_STEPS, MOST_TIMES = 16, 8
 """After each so many steps without a cheaper plan they are so many more, up to so many times as many."""
 STEPS_TOGETHER = 4
 """Steps of a search, at most, before both threads are waited for: more boxes take both more equally long."""
-BOXES_A_TIP = 2
-"""A scope tip is begun with instead of dividing so many boxes."""
 TRIED_A_QUEUE = 2
 """Deployments that are tried in one step, in the middle of the lowest boxes: less than a millisecond."""
 QUEUES = 2
@@ -222,7 +220,8 @@ class BoxQueue:
             self.settled = outcome != ENDED
             return
         first = self._next_tip
-        self._next_tip = min(first + max(boxes // BOXES_A_TIP, 1), self._tips)
+        # A scope tip is begun with instead of dividing so many boxes.
+        self._next_tip = min(first + max(boxes // 2, 1), self._tips)
         self._room = begin_queue(*self.about, self._longest, cost, first, self._next_tip, self._state)
         self.settled = not self._room
 

@@ -13,8 +13,6 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.window import WindowLimit
 from lungaccess.uncertainty.breathing.window import require_motion
 
-MOST_WINDOWS = 150
-"""Deployments whose windows are computed for the advice: of many, those that may have the widest."""
 WORTH_SAYING = 0.01
 """Phases of which a plan is not worth a sentence are fewer than this share of the breath."""
 
@@ -86,7 +84,8 @@ def _advice(search: WindowSearch | WindowTubeSearch) -> str:
         for begin, end in () if step.candidate is None or window is None else window.phases.tolist():
             held = max(begin, asked[0]), min(end, asked[1])
             best = max(best, held, key=lambda each: each[1] - each[0])
-        if number > MOST_WINDOWS:
+        # Deployments whose windows are computed for the advice: of many, those that may have the widest.
+        if number > 150:
             break
     first, last = math.ceil(100.0 * best[0]) / 100.0, math.floor(100.0 * best[1]) / 100.0
     if last - first < WORTH_SAYING:

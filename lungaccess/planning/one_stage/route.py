@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 CENTRELINE_SUFFIXES = (".vtp", ".vtu")
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-CURVE_SPACING_MM = 0.5
-"""Spacing of the points in the record: about a voxel; the spline itself is exact."""
 
 
 @frozen_record
@@ -181,7 +179,8 @@ def route_record(source: RouteSource, route: Route) -> dict[str, Any]:
     from stages.scope.route import measure
 
     measured = measure(route.curve, source.centreline)
-    count = max(round(route.curve.length_mm() / CURVE_SPACING_MM), 1)
+    # Spacing of the points in the record: about a voxel; the spline itself is exact.
+    count = max(round(route.curve.length_mm() / 0.5), 1)
     parameters = np.linspace(route.curve.breaks[0], route.curve.breaks[-1], count + 1)
     return {
         "source": source.name,

@@ -27,8 +27,6 @@ from stages.scope.advisor import (
 )
 
 ADVICE_FILE, CAMERA_FILE = "advice.json", "camera.mrk.json"
-CLEARANCE_AT_GOAL_MM = 0.25
-"""A goal in the lesion is chosen, if there is one, where the scope has this clearance, about half a voxel."""
 
 
 @frozen_record
@@ -104,7 +102,8 @@ def advise_scope(
     lumen, model = lumen_of_lung(lung), model_of(system.scope)
     start = start_state(lumen, lung.tree, model)
     width = lumen.width_from(lumen.voxel_at(start.lps_from_base[:3, 3]))
-    fits = width >= model.radius_mm + CLEARANCE_AT_GOAL_MM
+    # A goal in the lesion is chosen, if there is one, where the scope has this clearance, about half a voxel.
+    fits = width >= model.radius_mm + 0.25
     advisor = Advisor(lumen, model, goal_at(lumen, lesion_lps, lesion_radius_mm, preferred=fits))
     path = advisor.path(start, seed=seed)
     return ScopeAdvice(

@@ -32,8 +32,6 @@ from stages.tube import (
 )
 
 _REMEDY = "`lungaccess template tubes` prints a complete file to start from"
-AS_FAR = 0.95
-"""Share of the present reach that counts as about as far."""
 
 
 @settings
@@ -215,7 +213,8 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
     found = propose_designs(
         system.tubes, answer.outer_mm, answer.inner_mm, system.tubes.max_lateral_sweep_mm, limits
     )
-    enough = AS_FAR * present.tip_offset_mm
+    # Share of the present reach that counts as about as far.
+    enough = 0.95 * present.tip_offset_mm
 
     def rank(each: DesignProposal) -> tuple[float, float, float]:
         short = max(enough - each.tip_offset_mm, 0.0)

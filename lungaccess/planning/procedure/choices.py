@@ -28,8 +28,6 @@ from stages.tube import Deployment, Deployments, DeploymentValidator, SiteEnumer
 ENOUGH = 512
 """Deployments towards the target that are looked at from a scope's tip: several times what is ranked, since
 most are refused."""
-RANKED = 96
-"""Deployments that are ranked from one tip, spread over all of them: those between are much like them."""
 KEPT = 12
 """Deployments that are kept from one tip, the likeliest: further ones are alike or worse."""
 DRAWS = 16
@@ -160,7 +158,8 @@ def offered(
 def _some(entries: Deployments, worthwhile: Callable[[Float, Float], Bool]) -> Deployments:
     """Return some of the deployments towards the target, evenly."""
     near = np.flatnonzero(worthwhile(entries.positions, entries.tangents))
-    return entries.only(near[:: -(-len(near) // RANKED) or 1])
+    # Deployments that are ranked from one tip, spread over all of them: those between are much like them.
+    return entries.only(near[:: -(-len(near) // 96) or 1])
 
 
 def _none(plan: Plan) -> Deviations:

@@ -69,15 +69,10 @@ LEAST_CHANCE = 0.01
 """Below it nothing is left to do: chances are known to some percent."""
 SEARCHED_BELOW = 0.2
 """A search may find more where no path is proved and going on as planned succeeds less often than this."""
-ANOTHER_CHANNEL = 2.0
-"""Tubes that are out are drawn back only where another placement promises so many times as much, since each
-leaves a channel in tissue."""
 IMAGINED = 24
 """Placements of the scope that are imagined beforehand: their mean chance is then known to some percent."""
 PLACES = 1024
 """Places of the scope's tip that are imagined before it is measured: dozens are near any that is."""
-OFFERED = 6
-"""Tips from which deployments to choose from are looked for: the planned one, and imagined ones."""
 NEAREST_MM = 0.25
 """Spacing of the points of a path of which the one nearest to a needle's tip tells how much is inserted."""
 SAME = 1e-4
@@ -353,7 +348,9 @@ class Policy:
         tubes_out : bool
             Whether the tubes are out already.
         """
-        least = self.worth[left] / (ANOTHER_CHANNEL if tubes_out else 1.0)
+        # Tubes that are out are drawn back only where another placement promises so many times as much, since
+        # each leaves a channel in tissue.
+        least = self.worth[left] / (2.0 if tubes_out else 1.0)
         return np.asarray(chances >= max(least, LEAST_CHANCE))
 
     # Tubes ----------------------------------------------------------------------------------------
@@ -568,7 +565,8 @@ class Policy:
     def _offer(self) -> Offer:
         """The deployments to choose from."""
         planned = np.asarray(self.plan.scope.lps_from_scope_tip)[None]
-        frames = np.concatenate([planned, self._imagined.frames[: OFFERED - 1]])
+        # Deployments to choose from are looked for from the planned tip, and from five imagined ones.
+        frames = np.concatenate([planned, self._imagined.frames[:5]])
         return offered(
             self.plan, self.lung, self.system, self.errors, self.procedure, self.assessor.radius_mm,
             self._left, frames,

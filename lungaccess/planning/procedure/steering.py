@@ -9,9 +9,6 @@ from lungaccess.planning.procedure.policy import LEAST_CHANCE, OnTheWay, Policy,
 from lungaccess.planning.procedure.truth import Attempt, Steered, insert_needle, unknown_of
 from stages.needle import ArcPath, Query, Replan, Replanner, ReplanSettings
 
-WIDEST_MISS_MM = 10.0
-"""The most by which a replan may miss the target."""
-
 
 class PolicyReplanner(Replanner):
     """Goes on by what the policy chooses; it searches where no path is proved, for one that ends nearer.
@@ -52,7 +49,8 @@ class PolicyReplanner(Replanner):
             turned_rad=way.turned_rad, reference=way.reference,
         )  # fmt: skip
         rest = ArcPath(lps_from_start=lps_from_tip, arcs=way.rest)
-        allowed = ReplanSettings(largest_miss_mm=min(self._policy.aside_mm, WIDEST_MISS_MM))
+        # The most by which a replan may miss the target.
+        allowed = ReplanSettings(largest_miss_mm=min(self._policy.aside_mm, 10.0))
         replanner = Replanner(self._policy.environment, query, rest, settings=allowed)
         replanner.curvature_share = self.curvature_share
         return replanner.replan(lps_from_tip, target, way.inserted_mm)

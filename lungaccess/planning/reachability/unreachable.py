@@ -45,8 +45,6 @@ MOST_BOXES = 20_000_000
 """Boxes looked at for a target before it is given up, after half a minute or so."""
 MORE_LOOKS = 16
 """A box is given so many times as many looks as in the round before, so that rounds repeat little."""
-TASK_LOOKS = 16384
-"""Looks that a thread may take at a time."""
 
 
 NO_NEEDLE = Limits(**dict.fromkeys(Limits._fields, 0.0) | {"kappa": 1.0})
@@ -246,7 +244,8 @@ class UnreachableProof:
                             found,
                         )
 
-                    yield from in_tasks(pool, work, rows, max(TASK_LOOKS // most, 1))
+                    # Looks that a thread may take at a time.
+                    yield from in_tasks(pool, work, rows, max(16384 // most, 1))
                     most *= MORE_LOOKS
 
     def _environment(self, target: Float) -> ProofEnvironment:

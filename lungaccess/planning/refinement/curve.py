@@ -9,8 +9,6 @@ import numpy as np
 from anatomy.base.typed import Float
 from stages.needle import ArcPath, arc_transform, bend_direction
 
-AIM_STEPS = 6
-"""Newton steps converge quadratically: what has not arrived after these does not."""
 AIM_MM = 1e-10
 """Largest distance of an aimed path from the target: far below what a plan states, above rounding."""
 PROBE = 1e-6
@@ -70,7 +68,8 @@ def aimed(lps_from_start: Float, rows: Float, target: Float, max_curvature_per_m
     """
     scale = np.tile([LENGTH_SCALE_MM, max_curvature_per_mm, max_curvature_per_mm], len(rows))
     values = rows.ravel() / scale
-    for _ in range(AIM_STEPS):
+    # Newton steps converge quadratically: what has not arrived after these does not.
+    for _ in range(6):
         miss = target - _end(lps_from_start, values * scale)
         if np.linalg.norm(miss) <= AIM_MM:
             return np.asarray((values * scale).reshape(-1, 3), dtype=np.float64)

@@ -10,8 +10,6 @@ from lungaccess.problem.task import Task
 
 ITERATIONS = 40
 """Most steps of IPOPT by default; docs/explanation/refinement.md has what they save."""
-NEEDLE_SHARES = (1.0, 0.5)
-"""Where the needle that the program ends at is refused, the one half as far is tried."""
 BETTER = 1e-3
 """Share of the cost that an improvement must save."""
 
@@ -59,7 +57,8 @@ def _refined(
     for placement in reconstruction.placements(found):
         numbers = problem.for_needle(placement.x, placement.tip, placement.deployment.shape)
         aimed = solver.solve(placement.x, numbers, problem.boxes)
-        for share in NEEDLE_SHARES:
+        # Where the needle that the program ends at is refused, the one half as far is tried.
+        for share in (1.0, 0.5):
             new = reconstruction.candidate(placement, placement.x + share * (aimed - placement.x))
             if new is None:
                 continue

@@ -15,9 +15,6 @@ AXIS_SCALE_MM = 2.5
 ZONE_POINTS = 8
 NEEDLE_POINTS = 60
 TUBE_POINTS = 24
-WALL_POINTS = 8
-"""Samples of the exempt length, the needle, the tubes behind the exit and before it, about one a mm.  Slack
-in the constraints covers what lies between."""
 WALL_CONTACT_MM = 6.0
 """Length of the tubes before the exit where they may touch the wall."""
 SLOPE_MM = 0.5
@@ -54,7 +51,9 @@ class Layout:
     weighs_tubes: bool = False
     zone_points: int = ZONE_POINTS
     tube_points: int = TUBE_POINTS
-    wall_points: int = WALL_POINTS
+    # Samples of the exempt length, the needle, the tubes behind the exit and before it, about one a mm. Slack
+    # in the constraints covers what lies between.
+    wall_points: int = 8
 
     @cached_property
     def variables(self) -> dict[str, Any]:

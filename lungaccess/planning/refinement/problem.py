@@ -35,15 +35,11 @@ SHORTEST_ARC_MM = 1.0
 NEEDLE_SLACK_MM = 0.02
 TUBE_SLACK_MM = 0.1
 """The program demands so much more clearance, for what lies between samples and between lattice points."""
-SWEEP_SLACK_MM = 0.02
-"""The program keeps so far from the limit of the sweep, which its model knows to a few hundredths."""
 CURVATURE_SLACK = 1e-3
 ANGLE_SLACK_RAD = math.radians(2.0)
 """The program keeps so far from the limits of curvature and wall angle, for the same reason."""
 EASED = ("zone", "needle", "tube", "wall", "slope")
 """Constraints on field values, which the candidate may break in the program though it is proved."""
-EASE = 1e-4
-"""The candidate lies so far inside the eased constraints, so that it is a strictly feasible start."""
 
 
 class Weights(NamedTuple):
@@ -144,7 +140,8 @@ class Problem:
         least = self.numbers.least.copy()
         for name in EASED:
             place = self.layout.constraints[name]
-            least[place] = np.minimum(least[place], values[place] - EASE)
+            # The candidate lies so far inside the eased constraints, so that it is a strictly feasible start.
+            least[place] = np.minimum(least[place], values[place] - 1e-4)
         return replace(self.numbers, least=least)
 
     def for_needle(self, x: Float, tip: ScopeTip, shape: TubeShape) -> Numbers:
@@ -266,7 +263,8 @@ class Problem:
         system, deployment = self.task.system, self._candidate.deployment
         needle, tubes, margin = self._needle, system.tubes, system.margins.total_mm
         level, slope = self._lumen_at_exit()
-        allowed = max(tubes.max_lateral_sweep_mm - SWEEP_SLACK_MM, deployment.lateral_sweep_mm)
+        # The program keeps so far from the limit of the sweep, which its model knows to a few hundredths.
+        allowed = max(tubes.max_lateral_sweep_mm - 0.02, deployment.lateral_sweep_mm)
         thick = tubes.inner.radius_mm + TUBE_SLACK_MM
         clear = needle.radius_mm + margin + NEEDLE_SLACK_MM
         steep = math.sin(math.radians(tubes.min_wall_angle_deg) + ANGLE_SLACK_RAD)

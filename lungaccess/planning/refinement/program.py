@@ -32,15 +32,11 @@ from lungaccess.planning.refinement.geometry import Geometry
 from lungaccess.planning.refinement.layout import SLOPE_MM, Layout, Numbers
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
 
-FLOOR_WIDTH_MM = 0.05
-"""Width over which the floor of the clearance is rounded, so that the objective has derivatives."""
 ORDERS = (
     *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
     *((2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2)),
 )
 """Derivatives by the three lattice coordinates that are looked up."""
-LOOKED_UP = 13
-"""Numbers for each look-up: lattice coordinates (3), value, gradient (3), second derivatives (6)."""
 
 
 def _basis(t: Any) -> tuple[tuple[Any, ...], ...]:
@@ -84,7 +80,8 @@ def _look_up(cell: Any, places: Any, shape: Any, numbers: Any, begin: int) -> An
 def _floored(clearance: Any) -> Any:
     """Return a clearance in mm that is no less than its floor, rounded there."""
     over = clearance - CLEARANCE_FLOOR_MM
-    return CLEARANCE_FLOOR_MM + 0.5 * (over + casadi.sqrt(over**2 + FLOOR_WIDTH_MM**2))
+    # Width over which the floor of the clearance is rounded, so that the objective has derivatives.
+    return CLEARANCE_FLOOR_MM + 0.5 * (over + casadi.sqrt(over**2 + 0.05**2))
 
 
 def _quadratic(places: Any, seen: Any) -> list[Any]:
@@ -165,7 +162,8 @@ class Program:
         costed = needle + crossing
         looked = [costed, spared, walls, geometry.at_exit()] + ([costed] if layout.with_map else [])
         places = [self._on_lattice(p, n, points) for n, points in enumerate(looked)]
-        seen = [casadi.SX.sym(f"seen{n}", LOOKED_UP, len(points)) for n, points in enumerate(looked)]
+        # Numbers for each look-up: lattice coordinates (3), value, gradient (3), second derivatives (6).
+        seen = [casadi.SX.sym(f"seen{n}", 13, len(points)) for n, points in enumerate(looked)]
         fields = [_quadratic(*pair) for pair in zip(places, seen, strict=True)]
         f = self._objective(p, fields, steps)
         if layout.weighs_tubes:

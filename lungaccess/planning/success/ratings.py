@@ -26,8 +26,6 @@ from lungaccess.uncertainty.risk.breathing import model_for
 
 BATCH_SEED = 1 << 24
 """Distance between the seeds of two batches of draws: no seed of a search comes to that of another batch."""
-WORTH_SHARING = 400
-"""Procedures that several processes share: fewer take less time than to begin processes."""
 MANY = 10.0
 """Clear deployments that a scope tip needs so that one is likely to be left after measuring: ten lie some
 millimetres or degrees apart, as far as the errors move the tip.  It only ranks."""
@@ -140,7 +138,8 @@ class ChanceRating:
         simulator = Simulator(plan, self._lung, self.errors, self.procedure, radius_mm=self._radius_mm)
 
         def simulated(batch: int, draws: int, _factor: float) -> float:
-            processes = self._processes if draws >= WORTH_SHARING else 1
+            # Procedures that several processes share: fewer take less time than to begin processes.
+            processes = self._processes if draws >= 400 else 1
             return simulator.report(draws, self._batch_seed(batch), processes).succeeds.count
 
         return simulated

@@ -18,8 +18,6 @@ from lungaccess.uncertainty.breathing.moving import Moving
 
 PHASES = 41
 """Phases of the breath that are looked at, and of each stretch of the window a quarter as many."""
-CHORD_MM = 5.0
-"""Bends are looked at over two such chords: the distance of a motion's nodes."""
 
 
 @frozen_value
@@ -68,7 +66,8 @@ def carried_needle(plan: Plan, lung: Lung, window: BreathingWindow) -> CarriedNe
         )
     moving, devices = Moving.of(plan, lung), device_points(plan)
     needle = devices.points[devices.arc_mm >= devices.tube_mm][1:]
-    step = max(int(CHORD_MM / np.linalg.norm(needle[1] - needle[0])), 1)
+    # Bends are looked at over two such chords: the distance of a motion's nodes.
+    step = max(int(5.0 / np.linalg.norm(needle[1] - needle[0])), 1)
     tubes, target = plan.needle.lps_from_start[:3, 3], np.asarray(plan.target_lps)[None]
     ahead, breath = plan.needle.lps_from_start[:3, 2], np.linspace(0.0, 1.0, PHASES)
     worst = np.array([0.0, 0.0, 0.0, np.inf])

@@ -15,9 +15,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.uncertainty.breathing.kernels.rigid import Rigid, turned
 from lungaccess.uncertainty.breathing.window import carrier, require_motion
 
-BLEND_MM = 30.0
-"""So far beyond the carina's plane the other lung's displacement takes over: about half a mediastinum."""
-
 
 @frozen_record
 class Moving:
@@ -82,7 +79,8 @@ class Moving:
 def _one_field(motion: Motion, side: int) -> Float:
     x = motion.grid.lps_from_ijk[0, 3] + motion.grid.spacing_mm[0] * np.arange(motion.grid.shape[0])
     beyond = (x - motion.middle_x_mm) * (1.0 if side == 0 else -1.0)
-    share = np.clip(beyond / BLEND_MM, 0.0, 1.0)
+    # So far beyond the carina's plane the other lung's displacement takes over: about half a mediastinum.
+    share = np.clip(beyond / 30.0, 0.0, 1.0)
     share = (share**2 * (3.0 - 2.0 * share))[:, None, None, None]
     one = (1.0 - share) * motion.nodes[side] + share * motion.nodes[1 - side]
     return np.stack([one, one])

@@ -36,8 +36,6 @@ STRUCTURES: dict[str, int] = {
 }
 """What can go wrong before the end, and the flag that the kernel sets for it."""
 
-DEFAULT_RADIUS_MM = 5.0
-"""Radius of the goal where the target is no nodule of the nodule mask: one of 10 mm."""
 THREADS = 2
 """The kernel holds no lock, and two cores are the least that a machine of today has."""
 
@@ -209,4 +207,5 @@ def goal_radius(lung: Lung, target_lps: Float, radius_mm: float | None = None) -
         own = part[(voxels == nodules.grid.voxels(target_lps)).all(axis=1)]
         volume = float(np.count_nonzero(part == own)) * nodules.grid.voxel_volume_mm3
         return (0.75 * volume / math.pi) ** (1.0 / 3.0), "ball of the nodule's volume"
-    return DEFAULT_RADIUS_MM, "assumed: the target lies in no nodule of a mask"
+    # Radius of the goal where the target is no nodule of the nodule mask: one of 10 mm.
+    return 5.0, "assumed: the target lies in no nodule of a mask"

@@ -23,16 +23,14 @@ from lungaccess.problem.errors import IN_WINDOW, BreathingError, ErrorModel
 from lungaccess.uncertainty.breathing.window import carrier
 from lungaccess.uncertainty.risk.resting import about_resting_tip
 
-EXHALE_POWER = 6
-"""The phase in time is cos^6, the form that [Lujan1999] fits to quiet breathing: long at end-exhale."""
-
 BREATHS_LN = 0.36
 """Spread of the amplitude over breaths: 4.3 of 11.9 mm below the diaphragm, within a session [Liang2018]."""
 
 
 def phase(share_of_time: Float) -> Float:
     """Return how far between end-exhale, 0, and end-inhale, 1, the lung is at shares of the cycle, 0 to 1."""
-    return np.asarray(np.cos(np.pi * share_of_time) ** EXHALE_POWER)
+    # The phase in time is cos^6, the form that [Lujan1999] fits to quiet breathing: long at end-exhale.
+    return np.asarray(np.cos(np.pi * share_of_time) ** 6)
 
 
 def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:

@@ -14,8 +14,6 @@ from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, no_devi
 
 PATIENT, ATTEMPT = 0, 1
 """Levels at which errors are drawn."""
-_STRAIGHT = 2
-"""Stream of the numbers that decide which needles go straight."""
 DOWN = np.array([0.0, 0.0, -1.0])
 """Towards the feet, LPS."""
 
@@ -133,7 +131,8 @@ class Draws:
         error = self._error(CURVATURE, (self.count,), term.distribution, term.patient, term.attempt)
         factors = term.median * np.exp(error)
         if term.straight_share:
-            straight = _uniform(self._normal(CURVATURE, _STRAIGHT, (self.count,))) < term.straight_share
+            # Stream of the numbers that decide which needles go straight.
+            straight = _uniform(self._normal(CURVATURE, 2, (self.count,))) < term.straight_share
             factors[straight] = 0.0
         return factors
 

@@ -13,9 +13,6 @@ from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
 from lungaccess.uncertainty.risk.statistics import Share, share_of
 
-_SECOND = 1
-"""The second set of numbers of [Saltelli2010], independent of the first, comes from the seed and this."""
-
 
 @frozen_value
 class Sensitivity:
@@ -52,7 +49,8 @@ def sensitivities(
     Success counts as 1 and failure as 0.  Where all draws succeed, or none, the indices are 0.
     """
     kinds = [kind for kind in assessor.kinds if model.term(kind).size]
-    second = int(np.random.SeedSequence([seed, _SECOND]).generate_state(1)[0])
+    # The second set of numbers of [Saltelli2010], independent of the first, comes from the seed and this.
+    second = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
     first_draws, second_draws = assessor.draws(samples, seed), assessor.draws(samples, second)
     base, other = first_draws.deviations(model), second_draws.deviations(model)
     from_base, from_other = assessor.successes(base), assessor.successes(other)

@@ -16,12 +16,6 @@ from stages.tube import REASONS, Deployment, TubeShape, kernels, pieces_of_arcs
 
 NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
 """The meshes of these are one solid, so that the reason does not tell them apart."""
-LABEL_STEP_MM = 0.05
-"""Spacing of the samples whose voxels are looked up, about a tenth of a voxel."""
-SAMPLES_PER_CONTACT = 5
-"""Every so many samples it is asked whether the tube touches the wall from inside."""
-EXIT_SAMPLES = 51
-"""Points between two label samples among which the exit is found, about 0.001 mm from each other."""
 
 
 class TubeValidator:
@@ -35,7 +29,8 @@ class TubeValidator:
     def validate(self, lps_from_scope_tip: Float, rotation_rad: float, made: TubeShape) -> Deployment | str:
         """Return the deployment of a shape from a scope tip, or the reason why it is refused."""
         shape = path_of(lps_from_scope_tip, rotation_rad, made)
-        points, at_mm = shape.sample(LABEL_STEP_MM)
+        # Spacing of the samples whose voxels are looked up, about a tenth of a voxel.
+        points, at_mm = shape.sample(0.05)
         labels = self._obstacles.lung.grid.values_at(self._obstacles.lung.labels, points, OUTSIDE)
         first = self._first_outside(points, at_mm, (labels & LUMEN) != 0)
         if first == 0:
@@ -85,7 +80,8 @@ class TubeValidator:
 
     def _border_mm(self, points: Float, at_mm: Float, sample: int) -> float:
         """Return the arc length at which the axis crosses the border of the lumen before a sample."""
-        share = np.linspace(0.0, 1.0, EXIT_SAMPLES)
+        # Points between two label samples among which the exit is found, about 0.001 mm from each other.
+        share = np.linspace(0.0, 1.0, 51)
         begin, end = points[sample - 1 : sample + 1]
         lung, points = self._obstacles.lung, begin + share[:, None] * (end - begin)
         inside = (lung.grid.values_at(lung.labels, points, OUTSIDE) & LUMEN) != 0
@@ -127,7 +123,8 @@ class TubeValidator:
     def _contact_mm(self, points: Float, at_mm: Float, made: TubeShape) -> float:
         """Return the arc length from which on the tube is never clear of the wall, up to its exit."""
         radii, ends = made.arcs[:, kernels.RADIUS], np.cumsum(made.arcs[:, kernels.LENGTH])
-        for n in range(len(points) - 1, 0, -SAMPLES_PER_CONTACT):
+        # Every so many samples it is asked whether the tube touches the wall from inside.
+        for n in range(len(points) - 1, 0, -5):
             radius = radii[min(int(np.searchsorted(ends, at_mm[n])), len(radii) - 1)]
             if self._obstacles.lumen.depth_mm(points[n]) >= radius:
                 return float(at_mm[n])

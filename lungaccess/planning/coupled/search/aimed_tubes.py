@@ -47,8 +47,6 @@ TURN_RAD = math.pi / 12.0
 """The tubes are aimed from deployments that end near the target: as near as one of the same scope tip ends to
 every point that the tubes can come to.  Stops of turned tips are 4 mm apart, 2.8 mm in both insertions from
 the middle between them, and their rotations 30 degrees apart."""
-SHAPES_TRIED = 60
-"""Shapes from which the tubes are aimed from one pose, half a millisecond each at most."""
 NO_WAY = "on their way to the target the tubes would snap, sweep tissue or be strained too much"
 NO_SOLUTION = "no insertions bring the tip of the tubes to the target"
 
@@ -201,7 +199,8 @@ class AimedFromPose:
         shapes, seen = shapes_of(tubes), (target - self._frame[:3, 3]) @ self._frame[:3, :3]
         tips = shapes.scope_from_tip[:, :3, 3]
         aside = np.hypot(tips[:, 0], tips[:, 1]) - np.hypot(seen[0], seen[1])
-        near = np.argsort(np.hypot(aside, tips[:, 2] - seen[2]), kind="stable")[:SHAPES_TRIED]
+        # Shapes from which the tubes are aimed from one pose, half a millisecond each at most.
+        near = np.argsort(np.hypot(aside, tips[:, 2] - seen[2]), kind="stable")[:60]
         return many_shapes(shapes, near)
 
 

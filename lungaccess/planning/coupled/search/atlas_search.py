@@ -31,12 +31,8 @@ from stages.needle import successive_halving
 
 TRIES = 50
 """Variations of an iteration, which takes about a millisecond."""
-WORTH_EVALUATING = 0.999
-"""A run is evaluated in full only when its estimated cost has fallen by this factor, which saves time."""
 FUTILE_ITERATIONS = 1000
 """So many iterations without a deployment that has the target in its needle's workspace end the search."""
-WORTH_REFINING = 0.99
-"""The best candidate is refined again once it is cheaper by this factor, as a refinement takes long."""
 
 
 class LocalSearchRounds:
@@ -91,7 +87,8 @@ class LocalSearchRounds:
 
     def _evaluated(self, run: LocalSearchRun) -> Step:
         """Return what a run has found, if that may be the best."""
-        limit = min(WORTH_EVALUATING * run.evaluated_cost, ESTIMATE_SLACK * self._incumbent.cost)
+        # A run is evaluated in full only when its estimated cost has fallen by this factor, which saves time.
+        limit = min(0.999 * run.evaluated_cost, ESTIMATE_SLACK * self._incumbent.cost)
         if not run.cost < limit:
             return Step(iteration=0, phase=self.phase)
         run.evaluated_cost = run.cost
@@ -206,7 +203,8 @@ class AtlasSearch(SearchInParts):
         from lungaccess.planning.refinement import refine
 
         best = self.incumbent.candidate
-        if best is None or self.incumbent.cost >= WORTH_REFINING * self._refined_cost:
+        # The best candidate is refined again once it is cheaper by this factor, as a refinement takes long.
+        if best is None or self.incumbent.cost >= 0.99 * self._refined_cost:
             return
         before = self.incumbent.cost
         end = replace(self.task.target, lps_mm=self.evaluator.end_of(best.path))

@@ -23,8 +23,6 @@ TRIES = 2000
 """Samples of an iteration, a few milliseconds at most: nearly all end at the limits of the needle."""
 SPREADS = np.array([math.radians(15.0), 2.0])
 """How far rotation and insertions (mm) are varied: to the next entry of the atlas and beyond."""
-SWING_RAD = 0.15
-"""By about this angle such a variation turns the tip of the tubes."""
 
 
 class LocalSampling:
@@ -111,4 +109,5 @@ def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> I
     miss = np.maximum(radius - np.hypot(ahead, aside - radius), (turn - most_turn) * away)
     miss = np.maximum(miss, length - needle.max_length_mm)
     miss[miss <= 0.0] = np.inf
-    return np.argsort(miss / (SPREADS[1] + SWING_RAD * away), kind="stable")[:most].astype(np.int64)
+    # By about this angle such a variation turns the tip of the tubes.
+    return np.argsort(miss / (SPREADS[1] + 0.15 * away), kind="stable")[:most].astype(np.int64)

@@ -39,8 +39,6 @@ PERTURBATION = (4.0, math.radians(15.0), 2.0, math.radians(30.0))
 """Standard deviations of a perturbation: scope pose (rows), rotation, insertions in mm, and rotation of one
 tube against the others.  They are a few steps of the atlas, so that the search leaves the neighbourhood of
 where it was."""
-VIA_PERTURBATION_MM = 3.0
-"""The same for each coordinate of a via point: the largest spread of a variation in the local search."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -179,7 +177,8 @@ class LocalSearch:
         """Move a run some distance away at random, and leave out some of its via points."""
         run.choice.perturb(self.design, self._rng)
         run.count = min(run.count, int(self._rng.integers(MAX_VIAS)))
-        run.vias[: run.count] += VIA_PERTURBATION_MM * self._rng.standard_normal((run.count, 3))
+        # The same for each coordinate of a via point: the largest spread of a variation in the local search.
+        run.vias[: run.count] += 3.0 * self._rng.standard_normal((run.count, 3))
         run.cost = run.evaluated_cost = math.inf
 
     def candidate(self, run: LocalSearchRun) -> Candidate | None:

@@ -29,8 +29,6 @@ PLANNER = "ao-rrt"
 """The planner where none is named: of those that look for low cost, it finds its first path soonest."""
 DOUBLINGS = 3
 """In so many passes over the deployments the iterations double.  Later passes have other random numbers."""
-SLACK = 1.3
-"""A path may cost so many times what the best candidate costs: a local search can make it cheaper."""
 
 
 class NamedNeedlePlanner:
@@ -119,7 +117,8 @@ def needle_searches(
         for entry in ordered.tolist():
             if bounds[entry] >= incumbent.cost:
                 break
-            limit = SLACK * incumbent.cost - float(arcs.before(np.array([entry]))[0])
+            # A path may cost so many times what the best candidate costs: a local search can make it cheaper.
+            limit = 1.3 * incumbent.cost - float(arcs.before(np.array([entry]))[0])
             found = _with_path(arcs, planner, entry, limit, iterations, rng)
             first = found is not None and incumbent.step is None
             yield evaluated_step(arcs.evaluator, PHASE, found) if first else nothing, found

@@ -15,9 +15,8 @@ from anatomy.base.typed import Array, Float32, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom.branching import Centerlines, centerlines
-from anatomy.phantom.bullae import Bulla
 from anatomy.phantom.chest import make_chest
-from anatomy.phantom.nodules import Nodule
+from anatomy.phantom.nodules import Bulla, Nodule
 from anatomy.phantom.plan import PlannedTree, plan_patient
 from anatomy.phantom.rasterize import (
     LABELS,

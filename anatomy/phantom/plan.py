@@ -8,8 +8,7 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Bool, Float, UInt8
 from anatomy.phantom.branching import Sprouts
 from anatomy.phantom.bronchi import grow_airways
-from anatomy.phantom.bullae import Bulla, place_bullae
-from anatomy.phantom.nodules import Nodule, place_nodules
+from anatomy.phantom.nodules import Bulla, Nodule, place_bullae, place_nodules
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
 from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way

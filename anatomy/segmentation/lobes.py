@@ -17,8 +17,7 @@ from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIG
 from anatomy.morphology import bounds, window
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.closing import closed, largest_piece
-from anatomy.segmentation.cubic import EDGE_MM, Cubic
-from anatomy.segmentation.fissures import BLOCK, Fissureness, blocks_of, fissureness
+from anatomy.segmentation.fissures import BLOCK, EDGE_MM, Cubic, Fissureness, blocks_of, fissureness
 from anatomy.segmentation.lobar_bronchi import TRUNK_SHARE, Regions, lobes_of_branches
 from anatomy.segmentation.lungs import Lungs
 

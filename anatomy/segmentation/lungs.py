@@ -14,7 +14,7 @@ from anatomy.morphology import bounds, grown_by_one, window
 from anatomy.segmentation.central_airway import CentralAirway, central_airways, find_central_airway
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
-from anatomy.segmentation.hounsfield import (
+from anatomy.segmentation.input import (
     AIR_HU,
     GREATEST_OFFSET_HU,
     air_offset_hu,

@@ -15,8 +15,14 @@ from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.description import Description, description_text
-from anatomy.segmentation.folder import SegmentationFolder, digest_of, grid_digest, key_of
+from anatomy.segmentation.folder import (
+    Description,
+    SegmentationFolder,
+    description_text,
+    digest_of,
+    grid_digest,
+    key_of,
+)
 from anatomy.segmentation.gate import require_known_checks
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
 from anatomy.segmentation.nodules import centre_of

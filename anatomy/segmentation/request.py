@@ -1,17 +1,233 @@
 """What a segmentation starts from: a CT, and whatever other programs or people have made already."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
 
+import numpy as np
+
+from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.base.files import sha256
 from anatomy.base.records import frozen_record, frozen_value
-from anatomy.base.typed import Float
+from anatomy.base.typed import Array, Float
 from anatomy.grid import Grid, Volume
-from anatomy.io.images import images_in
+from anatomy.io.ct_cases import ct_case
+from anatomy.io.images import images_in, read_volume
+from anatomy.io.masks import SOLID, MaskSource, read_masks
+from anatomy.io.placement import place
+from anatomy.io.totalsegmentator import file_sources, mask_sources
+from anatomy.io.voxels import require_numbers
 from anatomy.segmentation.box import VOXEL_MM
-from anatomy.segmentation.given import ROLES, GivenImages, read_given
+from anatomy.segmentation.canonical import canonical
+from anatomy.segmentation.labels import lobe_numbers, sides_of_lobes
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM
+
+ROLES = {
+    "airway": "lumen",
+    "airway_wall": "wall",
+    "vessels": "vessels",
+    "lungs": "lung",
+    "lobes": "lobes",
+    "fissures": "fissures",
+}
+"""The images of the folder that may come from elsewhere, and the role of each among masks."""
+LABELLED = ("lungs", "lobes", "fissures")
+"""Images whose values mean something."""
+GREATEST_LOSS = 0.02
+"""Share of a mask that may lie outside the CT: more is another patient, or another frame."""
+
+
+@frozen_record
+class GivenImages:
+    """Images on the voxels of the CT by their names, what each was made from, and what to look at."""
+
+    images: Mapping[str, Volume]
+    sources: Mapping[str, str]
+    warnings: tuple[str, ...]
+
+
+@frozen_record
+class _Read:
+    """An image on its own voxels, and what it was made from."""
+
+    volume: Volume
+    source: str
+
+
+def read_given(files: Mapping[str, Path], folder: Path | None, grid: Grid) -> GivenImages:
+    """Read masks of other programs.
+
+    Parameters
+    ----------
+    files : mapping of str to Path
+        By the name of the image, a key of `ROLES`: a mask, a label map, `file#1,2` for some of its labels, a
+        folder of TotalSegmentator or a case of AeroPath.
+    folder : Path or None
+        Output of TotalSegmentator, for all images that it holds.
+    grid : Grid
+        The voxels of the CT, in the order of `canonical`.
+
+    Raises
+    ------
+    FileError
+        If a file is missing or damaged, or a folder holds nothing of the kind.
+    AnatomyError
+        If a mask is empty, or its values do not say what is what.
+    GridMismatchError
+        If a mask lies in another frame than the CT.
+    """
+    found = {} if folder is None else _all_of_folder(folder)
+    for image, path in files.items():
+        found[image] = _read(image, path)
+    placed, warnings = {}, []
+    for image, read in found.items():
+        name = read.source.split(" (")[0]
+        volume, coarse_mm = _onto_ct(read.volume, grid, name, solid=ROLES[image] in SOLID)
+        if not volume.array.any():
+            raise AnatomyError(
+                f"{name} holds nothing where the CT is: its mask is empty",
+                expected="voxels that are not zero",
+                remedy=f"Give another mask in place of the {image}, or leave the option out",
+            )
+        if coarse_mm:
+            warnings.append(
+                f"{name} has other voxels than the CT, of up to {coarse_mm:.2f} mm, and was carried over to "
+                "the nearest ones: what is thinner is no better than that."
+            )
+        placed[image] = volume
+    sources = {image: read.source for image, read in found.items()}
+    return GivenImages(images=placed, sources=sources, warnings=tuple(dict.fromkeys(warnings)))
+
+
+def _read(image: str, path: Path) -> _Read:
+    """Read one image from whatever a path names."""
+    if path.is_dir():
+        return _one_of_folder(image, path)
+    base, mark, stated = path.name.rpartition("#")
+    if mark and not path.exists():
+        return _of_labels(image, path.with_name(base), stated)
+    sources, _ = file_sources(path)
+    if sources:
+        return _of_sources(image, sources, path.name)
+    volume = read_volume(path)
+    require_numbers(volume.array, path)
+    if image == "lobes":
+        return _as_lobes(volume, path.name)
+    values = sorted({float(value) for value in np.unique(volume.array)} - {0.0})
+    if len(values) > 1 and image not in LABELLED:
+        raise AnatomyError(
+            f"{path.name} holds the values {', '.join(f'{v:g}' for v in values[:9])}, and names none of them",
+            expected=f"one value for the {_plain(image)}, or names of labels in the header or in a JSON file",
+            remedy=f"Say which count, as in {path.name}#{values[0]:g} or {path.name}#1,2",
+        )
+    return _Read(volume=volume, source=path.name)
+
+
+def _of_labels(image: str, path: Path, stated: str) -> _Read:
+    try:
+        labels = [int(label) for label in stated.split(",")]
+    except ValueError:
+        raise FileError(
+            f"{path.name}#{stated} names no labels",
+            expected="values after #, with commas between them",
+            remedy=f"Write for instance {path.name}#1,2",
+        ) from None
+    volume = read_volume(path)
+    mask = np.isin(volume.array, labels)
+    source = f"{path.name} (labels {stated})"
+    if image in LABELLED:
+        kept = Volume(grid=volume.grid, array=volume.array * mask)
+        return _as_lobes(kept, source) if image == "lobes" else _Read(volume=kept, source=source)
+    return _Read(volume=Volume(grid=volume.grid, array=mask), source=source)
+
+
+def _as_lobes(volume: Volume, source: str) -> _Read:
+    lobes = lobe_numbers(volume, source)
+    return _Read(volume=Volume(grid=volume.grid, array=lobes), source=source)
+
+
+def _one_of_folder(image: str, folder: Path) -> _Read:
+    case = ct_case(folder)
+    if case is not None:
+        path = {"airway": case.airway, "lungs": case.lungs}.get(image)
+        if path is not None:
+            read = _read(image, path)
+            return _Read(volume=read.volume, source=f"{read.source} ({case.data_set})")
+    return _of_sources(image, mask_sources(folder)[0], f"{folder.name}")
+
+
+def _all_of_folder(folder: Path) -> dict[str, _Read]:
+    if not folder.is_dir():
+        raise FileError(
+            f"There is no folder {folder}",
+            expected="a folder with output of TotalSegmentator",
+            remedy="Check the name and the folder",
+        )
+    sources, _ = mask_sources(folder)
+    roles = {source.role for source in sources}
+    roles |= {"lung"} if "lobes" in roles else set()
+    # The task total knows the trachea alone; only the task lung_vessels shows the airways.
+    if not roles & {"wall", "vessels"}:
+        roles.discard("lumen")
+    wanted = [image for image, role in ROLES.items() if role in roles]
+    if not wanted:
+        raise FileError(
+            f"{folder} holds no lobes, airways or vessels of TotalSegmentator",
+            expected="output of the tasks lung_vessels or total, such as lung_vessels.nii.gz",
+            remedy="Run its task lung_vessels, or give masks one by one: --airway, --vessels, --lungs",
+        )
+    return {image: _of_sources(image, sources, folder.name) for image in wanted}
+
+
+def _of_sources(image: str, sources: Sequence[MaskSource], name: str) -> _Read:
+    """Unite the masks of a role; lungs are the lobes where there are no lungs."""
+    role = ROLES[image]
+    fitting = [source for source in sources if source.role == role]
+    if image == "lungs" and not fitting:
+        fitting = [source for source in sources if source.role == "lobes"]
+    if not fitting:
+        there = ", ".join(dict.fromkeys(source.role for source in sources))
+        raise FileError(
+            f"{name} holds no {_plain(image)}, but {there or 'only what has no name that is known'}",
+            expected=f"a mask of the {_plain(image)}",
+            remedy="Give the file that shows them, or name the labels, as in FILE#1,2",
+        )
+    read = read_masks(fitting)
+    array: Array = read.masks[role] if role in read.masks else np.asarray(read.lobes)
+    if image == "lungs" and role not in read.masks:
+        array = sides_of_lobes(array)
+    files = ", ".join(dict.fromkeys(_shown(source) for source in fitting))
+    return _Read(volume=Volume(grid=read.grid, array=array), source=f"{name} (TotalSegmentator: {files})")
+
+
+def _shown(source: MaskSource) -> str:
+    labels = ", ".join(map(str, source.labels))
+    return f"{source.path.name}{f' label {labels}' if labels else ''}"
+
+
+def _plain(image: str) -> str:
+    return image.replace("_", " ")
+
+
+def _onto_ct(volume: Volume, grid: Grid, name: str, *, solid: bool) -> tuple[Volume, float]:
+    """Return an image on the voxels of the CT, and the size of its own if they are others, else 0."""
+    volume = canonical(volume)
+    if volume.grid.is_close(grid):
+        return Volume(grid=grid, array=volume.array), 0.0
+    axes = [each.lps_from_ijk[:3, :3] / each.spacing_mm for each in (volume.grid, grid)]
+    turned = float(np.abs(axes[0].T @ axes[1] - np.eye(3)).max())
+    placed = place(volume.array, volume.grid, grid, solid=solid)
+    lost = placed.n_lost / max(placed.n_voxels, 1)
+    # An axis may turn by so many radians: over 300 mm a mask is then 3 mm off.
+    if turned > 0.01 or lost > GREATEST_LOSS:
+        why = f"{lost:.0%} of it lie outside the CT" if lost > GREATEST_LOSS else "its axes are turned"
+        raise GridMismatchError(
+            f"{name} lies in another frame than the CT: {why}. It has {volume.grid.describe()}",
+            expected=f"a mask of this CT, which has {grid.describe()}",
+            remedy="Export the mask with the CT as its reference image, and check that both show one patient",
+        )
+    coarse_mm = float(volume.grid.spacing_mm.max()) if placed.is_resampled else 0.0
+    return Volume(grid=grid, array=placed.array), coarse_mm
 
 
 @frozen_value

@@ -17,10 +17,16 @@ from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
 from anatomy.segmentation.airway import wall_around
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.central_airway import without_larynx
-from anatomy.segmentation.description import Description
-from anatomy.segmentation.folder import IMAGES, SegmentationFolder, digest_of, grid_digest, key_of
+from anatomy.segmentation.folder import (
+    IMAGES,
+    Description,
+    SegmentationFolder,
+    digest_of,
+    grid_digest,
+    key_of,
+)
 from anatomy.segmentation.gate import plausibility, require_plausible
-from anatomy.segmentation.hounsfield import without_offset
+from anatomy.segmentation.input import without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
 from anatomy.segmentation.misplaced import misplaced

@@ -20,7 +20,7 @@ from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.motion.prepare import prepare_motion
 from anatomy.phantom import Phantom
-from anatomy.phantom.breathing import PhantomBreathing
+from anatomy.phantom.files import PhantomBreathing
 from anatomy.structures import BITS
 from lungaccess.cli import terminal
 from lungaccess.plans.parts import Exemption, NeedleArc, NeedlePath, ScopeInsertion, TubeDeployment, WallExit

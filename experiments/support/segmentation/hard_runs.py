@@ -17,8 +17,7 @@ from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.gate import plausibility, require_plausible
-from anatomy.segmentation.hounsfield import without_offset
-from anatomy.segmentation.input import require_chest_ct
+from anatomy.segmentation.input import require_chest_ct, without_offset
 from anatomy.segmentation.lungs import Lungs, segment_lungs
 from anatomy.segmentation.scan_warnings import airway_warnings, scan_warnings, tree_or_error
 from experiments.support.segmentation.hard_images import HardImage, upright

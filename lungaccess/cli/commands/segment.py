@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from anatomy.grid import Volume
     from anatomy.segmentation.pipeline import Segmentation
-    from anatomy.segmentation.quality import Quality
+    from anatomy.segmentation.scan_warnings import Quality
 
 STEP_SHARES = {
     "reading the CT": 0.02,
@@ -122,8 +122,8 @@ def segment(
     """
     from anatomy.segmentation.pipeline import memory_estimate_gib, read_ct
     from anatomy.segmentation.pipeline import segment as run
-    from anatomy.segmentation.quality import quality_of
     from anatomy.segmentation.request import Given, SegmentationRequest
+    from anatomy.segmentation.scan_warnings import quality_of
 
     for point in (target, seed):
         if point is not None:

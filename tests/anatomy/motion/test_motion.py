@@ -17,7 +17,7 @@ from anatomy.motion.population import share_of_motion
 from anatomy.motion.prepare import continued_unfolded, prepare_motion
 from anatomy.motion.source import MotionSource
 from anatomy.phantom import Phantom
-from anatomy.phantom.breathing import PhantomBreathing
+from anatomy.phantom.files import PhantomBreathing
 from anatomy.store import folder_name, open_lung
 from anatomy.structures import OUTSIDE
 from tests.anatomy.stored_toy import SOURCES

@@ -14,7 +14,7 @@ from anatomy.motion.motion import Motion
 from anatomy.motion.plausible import require_onto_lungs
 from anatomy.motion.prepare import prepare_motion
 from anatomy.phantom import Phantom
-from anatomy.phantom.breathing import PhantomBreathing
+from anatomy.phantom.files import PhantomBreathing
 from anatomy.structures import OUTSIDE
 
 SPACING_MM = 2.0

@@ -15,12 +15,11 @@ from anatomy.io import write_volume
 from anatomy.io.own_masks import load_own_masks
 from anatomy.phantom import Phantom
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.description import description_text
+from anatomy.segmentation.folder import description_text
 from anatomy.segmentation.gate import CHECKS
-from anatomy.segmentation.given import GivenImages, read_given
 from anatomy.segmentation.labels import NUMBERINGS, lobe_numbers, sides_of
 from anatomy.segmentation.misplaced import FITS, misplaced, moved_by
-from anatomy.segmentation.request import Given
+from anatomy.segmentation.request import Given, GivenImages, read_given
 
 TOTAL = (
     "lung_upper_lobe_left",

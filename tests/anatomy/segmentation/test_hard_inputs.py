@@ -10,7 +10,7 @@ from anatomy.grid import Volume
 from anatomy.phantom import Phantom
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.gate import CHECKS, Implausible, require_known_checks, require_plausible
-from anatomy.segmentation.hounsfield import without_offset
+from anatomy.segmentation.input import without_offset
 from experiments.support.segmentation.hard_cases import CASES
 from experiments.support.segmentation.hard_images import HardImage, phantom_image, turned
 from experiments.support.segmentation.hard_runs import plain_tree, run

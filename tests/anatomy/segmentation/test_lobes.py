@@ -7,8 +7,7 @@ import pytest
 
 from anatomy.grid import Grid
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.segmentation.cubic import Cubic
-from anatomy.segmentation.fissures import fissureness
+from anatomy.segmentation.fissures import Cubic, fissureness
 from anatomy.segmentation.kernels.flooding import diffuse, flood
 from anatomy.segmentation.lobar_bronchi import Regions, lobes_of_branches
 from anatomy.segmentation.lobes import SEEN, lobes_given

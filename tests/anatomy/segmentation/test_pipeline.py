@@ -24,8 +24,8 @@ from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, 
 from anatomy.segmentation.lobes import SEEN
 from anatomy.segmentation.parts import RefusedError
 from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
-from anatomy.segmentation.quality import quality_of
 from anatomy.segmentation.request import Given, SegmentationRequest
+from anatomy.segmentation.scan_warnings import quality_of
 from experiments.support.segmentation.hard_images import phantom_image, turned
 
 pytestmark = pytest.mark.slow

@@ -9,8 +9,8 @@ import pytest
 from scipy import ndimage
 
 from anatomy.base.typed import Float, Int16, Mask
+from anatomy.segmentation.growing import Tubes, follow_thin_airways
 from anatomy.segmentation.kernels.states import BANNED, LUMEN
-from anatomy.segmentation.thin_airways import Tubes, follow_thin_airways
 
 SHAPE = (96, 60, 60)
 SPACING_MM = np.full(3, 0.7)

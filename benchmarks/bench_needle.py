@@ -10,8 +10,7 @@ from benchmarks.fresh import FreshProcess
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
-from stages.needle.path import blocker_on_path, direct_path
-from stages.needle.query import Query
+from stages.needle.path import Query, blocker_on_path, direct_path
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.resolution import ResolutionSearch

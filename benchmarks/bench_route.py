@@ -7,9 +7,9 @@ import numpy as np
 from benchmarks.fresh import FreshProcess
 from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.route.centreline import Centreline, from_tree
+from stages.scope.route.guide_path import nearest_links
 from stages.scope.route.planner import Replanner, plan_route
 from stages.scope.route.proof import prove
-from stages.scope.route.search import nearest_links
 from stages.scope.route.settings import RouteLimits
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits

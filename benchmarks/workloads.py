@@ -109,14 +109,14 @@ def _direct_arcs(targets: int) -> Work:
 
 
 def _build_index(entries: int) -> Work:
-    from stages.needle.start_index import StartIndex
+    from stages.needle.reach import StartIndex
 
     positions, tangents = scenes.starts(entries)
     return lambda: StartIndex(positions, tangents)
 
 
 def _query_index(entries: int) -> Work:
-    from stages.needle.start_index import StartIndex
+    from stages.needle.reach import StartIndex
 
     environment, targets = scenes.free_environment(), scenes.index_targets()
     index = StartIndex(*scenes.starts(entries))

@@ -38,8 +38,7 @@ from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target
 from stages.needle.environment import needle_environment
 from stages.needle.objective import Objective
-from stages.needle.path import ArcPath, arc_transform
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, arc_transform
 from stages.needle.replanning.belief import tilt
 from stages.needle.replanning.replanner import Replanner
 

@@ -26,9 +26,9 @@ from experiments.support.route.groups import LIMITS_PER_MM, NOISE_MM, TRIALS, Tr
 from experiments.support.route.speed import replanning, side_by_side
 from lungaccess.showing.report import style
 from stages.scope.route.curve import Curve
+from stages.scope.route.guide_path import NoRouteError
 from stages.scope.route.planner import Repair, plan_route
 from stages.scope.route.proof import measure
-from stages.scope.route.search import NoRouteError
 from stages.scope.route.settings import RouteLimits
 
 METHODS = ("exact", "ga", "rrt", "rrt*", "rrt first", "rrt* first")

@@ -31,9 +31,8 @@ if TYPE_CHECKING:
         needle_environment,
         workspace_lengths,
     )
-    from stages.needle.infeasibility.backward_reach import NOT_BOUNDED, backward_reach
     from stages.needle.infeasibility.certificate import NoPathProof
-    from stages.needle.infeasibility.passage import Passage
+    from stages.needle.infeasibility.passage import NOT_BOUNDED, Passage, backward_reach
     from stages.needle.kernels.cost import ObjectiveArrays
     from stages.needle.kernels.limits import Limits
     from stages.needle.kernels.proof import Obstacles, blocker_on_arc
@@ -44,14 +43,21 @@ if TYPE_CHECKING:
         LENGTH,
         ROLL,
         ArcPath,
+        Query,
         arc_transform,
         bend_direction,
         blocker_on_path,
         direct_path,
+        violation,
     )
-    from stages.needle.planner_choice import has_ompl, require_planner
-    from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS, OMPL_TOLERANCE_MM, OUR_PLANNERS
-    from stages.needle.query import Query
+    from stages.needle.planner_choice import (
+        NEEDLE_PLANNERS,
+        OMPL_PLANNERS,
+        OMPL_TOLERANCE_MM,
+        OUR_PLANNERS,
+        has_ompl,
+        require_planner,
+    )
     from stages.needle.reach import (
         BLOCK_MM,
         DEFAULT_ARCS,
@@ -61,6 +67,7 @@ if TYPE_CHECKING:
         UNREACHED,
         Reached,
         ReachScan,
+        StartIndex,
     )
     from stages.needle.replanning.belief import Belief, Unknown, tilt
     from stages.needle.replanning.escaping import structure_name, with_limits
@@ -81,7 +88,6 @@ if TYPE_CHECKING:
     from stages.needle.search.planners import MakeSearch, searches
     from stages.needle.search.portfolio import PortfolioSearch, successive_halving
     from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
-    from stages.needle.start_index import StartIndex
     from stages.needle.start_region import (
         KINDS,
         REACHING,
@@ -92,6 +98,5 @@ if TYPE_CHECKING:
         proved_factor,
     )
     from stages.needle.start_region_trial import try_around, try_poses, try_starts
-    from stages.needle.violations import violation
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

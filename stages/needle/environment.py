@@ -16,7 +16,7 @@ from anatomy.margins import Margins
 from anatomy.organ import Organ
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, close_border, obstacle_bits
 from stages.needle.device import Needle
-from stages.needle.kernels import scan
+from stages.needle.kernels import start_trial
 from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.kernels.limits import Limits
 from stages.needle.kernels.proof import Obstacles
@@ -226,7 +226,7 @@ def workspace_lengths(
     """
     places = _plain(positions)
     lengths = np.zeros(len(places))
-    scan.workspace_scan(places, _plain(tangents), _plain(target), environment.limits, lengths)
+    start_trial.workspace_scan(places, _plain(tangents), _plain(target), environment.limits, lengths)
     return lengths
 
 
@@ -256,7 +256,7 @@ def direct_arcs(
     """
     blockers = np.zeros(len(branches), dtype=np.int64)
     costs = np.zeros((len(branches), 2))
-    scan.direct_arcs(
+    start_trial.direct_arcs(
         environment.obstacles,
         environment.limits,
         _plain(positions),

@@ -14,7 +14,7 @@ from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.limits import Limits
 from stages.needle.kernels.proof import exact_gap
-from stages.needle.query import Query
+from stages.needle.path import Query
 
 TRIALS = 256
 """Paths that are tried for the easiest one: some milliseconds."""

@@ -1,4 +1,7 @@
-"""Needle paths as a person steers them: roll, then insert along an arc."""
+"""Needle paths as a person steers them: roll, then insert along an arc.
+
+A query is what is asked of a path; violations are why one is no answer to it, whoever found it.
+"""
 
 import math
 from collections.abc import Iterator
@@ -7,14 +10,91 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
+from anatomy.base.errors import FrameError, SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
 from anatomy.kernels import arcs as arc_kernels
+from anatomy.structures import BITS
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import least_cosine
 from stages.needle.kernels.proof import blocker_on_arc
+
+
+@frozen_record
+class Query:
+    """A start pose and a target.
+
+    Parameters
+    ----------
+    lps_from_start : (4, 4) float64
+        +z is the direction of insertion.
+    target : (3,) float64, LPS mm
+    branch : int
+        Pierced branch, whose wall is exempt at the exit; -1 for none.
+    inserted_mm, turned_rad : float
+        Length of the needle behind the start and its accumulated turn: the limits count both, and so does
+        the exemption at the exit.
+    reference : (3,) float64, optional
+        Direction from which the limit of the angle counts; by default that of the start.
+
+    Raises
+    ------
+    FrameError
+        If there are not so many finite numbers, the pose is not rigid, or the reference has no length.
+    SettingsError
+        If the length or the turn behind the start is negative or not finite.
+    """
+
+    lps_from_start: Float
+    target: Float
+    branch: int = -1
+    inserted_mm: float = 0.0
+    turned_rad: float = 0.0
+    reference: Float | None = None
+
+    @property
+    def goal(self) -> tuple[float, float, float]:
+        """The target as the kernels take it."""
+        x, y, z = self.target.tolist()
+        return x, y, z
+
+    def __post_init__(self) -> None:
+        frame = np.array(self.lps_from_start, dtype=np.float64)
+        target = np.array(self.target, dtype=np.float64)
+        if frame.shape != (4, 4) or target.shape != (3,) or not np.isfinite([*frame.flat, *target]).all():
+            raise FrameError(
+                f"A needle query has a start of shape {frame.shape} and a target of shape {target.shape}",
+                expected="a 4x4 pose and three coordinates, all finite, LPS mm",
+            )
+        rotation = frame[:3, :3]
+        if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+            raise FrameError(
+                "The start of a needle query is not a right-handed rigid pose", expected="a rotation"
+            )
+        for name, value in (("inserted length", self.inserted_mm), ("accumulated turn", self.turned_rad)):
+            if not 0.0 <= value < math.inf:
+                raise SettingsError(f"The {name} is {value}", expected="a finite number of 0 or more")
+        object.__setattr__(self, "lps_from_start", frame)
+        object.__setattr__(self, "target", target)
+        if self.reference is not None:
+            object.__setattr__(self, "reference", _unit(np.array(self.reference, dtype=np.float64)))
+
+
+def _unit(direction: Float) -> Float:
+    length = float(np.linalg.norm(direction)) if direction.shape == (3,) else math.nan
+    if not 0.0 < length < math.inf:
+        raise FrameError(
+            f"The reference direction of a needle query is {direction.tolist()}",
+            expected="three finite numbers, not all 0",
+        )
+    return direction / length
+
+
+SAME_MM = 1e-6
+SAME_RAD = 1e-6
+"""Rounding that is forgiven."""
 
 LENGTH, ROLL, CURVATURE = 0, 1, 2
 
@@ -174,3 +254,40 @@ def kernel_arcs(path: ArcPath) -> Iterator[tuple[tuple[float, ...], tuple[float,
     for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
         pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
         yield pose, (float(curvature), *(float(v) for v in bend_direction(frame, roll))), float(length)
+
+
+def violation(
+    environment: NeedleEnvironment, query: Query, path: ArcPath, *, goal_tolerance_mm: float = 0.0
+) -> str:
+    """Tell why a path is no answer to a query; "" if it is one.
+
+    All limits of the needle are tested, and every arc is proved clear.
+
+    Parameters
+    ----------
+    goal_tolerance_mm : float
+        How far from the target the path may end, where the environment's own tolerance is smaller.
+    """
+    needle = environment.needle
+    reference = query.lps_from_start[:3, 2] if query.reference is None else query.reference
+    lengths, curvatures = path.arcs[:, 0], path.arcs[:, 2]
+    tolerance = max(goal_tolerance_mm, environment.goal_tolerance_mm)
+    turned = query.turned_rad + path.accumulated_turn_rad
+    # Not a number fails every one of these comparisons.
+    tests = {
+        "starts elsewhere": np.abs(path.lps_from_start - query.lps_from_start).max() <= SAME_MM,
+        "goes backwards": bool((lengths >= 0.0).all()),
+        "longer than the needle": query.inserted_mm + path.length_mm <= needle.max_length_mm + SAME_MM,
+        "bends too tightly": bool(
+            ((curvatures >= 0.0) & (curvatures <= needle.max_curvature_per_mm * (1.0 + SAME_MM))).all()
+        ),
+        "turns too far in all": turned <= math.radians(needle.max_accumulated_turn_deg) + SAME_RAD,
+        "points too far from its direction at the start": path.max_angle_from_start_rad(reference)
+        <= math.radians(needle.max_angle_from_start_deg) + SAME_RAD,
+        "misses the target": np.linalg.norm(path.frames()[-1][:3, 3] - query.target) <= tolerance + SAME_MM,
+    }
+    for reason, passed in tests.items():
+        if not passed:
+            return reason
+    label = blocker_on_path(environment, path, query.branch, query.inserted_mm)
+    return "" if label == 0 else "too near: " + next(name for name, bit in BITS.items() if label & bit)

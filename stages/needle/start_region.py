@@ -12,8 +12,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_region as proof_kernel
 from stages.needle.kernels import start_trial as kernel
 from stages.needle.kernels.limits import Limits
-from stages.needle.path import CURVATURE, ArcPath, arc_transform, direct_path
-from stages.needle.query import Query
+from stages.needle.path import CURVATURE, ArcPath, Query, arc_transform, direct_path
 
 KINDS = {
     kernel.DIRECT: "one arc",

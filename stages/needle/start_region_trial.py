@@ -13,8 +13,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_trial as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import SHORTEST
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.base import MAX_NODES, RANDOM_SHARE
 from stages.needle.start_region import TriedStarts
 

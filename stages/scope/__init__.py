@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from stages.scope.contact import WallContact
     from stages.scope.device import Bronchoscope
     from stages.scope.motion import ScopeMotion
     from stages.scope.motion_proof import (
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     )
     from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
     from stages.scope.passages import Passages, find_passages
-    from stages.scope.resting import RestingShaft, RestingShape, lumen_of
+    from stages.scope.resting import RestingShaft, RestingShape, WallContact, lumen_of
     from stages.scope.shifting import TipRow, evenly, shifted
     from stages.scope.tip_spread import TipSpread, off_pose, spread_of_tip
 

@@ -17,8 +17,7 @@ from anatomy.structures import LUMEN, OUTSIDE
 from stages.scope.device import SHORTEST_MM, Bronchoscope
 from stages.scope.kernels.body import MOST_TWIST_RAD, Walls, motion_room
 from stages.scope.kernels.growth import Device
-from stages.scope.kernels.shifting import shifted_tips
-from stages.scope.kernels.tolerances import step_tolerances
+from stages.scope.kernels.turning import shifted_tips, step_tolerances
 from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
 from stages.scope.shifting import TipRow, as_shifts
 from stages.scope.simplifying import Simplifier, frame_columns

@@ -8,19 +8,20 @@ the section bent as commanded, and the hand advances until the tip has the plann
 from __future__ import annotations
 
 import math
+from typing import Annotated
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from anatomy import poses as frames
 from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.settings import quantity, settings, text
 from anatomy.base.typed import Float, Mask
 from anatomy.fields import corner_geometry, distance_corners
 from anatomy.grid import Grid, read_only
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.structures import LUMEN
-from stages.scope.contact import WallContact
 from stages.scope.device import Bronchoscope, laid_pieces
 from stages.scope.kernels import resting as kernel
 from stages.scope.kernels.resting import Lumen
@@ -330,3 +331,49 @@ def signed_depth(inside: Mask, grid: Grid) -> Lumen:
     depth -= distance_corners(part, grid.spacing_mm)
     depth /= np.float32(UNITS_PER_MM)
     return Lumen(read_only(np.asfortranarray(depth)), corner_geometry(grid.crop(low, high)))
+
+
+@settings
+class WallContact:
+    """How the wall yields, how the shaft slides on it, and what it may bear.
+
+    `docs/explanation/resting_scope.md` says where the defaults come from.
+
+    Parameters
+    ----------
+    wall_stiffness_n_per_mm2 : float
+        Force on a mm of the shaft's length that presses the wall in by a mm.  Mucosa of 0.02 to 0.28 MPa
+        [Wang2011] yields by about as much as a bed of that modulus.
+    wall_stiffness_range, scope_stiffness_range : float
+        Factors by which the stiffness of wall and scope may be less or more.
+    max_friction : float
+        Largest coefficient of friction; the least is 0.
+    max_wall_force_n : float
+        Largest force on 10 mm of wall.
+    max_wall_give_mm : float
+        How far the wall may be pressed in; it is then twice as hard as at first, as soft tissue stiffens.
+    source : str
+        Where the numbers come from; what nobody has published begins with "assumption".
+    """
+
+    wall_stiffness_n_per_mm2: Annotated[
+        float, quantity("force on a mm of length that presses the wall in by a mm", above=0.0, at_most=100.0)
+    ] = 0.1
+    wall_stiffness_range: Annotated[
+        float, quantity("factor by which the wall may be softer or stiffer", at_least=1.0, at_most=100.0)
+    ] = 3.0
+    scope_stiffness_range: Annotated[
+        float, quantity("factor by which the scope may be softer or stiffer", at_least=1.0, at_most=100.0)
+    ] = 2.0
+    max_friction: Annotated[
+        float, quantity("largest coefficient of friction on the wall", at_least=0.0, at_most=2.0)
+    ] = 0.2
+    max_wall_force_n: Annotated[
+        float, quantity("largest force on 10 mm of wall", above=0.0, at_most=100.0)
+    ] = 1.0
+    max_wall_give_mm: Annotated[
+        float, quantity("how far the wall may be pressed in", above=0.0, at_most=10.0)
+    ] = 1.0
+    source: Annotated[str, text("where the numbers come from, or a text that begins with 'assumption'")] = (
+        "assumption"
+    )

@@ -6,9 +6,8 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
-from stages.scope.contact import WallContact
 from stages.scope.motion import BEND, ScopeMotion
-from stages.scope.resting import Circumstances, RestingShaft, RestingShape
+from stages.scope.resting import Circumstances, RestingShaft, RestingShape, WallContact
 
 PATIENTS, ATTEMPTS = 6, 6
 """Choices of the stiffness of scope and wall, and of friction for each of them."""

@@ -23,8 +23,7 @@ from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import Objective
-from stages.needle.path import ArcPath, blocker_on_path
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, blocker_on_path
 from stages.needle.search.base import RestartingRRT
 from tests.stages.scenes import Canvas
 

@@ -210,10 +210,9 @@ def _results(folder: Path) -> None:
 
 
 def _read_results(folder: Path) -> None:
-    from lungaccess.running.study.compare import differences
     from lungaccess.running.study.results import ResultsFile
     from lungaccess.running.study.summary import summarise
-    from lungaccess.running.study.tables import QUERIES, table
+    from lungaccess.running.study.tables import QUERIES, differences, table
 
     for left in folder.glob("results.db-*"):
         left.unlink()

@@ -12,8 +12,7 @@ from anatomy.base.records import frozen_value
 from anatomy.poses import pose
 from lungaccess.planning.one_stage.needle import plan_needle
 from lungaccess.problem.target import point_target
-from stages.needle.query import Query
-from stages.needle.violations import violation
+from stages.needle.path import Query, violation
 from tests.scenarios.cases import NEEDLE_DEVICE, NEEDLE_ITERATIONS, NEEDLE_OBJECTIVE, PLANNERS, Anatomy, Case
 from tests.scenarios.scenes import Scenes
 

@@ -17,8 +17,7 @@ from experiments.support.cost_map.inflation import refuting_labels
 from stages.needle.costs import voxel_sum
 from stages.needle.environment import NeedleEnvironment, direct_arcs, workspace_lengths
 from stages.needle.objective import SHORTEST
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.base import RestartingRRT
 
 EXIT_MM = (5.0, 9.0)

@@ -18,8 +18,7 @@ from experiments.support.cost_map.problems import LEAST_COST, TRIES, TRY_ITERATI
 from stages.needle.costs import map_integral, obstacle_clearance_mm, voxel_sum
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.portfolio import PortfolioSearch
 

@@ -1,6 +1,6 @@
 """Recorded needle queries on Med-RAD patients: their obstacles, poses, and the results of another planner.
 
-Their rules are those of `lungaccess.running.benchmark.unc_rules`.
+Their rules are those of `lungaccess.running.benchmark.published`.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from collections import Counter
 from typing import Any
 
 from experiments.support.needle.queries import Query, Validator
-from stages.needle import query as needle_query
+from stages.needle import path as needle_query
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.decision import Decision

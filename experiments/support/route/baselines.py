@@ -11,8 +11,8 @@ from anatomy.base.typed import Float, Int
 from experiments.support.route.sampling import grow
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve, interpolate
+from stages.scope.route.guide_path import NoRouteError
 from stages.scope.route.proof import prove
-from stages.scope.route.search import NoRouteError
 from stages.scope.route.settings import RouteLimits
 
 

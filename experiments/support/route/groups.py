@@ -22,7 +22,7 @@ from anatomy.io.centerlines import read_centerlines
 from anatomy.phantom import make_phantom
 from experiments.support.anatomies import PHANTOM, anatomy, data_folder, require_data
 from stages.scope.route.centreline import Centreline, from_image, from_lung, from_mask, from_tree
-from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
+from stages.scope.route.guide_path import Links, NoRouteError, fewest_hops, nearest_links
 
 LIMITS_PER_MM = {"G1": 0.08, "G2": 0.10, "G3": 0.08, "G4": 0.20}
 """Limits of curvature of the paper's groups, 1/mm."""

@@ -149,7 +149,7 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
     first, second : Path
         Results files.
     """
-    from lungaccess.running.study.compare import differences
+    from lungaccess.running.study.tables import differences
 
     found = differences(first, second)
     if output.json:

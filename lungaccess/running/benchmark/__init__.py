@@ -7,16 +7,18 @@ from anatomy.base.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.running.benchmark.export import summary_rows, write_rows
     from lungaccess.running.benchmark.peer import PeerResult, read_peer
-    from lungaccess.running.benchmark.published import PublishedQuery, patients_of, published_queries
-    from lungaccess.running.benchmark.runs import BenchmarkRow, posed_by_unc, posed_in_lung, run_query
-    from lungaccess.running.benchmark.unc_rules import (
+    from lungaccess.running.benchmark.published import (
         UNC_EXEMPT_MM,
         UNC_GOAL_TOLERANCE_MM,
         UNC_MAX_LENGTH_MM,
         UNC_NEEDLE_DIAMETER_MM,
+        PublishedQuery,
         UncObstacles,
+        patients_of,
+        published_queries,
         unc_needle,
         unc_obstacles,
     )
+    from lungaccess.running.benchmark.runs import BenchmarkRow, posed_by_unc, posed_in_lung, run_query
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

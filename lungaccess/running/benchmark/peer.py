@@ -12,7 +12,7 @@ from typing import Any
 from anatomy.base.errors import FileError
 from anatomy.base.files import DAMAGE, reason
 from anatomy.base.records import frozen_value
-from lungaccess.running.benchmark.unc_rules import UNC_EXEMPT_MM
+from lungaccess.running.benchmark.published import UNC_EXEMPT_MM
 
 Key = tuple[int, int, float]
 """Number of the patient, number of the start, and radius of curvature in mm."""

@@ -1,15 +1,38 @@
-"""The needle queries that were published with patients: every start pose with every target."""
+"""The needle queries that were published with patients: every start pose with every target.
+
+The rules of the UNC steerable-needle-planner: voxel centres, a ball around the start, no fissures.
+
+Obstacles are the masks as they are: airway, vessels and everything outside the lungs.  A point is free if
+every obstacle voxel's centre is at least the needle's radius and half a voxel diagonal away; voxels in a ball
+around the start do not count.  A path ends within a tolerance of the target, at any angle.
+"""
 
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from anatomy.base.errors import FileError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float
+from anatomy.base.typed import Float, Labels
+from anatomy.fields import CENTRES
+from anatomy.grid import Grid
 from anatomy.liver import LiverImages
+from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
 from anatomy.patient import PatientImages
+from anatomy.structures import AIRWAY, OBSTACLES, OUTSIDE, VESSEL
+from stages.needle import Needle, NeedleEnvironment, environment_of_labels
+
+UNC_NEEDLE_DIAMETER_MM = 2.0
+UNC_GOAL_TOLERANCE_MM = 1.0
+UNC_MAX_LENGTH_MM = 150.0
+UNC_MAX_TURN_DEG = 90.0
+UNC_EXEMPT_MM = 3.0
+"""Numbers of the recorded runs: diameter, tolerance, insertion, total turn, and the radius of the ball."""
+BORDER_MM = 30.0
+"""Obstacles are cut out so far around a query; a path that leaves this box is too long."""
 
 NO_STARTS = "no query: the patient came without start poses"
 NO_TARGETS = "no query: the patient came without targets"
@@ -90,3 +113,74 @@ def patients_of(folder: Path) -> list[Path]:
 def _natural(path: Path) -> tuple[str, int, str]:
     digits = re.search(r"\d+", path.name)
     return (path.name[: digits.start()] if digits else path.name, int(digits[0]) if digits else 0, path.name)
+
+
+def unc_needle(radius_mm: float, *, max_accumulated_turn_deg: float = UNC_MAX_TURN_DEG) -> Needle:
+    """Return the peer's needle, which bends with a radius of at least `radius_mm`."""
+    return Needle(
+        diameter_mm=UNC_NEEDLE_DIAMETER_MM,
+        max_curvature_per_mm=1.0 / radius_mm,
+        max_length_mm=UNC_MAX_LENGTH_MM,
+        max_angle_from_start_deg=UNC_MAX_TURN_DEG,
+        max_accumulated_turn_deg=max_accumulated_turn_deg,
+    )
+
+
+@frozen_record
+class UncObstacles:
+    """The label volume of one patient, and the distance that a needle's axis keeps from voxel centres."""
+
+    labels: Labels
+    grid: Grid
+
+    @property
+    def required_mm(self) -> float:
+        """Radius and half a voxel diagonal."""
+        return 0.5 * UNC_NEEDLE_DIAMETER_MM + 0.5 * float(np.linalg.norm(self.grid.spacing_mm))
+
+    def environment(
+        self, needle: Needle, lps_from_start: Float, target_lps: Float, *, exempt_mm: float = UNC_EXEMPT_MM
+    ) -> NeedleEnvironment:
+        """Return the labels in a box about start and target, less the exempt ball, as an environment.
+
+        Parameters
+        ----------
+        lps_from_start : (4, 4) float64
+        target_lps : (3,) float64, LPS mm
+        exempt_mm : float
+            Obstacle voxels whose centres lie so near to the start do not count.
+        """
+        ends = np.stack([lps_from_start[:3, 3], target_lps])
+        border = BORDER_MM + 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
+        corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+        ijk = self.grid.ijk((ends[:, None] + border * corners).reshape(-1, 3))
+        low = np.maximum(np.floor(ijk.min(axis=0)).astype(int), 0)
+        high = np.minimum(np.ceil(ijk.max(axis=0)).astype(int) + 1, self.grid.shape)
+        labels = self.labels[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].copy(order="F")
+        grid = self.grid.crop(low, high)
+        if exempt_mm > 0.0:
+            window = grid.window(ends[0], exempt_mm)
+            voxels = voxels_in(window, (labels[window] & OBSTACLES) != 0)
+            near = np.linalg.norm(grid.lps(voxels) - ends[0], axis=1) <= exempt_mm
+            labels[tuple(voxels[near].T)] = 0
+        return environment_of_labels(
+            labels,
+            grid,
+            needle,
+            required_clearance_mm=self.required_mm,
+            obstacles_as=CENTRES,
+            goal_tolerance_mm=UNC_GOAL_TOLERANCE_MM,
+        )
+
+
+def unc_obstacles(images: PatientImages | LiverImages) -> UncObstacles:
+    """Label the masks of a patient as they are; of a liver, its vessels and what is not liver or nodule."""
+    labels = np.zeros(images.grid.shape, dtype=np.uint16, order="F")
+    if isinstance(images, LiverImages):
+        labels[images.vessels] |= VESSEL
+        labels[~images.inside] |= OUTSIDE
+        return UncObstacles(labels=labels, grid=images.grid)
+    labels[images.lumen.array] |= AIRWAY
+    labels[images.vessels.array] |= VESSEL
+    labels[~images.lung.array] |= OUTSIDE
+    return UncObstacles(labels=labels, grid=images.grid)

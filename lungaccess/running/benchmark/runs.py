@@ -12,8 +12,7 @@ from anatomy.organ import Organ
 from anatomy.patient import PatientImages
 from lungaccess.planning.one_stage import PathSearch, needle_question, reason_in_words, search_path
 from lungaccess.problem.system import System
-from lungaccess.running.benchmark.published import PublishedQuery
-from lungaccess.running.benchmark.unc_rules import unc_needle, unc_obstacles
+from lungaccess.running.benchmark.published import PublishedQuery, unc_needle, unc_obstacles
 from stages.needle import OMPL_PLANNERS, ArcPath, NeedleEnvironment, Query, obstacle_clearance_mm
 
 SLICE = 200
@@ -190,7 +189,7 @@ def posed_in_lung(lung: Organ, system: System) -> Pose:
 
 
 def posed_by_unc(images: PatientImages | LiverImages) -> Pose:
-    """Return what poses queries by the rules of the peer; see `lungaccess.running.benchmark.unc_rules`."""
+    """Return what poses queries by the rules of the peer; see `lungaccess.running.benchmark.published`."""
     obstacles = unc_obstacles(images)
 
     def pose(published: PublishedQuery, radius_mm: float) -> tuple[NeedleEnvironment, Query]:

@@ -15,9 +15,7 @@ from anatomy.base.files import require_writable_folder, write_json, write_text
 from anatomy.base.records import frozen_value
 from anatomy.base.settings import override, settings_toml
 from lungaccess.problem.system import System, load_system, with_fissure_rule
-from lungaccess.running.design.criteria import CRITERIA, Contender
-from lungaccess.running.design.settings import Design
-from lungaccess.running.design.space import device, near, value_at
+from lungaccess.running.design.settings import CRITERIA, Contender, Design, device, near, value_at
 from lungaccess.running.study.driver import Progress, RunMaker, open_results
 from lungaccess.running.study.runs import Run, beside, runs_of
 from lungaccess.running.study.settings import StudyError

@@ -1,20 +1,31 @@
-"""What a search over devices is: a study's cases, and ranges of the numbers of their system."""
+"""What a search over devices is: a study's cases, ranges of the numbers of their system, and criteria.
+
+A point of the unit cube, with one coordinate a number, stands for a device that the search may try; each
+criterion is a line of a table.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from statistics import fmean, median
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import read_toml
-from anatomy.base.settings import impossible, parse, settings, text
-from lungaccess.running.design.criteria import CRITERIA
+from anatomy.base.records import frozen_value
+from anatomy.base.settings import impossible, override, parse, settings, text, to_mapping
+from lungaccess.problem.system import System
 from lungaccess.running.study.settings import Study, study_of
+
+DIGITS = 4
+"""Significant digits of a number in a range: a maker keeps no more, and equal devices are tried once."""
 
 _REMEDY = "`lungaccess template design` prints a complete file to start from"
 _OF_ONE_NUMBER = frozenset({"range", "one_of", "also"})
@@ -150,3 +161,110 @@ def _numbers(table: Mapping[str, Any], before: str = "") -> Iterator[dict[str, A
             yield {"key": before + name, **value}
         else:
             yield from _numbers(value, f"{before}{name}.")
+
+
+def near(system: System, numbers: Sequence[Number], even: Sequence[float], radius: float) -> list[float]:
+    """Return the point of the cube at most `radius` beside a system's, by a point of the whole cube.
+
+    What is one of several values changes for a share `radius` of the cube alone.
+    """
+    point = []
+    for number, x in zip(numbers, even, strict=True):
+        value = value_at(system, number.key)
+        if number.range is None:
+            known = number.one_of.index(value) if value in number.one_of else 0
+            point.append(x / radius if x < radius else (known + 0.5) / len(number.one_of))
+        else:
+            low, high = number.range
+            at = (value - low) / (high - low) if isinstance(value, int | float) else 0.5
+            at = min(max(at, 0.0), 1.0) + radius * (2.0 * x - 1.0)
+            point.append(1.0 - abs(1.0 - abs(at)))
+    return point
+
+
+def device(base: System, numbers: Sequence[Number], point: Sequence[float]) -> System:
+    """Return the system at a point of the cube, named by what it changes, which its sources call assumed.
+
+    Raises
+    ------
+    SettingsError
+        If the validator of devices refuses it.
+    """
+    changes: dict[str, Any] = {}
+    for number, x in zip(numbers, point, strict=True):
+        if number.range is None:
+            value = number.one_of[min(int(x * len(number.one_of)), len(number.one_of) - 1)]
+        else:
+            low, high = number.range
+            value = min(max(float(f"{low + x * (high - low):.{DIGITS}g}"), low), high)
+        changes |= dict.fromkeys(number.keys, value)
+    changed = override(base, changes, "the device")
+    found = [
+        f"{key} = {json.dumps(value)}: assumption, found by `lungaccess design`; `{base.name}` has "
+        f"{json.dumps(value_at(base, key))}"
+        for key, value in changes.items()
+    ]
+    names = {key.rpartition(".")[2] for key in changes}
+    kept = [f"`{base.name}`: {line}" if any(n in line for n in names) else line for line in base.sources]
+    return replace(
+        changed,
+        name=f"{base.name}-{hashlib.sha256(json.dumps(changes, sort_keys=True).encode()).hexdigest()[:8]}",
+        description=f"`{base.name}` with other numbers, found by a search over devices.",
+        sources=(*found, *kept),
+    )
+
+
+def value_at(system: System, path: str) -> Any:
+    """Return what the file of a system has at a dotted path; None for nothing."""
+    values: Any = to_mapping(system)
+    for part in path.split("."):
+        if isinstance(values, list):
+            values = values[int(part)] if part.isdigit() and int(part) < len(values) else None
+        else:
+            values = values.get(part) if isinstance(values, Mapping) else None
+    return values
+
+
+@frozen_value
+class Contender:
+    """A device, for each target counted whether the check accepts a plan, and what is made large.
+
+    Parameters
+    ----------
+    chances : tuple of float
+        For each target, the chance of success of its plan; 0 without one, or where no errors are stated.
+    values : tuple of float
+        The criteria of the search, in their order.
+    """
+
+    system: System
+    reached: tuple[bool, ...] = ()
+    chances: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()
+
+
+class Criterion(NamedTuple):
+    """A finite number that is the better the larger it is: its title with unit, and how it is counted."""
+
+    title: str
+    value: Callable[[Contender], float]
+    needs_errors: bool = False
+
+
+def _strain_left(device: Contender) -> float:
+    """Return the share of the largest strain, %, that no tube has when it is held straight."""
+    tubes = device.system.tubes
+    return 100.0 * (1.0 - max(tube.rest_strain for tube in tubes.nested) / tubes.max_strain)
+
+
+CRITERIA = {
+    "reach": Criterion("targets reached, %", lambda device: 100.0 * fmean(device.reached)),
+    "chance": Criterion("mean chance of success, %", lambda device: 100.0 * fmean(device.chances), True),
+    "median-chance": Criterion("median chance, %", lambda device: 100.0 * median(device.chances), True),
+    "needle-radius": Criterion(
+        "needle's tightest radius, mm",
+        lambda device: device.system.require_needle("The criterion").min_radius_of_curvature_mm,
+    ),
+    "strain-left": Criterion("strain left when straight, %", _strain_left),
+}
+"""The criteria by the names that a file gives them: a new one is one more line."""

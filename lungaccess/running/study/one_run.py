@@ -237,7 +237,7 @@ def main(words: list[str]) -> int:
 
 
 def needle_answer(run: Run, lung: Lung) -> answers.Answer:
-    """Search for a needle path and let `stages.needle.violations.violation` look at it.
+    """Search for a needle path and let `stages.needle.path.violation` look at it.
 
     Raises
     ------

@@ -1,11 +1,18 @@
-"""The tables of a results file as a user wants them: without the file's own row numbers."""
+"""The tables of a results file as a user wants them, and whether two files hold the same runs and answers."""
 
+import json
 from collections.abc import Iterator
+from itertools import zip_longest
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from anatomy.base.files import DAMAGE
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.rows import COST_COLUMNS
 from stages.needle import TERMS
+
+MOST = 20
+"""At most this many differences are listed: enough to see what kind they are."""
 
 TIMES = frozenset({"time", "cpu_time", "first_solution_time", "memory"})
 """Columns that two equal runs may differ in."""
@@ -84,3 +91,50 @@ def table(results: ResultsFile, name: str) -> Table:
     """
     columns = results.columns(QUERIES[name])
     return Table(columns, results.rows(QUERIES[name]))
+
+
+def differences(first: Path, second: Path) -> list[str]:
+    """Compare every row of two results files, but for times and memory.
+
+    Runs, costs over iterations, findings, rejections and plans are compared value by value; a number must be
+    the same to the last bit.
+
+    Returns
+    -------
+    list of str
+        What differs, in words, at most `MOST`; empty if nothing does.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read.
+    """
+    found: list[str] = []
+    with ResultsFile(first) as one, ResultsFile(second) as two:
+        for name in QUERIES:
+            columns, rows = table(one, name)
+            kept = [n for n, column in enumerate(columns) if column not in TIMES]
+            for a, b in zip_longest(rows, table(two, name).rows):
+                if len(found) == MOST:
+                    return found
+                if a is None or b is None:
+                    found.append(f"{name}: {'second' if a is None else 'first'} file alone: {_short(a or b)}")
+                    break
+                wrong = [columns[n] for n in kept if _plain(columns[n], a[n]) != _plain(columns[n], b[n])]
+                if wrong:
+                    found.append(f"{name}: {', '.join(wrong)} of {_short(a)}")
+    return found
+
+
+def _plain(column: str, value: Any) -> Any:
+    """Return a value without the times in it; a plan that is damaged, as its text."""
+    if column != "plan":
+        return value
+    try:
+        return {key: part for key, part in json.loads(value).items() if key != "timing"}
+    except DAMAGE:
+        return value
+
+
+def _short(row: tuple[Any, ...]) -> str:
+    return ", ".join(str(value)[:40] for value in row[:4])

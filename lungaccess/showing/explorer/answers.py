@@ -246,7 +246,7 @@ class Answers:
         return Part(message, plan=kept)
 
     def _reach(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
-        from lungaccess.showing.explorer.reach import reach_parts
+        from lungaccess.showing.explorer.exports import reach_parts
 
         system = self._system(asked.question.what_if)
         atlas = self._atlas(system, turn)
@@ -273,7 +273,7 @@ class Answers:
         )  # fmt: skip
 
     def _explain(self, asked: Asked, turn: Turn) -> Iterator[Part]:
-        from lungaccess.showing.explorer.explaining import explanation_part
+        from lungaccess.showing.explorer.exports import explanation_part
 
         system = self._system(asked.question.what_if)
         target: Target = target_of(self.lung, asked.question.target)

@@ -1,20 +1,44 @@
-"""Files about a plan: what the command line writes, one at a time."""
+"""What the page asks for now and then: files about a plan, why there is none, the reach of a system.
+
+Files are what the command line writes, one at a time.  Why there is no plan is told in the words of the
+command, and never more than is proved.  Reach comes voxel by voxel, from the target outward.
+"""
 
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from anatomy.base.errors import SettingsError
 from anatomy.base.files import write_json, write_text
 from anatomy.base.settings import settings_toml
+from anatomy.base.typed import Int
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import appraise, plan_record
+from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan, sections
+from lungaccess.planning import run
+from lungaccess.planning.coupled import Atlas
+from lungaccess.planning.reachability import KINDS, ReachStream
+from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.problem import System, Target
+from lungaccess.problem.request import Request
 from lungaccess.showing import report
+from lungaccess.showing.explorer.questions import ExplainQuestion
+from lungaccess.showing.explorer.worker import Part, Turn
 from lungaccess.showing.report.html import PageOptions, plan_page
 from lungaccess.showing.report.html.volumes import read_ct
 from lungaccess.showing.slicer import export_slicer
 from stages.needle import Objective
+
+Reached = MutableMapping[tuple[Any, ...], Int]
+"""The deployment that reached each voxel, by scope, tubes, margins and rule for fissures."""
+
+ITERATIONS = 100
 
 Curve = Sequence[tuple[float, float, float]]
 """Seconds, iterations and cost of better and better plans."""
@@ -63,3 +87,95 @@ def export_file(
             for each in sorted(scene.rglob("*")):
                 packed.write(each, Path("slicer") / each.relative_to(scene))
     return file
+
+
+def explanation_part(
+    lung: Lung,
+    system: System,
+    target: Target,
+    question: ExplainQuestion,
+    atlas: Atlas,
+    atlas_of: Callable[[System, Callable[[float], None]], Atlas],
+    is_kept: Callable[[System], bool],
+    turn: Turn,
+) -> Part:
+    """Return headline and sections of an explanation.
+
+    Raises
+    ------
+    SettingsError
+        If there is a plan.
+    """
+
+    def on_part(name: str) -> None:
+        turn.check()
+        turn.send(Part({"answer": "progress", "what": name, "share": None}))
+
+    try:
+        next(
+            run(
+                Request.of(
+                    lung, system, target, goal=question.objective, seed=question.seed, iterations=ITERATIONS
+                ),
+                atlas=atlas,
+                counterfactuals=False,
+                on_progress=lambda _event: turn.check(),
+            )
+        )
+    except NoPlan as failure:
+        made = explain_no_plan(
+            lung, system, target, failure, atlas=atlas, objective=question.objective, seed=question.seed,
+            time_s=DEFAULT_TIME_S, atlas_of=atlas_of, is_kept=is_kept, on_part=on_part,
+        )  # fmt: skip
+    else:
+        raise SettingsError("There is a plan to this target", remedy="Ask for it")
+    proved = made.verdict is not None and made.verdict.proved
+    return Part(
+        {
+            "answer": "explanation",
+            "headline": made.headline,
+            "proved_unreachable": proved,
+            "sections": [
+                {
+                    "title": each.title,
+                    "headings": list(each.headings),
+                    "rows": [list(row) for row in each.rows],
+                }
+                for each in sections(made)
+            ],
+        }
+    )
+
+
+def reach_parts(
+    lung: Lung, system: System, atlas: Atlas, around_lps: ArrayLike, reached: Reached, turn: Turn
+) -> Iterator[Part]:
+    """Yield the grid, then voxels with what became of them.
+
+    Where the atlas is that of the question before, voxels whose arc is clear for the needle of this one, too,
+    come first, all at once.
+    """
+    stream = ReachStream(lung, system, atlas)
+    grid = stream.grid
+    yield Part(
+        {
+            "answer": "reach grid", "shape": list(grid.shape), "spacing_mm": float(grid.spacing_mm[0]),
+            "ijk_from_lps": grid.ijk_from_lps.tolist(), "lps_from_ijk": grid.lps_from_ijk.tolist(),
+            "kinds": dict(KINDS), "counted": len(stream.counted),
+            "voxel_ml": float(grid.voxel_volume_mm3) / 1000.0, "system": system.name,
+        }
+    )  # fmt: skip
+    key = (system.scope, system.tubes, system.margins, atlas.with_fissures)
+    known = None if system.needle is None else reached.get(key)
+    reached.clear()  # Of one atlas only: a page changes the needle far more often than the scope.
+    kept = reached[key] = (
+        np.full(int(np.prod(grid.shape)), -1, dtype=np.int64) if known is None else known.copy()
+    )
+    for part in stream.parts(around_lps, known):
+        found = part.entries >= 0
+        kept[part.voxels[found]] = part.entries[found]
+        yield Part(
+            {"answer": "reach", "share": part.share},
+            {"voxels": part.voxels.astype(np.int32), "kinds": part.kinds.astype(np.uint8)},
+        )
+        turn.check()

@@ -18,10 +18,17 @@ from lungaccess.judging.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurve, DeviceCurves
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.slicer.breathing import write_breathing
-from lungaccess.showing.slicer.markups import TARGET_COLOUR, aim_point, curve_markup, points_of_interest
-from lungaccess.showing.slicer.models import device_surface, structure_surface, write_ply
+from lungaccess.showing.slicer.models import (
+    TARGET_COLOUR,
+    aim_point,
+    curve_markup,
+    device_surface,
+    points_of_interest,
+    structure_surface,
+    write_ply,
+    write_segmentation,
+)
 from lungaccess.showing.slicer.scene import Item, scene
-from lungaccess.showing.slicer.segments import write_segmentation
 from lungaccess.uncertainty.risk import proved_body, safe_start_region, tried_body
 
 SCENE_FILE, README_FILE, ROUTE_FILE, PLAN_FILE = "scene.mrml", "README.txt", "route_custusx.txt", "plan.json"

@@ -1,15 +1,35 @@
-"""Surfaces for 3D Slicer: small meshes of the structures, and the devices true to their radius."""
+"""The anatomy and the devices for 3D Slicer: surfaces, markups, and a label map.
 
+Meshes of the structures are small, and devices true to their radius.  Curves have radius and pose at every
+point, points have a name.  One `.seg.nrrd` holds the structures with names, colours and terminology.
+"""
+
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.files import atomic_write, require_suffix
-from anatomy.base.typed import Float
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float, UInt8
 from anatomy.grid import Volume
+from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, smooth_surface
+from anatomy.morphology import bounds
 from lungaccess.plans.curves import DeviceCurve
+from lungaccess.plans.plan import Plan
+from lungaccess.plans.window import BreathingAim
+from stages.scope.advisor import MARKUPS_SCHEMA
+
+_LIST = "Segmentation category and type - 3D Slicer General Anatomy list"
+_STRUCTURE = "SCT^123037004^Anatomical Structure"
+_TISSUE = "SCT^85756007^Tissue"
+_ALTERED = "SCT^49755003^Morphologically Altered Structure"
+
+TARGET_COLOUR = (0.17, 0.63, 0.17)
 
 MOST_TRIANGLES = 150_000
 """Enough for the shape of the vessels; models are for display alone."""
@@ -147,3 +167,188 @@ def write_ply(path: str | Path, mesh: SurfaceMesh) -> None:
         temporary.write_bytes(
             header.encode("ascii") + mesh.vertices_lps.astype("<f4").tobytes() + faces.tobytes()
         )
+
+
+def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
+    """Return the content of a `.mrk.json` file: an open curve in LPS mm.
+
+    `orientation` holds the pose of the device at each point, row by row: its columns are the x, y and z
+    axes of the device.  `Radius` is the radius of the device at each point.
+    """
+    points = [
+        _point(number, f"{curve.name} {along:.1f} mm", frame[:3, 3]) | _orientation(frame)
+        for number, (frame, along) in enumerate(
+            zip(curve.lps_from_device, curve.arc_length_mm.tolist(), strict=True), start=1
+        )
+    ]
+    radius = {
+        "name": "Radius",
+        "enabled": True,
+        "units": "mm",
+        "description": "outer radius of the device",
+        "controlPointValues": curve.radius_mm.tolist(),
+    }
+    return _file("Curve", curve.name, points, curve.colour, labels=False, measurements=[radius])
+
+
+def points_of_interest(plan: Plan) -> dict[str, Any]:
+    """Return the content of a `.mrk.json` file: scope tip, tip of the tubes, exit and target, LPS mm.
+
+    The tips keep the pose of their device, also where they are moved in 3D Slicer.
+    """
+    tips = {"scope tip": plan.scope.lps_from_scope_tip, "tube tip": plan.tube.lps_from_tip}
+    places = {
+        **{label: tip[:3, 3] for label, tip in tips.items()},
+        "exit through the wall": plan.tube.exit.point_lps,
+        "target": plan.target_lps,
+    }
+    return _fiducials("points", places, tips)
+
+
+def aim_point(aim: BreathingAim) -> dict[str, Any]:
+    """Return the content of a `.mrk.json` file: where devices end that were planned for a window, LPS mm."""
+    return _fiducials("aim", {"aim of the devices": aim.point_lps})
+
+
+def _fiducials(
+    name: str, places: Mapping[str, Float], poses: Mapping[str, Float] = MappingProxyType({})
+) -> dict[str, Any]:
+    points = [
+        _point(number, label, place) | (_orientation(poses[label]) if label in poses else {})
+        for number, (label, place) in enumerate(places.items(), start=1)
+    ]
+    return _file("Fiducial", name, points, TARGET_COLOUR, labels=True, measurements=[])
+
+
+def _orientation(pose: Float) -> dict[str, list[float]]:
+    return {"orientation": pose[:3, :3].ravel().tolist()}
+
+
+def _point(number: int, label: str, place: Float) -> dict[str, Any]:
+    return {
+        "id": f"{number}",
+        "label": label,
+        "position": place.tolist(),
+        "locked": False,
+        "visibility": True,
+        "positionStatus": "defined",
+    }
+
+
+def _file(
+    kind: str,
+    name: str,
+    points: list[dict[str, Any]],
+    colour: tuple[float, float, float],
+    *,
+    labels: bool,
+    measurements: list[dict[str, Any]],
+) -> dict[str, Any]:
+    display = {
+        "visibility": True,
+        "opacity": 1.0,
+        "color": list(colour),
+        "selectedColor": list(colour),
+        "propertiesLabelVisibility": not labels,
+        "pointLabelsVisibility": labels,
+        "glyphType": "Sphere3D",
+        "glyphScale": 2.0 if labels else 0.5,
+    }
+    markup = {
+        "type": kind,
+        "name": name,
+        "coordinateSystem": "LPS",
+        "coordinateUnits": "mm",
+        "locked": True,
+        "fixedNumberOfControlPoints": True,
+        "controlPoints": points,
+        "measurements": measurements,
+        "display": display,
+    }
+    return {"@schema": MARKUPS_SCHEMA, "markups": [markup]}
+
+
+@frozen_value
+class Segment:
+    """One segment: value in the label map, name, colour in [0, 1], category and type (SNOMED CT)."""
+
+    value: int
+    name: str
+    colour: tuple[float, float, float]
+    category: str
+    kind: str
+
+    @property
+    def terminology(self) -> str:
+        """The entry that 3D Slicer stores for a segment."""
+        return f"{_LIST}~{self.category}~{self.kind}~^^~Anatomic codes - DICOM master list~^^~^^"
+
+
+SEGMENTS: tuple[Segment, ...] = (
+    Segment(value=1, name="lung tissue", colour=(0.77, 0.64, 0.58), category=_STRUCTURE,
+            kind="SCT^39607008^Lung"),
+    Segment(value=2, name="fissure", colour=(0.58, 0.40, 0.74), category=_TISSUE, kind=_TISSUE),
+    Segment(value=3, name="nodule", colour=(0.17, 0.63, 0.17), category=_ALTERED,
+            kind="SCT^27925004^Nodule"),
+    Segment(value=4, name="vessel", colour=(0.84, 0.15, 0.16), category=_STRUCTURE,
+            kind="SCT^59820001^Blood vessel"),
+    Segment(value=5, name="airway wall", colour=(0.52, 0.52, 0.52), category=_STRUCTURE,
+            kind="SCT^89187006^Airway structure"),
+    Segment(value=6, name="airway lumen", colour=(0.62, 0.85, 0.90), category=_STRUCTURE,
+            kind="SCT^89187006^Airway structure"),
+)  # fmt: skip
+"""From the weakest to the strongest: where two structures overlap, the voxel goes to the later one.
+
+3D Slicer takes a grey of 0.5 for no colour, and draws one at random."""
+
+
+def label_map(lung: Lung) -> Volume:
+    """Return the structures of a lung as one volume of the values of `SEGMENTS`, uint8, 0 outside."""
+    outside = lung.mask("outside")
+    labels = np.where(outside.array, 0, 1).astype(np.uint8)
+    masks = {"fissure": "fissure", "nodule": "nodule", "vessel": "vessel", "airway wall": "airway",
+             "airway lumen": "lumen"}  # fmt: skip
+    for segment in SEGMENTS[1:]:
+        name = masks[segment.name]
+        if name == "nodule" and lung.nodules is None:
+            continue
+        labels[lung.mask(name).array] = segment.value
+    return Volume(grid=outside.grid, array=labels)
+
+
+def write_segmentation(path: str | Path, lung: Lung) -> tuple[Segment, ...]:
+    """Write the label map of a lung, and return the segments that are not empty.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    volume = label_map(lung)
+    present = tuple(each for each in SEGMENTS if (volume.array == each.value).any())
+    write_volume(path, volume, header=_header(volume.array, present))
+    return present
+
+
+def _header(labels: UInt8, segments: tuple[Segment, ...]) -> Mapping[str, str]:
+    """Return the keys from which 3D Slicer restores the segments."""
+    header = {
+        "Segmentation_ContainedRepresentationNames": "Binary labelmap|",
+        "Segmentation_MasterRepresentation": "Binary labelmap",
+        "Segmentation_ReferenceImageExtentOffset": "0 0 0",
+    }
+    for number, segment in enumerate(segments):
+        low, high = bounds(labels == segment.value)
+        where = np.stack([low, high - 1], axis=1).ravel().tolist()
+        header |= {
+            f"Segment{number}_ID": f"Segment_{segment.value}",
+            f"Segment{number}_Name": segment.name,
+            f"Segment{number}_NameAutoGenerated": "0",
+            f"Segment{number}_Color": " ".join(f"{c:g}" for c in segment.colour),
+            f"Segment{number}_ColorAutoGenerated": "0",
+            f"Segment{number}_LabelValue": f"{segment.value}",
+            f"Segment{number}_Layer": "0",
+            f"Segment{number}_Extent": " ".join(str(n) for n in where),
+            f"Segment{number}_Tags": f"TerminologyEntry:{segment.terminology}|",
+        }
+    return header

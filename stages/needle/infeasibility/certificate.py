@@ -17,14 +17,13 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Int
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds, cubes
+from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds
 from stages.needle.infeasibility.kernels import reachability_pruning as pruning
 from stages.needle.infeasibility.kernels import reachable_sets as sets
 from stages.needle.infeasibility.passage import Passage, tightest
-from stages.needle.infeasibility.path_bounds import ROUNDING, PathBounds
-from stages.needle.infeasibility.plane import Plane
+from stages.needle.infeasibility.plane import ROUNDING, PathBounds, Plane
 from stages.needle.obstruction import blocked_end
-from stages.needle.query import Query
+from stages.needle.path import Query
 
 # None of these numbers can make the proof wrong: they trade time and memory for how much is proved.
 FIRST_CELL_MM, LARGEST_SLOPE_CELL = 0.5, 0.17
@@ -204,16 +203,16 @@ class NoPathProof:
             return False
         seen, queue, span = np.zeros(shape, dtype=np.bool_), np.zeros(1, np.int32), np.zeros(2, np.int64)
         while True:
-            room = min(int(span[cubes.END]) + cubes.NEIGHBOURS * self._most_cubes + 1, size)
+            room = min(int(span[blocked.END]) + blocked.NEIGHBOURS * self._most_cubes + 1, size)
             if room > len(queue):
                 queue = np.concatenate([queue, np.zeros(min(room, size - len(queue)), np.int32)])
-            if cubes.flood(
+            if blocked.flood(
                 self._environment.obstacles, self._environment.limits, self._query.branch,
                 self._query.inserted_mm, self._scale, self._paths.ends, self._frame, side,
                 np.array([-before, -beside, -beside]), seen, queue, span, self._most_cubes,
             ):  # fmt: skip
                 return False
-            if span[cubes.BEGIN] == span[cubes.END]:
+            if span[blocked.BEGIN] == span[blocked.END]:
                 return True
             yield
 

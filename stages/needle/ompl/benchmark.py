@@ -15,8 +15,7 @@ from anatomy.base.files import atomic_write, require_writable_folder
 from anatomy.base.records import frozen_value
 from stages.needle.ompl.planner import NeedlePlanner, not_written
 from stages.needle.ompl.problem import NeedleProblem
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 
 
 def benchmark(
@@ -134,7 +133,7 @@ class Outcome:
     path : ArcPath or None
         What the planner took for a solution.
     violation : str
-        Why it is none: see `stages.needle.violations`.
+        Why it is none: see `stages.needle.path`.
     """
 
     path: ArcPath | None = None

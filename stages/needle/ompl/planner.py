@@ -11,8 +11,7 @@ from anatomy.base.errors import FileError
 from anatomy.base.typed import Float
 from stages.needle.kernels import states
 from stages.needle.ompl.states import numbers_of, put_numbers
-from stages.needle.path import ArcPath, arc_transform
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, arc_transform
 from stages.needle.search.base import Search, in_slices
 
 ROUNDING_MM = 1e-6

@@ -1,5 +1,9 @@
-"""The needle problem as OMPL takes it, made once and asked many times."""
+"""The needle problem as OMPL takes it, made once and asked many times; the needle moves in it step by step.
 
+Its bounds are the workspace's, and each step is proved clear.
+"""
+
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -10,18 +14,23 @@ import numpy as np
 from ompl import base, control, util
 
 from anatomy.base.errors import SettingsError
+from anatomy.kernels.field import MIN_GAP_MM
 from stages.needle.costs import map_integral
 from stages.needle.environment import NeedleEnvironment
+from stages.needle.kernels import states
+from stages.needle.kernels.limits import Limits
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.ompl.motion import ARC_STEPS, control_bounds, position_bounds, propagator, validity
 from stages.needle.ompl.planner import NO_LIMIT, NeedleGoal, NeedlePlanner, Question
-from stages.needle.ompl.states import path_of, put_numbers
-from stages.needle.path import ArcPath, direct_path
-from stages.needle.planner_names import OMPL_PLANNERS
-from stages.needle.query import Query
+from stages.needle.ompl.states import numbers_of, path_of, put_numbers
+from stages.needle.path import ArcPath, Query, direct_path, violation
+from stages.needle.planner_choice import OMPL_PLANNERS
 from stages.needle.search import planners
 from stages.needle.search.base import Search
-from stages.needle.violations import violation
+
+ARC_STEPS = 20
+"""A control of duration 1 is an arc; OMPL propagates it in so many steps."""
+LONGEST_STEP_MM = 1.0
+"""Longest step of a propagation."""
 
 util.setLogLevel(util.LogLevel.LOG_ERROR)
 
@@ -208,7 +217,7 @@ class NeedleProblem:
         """Tell why a path is no answer to the query posed last; "" if it is one.
 
         OMPL's states do not know how long the needle is or how much it has turned: see
-        `stages.needle.violations`.
+        `stages.needle.path`.
         """
         query = self._question.query
         if query is None:
@@ -269,3 +278,71 @@ def _termination(time_s: float, iterations: int = NO_LIMIT) -> Any:
     looks = count()
     counted = base.PlannerTerminationCondition(lambda: next(looks) >= iterations)
     return base.plannerOrTerminationCondition(timed, counted)
+
+
+def position_bounds(environment: NeedleEnvironment) -> Any:
+    """Bound positions by the box of the grid."""
+    grid = environment.grid
+    corners = grid.lps(list(itertools.product(*[(-0.5, n - 0.5) for n in grid.shape])))
+    bounds = base.RealVectorBounds(3)
+    for axis in range(3):
+        bounds.setLow(axis, float(corners[:, axis].min()))
+        bounds.setHigh(axis, float(corners[:, axis].max()))
+    return bounds
+
+
+def control_bounds(environment: NeedleEnvironment) -> Any:
+    """Bound length, roll and curvature of an arc, so that a step is at most 1 mm long."""
+    bounds = base.RealVectorBounds(3)
+    highs = (ARC_STEPS * LONGEST_STEP_MM, math.pi, environment.needle.max_curvature_per_mm)
+    for n, (low, high) in enumerate(zip((0.0, -math.pi, 0.0), highs, strict=True)):
+        bounds.setLow(n, low)
+        bounds.setHigh(n, high)
+    return bounds
+
+
+def _limits_of_steps(environment: NeedleEnvironment) -> Limits:
+    """Return the limits by which steps are proved, so that whatever is proved as an arc passes.
+
+    The proof refuses points that have less than MIN_GAP_MM to spare.  Between its points half of that is
+    left at least; so arcs that passed, cut anywhere, pass again with so much less required clearance, and
+    what passes this way still has all of it.
+    """
+    limits = environment.limits
+    return limits._replace(required_mm=max(limits.required_mm - 0.5 * MIN_GAP_MM, 0.0))
+
+
+def propagator(environment: NeedleEnvironment, question: Question) -> Callable[[Any, Any, float, Any], None]:
+    """Return how OMPL moves a state by a control."""
+    limits = _limits_of_steps(environment)
+    costs = environment.cost_map
+    forbidden = None if costs is None or np.isfinite(costs.array).all() else costs.array
+
+    def propagate(state: Any, u: Any, duration: float, result: Any) -> None:
+        """Advance along a share `duration` of an arc that bends towards `u[1]`, if that is proved clear."""
+        begin, arc = numbers_of(state), (u[1], u[2], duration * u[0])
+        moved = states.proved_step(
+            environment.obstacles, limits, begin, *arc, question.origin, question.branch
+        )
+        if forbidden is not None and states.is_forbidden(
+            forbidden, environment.obstacles.geometry, begin, *arc
+        ):
+            moved = (math.nan, math.nan, math.nan, *begin[3:])
+        put_numbers(result, moved)
+
+    return propagate
+
+
+def validity(environment: NeedleEnvironment, question: Question) -> Callable[[Any], bool]:
+    """Return how OMPL tells whether a state is allowed."""
+    limits = _limits_of_steps(environment)
+
+    def is_valid(state: Any) -> bool:
+        # A numpy.bool_ would raise std::bad_cast.
+        return bool(
+            states.is_allowed(
+                environment.obstacles, limits, numbers_of(state), question.origin, question.branch
+            )
+        )
+
+    return is_valid

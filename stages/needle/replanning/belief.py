@@ -14,8 +14,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
-from stages.needle.path import arc_transform
-from stages.needle.query import Query
+from stages.needle.path import Query, arc_transform
 
 DRIFT_RAD = math.radians(0.1)
 """Standard deviation of what the direction drifts in 1 mm beside all that is modelled [assumption]."""

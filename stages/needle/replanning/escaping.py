@@ -12,8 +12,7 @@ from anatomy.structures import BITS, LUMEN
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.path import bend_direction
-from stages.needle.query import Query
+from stages.needle.path import Query, bend_direction
 from stages.needle.replanning.reaiming import Attempts, Bend, Root, Source, as_point, pose_at, root_after
 
 ROLLS = 8

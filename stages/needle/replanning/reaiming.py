@@ -17,8 +17,7 @@ from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.objective import Objective
-from stages.needle.path import LENGTH, ArcPath, arc_transform, path_from_tree
-from stages.needle.query import Query
+from stages.needle.path import LENGTH, ArcPath, Query, arc_transform, path_from_tree
 from stages.needle.search.base import RestartingRRT, root_of
 
 LEAST_GAIN = 0.1

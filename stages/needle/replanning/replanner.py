@@ -21,8 +21,7 @@ from stages.needle.kernels import tree
 from stages.needle.kernels.connections import nearest_turn, seen_from
 from stages.needle.kernels.goal_ball import least_length_from
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import CURVATURE, ArcPath
-from stages.needle.query import Query
+from stages.needle.path import CURVATURE, ArcPath, Query
 from stages.needle.replanning.escaping import (
     blocker_at,
     roots_of_tip,

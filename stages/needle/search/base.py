@@ -11,8 +11,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import ArcPath, path_from_tree
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, path_from_tree
 
 MAX_NODES = 20_000
 """Rows of a tree, 2 MB; a tree that has more begins anew."""

@@ -10,8 +10,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.infeasibility.passage import Passage
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.base import Search
 from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.resolution import ResolutionSearch

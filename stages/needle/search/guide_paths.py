@@ -12,8 +12,7 @@ from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment, workspace_lengths
 from stages.needle.kernels import limits as index
 from stages.needle.objective import Objective
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.kernels import state_lattice as kernel
 from stages.needle.search.optimal import OptimalSearch
 

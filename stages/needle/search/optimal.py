@@ -7,8 +7,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import limits as index
 from stages.needle.kernels import tree
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import ArcPath, path_from_tree
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, path_from_tree
 from stages.needle.search.base import RestartingRRT
 from stages.needle.search.kernels import optimal
 

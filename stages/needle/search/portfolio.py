@@ -12,8 +12,7 @@ import numpy as np
 
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.guide_paths import GuidePathFinder, Work
 from stages.needle.search.optimal import OptimalSearch
 

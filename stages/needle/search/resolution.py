@@ -18,8 +18,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import tree
 from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, ObjectiveArrays
 from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
-from stages.needle.path import ArcPath, path_from_tree
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, path_from_tree
 from stages.needle.search.base import root_of
 from stages.needle.search.kernels import rank_queue
 from stages.needle.search.kernels import resolution as kernel

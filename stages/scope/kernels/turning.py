@@ -1,4 +1,7 @@
-"""The tips that a bronchoscope reaches from states by twisting and bending in place, one of each kind."""
+"""Tips that a bronchoscope reaches by turning in place, earlier and later ends of motions, errors of steps.
+
+These errors are how far advance, twist and bend of a step may err before the body has no room left.
+"""
 
 import math
 from typing import NamedTuple
@@ -6,10 +9,25 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.base.typed import Bool, Float, Int
-from anatomy.kernels.compiling import inner_kernel, kernel
-from stages.scope.kernels.body import move_along, nearest_setting, turn_room
+from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from stages.scope.kernels.body import (
+    BLOCKED,
+    along_setting,
+    move_along,
+    nearest_setting,
+    room_along,
+    turn_room,
+)
 from stages.scope.kernels.growth import BEND, CURVATURE, ROOM, TWIST, U, V
-from stages.scope.kernels.shifting import put_tip
+
+HALVINGS = 12
+"""A tolerance is found to this power of a half of the most that is looked for."""
+MOST_RAD = math.pi / 2.0
+"""Larger errors of twist and bend are not looked for."""
+MOST_MM = 10.0
+"""Larger errors of an advance are not looked for."""
+LONGEST_MM = 0.1
+"""Longest step of the walk along a body; half of it is lost."""
 
 POLAR_RAD = math.radians(15.0)
 """Tips are told apart by rings of so many degrees about the direction of the airway."""
@@ -186,3 +204,159 @@ def first_free(walls, device, most_curvature, states, offsets, best, tips, near,
             row[TIP_CURVATURE] = max(state[CURVATURE], math.hypot(u, v))
             row[SOURCE] = n
             break
+
+
+@merged_kernel
+def goes_by_straight(twist, bend, to_twist, to_bend):
+    """Tell whether a change in place moves the section less if it is straightened before it twists."""
+    change = math.hypot(to_bend - bend, max(abs(bend), abs(to_bend)) * (to_twist - twist))
+    return change > abs(bend) + abs(to_bend)
+
+
+@inner_kernel
+def put_tip(base, twist, bend, length, tip, scratch):
+    """Fill in point, direction and +x (9,) of the tip of a section."""
+    cosine = math.cos(twist)
+    sine = math.sin(twist)
+    kappa = bend / length
+    move_along(base, kappa * cosine, kappa * sine, length, scratch)
+    for k in range(3):
+        tip[k] = scratch[9 + k]
+        tip[3 + k] = scratch[6 + k]
+        tip[6 + k] = cosine * scratch[k] + sine * scratch[3 + k]
+
+
+@merged_kernel
+def last_slide(states):
+    """Return the state from which the last advance begins, -1 if there is none."""
+    for n in range(states.shape[0] - 2, -1, -1):
+        if states[n + 1, 0] > states[n, 0]:
+            return n
+    return -1
+
+
+@kernel()
+def shifted_tips(walls, device, entry, states, shifts, tips, rooms):
+    """Fill tips `(K, 9)` of motions whose base stops `shifts` (K,) mm beyond that of a proved one.
+
+    The base stays on its way, or goes on along its last arc; there the section takes the last twist and bend.
+    `rooms` (K,) become the room on what is new in such a motion, BLOCKED if it is not proved.
+    Where there is no such way, the tip is that of the motion itself.
+    """
+    length = device.length
+    base = entry.copy()
+    moved = entry.copy()
+    scratch = np.zeros(12)
+    slide = last_slide(states)
+    stop, twist, bend = states[-1]
+    done = np.zeros(shifts.shape[0], dtype=np.bool_)
+    rooms[:] = BLOCKED
+    for n in range(slide + 1):
+        begin, held_twist, held_bend = states[n]
+        u = held_bend / length * math.cos(held_twist)
+        v = held_bend / length * math.sin(held_twist)
+        end = states[n + 1, 0] if n < slide else math.inf
+        straight = goes_by_straight(held_twist, held_bend, twist, bend)
+        for k in range(shifts.shape[0]):
+            at = stop + shifts[k]
+            if not begin <= at < end:
+                continue
+            done[k] = True
+            move_along(base, u, v, at - begin, moved)
+            put_tip(moved, twist, bend, length, tips[k], scratch)
+            far = at - begin + length
+            if at <= stop or room_along(walls, device.radius, base, u, v, 0.0, far, 0.0, math.inf) >= 0.0:
+                rooms[k] = turn_room(
+                    walls, device.radius, length, moved, held_twist, held_bend, twist, bend, straight
+                )
+        move_along(base, u, v, min(end, stop) - begin, moved)
+        base[:] = moved
+    for k in range(shifts.shape[0]):
+        if not done[k]:
+            put_tip(base, twist, bend, length, tips[k], scratch)
+
+
+@inner_kernel
+def _spare(walls, radius, length, base, setting, far, growth, more):
+    """Return the largest change `D` of curvature for which the places of an arc have room, 0 if none has.
+
+    A place `s` mm from the base has to have (D / 2 + growth) s^2 mm.
+    """
+    u = setting[1] / length * math.cos(setting[0])
+    v = setting[1] / length * math.sin(setting[0])
+    if room_along(walls, radius, base, u, v, 0.0, far, 0.5 * more + growth, LONGEST_MM) >= 0.0:
+        return more
+    low, high = 0.0, more
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if room_along(walls, radius, base, u, v, 0.0, far, 0.5 * middle + growth, LONGEST_MM) >= 0.0:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@inner_kernel
+def _beyond(walls, radius, base, u, v, far):
+    """Return how much farther than `far` mm a section may go on along its arc."""
+    if room_along(walls, radius, base, u, v, far, far + MOST_MM, 0.0, LONGEST_MM) >= 0.0:
+        return MOST_MM
+    low, high = 0.0, MOST_MM
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if room_along(walls, radius, base, u, v, far, far + middle, 0.0, LONGEST_MM) >= 0.0:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@kernel()
+def step_tolerances(walls, radius, length, entry, states, finest, out):
+    """Fill in by how much advance (mm), twist and bend (rad) may err in each step, `out` (M - 1, 3).
+
+    Each holds for the whole step if all else is as stated.  A curvature vector that errs by D moves a place
+    `s` mm from the base by no more than D s^2 / 2, where the section is and where it has laid the shaft
+    in this step; a bend that errs by b has D = b / length, a twist that errs by t at the curvature kappa no
+    more than kappa t.  A base that stands x mm before or behind its place, on an arc of curvature kappa,
+    moves the place by no more than x (1 + kappa s).
+
+    states : (M, 3) advance, twist and bend; finest : a change in place is looked at in pieces that move the
+    tip by no more than this.
+    """
+    base, moved = entry.copy(), entry.copy()
+    setting = np.zeros(2)
+    laid = 0.0
+    for n in range(states.shape[0] - 1):
+        advance = states[n + 1, 0] - states[n, 0]
+        kappa = max(abs(states[n, 2]), abs(states[n + 1, 2])) / length
+        if advance > 0.0:
+            setting[:] = states[n, 1:]
+            u = setting[1] / length * math.cos(setting[0])
+            v = setting[1] / length * math.sin(setting[0])
+            spare = _spare(walls, radius, length, base, setting, length + advance, 0.0, MOST_RAD / length)
+            out[n, 0] = _beyond(walls, radius, base, u, v, length + advance)
+            move_along(base, u, v, advance, moved)
+            base[:] = moved
+            laid = abs(setting[1]) / length
+        else:
+            change = math.hypot(
+                states[n + 1, 2] - states[n, 2], kappa * length * (states[n + 1, 1] - states[n, 1])
+            )
+            change /= length
+            pieces = max(1, int(math.ceil(0.5 * change * length * length / finest)))
+            spare, room = MOST_RAD / length, math.inf
+            for m in range(pieces + 1):
+                share = m / pieces
+                setting[0] = states[n, 1] + share * (states[n + 1, 1] - states[n, 1])
+                setting[1] = states[n, 2] + share * (states[n + 1, 2] - states[n, 2])
+                # Between two pieces each place is within a quarter of their change of one of them.
+                growth = 0.25 * change / pieces
+                spare = _spare(walls, radius, length, base, setting, length, growth, spare)
+                room = min(
+                    room,
+                    along_setting(walls, radius, length, base, setting[0], setting[1], growth, LONGEST_MM),
+                )
+            out[n, 0] = min(MOST_MM, max(room, 0.0) / (1.0 + max(kappa, laid) * length))
+        out[n, 1] = min(MOST_RAD, spare / max(kappa, 1e-12))
+        out[n, 2] = spare * length

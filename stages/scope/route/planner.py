@@ -14,9 +14,16 @@ from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.exact import Problem, repair_exact
 from stages.scope.route.genetic import repair_genetic
-from stages.scope.route.guide_path import WAYPOINT_SPACING_MM, GuidePath, guide_path_along
+from stages.scope.route.guide_path import (
+    WAYPOINT_SPACING_MM,
+    GuidePath,
+    Links,
+    NoRouteError,
+    fewest_hops,
+    guide_path_along,
+    nearest_links,
+)
 from stages.scope.route.proof import Proof
-from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.settings import RouteLimits
 
 Repair = Literal["exact", "ga", "none"]

@@ -13,8 +13,7 @@ from anatomy.grid import Grid
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, begun_at_wall, environment_of_labels
-from stages.needle.path import ArcPath, blocker_on_path
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, blocker_on_path
 from stages.needle.search.resolution import Resolution
 
 SAMPLE_MM = 0.3

@@ -17,7 +17,7 @@ from anatomy.base.typed import Float
 from anatomy.structures import VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
-from stages.needle.query import Query
+from stages.needle.path import Query
 from tests.stages.scenes import Canvas
 
 CLEARANCE_MM = 1.0

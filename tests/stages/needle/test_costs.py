@@ -28,8 +28,7 @@ from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.kernels import cost as kernel
 from stages.needle.kernels import tree
 from stages.needle.objective import Objective
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.base import RestartingRRT
 from tests.stages.scenes import Canvas
 

@@ -15,7 +15,7 @@ from stages.needle.environment import NeedleEnvironment, begun_at_wall, environm
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.kernels.proof import WALL_ZONE_MM, blocker_on_arc, exact_gap
 from stages.needle.obstruction import blocked_end, easiest_obstruction, find_obstruction
-from stages.needle.query import Query
+from stages.needle.path import Query
 
 GRID = Grid.from_spacing((61, 61, 61), (0.5, 0.5, 0.5), (-15.0, -15.0, -15.0))
 NEEDLE = Needle(diameter_mm=1.0, max_curvature_per_mm=1 / 20)

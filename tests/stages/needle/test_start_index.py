@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import lungaccess as la
 from anatomy.lung import Lung
 from stages.needle.environment import NeedleEnvironment, needle_environment, workspace_lengths
-from stages.needle.start_index import StartIndex
+from stages.needle.reach import StartIndex
 
 SYSTEM = la.load_system("ultrathin")
 

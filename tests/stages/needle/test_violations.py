@@ -12,9 +12,7 @@ from anatomy.margins import Margins
 from anatomy.structures import VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import needle_environment
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
-from stages.needle.violations import violation
+from stages.needle.path import ArcPath, Query, violation
 from tests.stages.scenes import Canvas
 
 AROUND = np.array([[20.0, math.pi / 2, 1 / 60], [35.0, math.pi, 1 / 60]])

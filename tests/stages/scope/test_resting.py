@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from anatomy.grid import Grid
-from stages.scope.contact import WallContact
 from stages.scope.kernels import resting as kernel
-from stages.scope.resting import Circumstances, RestingShaft, RestingShape, signed_depth
+from stages.scope.resting import Circumstances, RestingShaft, RestingShape, WallContact, signed_depth
 from tests.stages.scope.lumens import Depth, motion_of, s_bend, sampled, scope_of, torus
 
 STIFF = WallContact(wall_stiffness_n_per_mm2=100.0)

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.scope.contact import WallContact
-from stages.scope.resting import RestingShaft
+from stages.scope.resting import RestingShaft, WallContact
 from tests.stages.scope.lumens import Depth, motion_of, s_bend, sampled, scope_of, torus
 
 elastica: Any = pytest.importorskip("elastica", reason="PyElastica (the extra 'test') is not installed")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from anatomy import poses
-from stages.scope.contact import WallContact
-from stages.scope.resting import RestingShaft
+from stages.scope.resting import RestingShaft, WallContact
 from stages.scope.tip_spread import choices, off_pose, spread_of_tip
 from tests.stages.scope.lumens import motion_of, sampled, scope_of, torus
 

@@ -10,7 +10,7 @@ from lungaccess.judging.checking.completion import Motions
 from lungaccess.plans.parts import DeployedShape, NeedleArc
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system
-from lungaccess.running.benchmark.synthetic.cases import BenchmarkQuery
+from lungaccess.running.benchmark.synthetic.cases import BenchmarkQuery, PublishedTips
 from lungaccess.running.benchmark.synthetic.submission import (
     ArcAnswer,
     NeedleAnswer,
@@ -18,7 +18,6 @@ from lungaccess.running.benchmark.synthetic.submission import (
     SubmittedAnswer,
     TubesAnswer,
 )
-from lungaccess.running.benchmark.synthetic.tips import PublishedTips
 from stages.tube import ConcentricTubes, TubeShape, deployed, design_arrays, shape_of_arrays, without_limits
 
 

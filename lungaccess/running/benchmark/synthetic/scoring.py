@@ -18,11 +18,15 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.patients import load_patient
 from lungaccess.problem.system import load_system
 from lungaccess.running.benchmark.synthetic.answers import motions_of_answer
-from lungaccess.running.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
+from lungaccess.running.benchmark.synthetic.cases import (
+    BenchmarkQuery,
+    PublishedTips,
+    all_queries,
+    require_cases,
+)
 from lungaccess.running.benchmark.synthetic.manifest import entries
 from lungaccess.running.benchmark.synthetic.phantoms import BenchmarkPhantom, phantom_named
 from lungaccess.running.benchmark.synthetic.submission import Submission, SubmittedAnswer, require_queries
-from lungaccess.running.benchmark.synthetic.tips import PublishedTips
 from lungaccess.uncertainty.breathing.window import with_window
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from lungaccess.planning import with_front
 from lungaccess.plans.chance import Chance
 from lungaccess.problem.error_files import error_preset_names, load_errors
 from lungaccess.problem.procedures import load_procedure, procedure_names
-from lungaccess.showing.report.html import breathing, phase, tables, words
+from lungaccess.showing.report.html import breathing, tables, words
 from lungaccess.showing.report.html.deployment import device_points, packed_plan
 from lungaccess.showing.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import start_meshes, structure_meshes
@@ -119,10 +119,10 @@ def plan_page(
         "title": words.text(f"Plan for {plan.patient_name}"),
         "glance": glance_section(first),
         "headline": words.headline(first.headline) + words.advice(chosen.advice),
-        "breathing": phase.window_headline(plan, lung, first.accepted),
-        "phase_player": phase.player(window, first.accepted),
-        "phase_chart": phase.chart(window),
-        "phase_slices": phase.slices_note(window),
+        "breathing": breathing.window_headline(plan, lung, first.accepted),
+        "phase_player": breathing.player(window, first.accepted),
+        "phase_chart": breathing.chart(window),
+        "phase_slices": breathing.slices_note(window),
         "limits": tables.limits_section(first),
         "summary": summary(plan),
         "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),

@@ -32,9 +32,9 @@ from lungaccess.running.benchmark.synthetic.scoring import (
 )
 from lungaccess.running.benchmark.synthetic.sheet import score_sheet
 from lungaccess.running.benchmark.synthetic.submission import Submission, SubmittedAnswer, read_submission
-from lungaccess.running.study.compare import differences
 from lungaccess.running.study.driver import run_study
 from lungaccess.running.study.results import ResultsFile
+from lungaccess.running.study.tables import differences
 from tests.lungaccess.cli.killing import START, require_gone, started
 from tests.lungaccess.running.study.test_study_command import stored
 

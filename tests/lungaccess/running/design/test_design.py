@@ -23,8 +23,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.problem.system import load_system
 from lungaccess.running.design import Contender, Design, design_of, run_design
 from lungaccess.running.design.search import chosen, front_of
-from lungaccess.running.design.settings import Number
-from lungaccess.running.design.space import device, near, value_at
+from lungaccess.running.design.settings import Number, device, near, value_at
 from lungaccess.running.study.results import ResultsFile
 from tests.lungaccess.cli.killing import START, require_gone, started
 from tests.lungaccess.running.design.conftest import BENT, TARGETS, TURN, ToyWorkers, design_content

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from lungaccess.plans.plan import Plan
-from lungaccess.running.study.compare import differences
 from lungaccess.running.study.driver import run_study
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.settings import read_study
+from lungaccess.running.study.tables import differences
 from tests.lungaccess.cli.killing import require_gone
 from tests.lungaccess.running.study.test_study_command import TOML, command, stored
 

@@ -21,11 +21,11 @@ from anatomy.base.errors import FileError
 from lungaccess.running.study import cluster as cluster_of_study
 from lungaccess.running.study import driver, one_run
 from lungaccess.running.study.answers import Answer
-from lungaccess.running.study.compare import differences
 from lungaccess.running.study.driver import StudyDone, run_study
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.runs import Run
 from lungaccess.running.study.settings import Study, StudyError, study_of
+from lungaccess.running.study.tables import differences
 from tests.lungaccess.running.study.toys import content, toy_answer
 
 LONGER = {"case": {"targets": [], "peripheral": {"per_lung": 4}}, "seeds": [0, 1, 2]}

@@ -20,7 +20,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim, BreathingWindow
 from lungaccess.showing.report.clock import PROVED, sectors, window_png
 from lungaccess.showing.report.html import breathing
-from lungaccess.showing.report.html import phase as controls
+from lungaccess.showing.report.html import breathing as controls
 from lungaccess.showing.report.html.deployment import CAP_MM, packed_plan, profile, profile_points
 from lungaccess.showing.report.html.page_of_plan import summary
 from lungaccess.showing.report.pack import unpack

@@ -23,12 +23,12 @@ from lungaccess.plans.curves import arc_lengths
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report import pack
 from lungaccess.showing.report.html import (
+    breathing,
     deployment,
     document,
     page_of_no_plan,
     page_of_plan,
     page_of_reach,
-    phase,
     tables,
     words,
 )
@@ -103,9 +103,9 @@ def test_scripts_find_only_elements_that_the_page_has() -> None:
         if page is page_of_plan:
             html += (
                 page_of_plan.FOLLOW
-                + phase.player(WINDOW, True)
-                + phase.chart(WINDOW)
-                + phase.clock_svg(WINDOW, True)
+                + breathing.player(WINDOW, True)
+                + breathing.chart(WINDOW)
+                + breathing.clock_svg(WINDOW, True)
             )
         html += page_of_no_plan.PLACES if page is page_of_no_plan else ""
         present = set(re.findall(r'id="([\w-]+)"', html + document.asset("frame.html")))

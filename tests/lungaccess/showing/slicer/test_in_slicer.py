@@ -16,8 +16,7 @@ from anatomy.io.centerlines import read_centerlines
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.slicer.export import PROVED_COLOUR, STEP_MM, STRUCTURES, TRIED_COLOUR
-from lungaccess.showing.slicer.markups import TARGET_COLOUR
-from lungaccess.showing.slicer.segments import SEGMENTS, label_map
+from lungaccess.showing.slicer.models import SEGMENTS, TARGET_COLOUR, label_map
 from lungaccess.uncertainty.breathing.moving import Moving
 from tests.lungaccess.showing.slicer.slicer_scene import (
     SlicerScene,

@@ -25,7 +25,7 @@ from lungaccess.cli import app as cli
 from lungaccess.judging.checking import CheckReport
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.slicer import Exported, export, export_slicer
-from lungaccess.showing.slicer.segments import SEGMENTS, label_map
+from lungaccess.showing.slicer.models import SEGMENTS, label_map
 
 DEVICES = ("scope", "tubes", "needle")
 # What the markups schema 1.0.3 of 3D Slicer says.

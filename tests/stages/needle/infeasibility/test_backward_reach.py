@@ -13,8 +13,8 @@ from anatomy.kernels.arcs import pose_on_arc
 from anatomy.structures import VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
-from stages.needle.infeasibility.backward_reach import NOT_BOUNDED, backward_reach
 from stages.needle.infeasibility.kernels.backward_reach import never_along
+from stages.needle.infeasibility.passage import NOT_BOUNDED, backward_reach
 from stages.needle.path import kernel_arcs
 from tests.stages.needle.corridors import Corridor, drawn_corridor
 

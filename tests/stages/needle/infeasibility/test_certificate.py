@@ -14,7 +14,7 @@ from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
 from stages.needle.infeasibility.certificate import NoPathProof
 from stages.needle.infeasibility.kernels import bitmaps
-from stages.needle.query import Query
+from stages.needle.path import Query
 from stages.needle.search.base import RestartingRRT
 
 SIDE = 64

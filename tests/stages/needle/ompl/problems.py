@@ -14,8 +14,7 @@ from anatomy.lung import Lung
 from anatomy.margins import Margins
 from anatomy.structures import OUTSIDE, VESSEL
 from stages.needle.environment import NeedleEnvironment, needle_environment
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.base import Search
 from tests.stages.scenes import Canvas
 

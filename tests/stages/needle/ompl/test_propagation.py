@@ -17,8 +17,7 @@ from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.kernels.states import proved_step
 from stages.needle.ompl import NeedleProblem, path_of, read_state, write_state
-from stages.needle.path import ArcPath, arc_transform
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, arc_transform
 from tests.stages.needle.ompl.problems import (
     GOAL,
     arcs_of,

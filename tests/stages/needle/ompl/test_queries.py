@@ -16,8 +16,7 @@ from anatomy.margins import Margins
 from stages.needle import ompl as ompl_planner
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.ompl import NeedleProblem
-from stages.needle.path import blocker_on_path
-from stages.needle.query import Query
+from stages.needle.path import Query, blocker_on_path
 from stages.needle.search.base import RestartingRRT
 from tests.stages.needle.ompl.problems import (
     GOAL,

@@ -13,8 +13,7 @@ from anatomy.poses import pose
 from anatomy.structures import OBSTACLES, VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.replanning.replanner import Replan, Replanner
 from stages.needle.search.base import RestartingRRT
 from tests.stages.scenes import Canvas, brute_clearance

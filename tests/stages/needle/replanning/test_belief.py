@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from anatomy.base.typed import Float
-from stages.needle.path import ArcPath, arc_transform, direct_path
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query, arc_transform, direct_path
 from stages.needle.replanning.belief import FACTORS, Belief, Unknown, tilt
 from stages.needle.replanning.insertion import TrueNeedle, steer
 from stages.needle.replanning.replanner import Replanner, ReplanSettings

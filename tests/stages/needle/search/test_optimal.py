@@ -13,7 +13,7 @@ from anatomy.structures import OUTSIDE, VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels, needle_environment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.query import Query
+from stages.needle.path import Query
 from stages.needle.search.base import RestartingRRT, luby
 from stages.needle.search.decision import Decision
 from stages.needle.search.optimal import OptimalSearch

@@ -13,7 +13,7 @@ from anatomy.structures import VESSEL
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.query import Query
+from stages.needle.path import Query
 from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.portfolio import FIRST_ITERATIONS, PortfolioSearch
 from tests.stages.needle.proved import assert_each_path_is_cheaper

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from anatomy.base.errors import SettingsError
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
 from tests.stages.needle import mazes
 from tests.stages.needle.mazes import CLEARANCE_MM, in_box, winding_maze

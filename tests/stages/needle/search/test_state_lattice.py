@@ -17,8 +17,7 @@ from stages.needle.costs import map_integral
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, needle_environment
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import ArcPath
-from stages.needle.query import Query
+from stages.needle.path import ArcPath, Query
 from stages.needle.search import guide_paths
 from stages.needle.search.guide_paths import (
     ARCS_PER_ITERATION,

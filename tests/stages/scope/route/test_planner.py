@@ -12,9 +12,9 @@ from experiments.support.route.baselines import SamplingSettings, sampled_route
 from stages.scope.route.centreline import Centreline, from_image
 from stages.scope.route.exact import segments
 from stages.scope.route.genetic import repair_genetic
+from stages.scope.route.guide_path import NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.planner import Replanner, plan_route
 from stages.scope.route.proof import Proof, measure
-from stages.scope.route.search import NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.settings import RouteLimits
 from tests.stages.scope.route.tubes import chain, corner, fork, least_clearance_of_corner, straight
 

@@ -10,8 +10,8 @@ import pytest
 from anatomy.io import read_mask
 from anatomy.io.centerlines import read_centerlines
 from stages.scope.route.centreline import Centreline, from_mask, from_tree
+from stages.scope.route.guide_path import Links, NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.planner import Replanner, plan_route
-from stages.scope.route.search import Links, NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.settings import RouteLimits
 
 pytestmark = pytest.mark.data

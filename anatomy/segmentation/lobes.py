@@ -212,7 +212,10 @@ class _LungParts:
         from anatomy.segmentation.kernels.flooding import diffuse
 
         seeds = self._seeded(lobe_of_branch)
-        likelihood = _without_holes(self._coarse, self._mask)
+        # Likelihoods with the holes of sheets closed, and the gaps between sheets and the pleura.
+        solid = np.asfortranarray((self._coarse > 0) | ~self._mask)
+        hidden = closed(solid, HOLE_MM, (BLOCK * EDGE_MM,) * 3) & self._mask
+        likelihood = np.where(hidden, np.maximum(self._coarse, HOLE_LIKELIHOOD), self._coarse)
         start = np.pad(self._flooded(seeds, likelihood), 1)
         # Vessels are so far apart within a lobe; farther from them, where fissures run, lung resists more.
         far = ndimage.distance_transform_edt(~self._vessels, sampling=BLOCK * EDGE_MM) / 6.0
@@ -255,13 +258,6 @@ class _LungParts:
             for n, m in zip(self._fine.shape, blocks.shape, strict=True)
         ]
         return np.ascontiguousarray(blocks[np.ix_(*places)])
-
-
-def _without_holes(likelihood: Float32, mask: Mask) -> Float32:
-    """Return likelihoods with the holes of sheets closed, and the gaps between sheets and the pleura."""
-    solid = np.asfortranarray((likelihood > 0) | ~mask)
-    hidden = closed(solid, HOLE_MM, (BLOCK * EDGE_MM,) * 3) & mask
-    return np.where(hidden, np.maximum(likelihood, HOLE_LIKELIHOOD), likelihood)
 
 
 def _regions_of(

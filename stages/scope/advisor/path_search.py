@@ -89,7 +89,10 @@ class PathSearch:
         # Potentials nearer than this are equal: rounding of sums of steps.
         enough = self._lowest_that_fits(states[0]) + 1e-9
         while end != kernel.REACHED and info[-1, 3] > enough and used < options.retreats:
-            kept = self._retreat(info, used)
+            # The number of the state to which the scope is pulled back.
+            retreat_mm = RETREATS_MM[used % len(RETREATS_MM)] * self._rng.uniform(0.5, 1.5)
+            behind = np.cumsum(info[::-1, 2])[::-1]
+            kept = int(np.flatnonzero(behind >= retreat_mm).max(initial=0))
             ahead = max(options.look_ahead_mm * float(self._rng.choice(LOOK_AHEADS)), options.sub_step_mm)
             more, more_info, new_end = self._compute_path(
                 states[: kept + 1], info[: kept + 1], self._random_weights(), ahead
@@ -103,12 +106,6 @@ class PathSearch:
     def _random_weights(self) -> Weights:
         low, high = (float(value) for value in np.sort(self._rng.uniform(size=2)))
         return Weights(nf1=low, clearance=high - low, twist=1.0 - high)
-
-    def _retreat(self, info: Float, used: int) -> int:
-        """Return the number of the state to which the scope is pulled back."""
-        retreat_mm = RETREATS_MM[used % len(RETREATS_MM)] * self._rng.uniform(0.5, 1.5)
-        behind = np.cumsum(info[::-1, 2])[::-1]
-        return int(np.flatnonzero(behind >= retreat_mm).max(initial=0))
 
     def _lowest_that_fits(self, state: Float) -> float:
         """Return the lowest potential of a voxel to which a ball of the scope's radius gets."""

@@ -41,6 +41,7 @@ def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[s
     FileError
         If the file cannot be written.
     """
+    rows = [(reason, count) for reason, count in explanation.failure.reasons.items() if count]
     parts = {
         "title": words.text(f"No plan for {explanation.patient_name}"),
         "headline": words.text(explanation.headline),
@@ -48,7 +49,7 @@ def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[s
         "slice_controls": slice_controls(more=PLACES),
         "scene": scene_figure(more_views=TARGET_BUTTON),
         "sections": sections_html(explanation),
-        "reasons": _reasons(explanation),
+        "reasons": words.pairs("What was looked at, and what was ruled out", rows),
     }
     return write_page(path, "no_plan.html", MODULES, page_data(explanation, lung), parts)
 
@@ -80,11 +81,6 @@ def sections_html(explanation: Explanation) -> str:
         words.table(each.title, each.headings, [[words.text(cell) for cell in row] for row in each.rows])
         for each in sections(explanation)
     )
-
-
-def _reasons(explanation: Explanation) -> str:
-    rows = [(reason, count) for reason, count in explanation.failure.reasons.items() if count]
-    return words.pairs("What was looked at, and what was ruled out", rows)
 
 
 def _starts(explanation: Explanation) -> list[Packed]:

@@ -87,7 +87,8 @@ def _refusals(report: CheckReport) -> str:
 
 
 def _limits(title: str, findings: Sequence[Finding]) -> str:
-    ordered = sorted(findings, key=lambda f: (f.ok, _headroom(f)))
+    # The margin as a share of the limit, which compares findings of different units.
+    ordered = sorted(findings, key=lambda f: (f.ok, (f.margin or 0.0) / max(abs(f.limit or 0.0), 1e-9)))
     rows = [
         (
             words.text(f.name),
@@ -105,11 +106,6 @@ def _limits(title: str, findings: Sequence[Finding]) -> str:
 def _limit(finding: Finding) -> str:
     spare = f" (tolerance {words.number(finding.tolerance, 2)})" if finding.tolerance else ""
     return words.text(f"{finding.side or ''} {words.number(finding.limit)} {finding.unit}{spare}")
-
-
-def _headroom(finding: Finding) -> float:
-    """Return the margin as a share of the limit, which compares findings of different units."""
-    return (finding.margin or 0.0) / max(abs(finding.limit or 0.0), 1e-9)
 
 
 def _value(finding: Finding) -> str:

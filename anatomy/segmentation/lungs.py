@@ -104,7 +104,7 @@ def segment_lungs(
     added: tuple[Mask | None, Mask | None]
     offset = 0.0
     if ex_vivo:
-        from anatomy.segmentation.ex_vivo import coarse_lung_ex_vivo
+        from anatomy.segmentation.lung_pieces import coarse_lung_ex_vivo
 
         threshold, airway, sides, warnings = coarse_lung_ex_vivo(coarse, seed)
         added = (None, None)

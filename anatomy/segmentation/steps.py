@@ -29,11 +29,10 @@ from anatomy.segmentation.gate import plausibility, require_plausible
 from anatomy.segmentation.input import without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
-from anatomy.segmentation.misplaced import misplaced
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
 from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import SegmentationRequest
-from anatomy.segmentation.scan_warnings import scan_warnings
+from anatomy.segmentation.scan_warnings import misplaced, scan_warnings
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from stages.needle.infeasibility.certificate import NoPathProof
     from stages.needle.infeasibility.passage import NOT_BOUNDED, Passage, backward_reach
     from stages.needle.kernels.cost import ObjectiveArrays
-    from stages.needle.kernels.limits import Limits
-    from stages.needle.kernels.proof import Obstacles, blocker_on_arc
+    from stages.needle.kernels.proof import Limits, Obstacles, blocker_on_arc
     from stages.needle.objective import DEFAULT, NO_MAP, SHORTEST, TERMS, Objective, Term
     from stages.needle.obstruction import Obstruction, easiest_obstruction, find_obstruction
     from stages.needle.path import (

@@ -18,8 +18,7 @@ from anatomy.structures import AIRWAY, BRANCH_SHIFT, OBSTACLES, close_border, ob
 from stages.needle.device import Needle
 from stages.needle.kernels import start_trial
 from stages.needle.kernels.cost import ObjectiveArrays
-from stages.needle.kernels.limits import Limits
-from stages.needle.kernels.proof import Obstacles
+from stages.needle.kernels.proof import Limits, Obstacles
 from stages.needle.objective import Objective
 
 

@@ -12,8 +12,7 @@ from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import obstruction as kernels
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
-from stages.needle.kernels.limits import Limits
-from stages.needle.kernels.proof import exact_gap
+from stages.needle.kernels.proof import Limits, exact_gap
 from stages.needle.path import Query
 
 TRIALS = 256

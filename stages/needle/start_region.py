@@ -11,7 +11,7 @@ from anatomy.grid import read_only
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_region as proof_kernel
 from stages.needle.kernels import start_trial as kernel
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 from stages.needle.path import CURVATURE, ArcPath, Query, arc_transform, direct_path
 
 KINDS = {

@@ -253,7 +253,7 @@ def _peer(folder: Path) -> None:
 
 
 def _read_peer(folder: Path) -> None:
-    from lungaccess.running.benchmark.peer import read_peer
+    from lungaccess.running.benchmark.published import read_peer
 
     read_peer(folder / "peer.json")
 

@@ -122,7 +122,7 @@ def export(
     parquet : Path
         Folder for the same as Parquet.
     """
-    from lungaccess.running.study.export import export_csv, export_parquet
+    from lungaccess.running.study.tables import export_csv, export_parquet
 
     if csv is None and parquet is None:
         raise SettingsError(

@@ -6,16 +6,17 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.running.benchmark.export import summary_rows, write_rows
-    from lungaccess.running.benchmark.peer import PeerResult, read_peer
     from lungaccess.running.benchmark.published import (
         UNC_EXEMPT_MM,
         UNC_GOAL_TOLERANCE_MM,
         UNC_MAX_LENGTH_MM,
         UNC_NEEDLE_DIAMETER_MM,
+        PeerResult,
         PublishedQuery,
         UncObstacles,
         patients_of,
         published_queries,
+        read_peer,
         unc_needle,
         unc_obstacles,
     )

@@ -10,7 +10,7 @@ from statistics import median
 
 from anatomy.base.errors import FileError
 from anatomy.base.files import atomic_write
-from lungaccess.running.benchmark.peer import Key, PeerResult, patient_number
+from lungaccess.running.benchmark.published import Key, PeerResult, patient_number
 from lungaccess.running.benchmark.runs import BenchmarkRow
 
 SUFFIXES = (".csv", ".json")

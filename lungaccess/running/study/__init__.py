@@ -6,10 +6,9 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.running.study.driver import StudyDone, run_study
-    from lungaccess.running.study.export import export_csv, export_parquet
     from lungaccess.running.study.results import ResultsFile
     from lungaccess.running.study.settings import Study, StudyError, read_study, study_of
     from lungaccess.running.study.summary import Group, summarise
-    from lungaccess.running.study.tables import differences
+    from lungaccess.running.study.tables import differences, export_csv, export_parquet
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -14,7 +14,7 @@ import math
 
 from anatomy.kernels.arcs import any_normal, arc_to_point
 from anatomy.kernels.compiling import kernel, merged_kernel
-from stages.needle.kernels.limits import TINY
+from stages.needle.kernels.proof import TINY
 
 
 @kernel()

@@ -15,7 +15,7 @@ from anatomy.base.typed import Float32
 from anatomy.kernels.arcs import SMALL_ANGLE, point_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_estimate
-from stages.needle.kernels.limits import TINY
+from stages.needle.kernels.proof import TINY
 
 CLEARANCE_FLOOR_MM = 0.1
 """Nearer than this, 1 / clearance stays at its value here, so that the integral is finite."""

@@ -10,7 +10,7 @@ import math
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.needle.kernels.connections import arc_and_straight, seen_from, shortest_legs, two_arcs
-from stages.needle.kernels.limits import MIN_ARC_MM, TINY
+from stages.needle.kernels.proof import MIN_ARC_MM, TINY
 
 
 @inner_kernel

@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import UNITS_PER_MM, exact_distance, interpolate_squared
-from stages.needle.kernels.limits import TINY
+from stages.needle.kernels.proof import TINY
 
 # A typed number: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)

@@ -10,7 +10,7 @@ from anatomy.kernels.random import uniform
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
-from stages.needle.kernels.limits import MIN_ARC_MM
+from stages.needle.kernels.proof import MIN_ARC_MM
 
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _ROOT = np.int64(0)

@@ -14,8 +14,7 @@ from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
 from stages.needle.kernels.connections import least_cosine, seen_from
-from stages.needle.kernels.limits import MIN_ARC_MM, TINY
-from stages.needle.kernels.proof import WALL_ZONE_MM
+from stages.needle.kernels.proof import MIN_ARC_MM, TINY, WALL_ZONE_MM
 
 CHORD, HALF_TURN, ARC_LENGTH, ARC_COLUMNS = 0, 1, 2, 3
 ARC, BEGIN, END, HALF_CELL, FREE, FREE_AT_EXIT, LUMEN_DISTANCE, STATION_COLUMNS = 0, 1, 2, 3, 4, 5, 6, 7

@@ -22,8 +22,7 @@ from anatomy.kernels.field import MIN_GAP_MM
 from stages.needle.kernels.connections import nearest_turn, seen_from, single_arc_exceeds
 from stages.needle.kernels.cost import inverse_clearance_on_arc
 from stages.needle.kernels.goal_ball import workspace_length
-from stages.needle.kernels.limits import MIN_ARC_MM
-from stages.needle.kernels.proof import blocker_on_arc, exact_gap
+from stages.needle.kernels.proof import MIN_ARC_MM, blocker_on_arc, exact_gap
 from stages.needle.kernels.rrt import grow_rrt
 from stages.needle.kernels.tree import ROWS_PER_STEP, add_arc, add_goal, pose_of
 

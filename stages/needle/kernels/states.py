@@ -13,8 +13,7 @@ import numpy as np
 from anatomy.kernels.arcs import any_normal, point_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel
 from stages.needle.kernels.cost import map_costs_on_arc
-from stages.needle.kernels.limits import TINY
-from stages.needle.kernels.proof import blocker_on_arc
+from stages.needle.kernels.proof import TINY, blocker_on_arc
 
 # Typed: a kernel is compiled once more for every literal that it is called with.
 _FIRST = np.bool_(True)

@@ -14,8 +14,7 @@ from anatomy.kernels.random import uniform
 from stages.needle.kernels.connections import least_cosine, nearest_turn, seen_from, shortest_legs
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.goal_ball import least_length_from
-from stages.needle.kernels.limits import MIN_ARC_MM, TINY
-from stages.needle.kernels.proof import blocker_on_arc
+from stages.needle.kernels.proof import MIN_ARC_MM, TINY, blocker_on_arc
 
 # Columns: pose (6), arc from the parent: length, bend (4); path length, accumulated turn, path cost.
 ARC_LENGTH, BEND, PATH_LENGTH, PATH_TURN, PATH_COST, NODE_COLUMNS = 6, 7, 11, 12, 13, 14

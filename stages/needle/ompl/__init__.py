@@ -17,9 +17,8 @@ except ImportError as error:
     ) from error
 
 from stages.needle.ompl.benchmark import benchmark
-from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question
+from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question, path_of, read_state, write_state
 from stages.needle.ompl.problem import Allocator, NeedleProblem, SearchFactory, seed_ompl
-from stages.needle.ompl.states import path_of, read_state, write_state
 
 __all__ = [
     "Allocator",

@@ -18,10 +18,17 @@ from anatomy.kernels.field import MIN_GAP_MM
 from stages.needle.costs import map_integral
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import states
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.ompl.planner import NO_LIMIT, NeedleGoal, NeedlePlanner, Question
-from stages.needle.ompl.states import numbers_of, path_of, put_numbers
+from stages.needle.ompl.planner import (
+    NO_LIMIT,
+    NeedleGoal,
+    NeedlePlanner,
+    Question,
+    numbers_of,
+    path_of,
+    put_numbers,
+)
 from stages.needle.path import ArcPath, Query, direct_path, violation
 from stages.needle.planner_choice import OMPL_PLANNERS
 from stages.needle.search import planners

@@ -28,7 +28,7 @@ def structure_name(label: int) -> str:
 
 
 def with_limits(environment: NeedleEnvironment, **limits: float) -> NeedleEnvironment:
-    """Return an environment with other limits, by the names of `stages.needle.kernels.limits.Limits`."""
+    """Return an environment with other limits, by the names of `stages.needle.kernels.proof.Limits`."""
     return replace(environment, limits=environment.limits._replace(**limits))
 
 

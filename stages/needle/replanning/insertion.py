@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
+from stages.needle.kernels import proof as index
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.path import LENGTH, ROLL, ArcPath, arc_transform, bend_direction
 from stages.needle.replanning.belief import Belief

@@ -13,7 +13,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
+from stages.needle.kernels import proof as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.objective import Objective

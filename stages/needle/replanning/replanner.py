@@ -16,7 +16,7 @@ from anatomy.base.typed import Float
 from anatomy.kernels.arcs import arc_to_point
 from anatomy.kernels.field import MIN_GAP_MM
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
+from stages.needle.kernels import proof as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import nearest_turn, seen_from
 from stages.needle.kernels.goal_ball import least_length_from

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment, workspace_lengths
-from stages.needle.kernels import limits as index
+from stages.needle.kernels import proof as index
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, Query
 from stages.needle.search.kernels import state_lattice as kernel

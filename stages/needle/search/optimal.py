@@ -4,7 +4,7 @@ import numpy as np
 
 from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.kernels import limits as index
+from stages.needle.kernels import proof as index
 from stages.needle.kernels import tree
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import ArcPath, Query, path_from_tree

@@ -20,8 +20,8 @@ from stages.needle.kernels.cost import CLEARANCE_FLOOR_MM, ObjectiveArrays
 from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
 from stages.needle.path import ArcPath, Query, path_from_tree
 from stages.needle.search.base import root_of
-from stages.needle.search.kernels import rank_queue
 from stages.needle.search.kernels import resolution as kernel
+from stages.needle.search.kernels import resolution_nodes
 from stages.needle.search.kernels import resolution_nodes as node_kernel
 
 T = TypeVar("T", bound=np.generic)
@@ -227,9 +227,9 @@ class ResolutionSearch:
         self._store = self._first_store()
         left = environment.limits.max_length_mm - query.inserted_mm
         pieces = max(int(left / self.resolution.fine_mm), 0) + 2
-        self._queue = _first_queue(pieces * len(self._words[4]) + rank_queue.LOOK_AHEAD + 1)
-        self._state = np.zeros(rank_queue.STATE_SIZE, dtype=np.int64)
-        self._state[rank_queue.FREE] = -1
+        self._queue = _first_queue(pieces * len(self._words[4]) + resolution_nodes.LOOK_AHEAD + 1)
+        self._state = np.zeros(resolution_nodes.STATE_SIZE, dtype=np.int64)
+        self._state[resolution_nodes.FREE] = -1
         self._counts = np.zeros(kernel.COUNTS, dtype=np.int64)
         self._counts[kernel.NODES] = 1
         self._best = np.zeros(kernel.BEST_SIZE)
@@ -277,7 +277,7 @@ class ResolutionSearch:
             )  # fmt: skip
             if reason == kernel.BETTER:
                 self.path = self._best_path()
-                if self._state[rank_queue.WAITING] == 0:
+                if self._state[resolution_nodes.WAITING] == 0:
                     self._end(Outcome.BEST)
                 return True
             if reason == kernel.EXHAUSTED:
@@ -332,8 +332,8 @@ class ResolutionSearch:
 
 def _first_queue(ranks: int) -> Queue:
     lists = np.zeros((ranks, 2), dtype=np.int32)
-    lists[:, rank_queue.HEAD] = -1
-    entries = np.zeros((FIRST_ENTRIES, rank_queue.ENTRY_COLUMNS), dtype=np.int32)
+    lists[:, resolution_nodes.HEAD] = -1
+    entries = np.zeros((FIRST_ENTRIES, resolution_nodes.ENTRY_COLUMNS), dtype=np.int32)
     heap = np.zeros(FIRST_ENTRIES, dtype=np.int32)
     return np.zeros(FIRST_ENTRIES), entries, np.zeros(FIRST_ENTRIES), heap, lists
 

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
         evaluate_motions,
     )
     from stages.scope.advisor.environment import ScopeEnvironment
-    from stages.scope.advisor.fly_through import MARKUPS_SCHEMA, FlyThrough, camera_flight
     from stages.scope.advisor.instructions import Instruction, instructions_along
     from stages.scope.advisor.kinematics import (
         ScopeModel,
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     )
     from stages.scope.advisor.lumen import Lumen, lumen_of_lung, lumen_of_mask
     from stages.scope.advisor.nf1 import Goal, NavigationField, goal_at, navigation_field
-    from stages.scope.advisor.path import ScopePath
+    from stages.scope.advisor.path import MARKUPS_SCHEMA, FlyThrough, ScopePath, camera_flight
     from stages.scope.advisor.path_search import PathSearch, PathSettings
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

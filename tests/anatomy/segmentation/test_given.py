@@ -18,8 +18,8 @@ from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.folder import description_text
 from anatomy.segmentation.gate import CHECKS
 from anatomy.segmentation.labels import NUMBERINGS, lobe_numbers, sides_of
-from anatomy.segmentation.misplaced import FITS, misplaced, moved_by
 from anatomy.segmentation.request import Given, GivenImages, read_given
+from anatomy.segmentation.scan_warnings import FITS, misplaced, moved_by
 
 TOTAL = (
     "lung_upper_lobe_left",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 
 RADIUS = 50.0
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from anatomy.kernels.arcs import pose_on_arc
 from stages.needle.kernels import connections, goal_ball
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 
 RADIUS = 50.0
 KAPPA = 1 / RADIUS

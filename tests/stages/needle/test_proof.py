@@ -14,7 +14,7 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from stages.needle.kernels import proof
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 from tests.stages.needle.needles import limits_of
 from tests.stages.scenes import Canvas, brute_clearance, line_tree, lung_of
 

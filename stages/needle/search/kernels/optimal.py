@@ -7,7 +7,7 @@ from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.random import uniform
 from stages.needle.kernels import tree
 from stages.needle.kernels.connections import seen_from, shortest_path
-from stages.needle.kernels.limits import MIN_ARC_MM, TINY
+from stages.needle.kernels.proof import MIN_ARC_MM, TINY
 from stages.needle.kernels.rrt import goal_from_root, random_arc, sample_between
 
 RANDOM_SHARE = 0.4

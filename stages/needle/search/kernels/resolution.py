@@ -14,10 +14,8 @@ from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.cost import cost_of_arc
 from stages.needle.kernels.goal_ball import least_length_from, shortest_into_ball, single_into_ball
-from stages.needle.kernels.limits import TINY
-from stages.needle.kernels.proof import blocker_on_arc
+from stages.needle.kernels.proof import TINY, blocker_on_arc
 from stages.needle.kernels.tree import angle_kept
-from stages.needle.search.kernels.rank_queue import WAITING, pop, push
 from stages.needle.search.kernels.resolution_nodes import (
     CLEAR,
     DIRECTION,
@@ -29,10 +27,13 @@ from stages.needle.search.kernels.resolution_nodes import (
     ROUNDING,
     STEPS,
     USELESS,
+    WAITING,
     bend_of,
     find_duplicate,
     follow,
     node_pose,
+    pop,
+    push,
 )
 
 # What `best` holds: its last node, then length and bend of each of the two legs from there to the goal.

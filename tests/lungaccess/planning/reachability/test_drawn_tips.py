@@ -15,7 +15,7 @@ from anatomy.kernels.arcs import pose_on_arc
 from lungaccess.planning.reachability.kernels import unreachable as kernel
 from stages.needle.infeasibility.kernels import escape_depth
 from stages.needle.kernels.connections import least_cosine
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 
 RADIUS_MM = 30.0
 AHEAD = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)

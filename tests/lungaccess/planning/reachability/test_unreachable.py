@@ -33,7 +33,7 @@ from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 from stages.scope import MAX_OFF_AXIS_MM, find_motions, in_tip_region
 from stages.tube import deployed, design_arrays, tube_environment
 from stages.tube.kernels import ACCEPTED, N_REASONS, N_TRACE, NEAR_VESSEL, SWEEP, validate_arcs

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from anatomy.kernels.arcs import pose_on_arc
 from stages.needle.kernels import goal_ball
-from stages.needle.kernels.limits import Limits
-from stages.needle.search.kernels import rank_queue
+from stages.needle.kernels.proof import Limits
+from stages.needle.search.kernels import resolution_nodes
 
 
 class TestGoalBall:
@@ -105,25 +105,25 @@ class TestQueue:
         rng = np.random.default_rng(7)
         size = 600
         lists = np.zeros((80, 2), dtype=np.int32)
-        lists[:, rank_queue.HEAD] = -1
-        entries = np.zeros((size, rank_queue.ENTRY_COLUMNS), dtype=np.int32)
+        lists[:, resolution_nodes.HEAD] = -1
+        entries = np.zeros((size, resolution_nodes.ENTRY_COLUMNS), dtype=np.int32)
         queue = np.zeros(size), entries, np.zeros(size), np.zeros(size, dtype=np.int32), lists
-        state = np.zeros(rank_queue.STATE_SIZE, dtype=np.int64)
-        state[rank_queue.FREE] = -1
+        state = np.zeros(resolution_nodes.STATE_SIZE, dtype=np.int64)
+        state[resolution_nodes.FREE] = -1
         waiting: dict[int, tuple[float, int]] = {}
         lowest = pushed = most = 0
         while pushed < 3000 or waiting:
             if pushed < 3000 and len(waiting) < size and (not waiting or rng.uniform() < 0.6):
                 f, rank = float(rng.uniform()), min(lowest + int(rng.integers(0, 12)), 70)
-                rank_queue.push(queue, state, f, pushed, -pushed, rank)
+                resolution_nodes.push(queue, state, f, pushed, -pushed, rank)
                 waiting[pushed] = f, rank
                 pushed += 1
                 most = max(most, len(waiting))
                 continue
             lowest = min(rank for _f, rank in waiting.values())
             ahead = {n: f for n, (f, rank) in waiting.items() if rank <= lowest + 3}
-            f, first, second, rank = rank_queue.pop(queue, state)
+            f, first, second, rank = resolution_nodes.pop(queue, state)
             assert first == min(ahead, key=ahead.__getitem__)
             assert second == -first and (f, rank) == waiting.pop(first)
-            assert state[rank_queue.WAITING] == len(waiting)
+            assert state[resolution_nodes.WAITING] == len(waiting)
         assert most > 400

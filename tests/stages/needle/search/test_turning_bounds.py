@@ -11,7 +11,7 @@ import pytest
 from anatomy.kernels.arcs import pose_on_arc
 from stages.needle.kernels.connections import least_cosine, seen_from
 from stages.needle.kernels.goal_ball import least_length, least_length_from, workspace_length
-from stages.needle.kernels.limits import Limits
+from stages.needle.kernels.proof import Limits
 
 RADIUS_MM = 30.0
 REFERENCE = (0.0, 0.0, 1.0)

@@ -11,14 +11,16 @@ if TYPE_CHECKING:
         MAX_OFF_AXIS_MM,
         MAX_TURN_AT_TIP_RAD,
         MotionProver,
+        TipRow,
+        evenly,
         in_tip_region,
         prove_motion,
         prover_of,
+        shifted,
     )
     from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
     from stages.scope.passages import Passages, find_passages
     from stages.scope.resting import RestingShaft, RestingShape, WallContact, lumen_of
-    from stages.scope.shifting import TipRow, evenly, shifted
     from stages.scope.tip_spread import TipSpread, off_pose, spread_of_tip
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

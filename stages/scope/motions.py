@@ -18,9 +18,16 @@ from stages.scope.kernels.body import Walls
 from stages.scope.kernels.growth import Device
 from stages.scope.kernels.turning import Places
 from stages.scope.motion import ScopeMotion
-from stages.scope.motion_proof import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD, kernel_device, walls_of
+from stages.scope.motion_proof import (
+    MAX_OFF_AXIS_MM,
+    MAX_TURN_AT_TIP_RAD,
+    State,
+    kernel_device,
+    slide,
+    turn,
+    walls_of,
+)
 from stages.scope.passages import Passages, find_passages
-from stages.scope.shifting import State, slide, turn
 
 
 @frozen_record

@@ -75,7 +75,7 @@ def med_rad(
         File for all runs: .csv, or .json, which holds the arcs of the paths, too.
     """
     from lungaccess.running.benchmark import read_peer, summary_rows, write_rows
-    from lungaccess.running.benchmark.export import require_table_file
+    from lungaccess.running.benchmark.runs import require_table_file
 
     names = _planners(planners)
     device = system.load()

@@ -197,7 +197,7 @@ def score(
     out : Path
         File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
     """
-    from lungaccess.running.benchmark.export import require_table_file
+    from lungaccess.running.benchmark.runs import require_table_file
     from lungaccess.running.benchmark.synthetic.scoring import REFUSED, score_submission
     from lungaccess.running.benchmark.synthetic.sheet import write_scores
     from lungaccess.running.benchmark.synthetic.submission import read_submission

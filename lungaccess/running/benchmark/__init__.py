@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.running.benchmark.export import summary_rows, write_rows
     from lungaccess.running.benchmark.published import (
         UNC_EXEMPT_MM,
         UNC_GOAL_TOLERANCE_MM,
@@ -20,6 +19,13 @@ if TYPE_CHECKING:
         unc_needle,
         unc_obstacles,
     )
-    from lungaccess.running.benchmark.runs import BenchmarkRow, posed_by_unc, posed_in_lung, run_query
+    from lungaccess.running.benchmark.runs import (
+        BenchmarkRow,
+        posed_by_unc,
+        posed_in_lung,
+        run_query,
+        summary_rows,
+        write_rows,
+    )
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -11,7 +11,7 @@ from typing import Any
 from anatomy.base.errors import FileError
 from anatomy.base.files import atomic_write, read_json
 from anatomy.base.records import frozen_value
-from lungaccess.running.benchmark.export import decimals, require_table_file
+from lungaccess.running.benchmark.runs import decimals, require_table_file
 from lungaccess.running.benchmark.synthetic.manifest import manifest_sha256
 from lungaccess.running.benchmark.synthetic.phantoms import VERSION
 from lungaccess.running.benchmark.synthetic.scoring import (

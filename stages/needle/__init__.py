@@ -49,14 +49,8 @@ if TYPE_CHECKING:
         direct_path,
         violation,
     )
-    from stages.needle.planner_choice import (
-        NEEDLE_PLANNERS,
-        OMPL_PLANNERS,
-        OMPL_TOLERANCE_MM,
-        OUR_PLANNERS,
-        has_ompl,
-        require_planner,
-    )
+    from stages.needle.planner_choice import has_ompl, require_planner
+    from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS, OMPL_TOLERANCE_MM, OUR_PLANNERS
     from stages.needle.reach import (
         BLOCK_MM,
         DEFAULT_ARCS,

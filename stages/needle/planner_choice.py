@@ -1,20 +1,11 @@
-"""The planners of the needle by name, and whether one can be chosen here: its library is there."""
+"""Whether a planner of the needle can be chosen here: its name is known, and its library is there."""
 
 from functools import cache
 
 from anatomy.base.errors import MissingLibraryError, SettingsError
 from anatomy.base.plugins import registered
 from anatomy.base.words import did_you_mean
-
-OUR_PLANNERS = ("rrt", "ao-rrt", "optimal", "resolution", "decide")
-"""Searches of the needle stage; `stages.needle.search.planners.searches` makes them."""
-OMPL_PLANNERS = ("control.RRT", "control.EST", "control.KPIECE1")
-"""Planners of OMPL itself.  They steer by chance and look at no objective."""
-NEEDLE_PLANNERS = (*OUR_PLANNERS, *OMPL_PLANNERS)
-PLUGINS = "lungaccess.needle_planners"
-"""The group of entry points by which packages add planners, whose names are known, too."""
-OMPL_TOLERANCE_MM = 1.0
-"""Distance to the target that counts as reached by OMPL's planners alone: they hardly ever come nearer."""
+from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS, PLUGINS
 
 
 @cache

@@ -30,7 +30,7 @@ from stages.needle.ompl.planner import (
     put_numbers,
 )
 from stages.needle.path import ArcPath, Query, direct_path, violation
-from stages.needle.planner_choice import OMPL_PLANNERS
+from stages.needle.planner_names import OMPL_PLANNERS
 from stages.needle.search import planners
 from stages.needle.search.base import Search
 

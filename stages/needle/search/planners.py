@@ -6,7 +6,7 @@ from anatomy.base.plugins import registered
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.objective import SHORTEST, Objective
 from stages.needle.path import Query
-from stages.needle.planner_choice import PLUGINS
+from stages.needle.planner_names import PLUGINS
 from stages.needle.search.base import RestartingRRT, Search
 from stages.needle.search.decision import Decision
 from stages.needle.search.optimal import OptimalSearch
@@ -45,7 +45,7 @@ _OWN: dict[str, MakeSearch] = {
     "resolution": _makes(ResolutionSearch),
     "decide": _makes(Decision),
 }
-"""See docs/explanation/needle.md; `stages.needle.planner_choice` states the names for a quick start."""
+"""See docs/explanation/needle.md; `stages.needle.planner_names` states the names for a quick start."""
 
 
 def searches() -> dict[str, MakeSearch]:

@@ -13,6 +13,18 @@ print(la.check(plan, lung).accepted)
 ```
 """
 
-from anatomy.base.facade import lazy_exports
+import importlib.util
+import os.path
+
+for _name in ("anatomy", "stages"):
+    _found = importlib.util.find_spec(_name)
+    _place = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
+    if _found is None or not os.path.realpath(_found.origin or "").startswith(os.path.join(_place, _name)):
+        raise ImportError(
+            f"The package {_name} of lungaccess is hidden by {_found and (_found.origin or _found.name)}, which "
+            f"Python finds before {os.path.join(_place, _name)}. Rename that file or folder, or run from another"
+        )
+
+from anatomy.base.facade import lazy_exports  # noqa: E402 -- it is known now whose package that is
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

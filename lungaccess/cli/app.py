@@ -1,7 +1,7 @@
 """The command line: plans, what is known about them, and each stage alone.
 
 Exit codes: 0, a plan was found and the independent check accepts it; 1, there is no plan or the check
-refuses it; 2, the input is bad.
+refuses it; 2, the input is bad; 70, the program crashed, which is no answer.
 """
 
 import contextlib
@@ -136,7 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The words after the name of the program; those of this process if None.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    terminal.accept_every_character()
+    terminal.prepare_surroundings()
     try:
         with warnings.catch_warnings(), _termination_as_interruption():
             warnings.showwarning = _show_damage(warnings.showwarning)
@@ -145,6 +145,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         terminal.give_up_output()
         return ExitCode.PIPE_CLOSED
+    except OSError as error:
+        terminal.give_up_output()
+        return _explain(_unusable(error), as_json=False)
     return code
 
 
@@ -200,9 +203,22 @@ def _answer(words: list[str]) -> int:
     except ImportError as error:
         # Compiled libraries turn an interruption of their loading into this.
         if not isinstance(error.__cause__, KeyboardInterrupt):
-            raise
+            return _crashed(error, words, as_json)
         return _interrupted()
+    except Exception as error:  # noqa: BLE001 -- whatever it is, it is no answer
+        return _crashed(error, words, as_json)
     return int(code or ExitCode.OK)
+
+
+def _crashed(error: Exception, words: list[str], as_json: bool) -> ExitCode:
+    """Write a report of an error of the program itself, and say where it is."""
+    from lungaccess.cli.crash import write_report
+
+    crash = write_report(error, words, _version())
+    terminal.show_error(crash, title="crash")
+    if as_json:
+        terminal.show_json({"error": crash.to_mapping()})
+    return ExitCode.CRASHED
 
 
 def _interrupted() -> ExitCode:

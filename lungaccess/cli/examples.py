@@ -63,7 +63,9 @@ EXAMPLES = MappingProxyType(
 """A command line for each command."""
 
 EXAMPLE_OF_ALL = f"Example: {EXAMPLES['demo']}"
-EXIT_CODES = "Exit codes: 0 done, any plan made is accepted by the check; 1 the answer is no; 2 bad input."
+EXIT_CODES = (
+    "Exit codes: 0 done, any plan made is accepted by the check; 1 the answer is no; 2 bad input; 70 a crash."
+)
 
 START_PAGE = """\
 lungaccess plans the access to a lung nodule: bronchoscope, concentric tubes, steerable needle.

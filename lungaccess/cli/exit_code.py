@@ -14,6 +14,8 @@ class ExitCode(IntEnum):
     """Of a question: no.  There is no plan, the check refuses it, or not all of what was asked was done."""
     BAD_INPUT = 2
     """The input is bad, and the error says how."""
+    CRASHED = 70
+    """The program itself is at fault: the number is EX_SOFTWARE of sysexits, and no answer to any question."""
     INTERRUPTED = 130
     """The user pressed Ctrl-C, for which shells state the same number, or SIGTERM ended the command."""
     PIPE_CLOSED = 141

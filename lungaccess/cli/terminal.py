@@ -70,8 +70,21 @@ def _plain(error: UnicodeError) -> tuple[str | bytes, int]:
 codecs.register_error("lungaccess-plain", _plain)
 
 
-def accept_every_character() -> None:
-    """Let standard output and error write what their encoding lacks in other words."""
+def prepare_surroundings() -> None:
+    """Let closed streams lead nowhere, and others write what their encoding lacks in other words.
+
+    A file that is opened next would else get the number of a closed stream, and what others print.  Pictures
+    are files, so that the user's choice of windows for matplotlib concerns none, and may stop its import.
+    """
+    os.environ.pop("MPLBACKEND", None)
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdin = sys.stdin or open(os.devnull, encoding="utf-8")  # noqa: SIM115 -- stays open
+    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         # Such as code page 1252 of Windows, which files get when output is redirected.
         if isinstance(stream, io.TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
@@ -185,14 +198,14 @@ def show_wide(tables: Iterable[Table]) -> None:
         console.print()
 
 
-def show_error(error: LungaccessError) -> None:
+def show_error(error: LungaccessError, title: str = "bad input") -> None:
     """Print what was found, what was expected and what to do, in a short panel on standard error."""
     parts = [(error.found.rstrip(".") + ".", "")]
     if error.expected:
         parts += [("\nexpected", "dim"), (f"  {error.expected}", "")]
     if error.remedy:
         parts += [("\nremedy", "dim"), (f"    {error.remedy}", "")]
-    error_console.print(Panel(styled(*parts), title="bad input", title_align="left", border_style="red"))
+    error_console.print(Panel(styled(*parts), title=title, title_align="left", border_style="red"))
 
 
 def show_no_plan(failure: NoPlan) -> None:

@@ -47,6 +47,7 @@ def on_rim(phase: float, *, exhaling: bool = False, radius: float = 1.0) -> tupl
     return radius * math.sin(angle), radius * math.cos(angle)
 
 
+@style.plain_look
 def window_png(window: BreathingWindow, path: str | os.PathLike[str]) -> Path:
     """Draw the window of a plan on the clock of a breath, with what ends it.
 

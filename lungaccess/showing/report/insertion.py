@@ -73,6 +73,7 @@ def draw_paths(axes: Any, lung: Lung, found: InsertionStudy) -> None:
     axes.legend(fontsize=8, loc="lower left", frameon=False)
 
 
+@style.plain_look
 def insertions_png(found: InsertionStudy, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw the true paths of all needles, and how many of them end how near to the target.
 
@@ -102,6 +103,7 @@ def insertions_png(found: InsertionStudy, lung: Lung, path: str | os.PathLike[st
     return style.save_png(figure, path)
 
 
+@style.plain_look
 def insertion_webp(
     found: InsertionStudy, lung: Lung, path: str | os.PathLike[str], *, frames: int = FRAMES
 ) -> Path:

@@ -31,6 +31,7 @@ SLAB_MM = 6.0
 """Half the thickness of the slab through the middle of each lung whose places are drawn."""
 
 
+@style.plain_look
 def motion_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw where places of the masks move from end-exhale to end-inhale, in their true length.
 

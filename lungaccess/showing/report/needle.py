@@ -31,6 +31,7 @@ STEP_MM = 0.25
 BLOCKED = "#D62728"
 
 
+@style.plain_look
 def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) -> Path:
     """Draw a needle planned alone and write the picture to `path`.
 

@@ -32,6 +32,7 @@ BLOCKED_AT = "#D32F2F"
 """Colour of the cross where a path is blocked first."""
 
 
+@style.plain_look
 def no_plan_png(explanation: Explanation, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw the starts of the needle from the front and the feet, and a cut along the nearest miss.
 

@@ -31,6 +31,7 @@ NAMED = 3
 """Places that are numbered and named in the legend."""
 
 
+@style.plain_look
 def open_places_png(
     lung: Lung,
     proof: UnreachableProof,

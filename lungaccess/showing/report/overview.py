@@ -35,6 +35,7 @@ EXIT_IN, NEEDLE_IN = (0.3, 0.75, 4.3, 4.3), (4.8, 0.75, 4.3, 4.3)
 CLEARANCE_IN, TEXT_IN = (9.75, 0.95, 4.75, 4.05), (14.85, 0.5, 2.95, 10.4)
 
 
+@style.plain_look
 def overview_png(
     plan: Plan, lung: Lung, path: str | os.PathLike[str], appraisal: Appraisal | None = None
 ) -> Path:

@@ -42,6 +42,7 @@ COLOURS: dict[str, str] = {
 }
 
 
+@style.plain_look
 def reach_png(reach: ReachMap, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw a reachability map in three planes and write the picture to `path`.
 

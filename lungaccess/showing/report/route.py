@@ -31,6 +31,7 @@ AROUND_MM = 6.0
 """Border around the route in a picture."""
 
 
+@style.plain_look
 def route_png(name: str, centreline: Centreline, route: Route, path: str | os.PathLike[str]) -> Path:
     """Draw a route in its tubes, the tentative curve beside it, and both along their length.
 

@@ -14,6 +14,7 @@ from anatomy.base.records import frozen_value
 from lungaccess.showing.report import drawing, style
 
 
+@style.plain_look
 def cost_over_time_png(
     history: Sequence[CostPoint], path: str | os.PathLike[str], objective: str = "cost"
 ) -> Path:

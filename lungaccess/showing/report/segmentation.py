@@ -24,6 +24,7 @@ PLANES = (("sagittal", 0, (1, 2)), ("coronal", 1, (0, 2)), ("axial", 2, (0, 1)))
 """Name, normal, and the axes across and up, as LPS axes."""
 
 
+@style.plain_look
 def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[str]) -> Path:
     """Draw the masks over the CT as it was measured: five sagittal, coronal and axial slices.
 

@@ -26,6 +26,7 @@ PANELS_IN = ((0.5, 0.9, 6.9, 5.8), (7.9, 0.9, 6.6, 5.8))
 PASS_COLOURS = {1: style.TUBE, 2: style.SCOPE}
 
 
+@style.plain_look
 def tour_png(answer: TourAnswer, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw the shortest tour of a patient from the front and from the left.
 

@@ -30,6 +30,7 @@ BAR_IN = (16.2, 0.8, 0.16, 4.9)
 """Left, bottom, width and height of panels and colour bar."""
 
 
+@style.plain_look
 def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw the airway tree of a patient over the airway mask, from three sides.
 
@@ -93,6 +94,7 @@ ARROW_MM = 25.0
 """Length of the arrow at a start: long enough to show its direction in a whole organ."""
 
 
+@style.plain_look
 def organ_png(organ: Organ, path: str | os.PathLike[str]) -> Path:
     """Draw an organ seen through from three sides; an arrow is a start, a ring a target.
 

@@ -37,6 +37,7 @@ STABILITY = "Stability: stable while the determinant stays above 0"
 SPACING_MM = 0.2
 
 
+@style.plain_look
 def tubes_png(
     equilibrium: Equilibrium,
     path: str | os.PathLike[str],

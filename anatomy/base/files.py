@@ -1,5 +1,6 @@
 """Hashes of inputs, and writing that leaves either the old file or the whole new one."""
 
+import codecs
 import errno
 import hashlib
 import json
@@ -50,14 +51,31 @@ def require_file(path: str | Path) -> Path:
 
 
 def read_text(path: str | Path) -> str:
-    """Read a UTF-8 text file, or raise `FileError`."""
+    """Read a text file as any editor saves it: UTF-8, or UTF-16 with its mark, with any ends of lines.
+
+    Raises
+    ------
+    FileError
+        If it is none, or cannot be read.
+    """
     path = require_file(path)
     with reading(path):
-        return path.read_text(encoding="utf-8")
+        content = path.read_bytes()
+    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise FileError(
+            f"{path} is no text in {encoding.removesuffix('-sig').upper()}: byte {error.start} is "
+            f"0x{content[error.start]:02x}",
+            expected="UTF-8 text, or UTF-16 with a byte-order mark",
+            remedy="Save the file as UTF-8 in its editor, or copy it again if it is damaged",
+        ) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_toml(
-    path: str | Path, *, remedy: str, expected: str = "UTF-8 text in TOML syntax"
+    path: str | Path, *, remedy: str, expected: str = "text in TOML syntax"
 ) -> dict[str, Any]:
     """Read a TOML file; `expected` and `remedy` are for the message.
 
@@ -66,14 +84,11 @@ def read_toml(
     SettingsError
         If it is not TOML.
     FileError
-        If it cannot be read.
+        If it cannot be read, or is no text.
     """
-    path = require_file(path)
+    content = read_text(path)
     try:
-        with path.open("rb") as stream:
-            return tomllib.load(stream)
-    except OSError as error:
-        raise unreadable(path, error) from error
+        return tomllib.loads(content)
     except DAMAGE as error:
         raise SettingsError(
             f"{path} is not valid TOML ({reason(error)})", expected=expected, remedy=remedy

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ from anatomy.base.files import reading, reason
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
-from anatomy.io.image_header import image_shape, named_grid
+from anatomy.io.image_header import image_shape, named_grid, require_directions, require_lengths
 
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset
@@ -23,10 +24,15 @@ if TYPE_CHECKING:
 _SPACING_TOLERANCE_MM = 0.05
 _TILT_TOLERANCE_MM = 0.1
 _MISSING_FACTOR = 1.5
+_HOUNSFIELD_TYPES = ("HU", "US", "", None)
+"""The standard has HU where a CT states none; US, unspecified, is what many scanners write for HU."""
 _GREY_KEYS = ("SamplesPerPixel", "PhotometricInterpretation")
 _UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept", *_GREY_KEYS)
 _NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEYS)
-_SERIES_KEYS = ("SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames")
+_SERIES_KEYS = ("RescaleType", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames")
+
+MOST_NAMED = 5
+"""Damaged files that a message names: the others lie beside them."""
 
 
 @frozen_value
@@ -53,7 +59,7 @@ def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
     FileError
         If there is no folder, or no DICOM image in it.
     """
-    by_uid = _headers_by_series(Path(folder))
+    by_uid, _ = _headers_by_series(Path(folder))
     with _reading(folder):
         return tuple(_info(uid, files) for uid, files in sorted(by_uid.items()))
 
@@ -75,19 +81,21 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
     Raises
     ------
     FileError
-        If the choice of series is open, slices are missing, doubled or unevenly spaced, or the
+        If the choice of series is open, slices are missing, damaged, empty, doubled or unevenly spaced, or the
         files do not state Hounsfield units.
     FrameError
         If the gantry was tilted, so that the voxels do not form a rectangular grid.
     """
-    by_uid = _headers_by_series(Path(folder))
-    headers = by_uid[_choose(by_uid, series_uid, folder)]
-    where = f"Series {headers[0][1].SeriesInstanceUID} of {folder}"
+    by_uid, others = _headers_by_series(Path(folder))
+    uid = _choose(by_uid, series_uid, folder)
+    headers = by_uid[uid]
+    where = f"Series {uid} of {folder}"
+    _require_no_dead_slices(headers, {path: of for path, of in others.items() if of in ("", uid)}, where)
     with _reading(where):
         _require_uniform([header for _, header in headers], where)
         _require_grey_values(headers[0][1], where)
         paths, grid = _geometry(headers, where)
-        return Volume(grid=grid, array=_pixels(paths, grid))
+        return Volume(grid=grid, array=_pixels(paths, grid, float(headers[0][1].RescaleIntercept)))
 
 
 @contextmanager
@@ -102,7 +110,13 @@ def _reading(what: str | Path) -> Iterator[None]:
             raise ValueError(reason(error)) from error
 
 
-def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]]:
+def _headers_by_series(
+    folder: Path,
+) -> tuple[dict[str, list[tuple[Path, FileDataset]]], dict[Path, str]]:
+    """Return the images of a folder by series, and the series of its other files, empty where none is stated.
+
+    Hidden files are left out: they are notes of systems, whatever their names end in.
+    """
     import pydicom
     from pydicom.errors import InvalidDicomError
 
@@ -113,22 +127,47 @@ def _headers_by_series(folder: Path) -> dict[str, list[tuple[Path, FileDataset]]
             remedy="Check the name; the CT may also be one file (.nii.gz, .nrrd, .mha)",
         )
     by_uid: dict[str, list[tuple[Path, FileDataset]]] = {}
+    others: dict[Path, str] = {}
     tags: list[Any] = [*_SERIES_KEYS, *_NEEDED_KEYS]
-    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR"):
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR" and p.name[0] != "."):
         with _reading(path):
             try:
                 header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
-            except InvalidDicomError:
+            except (InvalidDicomError, EOFError):
+                others[path] = ""
                 continue
-            if "SeriesInstanceUID" in header and "Rows" in header:
-                by_uid.setdefault(str(header.SeriesInstanceUID), []).append((path, header))
+            uid = str(header.get("SeriesInstanceUID") or "")
+            if uid and "Rows" in header:
+                by_uid.setdefault(uid, []).append((path, header))
+            else:
+                others[path] = uid
     if not by_uid:
         raise FileError(
             f"{folder} holds no DICOM images",
             expected="a folder of DICOM files",
             remedy="Name the folder that holds the slices themselves, or a file (.nii.gz, .nrrd, .mha)",
         )
-    return by_uid
+    return by_uid, others
+
+
+def _require_no_dead_slices(headers: Sequence[tuple[Path, Any]], others: Mapping[Path, str], where: str) -> None:
+    """Refuse a series beside which files lie that state its UID, or are named like its own, and are no slices."""
+    alike = {_likeness(path) for path, _ in headers}
+    dead = [path for path, uid in others.items() if uid or _likeness(path) in alike]
+    if dead:
+        named = ", ".join(f"{path.name} ({path.stat().st_size} bytes)" for path in dead[:MOST_NAMED])
+        raise FileError(
+            f"{where} has {len(dead)} damaged files beside its {len(headers)} slices: {named}"
+            + (" and others" if len(dead) > MOST_NAMED else ""),
+            expected="files that are named like slices to begin as DICOM and to hold an image",
+            remedy="Copy the series again; move away what does not belong to it",
+        )
+
+
+def _likeness(path: Path) -> tuple[Path, str]:
+    """Return what slices of one export have in common: folder, and ending, or name without its numbers."""
+    ending = path.suffix.lower()
+    return path.parent, ending if re.search("[a-z]", ending) else re.sub(r"[\d.]+", "", path.name.lower())
 
 
 def _info(uid: str, files: Sequence[tuple[Path, FileDataset]]) -> SeriesInfo:
@@ -200,10 +239,11 @@ def _require_grey_values(first: FileDataset, where: str) -> None:
         (samples, shown_as) != (1, "MONOCHROME2")
         or slope == 0
         or not np.isfinite([slope, float(first.RescaleIntercept)]).all()
+        or first.get("RescaleType", "HU") not in _HOUNSFIELD_TYPES
     ):
         raise FileError(
-            f"{where} has {samples} samples a pixel, shown as {shown_as}, RescaleSlope {slope:g} "
-            f"and RescaleIntercept {first.RescaleIntercept}",
+            f"{where} has {samples} samples a pixel, shown as {shown_as}, RescaleSlope {slope:g}, "
+            f"RescaleIntercept {first.RescaleIntercept} and RescaleType {first.get('RescaleType', 'HU')}",
             expected="one MONOCHROME2 sample a pixel, which slope and intercept turn into Hounsfield units",
             remedy="Export the CT series again, not a picture of it",
         )
@@ -220,13 +260,14 @@ def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[
             remedy="Choose one axial series, without scout images",
         )
     along_i, along_j = orientation[0, :3], orientation[0, 3:]
+    require_directions(np.stack([along_i, along_j], axis=1), "ImageOrientationPatient", Path(where))
     normal = np.cross(along_i, along_j)
     positions = np.array([h.ImagePositionPatient for _, h in headers], dtype=np.float64)
     order = np.argsort(positions @ normal, kind="stable")
     positions = positions[order]
-    spacing_k_mm = _slice_spacing(positions @ normal, where)
+    spacing_k_mm = _slice_spacing(positions @ normal, [headers[n][0].name for n in order], where)
     _require_no_tilt(positions, normal, where)
-    spacing_j_mm, spacing_i_mm = (float(s) for s in first.PixelSpacing)
+    spacing_j_mm, spacing_i_mm = require_lengths(first.PixelSpacing, "PixelSpacing", Path(where)).tolist()
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([along_i * spacing_i_mm, along_j * spacing_j_mm, normal * spacing_k_mm], axis=1)
     matrix[:3, 3] = positions[0]
@@ -235,7 +276,7 @@ def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[
     return [headers[n][0] for n in order], named_grid(shape, matrix, Path(where))
 
 
-def _slice_spacing(heights_mm: Float, where: str) -> float:
+def _slice_spacing(heights_mm: Float, names: Sequence[str], where: str) -> float:
     """Return the distance of neighbouring slices; the sorted heights must be evenly spaced."""
     if len(heights_mm) < 2:
         raise FileError(
@@ -245,11 +286,12 @@ def _slice_spacing(heights_mm: Float, where: str) -> float:
         )
     gaps = np.diff(heights_mm)
     spacing_mm = float(np.median(gaps))
-    if gaps.min() < _SPACING_TOLERANCE_MM:
+    if not gaps.min() >= _SPACING_TOLERANCE_MM:
+        at = int(gaps.argmin())
         raise FileError(
-            f"{where} has two slices at the height {heights_mm[int(gaps.argmin())]:.2f} mm",
+            f"{where} has two slices at the height {heights_mm[at]:.2f} mm: {names[at]} and {names[at + 1]}",
             expected="one slice at each position",
-            remedy="Keep one acquisition (phase, time or reconstruction) a series",
+            remedy="Keep one acquisition (phase, time or reconstruction) a series, and one copy of each file",
         )
     if gaps.max() > _MISSING_FACTOR * spacing_mm:
         at = int(gaps.argmax())
@@ -280,7 +322,7 @@ def _require_no_tilt(positions: Float, normal: Float, where: str) -> None:
         )
 
 
-def _pixels(paths: Sequence[Path], grid: Grid) -> Any:
+def _pixels(paths: Sequence[Path], grid: Grid, intercept: float) -> Any:
     """Read the slices in order; the reader applies slope and intercept of each file."""
     import SimpleITK
 
@@ -290,6 +332,12 @@ def _pixels(paths: Sequence[Path], grid: Grid) -> Any:
             plane = SimpleITK.GetArrayViewFromImage(image := SimpleITK.ReadImage(str(path)))
         if values is None:
             values = np.zeros(grid.shape, dtype=plane.dtype, order="F")
+        if (plane == intercept).all():
+            raise FileError(
+                f"{path} holds nothing but zeros as its pixels",
+                expected="slices of a CT, which are nowhere all alike",
+                remedy="Copy the series again; where it was made with empty slices at its ends, remove them",
+            )
         values[:, :, k] = plane.reshape(plane.shape[-2:]).T
         del plane, image
     return values

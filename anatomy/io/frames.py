@@ -56,14 +56,14 @@ def _point_error(text: str, problem: str) -> FrameError:
     )
 
 
-def read_pose(path: str | Path, frame: Frame) -> Float:
+def read_pose(path: str | Path, frame: Frame | None) -> Float:
     """Read a 4x4 pose whose +z column is the direction of insertion.
 
     Parameters
     ----------
     path : path of a text file of 16 numbers
     frame : "ras" or "lps"
-        The frame of the numbers, because the file cannot state it.
+        The frame of the numbers, because the file cannot state it; None is refused.
 
     Returns
     -------
@@ -74,9 +74,15 @@ def read_pose(path: str | Path, frame: Frame) -> Float:
     FileError
         If the file does not hold 4x4 finite numbers.
     FrameError
-        If the matrix is not a right-handed rigid pose.
+        If the frame is not stated, or the matrix is not a right-handed rigid pose.
     """
     matrix = _numbers(path)
+    if frame is None:
+        raise FrameError(
+            f"{path} does not state the frame of its numbers, and --frame is not given",
+            expected="--frame ras or --frame lps",
+            remedy="3D Slicer shows and saves RAS coordinates, DICOM and ITK use LPS",
+        )
     if matrix.shape != (4, 4):
         raise FileError(
             f"{path} holds an array of shape {matrix.shape}",

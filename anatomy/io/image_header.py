@@ -1,6 +1,6 @@
 """What the header of an image file says, whatever its format, and whether the file can hold it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,8 @@ MOST_HEADER_BYTES = 1 << 22
 """Longest header: those of real images, with segment names and label tables, have some ten thousand bytes."""
 MOST_COORDINATE_MM = 1e5
 """Farthest place of a voxel from the origin: no scanner or tracker has a frame of 100 m."""
+DIRECTION_TOLERANCE = 1e-2
+"""A direction may be so much longer or shorter than 1: some programs write three digits."""
 
 ONE_NUMBER = (
     "one image of three dimensions with one number a voxel",
@@ -130,6 +132,62 @@ def not_begun(path: Path, format_name: str, expected: str) -> FileError:
         expected=expected,
         remedy="Copy or export the file again",
     )
+
+
+def require_lengths(values: Sequence[float], name: str, path: Path) -> Float:
+    """Return the distances of voxels, or of vectors' ends, that a header states, as `(n,)` float64.
+
+    Raises
+    ------
+    FrameError
+        If one is not positive: programs differ in what they then read.
+    """
+    stated = np.array(values, dtype=np.float64)
+    if not (stated > 0.0).all():
+        raise FrameError(
+            f"{path} states the {name} {' '.join(f'{value:g}' for value in stated)}",
+            expected="positive distances, as the standard of the format asks for",
+            remedy="Export the image again, or correct the header: turned axes belong into its directions",
+        )
+    return stated
+
+
+def require_directions(vectors: Float, name: str, path: Path) -> None:
+    """Raise FrameError unless vectors, the columns of `(3, n)`, that are directions alone have the length 1."""
+    lengths = np.linalg.norm(vectors, axis=0)
+    if not (np.abs(lengths - 1.0) <= DIRECTION_TOLERANCE).all():
+        raise FrameError(
+            f"{path} states a {name} whose vectors are {' '.join(f'{length:g}' for length in lengths)} long",
+            expected="directions of length 1",
+            remedy="Export the image again; the distance of voxels belongs into a field of its own",
+        )
+
+
+def require_plain_fields(fields: Mapping[str, str], plain: Mapping[str, tuple[str, ...]], path: Path) -> None:
+    """Raise FileError if a header states another value of a field than those that are read as they stand.
+
+    `plain` holds the values of each field in lower case; a field may be missing.
+    """
+    odd = {key: fields[key] for key in plain if key in fields and fields[key].lower() not in plain[key]}
+    if odd:
+        raise FileError(
+            f"{path} says {', '.join(f'{key} = {value[:40]}' for key, value in odd.items())}",
+            expected="; ".join(f"{key} = {' or '.join(plain[key])}" for key in odd),
+            remedy="Save the image again, as 3D Slicer or ITK do, in millimetres",
+        )
+
+
+def fields_once(pairs: Iterable[tuple[str, str]], path: Path) -> dict[str, str]:
+    """Return the fields of a header by their names; FileError if one is stated twice, with two values."""
+    fields: dict[str, str] = {}
+    for name, value in pairs:
+        if fields.setdefault(name, value) != value:
+            raise FileError(
+                f"{path} says {name} = {fields[name][:40]} and {name} = {value[:40]}",
+                expected="each field of the header once",
+                remedy="Remove the wrong one of the two lines, or export the image again",
+            )
+    return fields
 
 
 def named_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> Grid:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from anatomy.base.files import DAMAGE, require_file, sha256
+from anatomy.base.errors import FileError
+from anatomy.base.files import DAMAGE, read_text, require_file, sha256
 from anatomy.io.images import image_suffix
 from anatomy.io.own_masks import DESCRIPTION
 
@@ -74,8 +75,8 @@ def _detached_data(image: Path) -> set[Path]:
 def _files_named_in(description: Path) -> set[Path]:
     """Return the files that strings of a description name, itself being judged elsewhere."""
     try:
-        values = tomllib.loads(description.read_text(encoding="utf-8"))
-    except DAMAGE:
+        values = tomllib.loads(read_text(description))
+    except (FileError, *DAMAGE):
         return set()
     return {file for text in _strings(values) for file in _files_meant(description.parent, text)}
 

@@ -18,8 +18,11 @@ _DTYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",
     "MET_UINT": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
 }  # fmt: skip
-_PLAIN = {"BinaryData": "true", "HeaderSize": "0"}
-"""Fields that may be missing, and the only value that is read."""
+_PLAIN = {
+    "BinaryData": ("true",), "HeaderSize": ("0",), "DistanceUnits": ("mm", "?"),
+    "ElementToIntensityFunctionSlope": ("1", "1.0"), "ElementToIntensityFunctionOffset": ("0", "0.0"),
+}  # fmt: skip
+"""Fields that may be missing, and the only values that are read."""
 
 
 def open_metaimage(path: Path, components: int = 1) -> tuple[image_header.ImageHeader, Iterator[bytes]]:
@@ -62,14 +65,14 @@ def _text(path: Path) -> tuple[dict[str, str], int]:
     end = re.search(rb"^ElementDataFile *= *([^\r\n]*?) *(\r?\n|\Z)", start, re.MULTILINE)
     if end is None:
         raise image_header.not_begun(path, "MetaImage", "a .mha or .mhd file")
-    pairs = [
-        line.partition("=") for line in start[: end.end()].decode("utf-8", errors="replace").splitlines()
-    ]
-    return {key.strip(): value.strip() for key, _, value in pairs}, end.end()
+    lines = start[: end.end()].decode("utf-8-sig", errors="replace").splitlines()
+    pairs = (line.partition("=") for line in lines if line.strip())
+    return image_header.fields_once(((key.strip(), value.strip()) for key, _, value in pairs), path), end.end()
 
 
 def _require_plain(fields: Mapping[str, str], path: Path) -> None:
-    odd = {key: fields[key] for key, only in _PLAIN.items() if fields.get(key, only).lower() != only}
+    image_header.require_plain_fields(fields, _PLAIN, path)
+    odd = {}
     if fields.get("NDims") != "3":
         odd["NDims"] = fields.get("NDims", "missing")
     if fields.get("ElementType") not in _DTYPES:
@@ -124,6 +127,8 @@ def _lps_from_ijk(fields: Mapping[str, str], path: Path) -> Float:
 
     matrix = np.eye(4)
     directions = numbers(("TransformMatrix", "Rotation", "Orientation"), 9, "1 0 0 0 1 0 0 0 1").reshape(3, 3)
-    matrix[:3, :3] = directions.T * numbers(("ElementSpacing", "ElementSize"), 3, "")
+    image_header.require_directions(directions.T, "TransformMatrix", path)
+    spacing = numbers(("ElementSpacing", "ElementSize"), 3, "").tolist()
+    matrix[:3, :3] = directions.T * image_header.require_lengths(spacing, "ElementSpacing", path)
     matrix[:3, 3] = numbers(("Offset", "Position", "Origin"), 3, "0 0 0")
     return matrix

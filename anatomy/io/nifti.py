@@ -24,14 +24,17 @@ from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
 _VERSION_1: dict[str, tuple[int, str]] = {
     "dim": (40, "8h"), "datatype": (70, "2h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),
     "slope": (112, "2f"), "units": (123, "B"), "codes": (252, "2h"), "quatern": (256, "6f"),
-    "srow": (280, "12f"), "intent": (68, "h"), "intent_name": (328, "16s"),
+    "srow": (280, "12f"), "intent": (68, "h"), "intent_name": (328, "16s"), "magic": (344, "4s"),
 }  # fmt: skip
 _VERSION_2: dict[str, tuple[int, str]] = {
     "dim": (16, "8q"), "datatype": (12, "2h"), "pixdim": (104, "8d"), "vox_offset": (168, "q"),
     "slope": (176, "2d"), "units": (500, "i"), "codes": (344, "2i"), "quatern": (352, "6d"),
-    "srow": (400, "12d"), "intent": (504, "i"), "intent_name": (508, "16s"),
+    "srow": (400, "12d"), "intent": (504, "i"), "intent_name": (508, "16s"), "magic": (4, "4s"),
 }  # fmt: skip
 _LAYOUTS = {348: _VERSION_1, 540: _VERSION_2}
+_MAGIC = {348: b"n+1\0", 540: b"n+2\0"}
+_XFORM_CODES = range(6)
+"""The standard knows these kinds of places: unknown, scanner, aligned, Talairach, MNI, another template."""
 _DTYPES = {
     2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8",
 }  # fmt: skip
@@ -182,7 +185,8 @@ def _fields(start: bytes, path: Path) -> dict[str, tuple[Any, ...]]:
             fields = {
                 name: struct.unpack_from(order + code, start, at) for name, (at, code) in layout.items()
             }
-            return fields | {"order": (order,), "size": (size,)}
+            if fields["magic"][0] == _MAGIC[size]:
+                return fields | {"order": (order,), "size": (size,)}
     raise image_header.not_begun(path, "NIfTI", "a single-file NIfTI image (.nii or .nii.gz)")
 
 
@@ -190,17 +194,23 @@ def _lps_from_ijk(
     fields: dict[str, tuple[Any, ...]], path: Path, shape: tuple[int, int, int], frame: Frame | None
 ) -> Float:
     """Choose the stored transform: sform before qform, as image libraries do."""
-    scale = np.diag([_MM_PER_UNIT.get(fields["units"][0] & 7, 1.0)] * 3 + [1.0])
-    qform_code, sform_code = fields["codes"]
+    unit, (qform_code, sform_code) = fields["units"][0] & 7, fields["codes"]
+    if unit not in _MM_PER_UNIT or qform_code not in _XFORM_CODES or sform_code not in _XFORM_CODES:
+        raise FrameError(
+            f"{path} states the unit {unit} and the codes {qform_code} of qform and {sform_code} of sform",
+            expected=f"a unit of {sorted(_MM_PER_UNIT)} and codes from 0 to {_XFORM_CODES[-1]}",
+            remedy="Export the file again",
+        )
+    scale = np.diag([_MM_PER_UNIT[unit]] * 3 + [1.0])
     if sform_code > 0:
         rows = np.array(fields["srow"], dtype=np.float64).reshape(3, 4)
         ras = np.vstack([rows, [0, 0, 0, 1]])
         if qform_code > 0:
-            _require_agreement(ras, _qform(fields), shape, path)
+            _require_agreement(ras, _qform(fields, path), shape, path)
     elif qform_code > 0:
-        ras = _qform(fields)
+        ras = _qform(fields, path)
     elif frame is not None:
-        return LPS_FROM[frame] @ scale @ np.diag([*np.abs(fields["pixdim"][1:4]), 1.0])
+        return LPS_FROM[frame] @ scale @ np.diag([*_pixdim(fields, path), 1.0])
     else:
         raise FrameError(
             f"{path} does not state its frame (qform and sform codes are 0)",
@@ -210,7 +220,11 @@ def _lps_from_ijk(
     return np.asarray(LPS_FROM_RAS @ scale @ ras)
 
 
-def _qform(fields: dict[str, tuple[Any, ...]]) -> Float:
+def _pixdim(fields: dict[str, tuple[Any, ...]], path: Path) -> Float:
+    return image_header.require_lengths(fields["pixdim"][1:4], "pixdim", path)
+
+
+def _qform(fields: dict[str, tuple[Any, ...]], path: Path) -> Float:
     """Build the 4x4 matrix of the quaternion form, RAS."""
     b, c, d, *offset = fields["quatern"]
     a = np.sqrt(max(0.0, 1.0 - b * b - c * c - d * d))
@@ -223,7 +237,7 @@ def _qform(fields: dict[str, tuple[Any, ...]]) -> Float:
     )
     handedness = -1.0 if fields["pixdim"][0] < 0 else 1.0
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation * np.array([1.0, 1.0, handedness]) * np.array(fields["pixdim"][1:4])
+    matrix[:3, :3] = rotation * np.array([1.0, 1.0, handedness]) * _pixdim(fields, path)
     matrix[:3, 3] = offset
     return matrix
 

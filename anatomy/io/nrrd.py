@@ -37,6 +37,14 @@ _DTYPES = {
     "uint64_t": "u8",
     "float": "f4", "double": "f8",
 }  # fmt: skip
+_MM = ("mm", "millimeter", "millimeters", "millimetre", "millimetres")
+_PLAIN = {
+    "space units": tuple(" ".join([f'"{unit}"'] * 3) for unit in _MM),
+    "units": tuple(" ".join([f'"{unit}"'] * 3) for unit in ("", *_MM)),
+    "space dimension": ("3",),
+    **dict.fromkeys(("axis mins", "axismins", "axis maxs", "axismaxs"), ("nan nan nan",)),
+}
+"""Fields that may be missing, and the values with which the others mean what is read here."""
 _NUMBER = r"\s*([-+0-9.eE]{1,40})\s*"
 _VECTOR = re.compile(rf"\({_NUMBER},{_NUMBER},{_NUMBER}\)")
 
@@ -59,6 +67,10 @@ def open_nrrd(
     fields, keys, offset = _text(path)
     dtype = _dtype(fields, path)
     sizes = tuple(int(n) for n in fields.get("sizes", "").split()[:8])
+    stated = {"dimension": (f"{len(sizes)}",)} | {
+        name: plain for name, plain in _PLAIN.items() if components == 1 or name.startswith("space")
+    }
+    image_header.require_plain_fields(fields, stated, path)
     is_first = False
     if components > 1:
         is_first = _is_first_axis(fields, sizes, path, components)
@@ -107,14 +119,15 @@ def _text(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
     end = re.search(rb"\r?\n\r?\n", start)
     if not start.startswith(b"NRRD") or end is None:
         raise image_header.not_begun(path, "NRRD", "a complete .nrrd file")
-    fields: dict[str, str] = {}
+    pairs: list[tuple[str, str]] = []
     keys: dict[str, str] = {}
     for line in start[: end.start()].decode("utf-8", errors="replace").splitlines()[1:]:
         match = re.match(r"([^#:][^:]*)(:=|: )(.*)", line)
         if match and match[2] == ":=":
             keys[match[1]] = match[3]
         elif match:
-            fields[match[1].lower()] = match[3].strip()
+            pairs.append((match[1].lower(), match[3].strip()))
+    fields = image_header.fields_once(pairs, path)
     if "data file" in fields or "datafile" in fields:
         raise FileError(
             f"{path} keeps its data in another file",
@@ -166,7 +179,9 @@ def _lps_from_ijk(fields: Mapping[str, str], path: Path, frame: Frame | None) ->
     if len(directions) == 3:
         matrix[:3, :3] = np.transpose(directions)
     elif "space directions" not in fields and len(spacings) == 3:
-        matrix[:3, :3] = np.diag([float(s) for s in spacings])
+        matrix[:3, :3] = np.diag(
+            image_header.require_lengths([float(s) for s in spacings], "spacings", path)
+        )
     else:
         raise FrameError(
             f"{path} does not state the directions of its axes",

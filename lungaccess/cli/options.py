@@ -48,6 +48,10 @@ DEFAULT_SYSTEM = "lung-default"
 DEFAULT_BUDGET_S = 10.0
 """Long enough that the best cost of most targets has settled, short enough to wait for."""
 
+FrameOfPose = Annotated[
+    Literal["ras", "lps"] | None,
+    Parameter(help="Frame of the numbers in a text file with a pose, which cannot state it: needed with one."),
+]
 PhasesText = Annotated[
     str | None,
     Parameter(

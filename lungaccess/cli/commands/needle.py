@@ -10,11 +10,11 @@ from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.base.errors import SettingsError
-from anatomy.io.frames import Frame
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import (
     BudgetOptions,
+    FrameOfPose,
     ObjectiveText,
     OurPlannerName,
     PatientFolder,
@@ -42,7 +42,7 @@ def needle(
             "starts there; or a text file with a 4x4 pose whose +z column is the direction of insertion."
         ),
     ],
-    frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
+    frame: FrameOfPose = None,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
     planner: Annotated[
@@ -155,7 +155,7 @@ def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
     return [terminal.table("needle", ("", ""), rows), arcs_table(path.arcs)]
 
 
-def _start_pose(lung: Organ, start: str, frame: Frame) -> Float:
+def _start_pose(lung: Organ, start: str, frame: FrameOfPose) -> Float:
     """Return a pose by its number among those of the patient, from a plan, or from a file of numbers."""
     from anatomy.io.frames import read_pose
     from lungaccess.plans.plan import Plan

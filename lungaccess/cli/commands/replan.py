@@ -10,12 +10,12 @@ from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.base.errors import SettingsError
-from anatomy.io.frames import Frame
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Positive, Seed
 from lungaccess.cli.options import (
     ErrorOptions,
+    FrameOfPose,
     ObjectiveText,
     PatientFolder,
     PatientOptions,
@@ -56,7 +56,7 @@ def replan(
         str | None,
         Parameter(help="Where the tip of the needle really is, with --procedure: stated as for --tube."),
     ] = None,
-    frame: Annotated[Frame, Parameter(help="Frame of the numbers in that text file.")] = "lps",
+    frame: FrameOfPose = None,
     plan: Annotated[
         Path | None,
         Parameter(help="plan.json that is carried out, with --procedure: the policy says what to do next."),
@@ -123,7 +123,7 @@ class _Followed(NamedTuple):
 
 
 def _decided(
-    patient: Path, stated: dict[str, str | None], frame: Frame, followed: _Followed, output: PatientOptions
+    patient: Path, stated: dict[str, str | None], frame: FrameOfPose, followed: _Followed, output: PatientOptions
 ) -> ExitCode:
     """Show what the policy of a procedure says about measured poses."""
     from lungaccess.planning.procedure import Measurements, Policy, ProcedureRecord
@@ -155,7 +155,7 @@ def _decided(
     return ExitCode.OK if decision.goes_on else ExitCode.NEGATIVE
 
 
-def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float, Plan | None]:
+def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[Float, Plan | None]:
     """Return the pose as measured, and the plan that it is of if it is one of a plan."""
     given = scope if tube is None else tube
     if given is None or (scope is not None and tube is not None):
@@ -167,7 +167,7 @@ def _measured(scope: str | None, tube: str | None, frame: Frame) -> tuple[Float,
     return _pose(given, "scope" if tube is None else "tubes", frame)
 
 
-def _pose(given: str, stage: str, frame: Frame) -> tuple[Float, Plan | None]:
+def _pose(given: str, stage: str, frame: FrameOfPose) -> tuple[Float, Plan | None]:
     """Return a pose as it is stated, and the plan that it is of if it is one of a plan."""
     from anatomy.io.frames import read_pose
     from anatomy.io.markups import parse_reference, read_named_pose

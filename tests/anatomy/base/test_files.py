@@ -5,7 +5,7 @@ import hashlib
 import pytest
 
 from anatomy.base.errors import FileError
-from anatomy.base.files import atomic_write, require_writable_folder, sha256
+from anatomy.base.files import atomic_write, read_json, read_toml, require_writable_folder, sha256
 
 
 def test_hash_is_of_the_bytes(tmp_path):
@@ -49,3 +49,19 @@ def test_a_folder_is_made_and_left_clean(tmp_path):
     folder = require_writable_folder(tmp_path / "a" / "b")
     assert folder.is_dir()
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-be"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_text_of_any_editor_is_read(tmp_path, encoding, end):
+    mark = "\ufeff" if encoding == "utf-16-be" else ""
+    (tmp_path / "a.toml").write_bytes((mark + end.join(["a = 'm\u00fc'", "b = 2", ""])).encode(encoding))
+    assert read_toml(tmp_path / "a.toml", remedy="") == {"a": "m\u00fc", "b": 2}
+    (tmp_path / "a.json").write_bytes((mark + end.join(['{"a":', "1}"])).encode(encoding))
+    assert read_json(tmp_path / "a.json", expected="", remedy="") == {"a": 1}
+
+
+def test_text_in_another_encoding_says_which_byte_is_none(tmp_path):
+    (tmp_path / "a.toml").write_bytes("a = 'm\u00fc'".encode("cp1252"))
+    with pytest.raises(FileError, match="byte 6 is 0xfc"):
+        read_toml(tmp_path / "a.toml", remedy="")

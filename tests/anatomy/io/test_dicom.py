@@ -139,6 +139,49 @@ def test_a_truncated_slice_is_refused(tmp_path, landmark):
         read_dicom(tmp_path)
 
 
+@pytest.mark.parametrize("damage", ["empty", "zeros", "no preamble", "cut in the header", "no pixels"])
+@pytest.mark.parametrize("ending", [".dcm", "", ".113.7"])
+def test_dead_slices_at_an_end_are_named(tmp_path, landmark, damage, ending):
+    write_series(tmp_path, landmark)
+    by_height = sorted(tmp_path.glob("*.dcm"), key=lambda p: pydicom.dcmread(p).ImagePositionPatient[2])
+    for n, path in enumerate(by_height):
+        path.rename(tmp_path / f"IM{n:04d}{ending}")
+    last = tmp_path / f"IM0007{ending}"
+    whole = last.read_bytes()
+    header = pydicom.dcmread(last)
+    header.PixelData = bytes(len(header.PixelData))
+    header.save_as(tmp_path / "black")
+    dead = {
+        "empty": b"", "zeros": bytes(len(whole)), "no preamble": whole[132:],
+        "cut in the header": whole[: whole.index(b"Lung 1.0")], "no pixels": (tmp_path / "black").read_bytes(),
+    }  # fmt: skip
+    (tmp_path / "black").unlink()
+    last.write_bytes(dead[damage])
+    with pytest.raises(FileError, match=last.name):
+        read_dicom(tmp_path)
+
+
+def test_notes_beside_a_series_are_left_alone(tmp_path, landmark, require_landmark):
+    write_series(tmp_path, landmark)
+    for name in ("notes.txt", "._1-0.dcm", "LICENSE", "DICOMDIR"):
+        (tmp_path / name).write_text("no slice")
+    require_landmark(read_dicom(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"PixelSpacing": [-1.0, -1.0]}, "PixelSpacing -1 -1"),
+        ({"ImageOrientationPatient": [2.0, 0.0, 0.0, 0.0, 1.0, 0.0]}, "2 1 long"),
+        ({"RescaleType": "OD"}, "RescaleType OD"),
+    ],
+)
+def test_numbers_beyond_the_standard_are_refused(tmp_path, landmark, change, problem):
+    write_series(tmp_path, landmark, **change)
+    with pytest.raises((FileError, FrameError), match=problem):
+        read_dicom(tmp_path)
+
+
 def test_folders_without_dicom_are_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("no image")
     with pytest.raises(FileError, match="no DICOM images"):

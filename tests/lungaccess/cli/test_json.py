@@ -170,7 +170,7 @@ def test_alternatives_and_needle_as_json(
     first = Plan.load(found[0]["plan"])
     assert found[0]["criteria"]["inverse_clearance"] == pytest.approx(first.costs["inverse_clearance"])
     np.savetxt(tmp_path / "pose.txt", first.tube.lps_from_tip)
-    start = ["--start", str(tmp_path / "pose.txt"), "--iterations", "2000"]
+    start = ["--start", str(tmp_path / "pose.txt"), "--frame", "lps", "--iterations", "2000"]
     path = answer_of(["needle", str(patient), *common, *start], capsys)["path"]
     assert path["length_mm"] == pytest.approx(sum(arc["length_mm"] for arc in path["arcs"]))
     assert path["lps_from_start"][3] == [0.0, 0.0, 0.0, 1.0]

@@ -226,6 +226,9 @@ def test_command(
     np.savetxt(start, start_beside(small_lung, 8.0))
     command = ["needle", str(folder), "--nodule", "1", "--system", "ultrathin", "--iterations", "2000"]
     command += ["--cache", str(tmp_path / "cache")]
+    assert main([*command, "--start", str(start)]) == ExitCode.BAD_INPUT
+    assert "--frame ras or --frame lps" in " ".join(capsys.readouterr().err.split())
+    command += ["--frame", "lps"]
     assert main([*command, "--start", str(start)]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "proved clear" in shown and "insert, mm" in shown

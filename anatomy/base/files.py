@@ -74,9 +74,7 @@ def read_text(path: str | Path) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_toml(
-    path: str | Path, *, remedy: str, expected: str = "text in TOML syntax"
-) -> dict[str, Any]:
+def read_toml(path: str | Path, *, remedy: str, expected: str = "text in TOML syntax") -> dict[str, Any]:
     """Read a TOML file; `expected` and `remedy` are for the message.
 
     Raises

@@ -29,7 +29,14 @@ _HOUNSFIELD_TYPES = ("HU", "US", "", None)
 _GREY_KEYS = ("SamplesPerPixel", "PhotometricInterpretation")
 _UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept", *_GREY_KEYS)
 _NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEYS)
-_SERIES_KEYS = ("RescaleType", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames")
+_SERIES_KEYS = (
+    "RescaleType",
+    "SeriesInstanceUID",
+    "SeriesNumber",
+    "SeriesDescription",
+    "Modality",
+    "NumberOfFrames",
+)
 
 MOST_NAMED = 5
 """Damaged files that a message names: the others lie beside them."""
@@ -81,8 +88,8 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
     Raises
     ------
     FileError
-        If the choice of series is open, slices are missing, damaged, empty, doubled or unevenly spaced, or the
-        files do not state Hounsfield units.
+        If the choice of series is open, slices are missing, damaged, empty, doubled or unevenly spaced, or
+        the files do not state Hounsfield units.
     FrameError
         If the gantry was tilted, so that the voxels do not form a rectangular grid.
     """
@@ -110,9 +117,7 @@ def _reading(what: str | Path) -> Iterator[None]:
             raise ValueError(reason(error)) from error
 
 
-def _headers_by_series(
-    folder: Path,
-) -> tuple[dict[str, list[tuple[Path, FileDataset]]], dict[Path, str]]:
+def _headers_by_series(folder: Path) -> tuple[dict[str, list[tuple[Path, FileDataset]]], dict[Path, str]]:
     """Return the images of a folder by series, and the series of its other files, empty where none is stated.
 
     Hidden files are left out: they are notes of systems, whatever their names end in.
@@ -129,7 +134,9 @@ def _headers_by_series(
     by_uid: dict[str, list[tuple[Path, FileDataset]]] = {}
     others: dict[Path, str] = {}
     tags: list[Any] = [*_SERIES_KEYS, *_NEEDED_KEYS]
-    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR" and p.name[0] != "."):
+    for path in sorted(
+        p for p in folder.rglob("*") if p.is_file() and p.name != "DICOMDIR" and p.name[0] != "."
+    ):
         with _reading(path):
             try:
                 header = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=tags)
@@ -150,8 +157,10 @@ def _headers_by_series(
     return by_uid, others
 
 
-def _require_no_dead_slices(headers: Sequence[tuple[Path, Any]], others: Mapping[Path, str], where: str) -> None:
-    """Refuse a series beside which files lie that state its UID, or are named like its own, and are no slices."""
+def _require_no_dead_slices(
+    headers: Sequence[tuple[Path, Any]], others: Mapping[Path, str], where: str
+) -> None:
+    """Refuse a series with files beside it that state its UID, or are named alike, but are no slices."""
     alike = {_likeness(path) for path, _ in headers}
     dead = [path for path, uid in others.items() if uid or _likeness(path) in alike]
     if dead:

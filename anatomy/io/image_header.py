@@ -153,7 +153,7 @@ def require_lengths(values: Sequence[float], name: str, path: Path) -> Float:
 
 
 def require_directions(vectors: Float, name: str, path: Path) -> None:
-    """Raise FrameError unless vectors, the columns of `(3, n)`, that are directions alone have the length 1."""
+    """Raise FrameError unless vectors that are directions, the columns of `(3, n)`, have the length 1."""
     lengths = np.linalg.norm(vectors, axis=0)
     if not (np.abs(lengths - 1.0) <= DIRECTION_TOLERANCE).all():
         raise FrameError(

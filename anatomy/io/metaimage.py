@@ -67,7 +67,9 @@ def _text(path: Path) -> tuple[dict[str, str], int]:
         raise image_header.not_begun(path, "MetaImage", "a .mha or .mhd file")
     lines = start[: end.end()].decode("utf-8-sig", errors="replace").splitlines()
     pairs = (line.partition("=") for line in lines if line.strip())
-    return image_header.fields_once(((key.strip(), value.strip()) for key, _, value in pairs), path), end.end()
+    return image_header.fields_once(
+        ((key.strip(), value.strip()) for key, _, value in pairs), path
+    ), end.end()
 
 
 def _require_plain(fields: Mapping[str, str], path: Path) -> None:

@@ -179,9 +179,7 @@ def _lps_from_ijk(fields: Mapping[str, str], path: Path, frame: Frame | None) ->
     if len(directions) == 3:
         matrix[:3, :3] = np.transpose(directions)
     elif "space directions" not in fields and len(spacings) == 3:
-        matrix[:3, :3] = np.diag(
-            image_header.require_lengths([float(s) for s in spacings], "spacings", path)
-        )
+        matrix[:3, :3] = np.diag(image_header.require_lengths([float(s) for s in spacings], "spacings", path))
     else:
         raise FrameError(
             f"{path} does not state the directions of its axes",

@@ -16,6 +16,7 @@ from anatomy.base.files import atomic_write, read_json, require_writable_folder,
 from anatomy.base.typed import Array, Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
+from anatomy.io.own_masks import DESCRIPTION
 from anatomy.io.voxels import COST_MAP_NOTE
 from anatomy.lobes import LOBES
 from anatomy.segmentation.canonical import canonical
@@ -50,18 +51,33 @@ class SegmentationFolder:
         The grid of the CT, which all images get.
     ct_digest : str
         Content of the CT.
+    inputs : sequence of path
+        Files that are read: none of them may lie where an image is written or looked for.
+    force : bool
+        Whether files of others may lie there; masks then count as corrections.
 
     Raises
     ------
     AnatomyError
         If the folder holds corrections made for another CT.
     FileError
-        If the folder cannot be written to, or its record is damaged.
+        If the folder cannot be written to, its record is damaged, or it holds inputs or files of others.
     """
 
-    def __init__(self, folder: str | Path, grid: Grid, ct_digest: str) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        grid: Grid,
+        ct_digest: str,
+        *,
+        inputs: Sequence[Path] = (),
+        force: bool = False,
+    ) -> None:
         self.path = require_writable_folder(folder)
         self.grid = grid
+        self._refuse_inputs(inputs)
+        if not force and not (self.path / STATE).is_file():
+            self._refuse_foreign()
         self._record = _read_record(self.path / STATE)
         for left in self.path.glob(f".*-*{_MADE_SUFFIX}"):  # of a run that was killed
             left.unlink(missing_ok=True)
@@ -80,6 +96,30 @@ class SegmentationFolder:
             if path.is_file():
                 return path
         return None
+
+    def _places(self) -> list[Path]:
+        """Return all files that may be written here or be corrections: they are moved, or overwritten."""
+        images = [f"{name}{suffix}" for name in IMAGES for suffix in SUFFIXES]
+        return [self.path / name for name in (*images, f"cost{_MADE_SUFFIX}", DESCRIPTION)]
+
+    def _refuse_inputs(self, inputs: Sequence[Path]) -> None:
+        stated = {os.path.realpath(path) for path in inputs}
+        if found := [path.name for path in self._places() if os.path.realpath(path) in stated]:
+            raise FileError(
+                f"{self.path} is to be written, and its {', '.join(found)} are inputs",
+                expected="inputs outside of the folder that is written, or under other names",
+                remedy="Choose another folder with --out; a mask that was corrected in this folder is found "
+                "without an option",
+            )
+
+    def _refuse_foreign(self) -> None:
+        if found := [path.name for path in self._places() if path.is_file()]:
+            raise FileError(
+                f"{self.path} holds {', '.join(found)}, but no {STATE} that says a segmentation made them",
+                expected="an empty folder, or one that was segmented into before",
+                remedy="Choose another folder with --out, or say --force: masks then count as corrections, "
+                f"and {DESCRIPTION} is kept",
+            )
 
     def _collect_corrections(self) -> None:
         """Move images that were not written here to the corrections."""

@@ -90,7 +90,7 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     SettingsError
         If a check that is accepted is none, or vessels cannot be told by the radius.
     FileError
-        If a file cannot be read or written.
+        If a file cannot be read or written, or the folder holds inputs or files of others.
     """
     tell = progress or (lambda _step: None)
     tell("checking the CT")
@@ -102,7 +102,8 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     stated = request.given.target
     target = None if stated is None else parse_point(stated)
     ct_digest = key_of("ct", voxels=digest_of(request.ct.array), grid=grid_digest(grid))
-    folder = SegmentationFolder(request.out, grid, ct_digest)
+    inputs = [Path(name) for name in (*request.given.hashes(), *request.sources)]
+    folder = SegmentationFolder(request.out, grid, ct_digest, inputs=inputs, force=request.force)
     description = Description(folder, DESCRIPTION)
     steps = Steps(request, folder, description, ct_digest, tell)
     parts = steps.run()

@@ -315,6 +315,8 @@ class SegmentationRequest:
     given : Given
     voxel_mm : float
         Axes along which the CT has larger voxels are interpolated to about this size.
+    force : bool
+        Whether the folder may hold masks and a description of others, which then count as corrections.
     """
 
     ct: Volume
@@ -328,3 +330,4 @@ class SegmentationRequest:
     seed_lps: Float | None = None
     given: Given = field(default_factory=Given)
     voxel_mm: float = VOXEL_MM
+    force: bool = False

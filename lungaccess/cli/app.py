@@ -18,7 +18,7 @@ from anatomy.base.checksums import DamagedCacheWarning
 from anatomy.base.errors import AnatomyError, FileError, LungaccessError
 from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import KernelsNotKeptWarning
-from lungaccess.cli import plan_tables, terminal
+from lungaccess.cli import plan_tables, result_folder, terminal
 from lungaccess.cli.commands.advise import advise
 from lungaccess.cli.commands.alternatives import alternatives
 from lungaccess.cli.commands.benchmark import benchmark
@@ -187,6 +187,7 @@ def _answer(words: list[str]) -> int:
     as_json = asks_json(words)
     first_compilation.command = words[0]
     try:
+        result_folder.refuse_inputs_as_outputs(words)
         code = app.meta(with_nodule_number(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:
         return _explain(usage_error(error), as_json)
@@ -205,8 +206,10 @@ def _answer(words: list[str]) -> int:
         if not isinstance(error.__cause__, KeyboardInterrupt):
             return _crashed(error, words, as_json)
         return _interrupted()
-    except Exception as error:  # noqa: BLE001 -- whatever it is, it is no answer
+    except Exception as error:
         return _crashed(error, words, as_json)
+    finally:
+        result_folder.held.close()
     return int(code or ExitCode.OK)
 
 

@@ -35,7 +35,7 @@ def write_report(error: Exception, words: Sequence[str], version: str) -> CrashE
     except OSError:
         name = f"{os.devnull}: there is no room for it"
     return CrashError(
-        f"The program crashed ({type(error).__name__}: {str(error)[:200]}), which is no answer to the command",
+        f"The program crashed ({type(error).__name__}: {str(error)[:200]}); that is no answer",
         expected="an answer, or an error that says what is wrong with the input",
         remedy=f"Send the report {name} to the developers; the command line and names of files in it may "
         "name a patient, so read it first",

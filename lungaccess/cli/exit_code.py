@@ -15,7 +15,7 @@ class ExitCode(IntEnum):
     BAD_INPUT = 2
     """The input is bad, and the error says how."""
     CRASHED = 70
-    """The program itself is at fault: the number is EX_SOFTWARE of sysexits, and no answer to any question."""
+    """The program itself is at fault, which answers no question; the number is EX_SOFTWARE of sysexits."""
     INTERRUPTED = 130
     """The user pressed Ctrl-C, for which shells state the same number, or SIGTERM ended the command."""
     PIPE_CLOSED = 141

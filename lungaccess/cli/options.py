@@ -50,7 +50,9 @@ DEFAULT_BUDGET_S = 10.0
 
 FrameOfPose = Annotated[
     Literal["ras", "lps"] | None,
-    Parameter(help="Frame of the numbers in a text file with a pose, which cannot state it: needed with one."),
+    Parameter(
+        help="Frame of the numbers in a text file with a pose, which cannot state it: needed with one."
+    ),
 ]
 PhasesText = Annotated[
     str | None,

@@ -38,6 +38,8 @@ SUMMARY_FILE = "summary.json"
 """What `--json` prints: headline, limits, costs.  The plan's own file states only the plan."""
 PICTURES = ("overview.png", "tree.png", "cost_over_time.png")
 """Pictures of a found plan, unless the user wants none."""
+RESULTS = (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *PICTURES, "no_plan.*", "plan-*.json", "report.html")
+"""All files that `plan` may write, and the page that `report` writes beside them."""
 
 
 class Display(AbstractContextManager[Any], Protocol):

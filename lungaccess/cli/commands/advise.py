@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Seed
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions, TargetOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 
 if TYPE_CHECKING:
     from lungaccess.planning.one_stage import ScopeAdvice
@@ -29,6 +29,7 @@ def advise(
         Path,
         Parameter(help="Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer."),
     ] = Path("lungaccess-advice"),
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Advise the bronchoscope: turn by turn to a lesion, or as near as it gets, and why not nearer.
@@ -40,7 +41,7 @@ def advise(
     from lungaccess.problem.system import load_system
 
     stated = target.stated()
-    require_writable_folder(out)
+    claim_folder(out, (ADVICE_FILE, CAMERA_FILE), force=force)
     device = load_system(system)
     lung = output.load(patient)
     with progress("steering the scope"):

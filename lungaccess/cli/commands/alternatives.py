@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative
@@ -21,6 +20,7 @@ from lungaccess.cli.options import (
 )
 from lungaccess.cli.plan_search import system_of
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 from lungaccess.problem.goals import SUCCESS
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ def alternatives(
     out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on, and trade_off.svg.")] = Path(
         "lungaccess-alternatives"
     ),
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show plans to one target that differ, check each, and write them.
@@ -75,7 +76,7 @@ def alternatives(
 
     stated, systems = target.stated(), system.candidates()
     asked = search.asked(systems, errors.given(), errors.given_procedure())
-    require_writable_folder(out)
+    claim_folder(out, ("plan-*.json", PICTURE), force=force)
     lung = output.load(patient)
     request = asked.request(lung, stated.resolve(lung))
     with progress("searching") as shown:

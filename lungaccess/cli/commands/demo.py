@@ -11,13 +11,13 @@ from cyclopts import Parameter
 from rich.panel import Panel
 
 from anatomy.base.errors import AnatomyError
-from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Seconds, Seed
 from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions
-from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, PlanJob, plan_and_report
+from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, RESULTS, PlanJob, plan_and_report
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -32,6 +32,7 @@ def demo(
     budget: Annotated[Seconds, Parameter(help="Planning time in seconds.")] = 3.0,
     # The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps.
     seed: Annotated[Seed, Parameter(help="Seed of the patient and of the search.")] = 1,
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it."""
@@ -39,7 +40,7 @@ def demo(
     from lungaccess.problem.target import stated_target
 
     search = SearchOptions(budget=budget, seed=seed)
-    require_writable_folder(out)
+    claim_folder(out, RESULTS, force=force)
     with progress("making a synthetic patient") as shown:
         lung = demo_lung(seed, output.cache, shown.step)
     target, systems = stated_target(None, 1), SystemOptions().candidates()

@@ -10,6 +10,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 
 
 def export(
@@ -26,6 +27,7 @@ def export(
         Path | None,
         Parameter(help="Folder for the motion in time: joint values as CSV, and messages of ROS 2 as YAML."),
     ] = None,
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Write a stored plan for 3D Slicer, for robots, or both; exit code 1 if the check refuses the plan.
@@ -46,6 +48,9 @@ def export(
     from lungaccess.showing.slicer import export_slicer
     from lungaccess.uncertainty.risk import assess
 
+    for folder in (slicer, trajectory):
+        if folder is not None:
+            claim_folder(folder, ("*",), force=force)
     stored = Plan.load(plan)
     lung = output.load(patient)
     stored.require_lung(lung)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 from rich.table import Table
 
-from anatomy.base.files import require_writable_folder
 from lungaccess.cli import anatomy_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import OutputOptions, PatientFolder, PatientOptions
+from lungaccess.cli.result_folder import Force, claim_folder
 
 if TYPE_CHECKING:
     from lungaccess.problem.system import System
@@ -27,11 +27,12 @@ def info(
             help="Folder for tree.png, a picture of the airway tree, and motion.png; for a liver organ.png."
         ),
     ] = None,
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show what was understood of a patient: volumes, airway tree, sources and warnings."""
     if out is not None:
-        require_writable_folder(out)
+        claim_folder(out, ("tree.png", "motion.png", "organ.png"), force=force)
     lung = output.load_organ(patient, thick_slices=True)
     if output.json:
         terminal.show_json(anatomy_tables.organ_record(lung))

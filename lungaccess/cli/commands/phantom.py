@@ -5,12 +5,12 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Seed
 from lungaccess.cli.options import OutputOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, require_empty_folder
 
 
 def phantom(
@@ -28,12 +28,13 @@ def phantom(
         bool,
         Parameter(negative="", help="Also motion.nrrd, how the lungs breathe; the masks show end-inhale."),
     ] = False,
+    force: Force = False,
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Write a synthetic patient: masks, CT and the truth about it; no data are needed."""
     from anatomy.phantom import make_phantom, write_phantom
 
-    require_writable_folder(out)
+    require_empty_folder(out, force=force)
     with progress("making a synthetic patient"):
         made = make_phantom(seed=seed, spacing_mm=spacing, size=size)
     with progress(f"writing {out}"):

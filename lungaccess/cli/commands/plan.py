@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 from rich.panel import Panel
 
-from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative
@@ -21,8 +20,9 @@ from lungaccess.cli.options import (
     SystemOptions,
     TargetOptions,
 )
-from lungaccess.cli.plan_search import PlanJob, plan_and_report
+from lungaccess.cli.plan_search import RESULTS, PlanJob, plan_and_report
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,7 +39,6 @@ MORE_TIME = (
     "The explanation took {:.1f} s of processor time, without compiling kernels; "
     "a longer --explain-time tries the rest."
 )
-STALE = "plan.json in this folder is from another run: it is no answer to this one"
 
 
 def plan(
@@ -68,6 +67,7 @@ def plan(
             "proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is."
         ),
     ] = None,
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
@@ -77,7 +77,7 @@ def plan(
     stated = target.stated()
     systems = system.candidates()
     asked = search.asked(systems, errors.given(), errors.given_procedure(), through.stated())
-    require_writable_folder(out)
+    claim_folder(out, RESULTS, force=force)
     lung = output.load(patient, thick_slices=thick_slices)
     job = PlanJob(asked=asked, target=stated, out=out, output=output, pictures=pictures)
     try:
@@ -119,8 +119,6 @@ def explain_and_report(
     record |= {"folder": str(job.out), "files": list(written)}
     if not job.output.json:
         terminal.say(f"Written to {job.out}: {', '.join(written)}")
-        if (job.out / "plan.json").exists():
-            terminal.say(STALE)
     return record
 
 

@@ -14,6 +14,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, Spacing
 from lungaccess.cli.options import PatientFolder, PatientOptions, PhasesText, SystemOptions, stated_phases
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -43,6 +44,7 @@ def reach(
             help="HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline."
         ),
     ] = None,
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Map what a system reaches of the lung, and write the map as volumes for 3D Slicer and as a picture.
@@ -60,7 +62,7 @@ def reach(
         raise SettingsError(
             "--search is asked for with --phases", expected="single arcs only", remedy="Leave out --search"
         )
-    folder = require_writable_folder(out)
+    folder = claim_folder(out, ("reach.json", "reach.png", "reach*.nrrd", "reach-*.png"), force=force)
     if page is not None:
         require_writable_folder(page.parent)
     lung = output.load(patient)

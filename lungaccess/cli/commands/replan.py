@@ -123,7 +123,11 @@ class _Followed(NamedTuple):
 
 
 def _decided(
-    patient: Path, stated: dict[str, str | None], frame: FrameOfPose, followed: _Followed, output: PatientOptions
+    patient: Path,
+    stated: dict[str, str | None],
+    frame: FrameOfPose,
+    followed: _Followed,
+    output: PatientOptions,
 ) -> ExitCode:
     """Show what the policy of a procedure says about measured poses."""
     from lungaccess.planning.procedure import Measurements, Policy, ProcedureRecord

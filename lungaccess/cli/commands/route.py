@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.base.files import require_writable_folder, write_json
+from anatomy.base.files import write_json
 from anatomy.io.frames import Frame, parse_point
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative, Positive, Seed
 from lungaccess.cli.options import PatientOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 
 if TYPE_CHECKING:
     from stages.scope.route import Route
@@ -56,6 +57,7 @@ def route(
     ] = None,
     pixel: Annotated[Positive | None, Parameter(help="Size of a pixel of a drawing, mm.")] = None,
     out: Annotated[Path, Parameter(help="Folder for route.json and route.png.")] = Path("lungaccess-route"),
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it."""
@@ -72,7 +74,7 @@ def route(
     for text in (goal, start or goal):
         if ":" in text:
             parse_point(text)
-    require_writable_folder(out)
+    claim_folder(out, ("route.json", "route.png"), force=force)
     with progress("route") as shown:
         shown.step("reading the tubes")
         opened = open_source(source, lumen=lumen, frame=frame, pixel_mm=pixel, cache=output.cache)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anatomy.base.errors import AnatomyError
-from anatomy.base.files import require_writable_folder, write_json
+from anatomy.base.files import write_json
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.frames import parse_point
 from anatomy.segmentation.box import VOXEL_MM
@@ -16,6 +16,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive
 from lungaccess.cli.options import OutputOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import claim_folder
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -59,6 +60,7 @@ def segment(
     totalsegmentator: Path | None = None,
     name: str = "",
     pictures: bool = True,
+    force: bool = False,
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Segment a chest CT into lungs, airway, vessels and cost map: a folder that the other commands take.
@@ -117,6 +119,8 @@ def segment(
         How reports call the patient.
     pictures : bool
         Draw the pictures of the quality report.
+    force : bool
+        Take masks and a patient.toml of others that lie in the folder for corrections, instead of refusing.
     json : bool
         Print JSON, the content of quality.json, instead of tables.
     """
@@ -131,7 +135,7 @@ def segment(
     case = ct_case(ct)
     if case is not None:
         ct, airway, lungs, name = case.ct, airway or case.airway, lungs or case.lungs, name or case.out
-    require_writable_folder(out)
+    claim_folder(out, ())
     with progress(f"reading {ct}") as shown:
         volume, sources = read_ct(ct, series)
         estimate = f"{memory_estimate_gib(volume.grid, voxel_mm):.1f} GiB"
@@ -149,6 +153,7 @@ def segment(
             accept=accept,
             seed_lps=None if seed is None else parse_point(seed),
             voxel_mm=voxel_mm,
+            force=force,
             given=Given(
                 lungs=lungs,
                 airway=airway,

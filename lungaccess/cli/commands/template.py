@@ -9,6 +9,7 @@ from cyclopts import Parameter
 from anatomy.base.files import write_text
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.result_folder import Force, require_new_file
 
 Kind = Literal["patient", "errors", "procedure", "study", "design", "tubes", "lesions", "pose", "contours"]
 FILES = {
@@ -38,6 +39,7 @@ def template(
     /,
     *,
     out: Annotated[Path | None, Parameter(help="File to write; it is printed if not given.")] = None,
+    force: Force = False,
 ) -> ExitCode:
     """Print an example of a file that a command reads, every key explained; edit it and hand it over.
 
@@ -47,6 +49,7 @@ def template(
     if out is None:
         terminal.console.file.write(text)
         return ExitCode.OK
+    require_new_file(out, force=force)
     write_text(out, text)
     terminal.say(f"Written to {out}")
     return ExitCode.OK

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from anatomy.base.files import require_writable_folder, write_json
+from anatomy.base.files import write_json
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, NotNegative, Positive
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import Force, claim_folder
 
 if TYPE_CHECKING:
     from lungaccess.planning import TourAnswer
@@ -65,6 +66,7 @@ def tour(
     speed: Annotated[Positive, Parameter(help="Speed of the scope, mm/s, for the times.")] = 10.0,
     per_lesion: Annotated[NotNegative, Parameter(help="Time that each lesion takes besides, s.")] = 300.0,
     out: Annotated[Path, Parameter(help="Folder for tour.json and tour.png.")] = Path("lungaccess-tour"),
+    force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out."""
@@ -74,7 +76,7 @@ def tour(
     from stages.scope.tour import Resistances
 
     stated = None if targets is None else read_lesions(targets)
-    require_writable_folder(out)
+    claim_folder(out, ("tour.json", "tour.png"), force=force)
     device = load_system(system)
     lung, atlas = output.load(patient), None
     lesions = lesions_of(lung) if stated is None else stated

@@ -47,7 +47,6 @@ def on_rim(phase: float, *, exhaling: bool = False, radius: float = 1.0) -> tupl
     return radius * math.sin(angle), radius * math.cos(angle)
 
 
-@style.plain_look
 def window_png(window: BreathingWindow, path: str | os.PathLike[str]) -> Path:
     """Draw the window of a plan on the clock of a breath, with what ends it.
 
@@ -56,6 +55,12 @@ def window_png(window: BreathingWindow, path: str | os.PathLike[str]) -> Path:
     FileError
         If the file cannot be written.
     """
+    from lungaccess.showing.report import style
+
+    return style.plain_look(_drawn)(window, path)
+
+
+def _drawn(window: BreathingWindow, path: str | os.PathLike[str]) -> Path:
     import textwrap
 
     from matplotlib.patches import Patch, Wedge

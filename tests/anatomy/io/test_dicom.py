@@ -151,9 +151,10 @@ def test_dead_slices_at_an_end_are_named(tmp_path, landmark, damage, ending):
     header = pydicom.dcmread(last)
     header.PixelData = bytes(len(header.PixelData))
     header.save_as(tmp_path / "black")
+    cut, black = whole[: whole.index(b"Lung 1.0")], (tmp_path / "black").read_bytes()
     dead = {
-        "empty": b"", "zeros": bytes(len(whole)), "no preamble": whole[132:],
-        "cut in the header": whole[: whole.index(b"Lung 1.0")], "no pixels": (tmp_path / "black").read_bytes(),
+        "empty": b"", "zeros": bytes(len(whole)), "no preamble": whole[132:], "cut in the header": cut,
+        "no pixels": black,
     }  # fmt: skip
     (tmp_path / "black").unlink()
     last.write_bytes(dead[damage])

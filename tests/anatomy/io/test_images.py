@@ -344,9 +344,7 @@ def test_nifti_fields_beyond_the_standard_are_refused(tmp_path, landmark, at, co
         ("a.mha", b"DimSize", b"Offset = 1 2 3\nDimSize", "Offset = "),
     ],
 )
-def test_fields_of_text_headers_beyond_the_standard_are_refused(
-    tmp_path, landmark, name, old, new, problem
-):
+def test_fields_of_text_headers_beyond_the_standard_are_refused(tmp_path, landmark, name, old, new, problem):
     SimpleITK.WriteImage(to_itk(landmark), str(tmp_path / name))
     content = (tmp_path / name).read_bytes()
     assert old in content

@@ -1,0 +1,137 @@
+"""Where commands write: one question, one folder, one command at a time, and nothing of others is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from anatomy.base.errors import FileError
+from anatomy.base.files import require_writable_folder
+from anatomy.base.unfinished import locked
+
+MARK = ".lungaccess"
+"""A folder of results holds this one: by it the folder is known, and in it lies the lock."""
+EARLIER = "earlier-{}"
+"""A folder inside, into which the results of earlier runs are moved."""
+MOST_NAMED = 5
+"""Files that a message names."""
+OUTPUTS = frozenset({"--out", "--page", "--film", "--movie", "--picture", "--csv", "--parquet"})
+"""Options that name what is written; none of them names what is read."""
+REMEDY = "Choose another with --out, or say --force where these files may be lost"
+
+Force = Annotated[
+    bool, Parameter(negative="", help="Overwrite what lies where results go; it is lost.", show_default=False)
+]
+"""The option of commands that would else refuse to write, or move earlier results aside."""
+
+held = contextlib.ExitStack()
+"""The locks that this command holds, which end with it."""
+
+
+def claim_folder(out: Path, results: Sequence[str], *, force: bool = False) -> Path:
+    """Lock a folder for the results of one command, after moving those of an earlier one aside.
+
+    Parameters
+    ----------
+    out : path
+        Made if it is missing.
+    results : sequence of str
+        Patterns of the names of all files that the command, or what shows its results, may write.
+    force : bool
+        Remove such files instead.
+
+    Raises
+    ------
+    FileError
+        If another command writes into the folder, the folder cannot be written, or such files lie in it
+        which no command is known to have left there.
+    """
+    folder = require_writable_folder(out)
+    mark, is_ours = folder / MARK, (folder / MARK).is_dir()
+    found = {path for pattern in results for path in folder.glob(pattern) if path.is_file()}
+    there = sorted(path for path in found if path.name[0] != ".")
+    if there and not is_ours and not force:
+        raise _occupied(folder, there)
+    mark.mkdir(exist_ok=True)
+    try:
+        held.enter_context(locked(mark))
+    except BlockingIOError as error:
+        raise FileError(
+            f"Another command writes its results into {folder}",
+            expected="one command at a time for each folder",
+            remedy="Wait until it has ended, or choose another folder with --out",
+        ) from error
+    aside = next(
+        place
+        for n in range(1, len(os.listdir(folder)) + 2)
+        if not (place := folder / EARLIER.format(n)).exists()
+    )
+    for path in there:
+        if force:
+            path.unlink()
+            continue
+        aside.mkdir(exist_ok=True)
+        path.rename(aside / path.name)
+    return folder
+
+
+def require_empty_folder(out: Path, *, force: bool) -> None:
+    """Raise FileError unless a folder is missing or empty, or what it holds may be lost."""
+    folder = require_writable_folder(out)
+    if not force and (there := sorted(folder.iterdir())):
+        raise _occupied(folder, there)
+
+
+def require_new_file(path: Path, *, force: bool) -> None:
+    """Raise FileError if there is a file of that name, unless it may be lost."""
+    if path.exists() and not force:
+        raise FileError(f"{path} exists already", expected="a file that is not there yet", remedy=REMEDY)
+
+
+def _occupied(folder: Path, there: Sequence[Path]) -> FileError:
+    names = ", ".join(path.name for path in there[:MOST_NAMED])
+    more = f" and {len(there) - MOST_NAMED} more" if len(there) > MOST_NAMED else ""
+    return FileError(
+        f"{folder} holds {names}{more}, which this command would overwrite or mix with its results",
+        expected="a folder of results, or one without such files",
+        remedy=REMEDY,
+    )
+
+
+def refuse_inputs_as_outputs(words: Sequence[str]) -> None:
+    """Raise FileError if a file that a command line wants written is, or lies in, what it wants read.
+
+    New files may be written beside inputs; those that are there may not be overwritten.
+    """
+    pairs = [word.partition("=")[::2] for word in words]
+    written = [value for name, value in pairs if name in OUTPUTS and value]
+    written += [after for word, after in zip(words, words[1:], strict=False) if word in OUTPUTS]
+    read = {*words, *(value for name, value in pairs if name not in OUTPUTS)} - {*written, ""}
+    read |= {name for name in written if (*words,).count(name) > 1}
+    inputs = [
+        Path(name) for each in read for name in {each, each.partition("#")[0]} if name and _exists(name)
+    ]
+    for output in map(Path, written):
+        found = [each for each in inputs if _exists(output) and output.is_file() and _holds(each, output)]
+        if found:
+            raise FileError(
+                f"{output} would be overwritten, but is an input of this command ({found[0]})",
+                expected="results in files of their own",
+                remedy="Choose another file with --out",
+            )
+
+
+def _exists(path: str | Path) -> bool:
+    try:
+        return os.path.exists(path)
+    except ValueError:
+        return False
+
+
+def _holds(place: Path, path: Path) -> bool:
+    return place.samefile(path) or (place.is_dir() and path.resolve().parent == place.resolve())

@@ -67,7 +67,7 @@ class Grid:
                 remedy="Check the image header",
             )
         # The last row of a homogeneous matrix is exact in every format.
-        if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+        if not np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() <= 1e-9:
             raise FrameError(
                 f"The last row of a grid matrix is {matrix[3].tolist()}",
                 expected="[0, 0, 0, 1]",
@@ -75,14 +75,14 @@ class Grid:
             )
         columns = matrix[:3, :3]
         spacing = np.linalg.norm(columns, axis=0)
-        if (spacing <= 0).any():
+        if not (spacing > 0).all():
             raise FrameError(
                 f"A grid has the voxel size {spacing.tolist()} mm",
                 expected="three positive lengths",
                 remedy="Check the spacing in the image header",
             )
         direction = columns / spacing
-        if np.abs(direction.T @ direction - np.eye(3)).max() > ORTHONORMAL_TOLERANCE:
+        if not np.abs(direction.T @ direction - np.eye(3)).max() <= ORTHONORMAL_TOLERANCE:
             raise FrameError(
                 f"The axes of an image are not orthonormal: {np.round(direction, 4).tolist()}",
                 expected="three perpendicular unit axes (no shear or gantry tilt)",
@@ -92,7 +92,7 @@ class Grid:
             # Distances are computed as if the axes were perpendicular, so they are made so.
             left, _stretch, right = np.linalg.svd(direction)
             matrix[:3, :3] = left @ right * spacing
-        if np.linalg.det(direction) < 0:
+        if not np.linalg.det(direction) > 0:
             raise FrameError(
                 "The axes of an image form a left-handed frame (determinant < 0)",
                 expected="a right-handed frame",

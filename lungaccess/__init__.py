@@ -21,9 +21,8 @@ for _name in ("anatomy", "stages"):
     _place = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
     if _found is None or not os.path.realpath(_found.origin or "").startswith(os.path.join(_place, _name)):
         raise ImportError(
-            f"The package {_name} of lungaccess is hidden by {(_found and _found.origin) or _found}, "
-            f"which Python finds before {os.path.join(_place, _name)}. Rename that file or folder, or run from "
-            "another"
+            f"The package {_name} of lungaccess is hidden by {_found and _found.origin}, which Python finds "
+            f"before {os.path.join(_place, _name)}. Rename what hides it, or run from another folder"
         )
 
 from anatomy.base.facade import lazy_exports  # noqa: E402 -- it is known now whose package that is

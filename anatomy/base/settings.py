@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar, cast, dataclass_transform
 
 import annotated_types
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
@@ -20,6 +20,11 @@ from anatomy.base.records import LEFT_OUT_IF_EMPTY
 
 T = TypeVar("T")
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+MOST, LEAST = 10**15, 1e-15
+"""Ends of every number that states no others, and its least size if it is not 0: no quantity of a device or a
+patient lies beyond, in whatever unit, and what does is no number to divide or to count by."""
+MOST_SHOWN = 200
+"""Letters of a value that a message shows: a list can have a million."""
 _REMEDY = "Correct what is named; keys that are left out take their defaults"
 
 
@@ -69,16 +74,26 @@ def quantity(
     description : str
         Meaning and effect; the unit is in the name of the field.
     above, at_least, below, at_most : float, optional
-        Ends of the allowed range.
+        Ends of the allowed range; `MOST` either way where none is given.
 
     Returns
     -------
     pydantic.fields.FieldInfo
         For use in `Annotated[float, quantity(...)]`. An integer is accepted, text and booleans are not.
     """
-    return Field(
+    at_least = -MOST if above is None and at_least is None else at_least
+    at_most = MOST if below is None and at_most is None else at_most
+    made = Field(
         description=description, strict=True, allow_inf_nan=False, gt=above, ge=at_least, lt=below, le=at_most
     )
+    made.metadata.append(AfterValidator(_require_not_tiny))
+    return made
+
+
+def _require_not_tiny(value: float | None) -> float | None:
+    if value is not None and 0.0 < abs(value) < LEAST:
+        raise PydanticCustomError("tiny", "0, or a size of at least {least}", {"least": LEAST})
+    return value
 
 
 def text(description: str, *, may_be_empty: bool = False) -> Any:
@@ -109,7 +124,7 @@ def impossible(key: str, value: object, allowed: str) -> PydanticCustomError:
         Becomes a `SettingsError` with the whole key path.
     """
     return PydanticCustomError(
-        "impossible", "{key} = {value}: {allowed}", {"key": key, "value": repr(value), "allowed": allowed}
+        "impossible", "{key} = {value}: {allowed}", {"key": key, "value": _shown(value), "allowed": allowed}
     )
 
 
@@ -223,8 +238,15 @@ def _explain(cls: type, detail: ErrorDetails) -> tuple[str, str]:
         return f"{path} = {context['value']}", f"{path}: {context['allowed']}"
     if kind == "unexpected_keyword_argument":
         return f"{path} is not a setting", _known_keys(cls, detail["loc"])
-    allowed = f"{path}: {_allowed(cls, detail['loc']) or detail['msg']}"
-    return (f"{path} is missing" if kind == "missing" else f"{path} = {detail['input']!r}"), allowed
+    stated = "" if kind == "tiny" else _allowed(cls, detail["loc"])
+    allowed = f"{path}: {stated or detail['msg']}"
+    return (f"{path} is missing" if kind == "missing" else f"{path} = {_shown(detail['input'])}"), allowed
+
+
+def _shown(value: object) -> str:
+    """Return a value as a message shows it."""
+    text = repr(value)
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 
 
 def _known_keys(cls: type, loc: Sequence[int | str]) -> str:

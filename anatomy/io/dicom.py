@@ -262,7 +262,7 @@ def _geometry(headers: Sequence[tuple[Path, FileDataset]], where: str) -> tuple[
     """Sort the slices along their normal and prove that they form a rectangular grid."""
     first = headers[0][1]
     orientation = np.array([h.ImageOrientationPatient for _, h in headers], dtype=np.float64)
-    if np.abs(orientation - orientation[0]).max() > 1e-4:
+    if not np.abs(orientation - orientation[0]).max() <= 1e-4:
         raise FrameError(
             f"{where} has slices of different orientation",
             expected="parallel slices",
@@ -302,7 +302,7 @@ def _slice_spacing(heights_mm: Float, names: Sequence[str], where: str) -> float
             expected="one slice at each position",
             remedy="Keep one acquisition (phase, time or reconstruction) a series, and one copy of each file",
         )
-    if gaps.max() > _MISSING_FACTOR * spacing_mm:
+    if not gaps.max() <= _MISSING_FACTOR * spacing_mm:
         at = int(gaps.argmax())
         raise FileError(
             f"{where} misses slices between the heights {heights_mm[at]:.2f} and {heights_mm[at + 1]:.2f} mm",
@@ -310,7 +310,7 @@ def _slice_spacing(heights_mm: Float, names: Sequence[str], where: str) -> float
             remedy="Export the complete series again",
         )
     even = heights_mm[0] + (heights_mm[-1] - heights_mm[0]) / (len(gaps)) * np.arange(len(heights_mm))
-    if np.abs(heights_mm - even).max() > _SPACING_TOLERANCE_MM:
+    if not np.abs(heights_mm - even).max() <= _SPACING_TOLERANCE_MM:
         raise FileError(
             f"{where} has slices spaced {gaps.min():.3f} to {gaps.max():.3f} mm apart",
             expected="one distance between all slices",
@@ -322,7 +322,7 @@ def _slice_spacing(heights_mm: Float, names: Sequence[str], where: str) -> float
 def _require_no_tilt(positions: Float, normal: Float, where: str) -> None:
     travel = positions - positions[0]
     sideways_mm = np.linalg.norm(travel - np.outer(travel @ normal, normal), axis=1)
-    if sideways_mm.max() > _TILT_TOLERANCE_MM:
+    if not sideways_mm.max() <= _TILT_TOLERANCE_MM:
         degrees = float(np.degrees(np.arctan2(sideways_mm[-1], travel[-1] @ normal)))
         raise FrameError(
             f"{where} was taken with the gantry tilted by {degrees:.2f} degrees",

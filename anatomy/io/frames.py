@@ -14,6 +14,8 @@ from anatomy.grid import ORTHONORMAL_TOLERANCE, read_only, transform_points
 
 Frame = Literal["ras", "lps"]
 
+MOST_COORDINATE_MM = 1e5
+"""Farthest place from the origin: no scanner or tracker has a frame of 100 m."""
 LPS_FROM_RAS: Float = read_only(np.diag([-1.0, -1.0, 1.0, 1.0]))
 LPS_FROM: dict[str, Float] = {"lps": read_only(np.eye(4)), "ras": LPS_FROM_RAS}
 
@@ -43,8 +45,8 @@ def parse_point(text: str) -> Float:
         values = [float(number) for number in numbers.split(",")]
     except ValueError as error:
         raise _point_error(text, "does not hold three numbers") from error
-    if len(values) != 3 or not np.isfinite(values).all():
-        raise _point_error(text, "does not hold three finite numbers")
+    if len(values) != 3 or not (np.abs(values) <= MOST_COORDINATE_MM).all():
+        raise _point_error(text, f"does not hold three finite numbers up to {MOST_COORDINATE_MM:.0f}")
     return transform_points(LPS_FROM[frame], values)
 
 
@@ -122,10 +124,10 @@ def _numbers(path: str | Path) -> Float:
             expected="numbers apart by spaces, the same count in each line",
             remedy="`lungaccess template pose` prints a pose that can be read",
         ) from error
-    if not np.isfinite(values).all():
+    if not (np.abs(values) <= MOST_COORDINATE_MM).all():
         raise FileError(
-            f"{path} holds numbers that are not finite",
-            expected="finite numbers in mm",
+            f"{path} holds the number {values[~(np.abs(values) <= MOST_COORDINATE_MM)][0]:g}",
+            expected=f"finite numbers in mm, up to {MOST_COORDINATE_MM:.0f}",
             remedy="Correct the numbers in the file",
         )
     return values
@@ -135,7 +137,7 @@ def _require_rigid(matrix: Float, path: str | Path) -> None:
     rotation = matrix[:3, :3]
     skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
     last_row = np.abs(matrix[3] - [0, 0, 0, 1]).max()
-    if max(skew, last_row) > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+    if not (max(skew, last_row) <= ORTHONORMAL_TOLERANCE and np.linalg.det(rotation) > 0):
         raise FrameError(
             f"{path} does not hold a right-handed rigid pose (off by {max(skew, last_row):.2g})",
             expected="a rotation with determinant +1, and 0 0 0 1 as the last row",

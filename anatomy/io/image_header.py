@@ -11,6 +11,7 @@ from anatomy.base.errors import FileError, FrameError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import Grid
+from anatomy.io.frames import MOST_COORDINATE_MM
 
 MOST_IMAGE_BYTES = 1 << 32
 """Most stored voxels of one image: four times a chest of 1024 x 1024 x 500 voxels of 16 bits."""
@@ -18,8 +19,6 @@ MOST_INFLATION = 1032
 """No stream of the deflate method becomes more than 1032 times as large."""
 MOST_HEADER_BYTES = 1 << 22
 """Longest header: those of real images, with segment names and label tables, have some ten thousand bytes."""
-MOST_COORDINATE_MM = 1e5
-"""Farthest place of a voxel from the origin: no scanner or tracker has a frame of 100 m."""
 DIRECTION_TOLERANCE = 1e-2
 """A direction may be so much longer or shorter than 1: some programs write three digits."""
 

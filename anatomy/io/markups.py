@@ -19,12 +19,14 @@ from anatomy.base.files import read_text, reading, require_file
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import ORTHONORMAL_TOLERANCE, freeze_arrays
-from anatomy.io.frames import LPS_FROM
+from anatomy.io.frames import LPS_FROM, MOST_COORDINATE_MM
 
 MASKS_TRANSFORMS = ("breathing tissue", "breathing devices")
 """Transforms of an exported breathing scene, by name: points below them are stored in the masks' phase."""
 _REFERENCE = re.compile(r"(?P<file>.+?\.(?:mrml|mrb|json))#(?P<name>.+)", re.IGNORECASE | re.DOTALL)
 _REMEDY = "Save the scene in 3D Slicer with its markups as .mrk.json"
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""How 3D Slicer packs bundles; other methods unpack far more at a time than is asked for."""
 _LARGEST_BYTES = 1 << 28
 """A scene or markups in a bundle that unpack to more are not what 3D Slicer writes."""
 
@@ -164,7 +166,18 @@ def read_markups(path: str | Path) -> tuple[Markup, ...]:
     path = require_file(path)
     kind = path.suffix.lower()
     if kind == ".mrml":
-        return _of_scene(read_text(path), lambda name: read_text(path.parent / name), path)
+
+        def beside(name: str) -> str:
+            file = path.parent / name
+            if not file.resolve().is_relative_to(path.parent.resolve()):
+                raise FileError(
+                    f"{path} names {name}, which lies elsewhere",
+                    expected="files in the folder of the scene, or below",
+                    remedy=_REMEDY,
+                )
+            return read_text(file)
+
+        return _of_scene(read_text(path), beside, path)
     if kind == ".mrb":
         return _of_bundle(path)
     if kind == ".json":
@@ -174,27 +187,34 @@ def read_markups(path: str | Path) -> tuple[Markup, ...]:
 
 def _of_bundle(path: Path) -> tuple[Markup, ...]:
     with reading(path), zipfile.ZipFile(path) as bundle:
-        sizes = {each.filename: each.file_size for each in bundle.infolist()}
-        scenes = sorted((name for name in sizes if name.endswith(".mrml")), key=lambda name: name.count("/"))
+        members = {each.filename: each for each in bundle.infolist()}
+        scenes = sorted(
+            (name for name in members if name.endswith(".mrml")), key=lambda name: name.count("/")
+        )
         if not scenes:
             raise FileError(f"{path} holds no scene", expected="a .mrml in the bundle", remedy=_REMEDY)
         folder = scenes[0].rpartition("/")[0]
 
         def text(name: str) -> str:
             member = f"{folder}/{name}" if folder else name
-            if sizes.get(member, _LARGEST_BYTES) >= _LARGEST_BYTES:
+            content = b""
+            if member in members and members[member].compress_type in _METHODS:
+                with bundle.open(member) as stream:
+                    content = stream.read(_LARGEST_BYTES)
+            if not 0 < len(content) < _LARGEST_BYTES:
                 raise FileError(
-                    f"{path} holds no {name} of a readable size",
-                    expected=f"less than {_LARGEST_BYTES >> 20} MiB",
+                    f"{path} holds no {name} of a readable size and kind",
+                    expected=f"less than {_LARGEST_BYTES >> 20} MiB, stored or deflated",
                     remedy=_REMEDY,
                 )
-            return bundle.read(member).decode("utf-8")
+            return content.decode("utf-8")
 
         return _of_scene(text(scenes[0].rpartition("/")[2]), text, path)
 
 
 def _of_scene(text: str, read: Callable[[str], str], path: Path) -> tuple[Markup, ...]:
-    """Return the markups of a scene; `read` returns the text of a file beside it."""
+    """Return the markups of a scene; `read` returns the text of a file beside it, each of them once."""
+    lists: dict[str, list[Markup]] = {}
     with reading(path):
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
             raise ValueError("it declares XML entities, which scenes never do")
@@ -211,9 +231,11 @@ def _of_scene(text: str, read: Callable[[str], str], path: Path) -> tuple[Markup
             continue
         transform = references.get("transform")
         _require_still(node, by_id.get(transform or ""), transform, path)
+        if file not in lists:
+            lists[file] = _of_file(read(file), path.parent / file)
         markups += [
             Markup(name=node.get("name") or each.name, kind=each.kind, points=each.points)
-            for each in _of_file(read(file), path.parent / file)
+            for each in lists[file]
         ]
     return tuple(markups)
 
@@ -261,12 +283,14 @@ def _point(content: dict[str, Any], lps_from_frame: Float, path: Path) -> Contro
     place = np.array(content["position"], dtype=np.float64)
     turn = content.get("orientation")
     rotation = lps_from_frame if turn is None else np.array(turn, dtype=np.float64).reshape(3, 3)
-    if place.shape != (3,) or not (np.isfinite(place).all() and np.isfinite(rotation).all()):
+    if place.shape != (3,) or not (
+        (np.abs(place) <= MOST_COORDINATE_MM).all() and np.isfinite(rotation).all()
+    ):
         raise FileError(
             f"The point {label!r} of {path} is not three finite numbers", expected="mm", remedy=_REMEDY
         )
     skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if skew > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0.0:
+    if not (skew <= ORTHONORMAL_TOLERANCE and np.linalg.det(rotation) > 0.0):
         raise FrameError(
             f"The orientation of the point {label!r} of {path} is no rotation (off by {skew:.2g})",
             expected="a right-handed frame of three unit vectors",

@@ -1,5 +1,8 @@
 """Reads what a patient.toml says of breathing: a displacement field, a transform, landmarks, two images."""
 
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -7,12 +10,12 @@ import numpy as np
 from pydantic import Field
 
 from anatomy.base.errors import AnatomyError, FileError, FrameError, SettingsError
-from anatomy.base.files import read_text, reading, reason, require_file
+from anatomy.base.files import MOST_REASON, read_text, reading, reason, require_file, unreadable
 from anatomy.base.settings import quantity, settings, switch, text
 from anatomy.base.typed import Array, Float
 from anatomy.grid import Grid, transform_points
-from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS
-from anatomy.io.image_header import right_handed_grid
+from anatomy.io import transform_values
+from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, MOST_COORDINATE_MM
 from anatomy.io.images import (
     SUFFIXES,
     image_suffix,
@@ -29,6 +32,10 @@ TRANSFORMS = (".h5", ".hdf5", ".tfm", ".txt", ".mat", ".xfm")
 LANDMARKS = ".csv"
 SAMPLE_MM = 4.0
 """Spacing of the points at which a transform is evaluated: finer than the nodes of a motion."""
+TRANSFORM_S = 300.0
+"""A transform that takes longer is damaged: others take a second."""
+MOST_DISPLACEMENT_MM = 1000.0
+"""No tissue moves so far; what is plausible for a lung is judged where its place in the lung is known."""
 MEDIAN_MOTION_MM = 17.3
 """Median of the population's 95 % motion (exp 2.85)."""
 WORKING_MM = 4.0
@@ -183,7 +190,7 @@ def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
             row = [float(each) for each in line.replace(";", ",").split(",")]
         except ValueError:
             row = []
-        if len(row) != 6 or not np.isfinite(row).all():
+        if len(row) != 6 or not (np.abs(row) <= MOST_COORDINATE_MM).all():
             raise FileError(
                 f"Line {number} of {path} is {line.strip()!r:.60}",
                 expected="six finite numbers: x, y, z at end-exhale, then x, y, z at end-inhale, mm",
@@ -221,10 +228,10 @@ def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
     Raises
     ------
     FileError
-        If it is no transform that ITK reads.
+        If it is no transform of three dimensions that ITK reads.
+    AnatomyError
+        If it moves nothing, or farther than a lung is large.
     """
-    import SimpleITK
-
     if path.suffix.lower() not in TRANSFORMS:
         raise FileError(
             f"{path} is of an unknown kind",
@@ -232,35 +239,38 @@ def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
             f"({', '.join(TRANSFORMS)}) or landmark pairs ({LANDMARKS})",
             remedy="Export the registration in one of them",
         )
-    with reading(path):
-        transform = SimpleITK.ReadTransform(str(path))
     low, high = masks.corners_lps.min(axis=0), masks.corners_lps.max(axis=0)
     size = [int(n) for n in np.ceil((high - low) / SAMPLE_MM) + 1]
-    spacing = (SAMPLE_MM,) * 3
-    image = SimpleITK.TransformToDisplacementField(
-        transform, SimpleITK.sitkVectorFloat64, size, low.tolist(), spacing, np.eye(3).ravel().tolist()
-    )
-    return _grid_and_vectors(image, path)
-
-
-def _grid_and_vectors(image: Any, path: Path) -> tuple[Grid, Float]:
-    import SimpleITK
-
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * np.array(image.GetSpacing())
-    matrix[:3, 3] = image.GetOrigin()
-    ni, nj, nk = image.GetSize()
-    grid, is_reversed = right_handed_grid((ni, nj, nk), matrix, path)
-    vectors = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0, 3)
-    return grid, _finite(vectors[::-1] if is_reversed else vectors, path)
+    grid = Grid.from_spacing(size, (SAMPLE_MM,) * 3, low)
+    numbers = ",".join(repr(float(n)) for n in (*low, *size, *grid.spacing_mm))
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder, "values.npy")
+        command = [sys.executable, "-P", transform_values.__file__, str(path.resolve()), numbers, str(out)]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=TRANSFORM_S, check=False)
+            said = done.stderr.decode("utf-8", errors="replace").strip().splitlines()
+            why = (
+                said[-1][:MOST_REASON]
+                if done.returncode > 0 and said
+                else f"ITK ended with {done.returncode}"
+            )
+        except subprocess.TimeoutExpired:
+            why = f"ITK takes more than {TRANSFORM_S:g} s"
+        if not out.is_file():
+            raise unreadable(path, ValueError(why))
+        vectors = np.load(out).transpose(2, 1, 0, 3)
+    return grid, _finite(vectors, path)
 
 
 def _finite(vectors: Array, path: Path) -> Float:
     vectors = np.ascontiguousarray(vectors, dtype=np.float64)
-    if not np.isfinite(vectors).all():
+    farthest = float(np.abs(vectors).max())
+    if not 0.0 < farthest <= MOST_DISPLACEMENT_MM:
         raise AnatomyError(
-            f"{path} holds displacements that are not finite",
-            expected="finite numbers in mm",
+            f"{path} holds displacements that are not finite"
+            if not np.isfinite(farthest)
+            else f"{path} holds displacements of at most {farthest:.3g} mm",
+            expected=f"finite numbers in mm, some of them not 0, none above {MOST_DISPLACEMENT_MM:g}",
             remedy="Register again, or fill what is missing",
         )
     return vectors

@@ -86,7 +86,7 @@ def union_grid(reference: Grid, others: list[tuple[str, Grid]]) -> Grid:
         low, high = np.minimum(low, first), np.maximum(high, last)
         largest = max(np.prod(grid.shape), np.prod(reference.shape))
         finer = max(1.0, grid.voxel_volume_mm3 / reference.voxel_volume_mm3)
-        if np.prod(high - low) > LARGEST_GROWTH * largest * finer:
+        if not np.prod(high - low) <= LARGEST_GROWTH * largest * finer:
             raise FrameError(
                 f"{name} lies apart from the other masks: its header says {grid.describe()}",
                 expected=f"a place near {reference.describe()}",

@@ -26,13 +26,13 @@ def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
     moved = {side: motion.amplitude * motion.displacements_mm(lungs[side], side) for side in lungs}
     far = {side: float(np.percentile(np.linalg.norm(each, axis=1), 95)) for side, each in moved.items()}
     down = {side: _basal_mm(lungs[side], moved[side]) for side in lungs}
-    if max(far.values()) > GREATEST_MM:
+    if not all(value <= GREATEST_MM for value in far.values()):
         raise AnatomyError(
             f"The lungs move by up to {max(far.values()):.0f} mm",
             expected=f"less than {GREATEST_MM:g} mm in quiet breathing",
             remedy="Check that the displacements are mm, and their frame",
         )
-    if max(down.values()) < -SEEN_MM:
+    if not any(value >= -SEEN_MM for value in down.values()):
         raise AnatomyError(
             f"Inhaling moves the bases of the lungs to the head, by {-down[RIGHT]:.1f} mm (right) and "
             f"{-down[LEFT]:.1f} mm (left)",
@@ -87,7 +87,7 @@ def _require_invertible(motion: Motion) -> float:
     least = np.stack([motion.least_stretch(side) for side in (RIGHT, LEFT)])
     worst = np.unravel_index(int(least.argmin()), least.shape)
     value = float(least[worst])
-    if value <= 0.0:
+    if not value > 0.0:
         at = motion.grid.lps(np.array(worst[1:]) + 0.5)
         folded = float((least <= 0.0).mean())
         raise AnatomyError(
@@ -154,7 +154,7 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
         moved[chosen] = grid.values_at(lungs, motion.pulled_back(points[chosen], phase, side), False)
     dice, unmoved = _dice(moved, there), _dice(still, there)
     # Two Dice scores of samples that differ by less are equal.
-    if dice < max(LEAST_DICE, unmoved - 0.005):
+    if not dice >= max(LEAST_DICE, unmoved - 0.005):
         raise AnatomyError(
             f"The motion leads the lungs onto the other lungs with a Dice of {dice:.3f}; without it they "
             f"have {unmoved:.3f}",

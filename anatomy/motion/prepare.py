@@ -169,7 +169,7 @@ def _of_field(
 
 def _require_covered(source: MotionSource, places: Float) -> None:
     covered = 0.0 if source.grid is None else float(source.grid.contains(places).mean())
-    if covered < LEAST_COVERED:
+    if not covered >= LEAST_COVERED:
         raise FrameError(
             f"The {source.description} covers {100.0 * covered:.0f} % of the lungs",
             expected="a field over both lungs, LPS mm of the masks",

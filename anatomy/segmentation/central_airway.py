@@ -100,7 +100,7 @@ def _smoothed(ct: CoarseCt) -> CoarseCt:
 def _long_enough(ct: CoarseCt, found: CentralAirway) -> CentralAirway:
     low, high = bounds(found.grown)
     length_mm = float((high - low)[2] * ct.spacing_mm[2])
-    if length_mm < SHORTEST_COLUMN_MM:
+    if not length_mm >= SHORTEST_COLUMN_MM:
         raise AnatomyError(
             f"Only {length_mm:.0f} mm of the trachea could be followed",
             expected=f"at least {SHORTEST_COLUMN_MM:g} mm",

@@ -248,7 +248,7 @@ def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
     axes = grid.ijk_from_lps[:3, :3] @ volume.grid.lps_from_ijk[:3, :3]
     steps = np.abs(axes - np.eye(3)).max() * max(volume.grid.shape)
     # Largest deviation from a whole number of voxels, in voxels.
-    if max(float(np.abs(start - shift).max()), float(steps)) > 0.05:
+    if not (np.abs(start - shift).max() <= 0.05 and steps <= 0.05):
         raise GridMismatchError(
             f"The voxels of {name} are not those of the CT: {volume.grid.describe()}",
             expected=f"a box of voxels of {grid.describe()}",

@@ -88,7 +88,7 @@ def _require_hounsfield(values: Array) -> None:
             remedy="Export the image again",
         )
     # The lowest value of an image whose offset of -1000 is missing is about 0, and above this.
-    if least > -400.0:
+    if not least <= -400.0:
         raise AnatomyError(
             f"The lowest value of the image is {least:g}: its offset of about -1000 HU seems to be missing",
             expected="Hounsfield units, where air is about -1000 and water 0",
@@ -97,7 +97,7 @@ def _require_hounsfield(values: Array) -> None:
     count = values.size
     air = np.count_nonzero(values < GAS_HU) / count
     tissue = np.count_nonzero((values > TISSUE_HU[0]) & (values < TISSUE_HU[1])) / count
-    if min(air, tissue) < LEAST_SHARE:
+    if not (air >= LEAST_SHARE and tissue >= LEAST_SHARE):
         missing = "air (below -700 HU)" if air < LEAST_SHARE else "soft tissue (-200 to 200 HU)"
         raise AnatomyError(
             f"The image, {least:g} to {greatest:g}, holds hardly any {missing}",
@@ -109,7 +109,7 @@ def _require_hounsfield(values: Array) -> None:
 def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
     spacing = ct.grid.spacing_mm
     extent = spacing * np.asarray(ct.grid.shape)
-    if extent.min() < LEAST_SIZE_MM:
+    if not extent.min() >= LEAST_SIZE_MM:
         raise AnatomyError(
             f"The image measures {' x '.join(f'{e:.0f}' for e in extent)} mm",
             expected=f"at least {LEAST_SIZE_MM:g} mm in every direction, to hold a lung",

@@ -19,6 +19,8 @@ from anatomy.grid import Volume
 from anatomy.segmentation.closing import largest_piece
 
 SUFFIX = ".onnx"
+MOST_TILE = 512
+"""A tile of a whole chest at 1 mm; the network holds many numbers for each of its voxels."""
 EXTRA = "learned"
 """The extra of the package that brings onnxruntime."""
 
@@ -53,8 +55,8 @@ class NetworkSettings:
     def __post_init__(self) -> None:
         if len(self.spacing_mm) not in (0, 3) or any(not 0.1 <= s <= 5.0 for s in self.spacing_mm):
             raise impossible("spacing_mm", self.spacing_mm, "three numbers from 0.1 to 5, or none")
-        if min(self.tile) < 8:
-            raise impossible("tile", self.tile, "three numbers, 8 or more")
+        if not all(8 <= n <= MOST_TILE for n in self.tile):
+            raise impossible("tile", self.tile, f"three numbers from 8 to {MOST_TILE}")
         if self.low_hu >= self.high_hu:
             raise impossible("low_hu", self.low_hu, f"less than high_hu, {self.high_hu:g}")
 

@@ -270,7 +270,7 @@ def _airway(ct: CoarseCt, hull: Mask, seed_lps: Float | None) -> CentralAirway:
     air = np.asfortranarray((ct.hu < AIRWAY_BELOW_HU) & hull)
     radius = edt.edt(air, anisotropy=ct.spacing_mm, order="F", black_border=True)
     widest = np.unravel_index(int(np.argmax(radius)), radius.shape)
-    if radius[widest] < LEAST_AIRWAY_RADIUS_MM:
+    if not radius[widest] >= LEAST_AIRWAY_RADIUS_MM:
         raise AnatomyError(
             f"The widest airway in the lung has a radius of {float(radius[widest]):.1f} mm",
             expected=f"a main bronchus of at least {LEAST_AIRWAY_RADIUS_MM:g} mm",

@@ -219,7 +219,7 @@ def _onto_ct(volume: Volume, grid: Grid, name: str, *, solid: bool) -> tuple[Vol
     placed = place(volume.array, volume.grid, grid, solid=solid)
     lost = placed.n_lost / max(placed.n_voxels, 1)
     # An axis may turn by so many radians: over 300 mm a mask is then 3 mm off.
-    if turned > 0.01 or lost > GREATEST_LOSS:
+    if not (turned <= 0.01 and lost <= GREATEST_LOSS):
         why = f"{lost:.0%} of it lie outside the CT" if lost > GREATEST_LOSS else "its axes are turned"
         raise GridMismatchError(
             f"{name} lies in another frame than the CT: {why}. It has {volume.grid.describe()}",

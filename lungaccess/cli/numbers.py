@@ -20,6 +20,12 @@ MOST_PROCESSES = 1024
 """No machine that these commands run on has as many cores."""
 MOST_SAMPLES = 10_000_000
 """Their random numbers fit into memory, and shares are then known to 0.03 %."""
+LEAST = 1e-9
+"""No length, speed or time above nothing is smaller; what is divides to more than numbers hold."""
+LONGEST_S = 1e8
+"""No command runs for three years."""
+ONE_TURN_DEG = 360.0
+"""A tube that is turned farther comes back to where it was."""
 FARTHEST_MM = 1e4
 """No length in a patient comes near ten metres; larger numbers are slips."""
 
@@ -35,7 +41,7 @@ class Within:
 
     def __call__(self, kind: object, value: float | None) -> None:
         """Raise ValueError, whose text says what is allowed, if a value lies outside."""
-        if value is None or (math.isfinite(value) and self._holds(value)):
+        if value is None or (math.isfinite(value) and self._holds(value) and not 0.0 < abs(value) < LEAST):
             return
         noun = "a whole number" if isinstance(value, int) else "a finite number"
         raise ValueError(f"{noun} {self._ends}".strip())
@@ -71,8 +77,8 @@ SamplesOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=
 Port = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=LARGEST_PORT))]
 Hertz = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FASTEST_HZ))]
 Spacing = Annotated[float, Parameter(validator=Within(at_least=0.5, at_most=50.0))]
-Seconds = Annotated[float, Parameter(validator=Within(above=0.0))]
+Seconds = Annotated[float, Parameter(validator=Within(above=0.0, at_most=LONGEST_S))]
 Positive = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FARTHEST_MM))]
 NotNegative = Annotated[float, Parameter(validator=Within(at_least=0.0, at_most=FARTHEST_MM))]
-Finite = Annotated[float, Parameter(validator=Within())]
+Angle = Annotated[float, Parameter(validator=Within(at_least=-ONE_TURN_DEG, at_most=ONE_TURN_DEG))]
 Probability = Annotated[float, Parameter(validator=Within(above=0.0, below=1.0))]

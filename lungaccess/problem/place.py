@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from anatomy.base.errors import TargetError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from anatomy.io.frames import MOST_COORDINATE_MM
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
 
@@ -59,7 +60,7 @@ def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
         If the point is not three finite numbers.
     """
     point = np.array(lps_mm, dtype=np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all():
+    if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():
         raise TargetError(
             f"The place {point.tolist()} is not a point", expected="three finite numbers, LPS mm"
         )

@@ -8,6 +8,7 @@ from anatomy.base.errors import TargetError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume, read_only
+from anatomy.io.frames import MOST_COORDINATE_MM
 from anatomy.lung import Lung
 from anatomy.morphology import components
 from anatomy.organ import Organ
@@ -158,7 +159,7 @@ def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target
         If the point is not finite, outside the lung or inside an obstacle.
     """
     point = np.array(lps_mm, dtype=np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all():
+    if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():
         raise TargetError(
             f"The target {point.tolist()} is not a point",
             expected="three finite mm",

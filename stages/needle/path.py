@@ -69,7 +69,7 @@ class Query:
                 expected="a 4x4 pose and three coordinates, all finite, LPS mm",
             )
         rotation = frame[:3, :3]
-        if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+        if not (np.abs(rotation.T @ rotation - np.eye(3)).max() <= 1e-6 and np.linalg.det(rotation) > 0):
             raise FrameError(
                 "The start of a needle query is not a right-handed rigid pose", expected="a rotation"
             )

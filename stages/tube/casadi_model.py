@@ -289,7 +289,7 @@ class CasadiTubes:
         """
         beta = self._vector(beta_mm, "beta")
         ends = beta + [tube.length_mm for tube in self._tubes]
-        if (beta > 0.0).any() or (ends < 0.0).any() or (np.diff(ends) > 0.0).any():
+        if not ((beta <= 0.0).all() and (ends >= 0.0).all() and (np.diff(ends) <= 0.0).all()):
             raise SettingsError(
                 f"The tubes' bases are at {beta.tolist()} mm and their ends at {ends.tolist()} mm",
                 expected="bases at 0 or behind, ends at 0 or ahead, and none ahead of that of a tube inside",

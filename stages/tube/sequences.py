@@ -265,7 +265,7 @@ def _insertions(tubes: collections.abc.Sequence[Tube], insertions_mm: ArrayLike)
             expected=f"one finite length for each of the {len(tubes)} tubes",
             remedy="Give one insertion for each tube",
         )
-    if (insertions < 0.0).any() or (np.diff(insertions) > ROUNDING_MM).any():
+    if not ((insertions >= 0.0).all() and (np.diff(insertions) <= ROUNDING_MM).all()):
         raise SettingsError(
             f"The insertions are {', '.join(f'{v:g}' for v in insertions)} mm, innermost tube first",
             expected="0 <= outer <= inner",
@@ -315,19 +315,19 @@ def _require_order(sequence: Sequence, tubes: collections.abc.Sequence[Tube]) ->
         )
     lengths = np.array([tube.length_mm for tube in tubes])
     beta, tips = sequence.beta_mm, sequence.beta_mm + lengths
-    if (beta > ROUNDING_MM).any():
+    if not (beta <= ROUNDING_MM).all():
         raise SettingsError(
             f"The insertions of sequence {sequence.name!r} reach {tips.max(axis=0).tolist()} mm",
             expected=f"at most the lengths of the tubes, {lengths.tolist()} mm",
             remedy="Insert less, or take longer tubes",
         )
-    if (tips < -ROUNDING_MM).any() or (np.diff(tips, axis=1) > ROUNDING_MM).any():
+    if not ((tips >= -ROUNDING_MM).all() and (np.diff(tips, axis=1) <= ROUNDING_MM).all()):
         raise SettingsError(
             f"In sequence {sequence.name!r} an outer tube is ahead of an inner one, or a tip is in the scope",
             expected="tips in order: 0 <= outer <= inner",
         )
     ahead = (tips[:, :-1] - tips[:, 1:]) - (lengths[:-1] - lengths[1:])
-    if (ahead > ROUNDING_MM).any():
+    if not (ahead <= ROUNDING_MM).all():
         worst = int(np.argmax(ahead.max(axis=0)))
         raise SettingsError(
             f"In sequence {sequence.name!r} tube {worst + 1} (from the inside) is "

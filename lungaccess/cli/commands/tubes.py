@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Finite, NotNegative
+from lungaccess.cli.numbers import Angle, NotNegative
 from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions, require_picture
 
 if TYPE_CHECKING:
@@ -32,13 +32,13 @@ def tubes(
         ),
     ] = DEFAULT_SYSTEM,
     rotate: Annotated[
-        Finite,
+        Angle,
         Parameter(
             help="Direction of the inner tube's bend about the scope's axis, from +x of its tip, degrees."
         ),
     ] = 0.0,
     relative: Annotated[
-        Finite, Parameter(help="How much farther the base of the outer tube is turned, degrees.")
+        Angle, Parameter(help="How much farther the base of the outer tube is turned, degrees.")
     ] = 0.0,
     propose: Annotated[
         bool, Parameter(help="Compare sequences to the same place, and look for designs that sweep less.")

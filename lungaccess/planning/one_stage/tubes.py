@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Annotated, Any
 
@@ -32,6 +33,8 @@ from stages.tube import (
 )
 
 _REMEDY = "`lungaccess template tubes` prints a complete file to start from"
+MOST_TURN_RAD = 2.0 * math.pi
+"""Tubes that are turned farther come back to where they were, and the steps on the way have no end."""
 
 
 @settings
@@ -145,7 +148,7 @@ def deploy_tubes(
     Raises
     ------
     SettingsError
-        If the insertions are impossible, nothing comes out, or an angle is not finite.
+        If the insertions are impossible, nothing comes out, or an angle is more than a turn.
     """
     tubes = tubes_of(device)
     if len(tubes) != 2:
@@ -159,6 +162,12 @@ def deploy_tubes(
             "The inner tube stays in the scope",
             expected="an insertion above 0",
             remedy="Insert it, for instance --outer 10 --inner 40",
+        )
+    if not (abs(rotation_rad) <= MOST_TURN_RAD and abs(relative_rad) <= MOST_TURN_RAD):
+        raise SettingsError(
+            f"The tubes are to be turned by {rotation_rad:g} and {relative_rad:g} rad",
+            expected=f"at most one turn, {MOST_TURN_RAD:.4f} rad, either way",
+            remedy="Leave out whole turns: every tenth of a turn is a step that is looked at",
         )
     angles = np.array([rotation_rad, rotation_rad + relative_rad]) + BEND_RAD
     sequence = kuntz2015(tubes, angles, outer_mm, inner_mm)

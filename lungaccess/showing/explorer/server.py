@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import hmac
+import logging
 import secrets
 import shutil
 import signal
@@ -11,8 +12,10 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
@@ -25,6 +28,10 @@ from lungaccess.showing.report.html.document import filled, scene_figure, slice_
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24
 MOST_FILES = 20
+MOST_WAITING_BYTES = 1 << 27
+"""Answers that wait for a page which does not read; it is closed when they become more."""
+REQUEST_S = 5.0
+"""A connection that sends no whole request within one to two times as long is closed: browsers take 1 ms."""
 MOST_OPEN = 64
 """Questions of one page that may wait for answers: a page asks a handful at a time."""
 FOLDERS = {"explorer": "lungaccess.showing.explorer", "report": "lungaccess.showing.report"}
@@ -36,6 +43,10 @@ REACH = (
     '<label><input type="checkbox" id="reach-scene"> reach in 3-D</label>'
 )
 CLICKS = "; a click chooses a nodule, a painted exit, or the place in the plane through the cross"
+
+LOG = logging.getLogger(__name__)
+"""Where aiohttp reports errors; malformed requests of strangers are none."""
+LOG.addFilter(lambda record: _is_ours(record))
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -72,6 +83,8 @@ class Page:
         self.plans: OrderedDict[str, KeptPlan] = OrderedDict()
         self.asked: dict[int, str] = {}
         self.outbox: asyncio.Queue[Given] = asyncio.Queue()
+        self.waiting_bytes = 0
+        self.closing: asyncio.Task[bool] | None = None
 
     def keep(self, plan: KeptPlan) -> None:
         """Keep a plan, and forget the oldest of too many."""
@@ -100,6 +113,8 @@ class Explorer:
         self._files: OrderedDict[str, Path] = OrderedDict()
         self._processes: dict[str, Process] = {}
         self._runner: web.AppRunner | None = None
+        self._served: set[object] = set()
+        self._sweep: asyncio.Task[None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self.address: Address | None = None
 
@@ -117,13 +132,16 @@ class Explorer:
             If the port is taken.
         """
         self._loop = asyncio.get_running_loop()
+        self._loop.set_exception_handler(_without_failed_connections)
         self._processes = {name: Process(self._source, self._folder, self._given) for name in NAMES}
         app = web.Application(middlewares=[self._guard], client_max_size=1)
         app.router.add_get("/", self._index)
         app.router.add_get("/socket", self._socket)
         app.router.add_get("/download/{ticket}/{name}", self._download)
         app.router.add_get("/{folder}/{name}", self._asset)
-        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
+        self._runner = web.AppRunner(
+            app, access_log=None, handle_signals=False, shutdown_timeout=1.0, logger=LOG
+        )
         await self._runner.setup()
         site = web.TCPSite(self._runner, HOST, self._port)
         try:
@@ -134,6 +152,7 @@ class Explorer:
                 expected="a free port of this machine, from 1024 to 65535",
                 remedy="Leave out --port, or choose another one",
             ) from error
+        self._sweep = asyncio.create_task(self._close_half_open(self._runner))
         port = int(self._runner.addresses[0][1])
         self.address = Address(port=port, token=self._token)
         return self.address
@@ -143,10 +162,24 @@ class Explorer:
         for page in list(self._pages.values()):
             with contextlib.suppress(ConnectionError):
                 await page.socket.close(code=1001, message=b"the explorer has ended")
+        if self._sweep is not None:
+            self._sweep.cancel()
         if self._runner is not None:
             await self._runner.cleanup()
         await asyncio.to_thread(self._end_processes)
         shutil.rmtree(self._folder, ignore_errors=True)
+
+    async def _close_half_open(self, runner: web.AppRunner) -> None:
+        """Close connections that have sent no whole request since the last look: each takes a place."""
+        waiting: set[object] = set()
+        while runner.server is not None:
+            connections = set(runner.server.connections)
+            self._served &= connections
+            for each in connections - self._served:
+                if each in waiting:
+                    each.force_close()
+            waiting = connections - self._served
+            await asyncio.sleep(REQUEST_S)
 
     def _end_processes(self) -> None:
         for each in self._processes.values():
@@ -165,6 +198,7 @@ class Explorer:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Serve nothing but to the page itself, on this machine, with its token."""
+        self._served.add(request.protocol)
         address = self._required_address
         allowed = request.headers.getall("Host", []) == [f"{HOST}:{address.port}"]
         allowed = allowed and request.headers.get("Origin", address.origin) == address.origin
@@ -241,7 +275,7 @@ class Explorer:
                     await socket.send_str(str(frame(error_message(None, error))))
         finally:
             sending.cancel()
-            del self._pages[page.name]
+            self._pages.pop(page.name, None)
             for process in self._processes.values():
                 process.end(Ended(page=page.name))
         return socket
@@ -280,7 +314,13 @@ class Explorer:
             page.keep(given.plan)
         if given.last:
             page.asked.pop(given.number, None)
+        page.waiting_bytes += len(given.sent)
         page.outbox.put_nowait(given)
+        if page.waiting_bytes > MOST_WAITING_BYTES and page.outbox.qsize() > 1:
+            page.outbox = asyncio.Queue()
+            page.waiting_bytes = 0
+            del self._pages[page.name]
+            page.closing = asyncio.create_task(page.socket.close(code=1013, message=b"too slow"))
 
     async def _send_all(self, page: Page) -> None:
         """Send what is answered, in its order."""
@@ -295,6 +335,7 @@ class Explorer:
                     await page.socket.send_str(given.sent)
                 else:
                     await page.socket.send_bytes(given.sent)
+            page.waiting_bytes -= len(given.sent)
 
     def _ticket(self, file: Path) -> str:
         """Return the name under which a file can be fetched; the oldest of too many files is removed."""
@@ -304,6 +345,17 @@ class Explorer:
             _ticket, old = self._files.popitem(last=False)
             shutil.rmtree(old.parent, ignore_errors=True)
         return ticket
+
+
+def _is_ours(record: logging.LogRecord) -> bool:
+    """Tell whether a record of the log speaks of the explorer, and not of a request that is none."""
+    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError | ConnectionError))
+
+
+def _without_failed_connections(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Report what goes wrong in the loop, but not that a connection could not be made or was lost."""
+    if not isinstance(context.get("exception"), OSError):
+        loop.default_exception_handler(context)
 
 
 @contextlib.contextmanager

@@ -24,8 +24,11 @@ MOST_WAITING = 200
 RETRY_S = 0.5
 """Time between two attempts to reach a server."""
 MOST_PEERS = 8
+SILENT_S = 10.0
+"""Where all places are taken, the program that has sent nothing for longest gives way after so long."""
 
 LATE, UNREADABLE, LOST, REFUSED = "not read in time", "unreadable", "connection lost", "too many programs"
+GAVE_WAY = "gave way to another program"
 
 
 @frozen_value
@@ -54,6 +57,7 @@ class _Peer:
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection, self.decoder = connection, Decoder()
+        self.heard_s = time.monotonic()
         self.waiting: deque[bytes] = deque()
         self.begun = b""
         """What is left of the message that is being sent: it may not be dropped any more."""
@@ -197,9 +201,13 @@ class Link:
         except OSError:
             return
         if len(self._peers) >= MOST_PEERS:
-            self._dropped[REFUSED] += 1
-            connection.close()
-            return
+            silent = min(self._peers.values(), key=lambda peer: peer.heard_s)
+            if time.monotonic() - silent.heard_s < SILENT_S:
+                self._dropped[REFUSED] += 1
+                connection.close()
+                return
+            self._dropped[GAVE_WAY] += 1
+            self._leave(silent)
         self._join(connection)
 
     def _join(self, connection: socket.socket) -> None:
@@ -229,6 +237,8 @@ class Link:
                     self._counts["sent"] += 1
             except (BlockingIOError, InterruptedError):
                 continue
+            except (BrokenPipeError, ConnectionResetError):
+                self._leave(peer)  # Whoever closes before all is read ends so.
             except OSError:
                 self._dropped[LOST] += 1
                 self._leave(peer)
@@ -238,11 +248,15 @@ class Link:
         found: list[Received] = []
         try:
             data = peer.connection.recv(RECEIVED_BYTES)
+            peer.heard_s = time.monotonic()
             found.extend(peer.decoder.feed(data))
         except (BlockingIOError, InterruptedError):
             return found
         except FileError:
             self._dropped[UNREADABLE] += 1
+            self._leave(peer)
+            return found
+        except ConnectionResetError:
             self._leave(peer)
             return found
         except OSError:

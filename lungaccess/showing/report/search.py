@@ -92,6 +92,7 @@ def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str
     return Path(path)
 
 
+@style.plain_look
 def front_png(
     criteria: Sequence[str],
     values: Mapping[str, Sequence[float]],

@@ -36,7 +36,7 @@ class Weights:
     def __post_init__(self) -> None:
         total = self.nf1 + self.clearance + self.twist
         # Weights may add up to 1 but for rounding.
-        if abs(total - 1.0) > 1e-9:
+        if not abs(total - 1.0) <= 1e-9:
             raise impossible("nf1", self.nf1, f"the three weights add up to {total:g}, not 1")
 
     @property

@@ -111,7 +111,7 @@ def test_override_checks_changes_together() -> None:
 @given(
     name=st.text(min_size=1),
     diameter=st.floats(1.5, 100.0),
-    hub=st.floats(-0.0, 1.4),
+    hub=st.sampled_from((-0.0, 0.0)) | st.floats(1e-15, 1.4),
     sources=st.lists(st.text()),
     braked=st.booleans(),
 )
@@ -135,3 +135,20 @@ def test_margins_add_up() -> None:
     assert Margins(segmentation_margin_mm=0.25, registration_margin_mm=1.0).total_mm == 1.25
     with pytest.raises(SettingsError, match="registration_margin_mm = -0.1"):
         Margins(registration_margin_mm=-0.1)
+
+
+@pytest.mark.parametrize("value", [5e-324, -1e-300, 1e308, float("nan"), float("inf")])
+def test_no_number_is_without_bounds(value):
+    @settings
+    class Open:
+        size: Annotated[float, quantity("size")]
+
+    with pytest.raises(SettingsError, match="size"):
+        Open(size=value)
+    assert Open(size=0.0).size == 0.0
+
+
+def test_a_long_value_is_shown_in_short():
+    with pytest.raises(SettingsError) as caught:
+        parse(Wheel, {"diameter_mm": [1.0] * 200_000}, "a.toml")
+    assert len(str(caught.value)) < 1000

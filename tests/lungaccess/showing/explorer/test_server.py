@@ -17,6 +17,7 @@ import pytest
 from anatomy.base.errors import SettingsError
 from lungaccess.showing.explorer import Explorer, PatientSource
 from lungaccess.showing.explorer.server import FOLDERS, asset_names, page_text
+from lungaccess.showing.explorer.worker import Given
 from tests.lungaccess.showing.explorer.client import Client, opened, serving, source_of, with_client
 
 NOBODY = PatientSource(folder=Path("nowhere"), system="lung-default")
@@ -271,3 +272,36 @@ def test_two_pages_do_not_see_each_other(patient: Path) -> None:
             assert [each["lps_mm"][0] for each in found] == [0.0, 10.0]
 
     asyncio.run(run())
+
+
+def test_half_open_and_malformed_requests_are_closed_without_a_word(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lungaccess.showing.explorer.server.REQUEST_S", 0.2)
+
+    async def run() -> list[bytes]:
+        async with serving(NOBODY) as (_explorer, address):
+            ends = []
+            for sent in (b"", b"GET / HTTP/1.1\r\nHost:", b"\x16\x03\x01\x00\xff\xfe nonsense\r\n\r\n"):
+                reader, writer = await asyncio.open_connection("127.0.0.1", address.port)
+                writer.write(sent)
+                ends.append(reader)
+            return [await asyncio.wait_for(reader.read(), 20.0) for reader in ends]
+
+    assert asyncio.run(run())[:2] == [b"", b""]
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_page_that_does_not_read_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lungaccess.showing.explorer.server.MOST_WAITING_BYTES", 1000)
+
+    async def run() -> tuple[int, int]:
+        async with serving(NOBODY) as (explorer, address), aiohttp.ClientSession() as session:
+            headers = {"Cookie": f"{address.cookie}={address.token}", "Origin": address.origin}
+            async with session.ws_connect(f"{address.origin}/socket", headers=headers):
+                (page,) = explorer._pages.values()
+                for _ in range(100):
+                    explorer._take(Given(page=page.name, number=1, sent="x" * 100, last=False))
+                return len(explorer._pages), page.outbox.qsize()
+
+    assert asyncio.run(run()) == (0, 0)

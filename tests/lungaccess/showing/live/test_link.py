@@ -15,7 +15,7 @@ pyigtl = pytest.importorskip("pyigtl", reason="pyigtl (extra `live`) is not inst
 from anatomy.io.openigtlink import pose_message  # noqa: E402
 from lungaccess.showing.live import Link  # noqa: E402
 from lungaccess.showing.live import link as link_module  # noqa: E402
-from lungaccess.showing.live.link import LATE, LOST, REFUSED, UNREADABLE  # noqa: E402
+from lungaccess.showing.live.link import LATE, REFUSED, UNREADABLE  # noqa: E402
 
 PATIENCE = 2000
 """Rounds of a few milliseconds until something has to have happened."""
@@ -140,7 +140,7 @@ def test_a_reset_connection_is_no_error(link: Link) -> None:
     for _ in range(50):
         link.send(message)
         link.poll(0.002)
-    assert link.peers == 0 and set(link.counts.dropped) <= {LOST}
+    assert link.peers == 0 and not link.counts.dropped
 
 
 def test_too_many_programs_are_refused(link: Link) -> None:
@@ -173,3 +173,23 @@ def test_a_port_in_use_is_an_error_in_words(link: Link) -> None:
         Link(port=link.port)
     with pytest.raises(SettingsError, match="cannot be listened at"):
         Link(host="192.0.2.1", port=0)
+
+
+def test_silent_programs_give_way_where_all_places_are_taken(
+    link: Link, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = joined(link, link_module.MOST_PEERS)
+    monkeypatch.setattr(link_module, "SILENT_S", 0.0)
+    newcomer = socket.create_connection(("127.0.0.1", link.port))
+    until(lambda: link.counts.dropped.get(link_module.GAVE_WAY) == 1, link)
+    assert link.peers == link_module.MOST_PEERS
+    for each in (*silent, newcomer):
+        each.close()
+
+
+def test_a_program_that_closes_before_it_has_read_all_is_not_lost(link: Link) -> None:
+    (client,) = joined(link)
+    link.send(*(pose_message("Tip", pose_at(n), 1.0) for n in range(50)))
+    client.close()
+    until(lambda: link.peers == 0, link)
+    assert not link.counts.dropped and link.counts.left == 1

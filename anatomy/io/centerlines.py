@@ -10,8 +10,7 @@ from anatomy.base.errors import FileError, FrameError
 from anatomy.base.files import require_suffix, write_text
 from anatomy.base.typed import Float, Int
 from anatomy.grid import transform_points
-from anatomy.io.frames import LPS_FROM, Frame
-from anatomy.io.image_header import MOST_COORDINATE_MM
+from anatomy.io.frames import LPS_FROM, MOST_COORDINATE_MM, Frame
 from anatomy.io.vtk_xml import VtkFile, VtkPiece, read_vtk_xml
 from anatomy.tree import tree_from_graph
 

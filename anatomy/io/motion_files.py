@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from anatomy.base.errors import AnatomyError, FileError, FrameError, SettingsError
-from anatomy.base.files import MOST_REASON, read_text, reading, reason, require_file, unreadable
+from anatomy.base.files import read_text, reading, reason, require_file, unreadable
 from anatomy.base.settings import quantity, settings, switch, text
 from anatomy.base.typed import Array, Float
 from anatomy.grid import Grid, transform_points
@@ -248,16 +248,12 @@ def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
         command = [sys.executable, "-P", transform_values.__file__, str(path.resolve()), numbers, str(out)]
         try:
             done = subprocess.run(command, capture_output=True, timeout=TRANSFORM_S, check=False)
-            said = done.stderr.decode("utf-8", errors="replace").strip().splitlines()
-            why = (
-                said[-1][:MOST_REASON]
-                if done.returncode > 0 and said
-                else f"ITK ended with {done.returncode}"
-            )
+            said = done.stderr.decode("utf-8", errors="replace")
+            why = ValueError(said if done.returncode > 0 else f"ITK ended with {done.returncode}")
         except subprocess.TimeoutExpired:
-            why = f"ITK takes more than {TRANSFORM_S:g} s"
+            why = ValueError(f"ITK takes more than {TRANSFORM_S:g} s")
         if not out.is_file():
-            raise unreadable(path, ValueError(why))
+            raise unreadable(path, why)
         vectors = np.load(out).transpose(2, 1, 0, 3)
     return grid, _finite(vectors, path)
 

@@ -93,7 +93,7 @@ def _not_contours(path: Path, what: str) -> FileError:
 
 def _require_axial(grid: Grid) -> None:
     direction = np.abs(grid.lps_from_ijk[:3, :3] / grid.spacing_mm)
-    if np.abs(direction - np.eye(3)).max() > 1e-3:
+    if not np.abs(direction - np.eye(3)).max() <= 1e-3:
         raise GridMismatchError(
             "Contours in columns and rows were given for an image that is not axial",
             expected="the CT whose slices the contours were drawn in",

@@ -171,7 +171,7 @@ class Explorer:
 
     async def _close_half_open(self, runner: web.AppRunner) -> None:
         """Close connections that have sent no whole request since the last look: each takes a place."""
-        waiting: set[object] = set()
+        waiting: set[web.RequestHandler] = set()
         while runner.server is not None:
             connections = set(runner.server.connections)
             self._served &= connections

@@ -147,7 +147,7 @@ def test_an_accepted_plan_writes_everything_and_exits_0(
     out = tmp_path / "out"
     words = ["plan", "toy", "--target", "lps:1,2,3", "--goal", "inverse-clearance"]
     assert cli.main([*words, "--out", str(out)]) == ExitCode.OK
-    assert {file.name for file in out.iterdir()} == WRITTEN
+    assert {file.name for file in out.iterdir() if file.is_file()} == WRITTEN
     assert Plan.load(out / "plan.json").digest == toy_plan.digest
     with (out / "cost_over_time.csv").open(newline="", encoding="utf-8") as file:
         costs = [row["best_cost"] for row in csv.DictReader(file)]
@@ -295,7 +295,7 @@ def test_the_demonstration_ends_with_an_accepted_plan(
     out = tmp_path / "out"
     words = ["demo", "--budget", "1", "--out", str(out), "--cache", str(tmp_path / "cache")]
     assert cli.main(words) == ExitCode.OK, capsys.readouterr().out
-    assert {file.name for file in out.iterdir()} == WRITTEN | {"report.html"}
+    assert {file.name for file in out.iterdir() if file.is_file()} == WRITTEN | {"report.html"}
 
 
 # Bad input ---------------------------------------------------------------------------------------

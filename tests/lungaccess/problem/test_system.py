@@ -120,7 +120,7 @@ def test_bad_device_files_are_refused(tmp_path: Path, old: str, new: str, messag
 def test_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "device.toml"
     path.write_bytes(b"name = '\xff\xfe'")
-    with pytest.raises(SettingsError, match="not valid TOML"):
+    with pytest.raises(FileError, match="no text in UTF-8: byte 8"):
         load_system(path)
 
 

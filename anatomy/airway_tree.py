@@ -18,6 +18,8 @@ from anatomy.tree_report import TreeReport
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
+    from anatomy.tree.naming import BronchialNames
+
 LEAST_CONTINUED_RADIUS = 0.85
 MOST_SIDE_RADIUS = 0.6
 """A bronchus goes on behind a fork with at least the one share of its radius if all else is below the other.
@@ -206,6 +208,13 @@ class AirwayTree:
         radius = self.branch_mean_radius_mm / self.branch_mean_radius_mm[parent]
         others = radius[np.setdiff1d(self.children(parent), branch)]
         return bool(radius[branch] >= LEAST_CONTINUED_RADIUS and (others < MOST_SIDE_RADIUS).all())
+
+    @cached_property
+    def bronchi(self) -> BronchialNames:
+        """Which bronchus each branch is, with a confidence; see `anatomy.tree.naming`."""
+        from anatomy.tree.naming import name_bronchi
+
+        return name_bronchi(self)
 
     @cached_property
     def nearest_point_index(self) -> cKDTree:

@@ -111,6 +111,7 @@ def build_lung(
         lumen_depth=_lumen_depth(images.lumen, keep),
         tree=tree,
         nodules=_cut_volume(images.nodules, box, "nodules", keep),
+        nodule_labels=_cut_volume(images.nodule_labels, box, "nodule_labels", keep),
         cost=_cut_volume(images.cost, box, "cost", keep),
         lobes=_cut_volume(images.lobes, box, "lobes", keep),
         motion=motion,

@@ -42,6 +42,8 @@ class Organ:
         "obstacle" without fissures, "obstacle_fissure" with them.  The "pleura" of a liver is its capsule.
     nodules, cost : Volume or None
         Nodule mask; cost map in [0, 1] or infinite.  Both on `grid`.
+    nodule_labels : Volume or None
+        uint16 numbers of the nodules by the patient's files, on `grid`, if these tell more than one apart.
     starts, targets_lps : tuple of arrays
         Poses `lps_from_tip` (4, 4) and points (3,) that came with the patient.
     start_names, target_names : tuple of str
@@ -73,6 +75,7 @@ class Organ:
     targets_lps: tuple[Float, ...]
     start_names: tuple[str, ...] = ()
     target_names: tuple[str, ...] = ()
+    nodule_labels: Volume | None = None
     breath_hold: str | None
     sources: Mapping[str, str]
     warnings: tuple[str, ...]

@@ -31,6 +31,8 @@ class PatientImages:
         Bool masks; None when the patient has none.
     lobes : Volume or None
         uint8 numbers of `anatomy.lobes.LOBES`; 0 is no lobe.
+    nodule_labels : Volume or None
+        uint16 numbers of the nodules by the patient's files, if these tell more than one apart; else 0.
     cost : Volume or None
         float32 cost of passing a voxel, in [0, 1], or infinity where passing is forbidden.
     starts : tuple of (4, 4) float64
@@ -66,6 +68,7 @@ class PatientImages:
     fissures: Volume | None = None
     nodules: Volume | None = None
     lobes: Volume | None = None
+    nodule_labels: Volume | None = None
     cost: Volume | None = None
     starts: tuple[Float, ...] = ()
     targets_lps: tuple[Float, ...] = ()
@@ -79,8 +82,10 @@ class PatientImages:
     def __post_init__(self) -> None:
         for role in MASKS:
             _require_mask(getattr(self, role), role, self.grid)
-        if self.lobes is not None:
-            self.grid.require_same(self.lobes.grid, "the lobes")
+        for name in ("lobes", "nodule_labels"):
+            numbers = getattr(self, name)
+            if numbers is not None:
+                self.grid.require_same(numbers.grid, f"the {name.replace('_', ' ')}")
         if self.cost is not None:
             _require_cost(self.cost, self.grid)
         object.__setattr__(self, "starts", tuple(read_only(np.array(p, float)) for p in self.starts))

@@ -35,6 +35,8 @@ REPORT_RECORDS: dict[str, Any] = {
     "loops_opened": LoopOpened,
 }
 FIELD_NAMES = ("airway", "vessel", "pleura", "fissure", "obstacle", "obstacle_fissure")
+KEPT = 1
+"""Version of what is kept of a lung: it is raised when more is kept, and the lung itself is the same."""
 
 
 def open_lung(
@@ -78,7 +80,7 @@ def open_lung(
 
 def stored_format() -> str:
     """Return what tells stored lungs of this version and these kernels from all others."""
-    return f"{FORMAT}-{kernel_digest('anatomy')}"
+    return f"{FORMAT}.{KEPT}-{kernel_digest('anatomy')}"
 
 
 def folder_name(key: str) -> str:
@@ -173,6 +175,7 @@ def _save_rest(lung: Lung, folder: Path) -> None:
         "fields": [name for name in FIELD_NAMES if name in lung.fields],
         "tree_report": _report_to_json(lung.tree.report),
         "nodules": lung.nodules is not None,
+        "nodule_labels": lung.nodule_labels is not None,
         "cost": lung.cost is not None,
         "lobes": lung.lobes is not None,
         **({} if lung.motion is None else {"motion": lung.motion.record()}),
@@ -231,6 +234,7 @@ def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
         lumen_depth=lumen,
         tree=_load_tree(folder, meta["tree_report"]),
         nodules=Volume(grid=grid, array=array("nodules")) if meta["nodules"] else None,
+        nodule_labels=Volume(grid=grid, array=array("nodule_labels")) if meta["nodule_labels"] else None,
         cost=Volume(grid=grid, array=array("cost")) if meta["cost"] else None,
         lobes=Volume(grid=grid, array=array("lobes")) if meta["lobes"] else None,
         motion=stored_motion(meta["motion"], array("motion")) if "motion" in meta else None,

@@ -50,6 +50,8 @@ def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any
     known: dict[str, Any] = dict(volumes)
     if masks.lobes is not None:
         known["lobes"] = Volume(grid=masks.grid, array=masks.lobes)
+    if masks.nodule_labels is not None:
+        known["nodule_labels"] = Volume(grid=masks.grid, array=masks.nodule_labels)
     return PatientImages(
         name=name,
         kind=kind,

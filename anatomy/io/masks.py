@@ -3,6 +3,7 @@
 import os.path
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from anatomy.base.errors import AnatomyError
 from anatomy.base.files import sha256
 from anatomy.base.records import frozen_record, frozen_value
-from anatomy.base.typed import Array, Float, Mask, UInt8
+from anatomy.base.typed import Array, Float, Mask, UInt8, UInt16
 from anatomy.grid import Grid
 from anatomy.io.frames import Frame
 from anatomy.io.images import read_grid, read_mask, read_volume
@@ -20,6 +21,8 @@ from anatomy.io.voxels import require_numbers
 _READERS = 2  # decompression releases the interpreter; more threads only raise the peak of memory
 SOLID = ("wall", "vessels", "fissures", "hepatic-vein", "portal-vein", "hepatic-artery")
 """Obstacles: none of their voxels may be lost where they are put on another grid."""
+MOST_NODULE_LABELS = 100
+"""A file with more values is no map of labels, which counts nodules, but a mask with soft edges."""
 EXTENT = ("lumen", "lung", "lobes")
 """Roles whose files decide how far the common grid reaches."""
 
@@ -29,13 +32,14 @@ class MaskSource:
     """A file that makes up (a part of) the mask `role`, one of `anatomy.patient.MASKS` or "lobes".
 
     Of the file count the voxels of the labels, or, if there are none, all but zero.  `lobe` is the number of
-    the lobe for the role "lobes".
+    the lobe for the role "lobes", `nodule` that of the nodule for the role "nodules", 0 if it has none.
     """
 
     role: str
     path: Path
     labels: tuple[int, ...] = ()
     lobe: int = 0
+    nodule: int = 0
 
 
 @frozen_record
@@ -43,7 +47,8 @@ class MaskSet:
     """The masks by role, the files each came from, the SHA-256 of every file, and how files were placed.
 
     Files in different folders are named from their common folder on.  `lobes` are numbers of
-    `anatomy.lobes.LOBES`, if there are lobes; their own role is "lobes" in `files` alone.
+    `anatomy.lobes.LOBES`, if there are lobes; their own role is "lobes" in `files` alone.  `nodule_labels`
+    are the numbers of nodules by their files, if these tell more than one apart.
     """
 
     grid: Grid
@@ -51,6 +56,7 @@ class MaskSet:
     files: Mapping[str, tuple[str, ...]]
     sources: Mapping[str, str]
     lobes: UInt8 | None = None
+    nodule_labels: UInt16 | None = None
     statements: tuple[str, ...] = ()
 
 
@@ -88,6 +94,9 @@ def read_masks(
         files=_files_by_role(sources),
         sources=hashes,
         lobes=gathered.lobes,
+        nodule_labels=gathered.nodule_labels
+        if len(gathered.nodules) > 1 and 0 not in gathered.nodules
+        else None,
         statements=tuple(gathered.finish()),
     )
 
@@ -101,10 +110,17 @@ class _Gathered:
         self._statements: list[str] = []
         self.masks: dict[str, Mask] = {}
         self.lobes: UInt8 | None = None
+        self.nodules: set[int] = set()
+        self.nodule_labels: UInt16 | None = None
 
     def add(self, name: str, grid: Grid, parts: list[tuple[MaskSource, Mask]]) -> None:
         for source, mask in parts:
             on_grid = mask if self._grid.is_close(grid) else self._placed(name, source.role, grid, mask)
+            if source.role == "nodules":
+                self.nodules.add(source.nodule)
+                if self.nodule_labels is None:
+                    self.nodule_labels = np.zeros(self._grid.shape, dtype=np.uint16, order="F")
+                self.nodule_labels[on_grid & (self.nodule_labels == 0)] = source.nodule
             if source.role != "lobes":
                 _unite(self.masks, source.role, on_grid)
                 continue
@@ -155,14 +171,28 @@ def _read_file(
     path: Path, sources: Sequence[MaskSource], frame: Frame | None
 ) -> tuple[Grid, list[tuple[MaskSource, Mask]], str]:
     sources = [source for source in sources if source.path == path]
-    if not any(source.labels for source in sources):
+    if not any(source.labels or source.role == "nodules" for source in sources):
         volume = read_mask(path, frame=frame)
         parts = [(source, volume.array) for source in sources]
     else:
         volume = read_volume(path, frame=frame)
         require_numbers(volume.array, path)
-        parts = [(source, select(volume.array, source.labels)) for source in sources]
+        apart = [each for source in sources for each in _nodules_apart(source, volume.array)]
+        parts = [(source, select(volume.array, source.labels)) for source in apart]
     return volume.grid, parts, sha256(path)
+
+
+def _nodules_apart(source: MaskSource, values: Array) -> list[MaskSource]:
+    """Return a source for each nodule that the labels of a file tell apart; the source itself if none are."""
+    if source.role != "nodules":
+        return [source]
+    held = np.unique(values[values != 0])
+    labels = held if not source.labels else np.intersect1d(held, source.labels)
+    if len(source.labels) == 1:
+        return [replace(source, nodule=source.labels[0])]
+    if not 1 < len(labels) <= MOST_NODULE_LABELS or (labels != np.floor(labels)).any() or labels[0] < 0:
+        return [source]
+    return [replace(source, labels=(int(label),), nodule=int(label)) for label in labels]
 
 
 def select(values: Array, labels: tuple[int, ...]) -> Mask:

@@ -114,9 +114,11 @@ def _of_a_case(images: Mapping[str, Path]) -> Path | None:
 
 
 def numbered_nodules(images: Mapping[str, Path]) -> list[MaskSource]:
-    """Return the masks called nodule, nodules, tumour, nodule1, nodule2 and so on."""
-    found = [path for stem, path in images.items() if re.fullmatch(r"(nodule|tumou?r)s?\d*", stem)]
-    return [MaskSource(role="nodules", path=path) for path in found]
+    """Return the masks called nodule, nodules, tumour, nodule1, nodule2 and so on, with these numbers."""
+    found = [(re.fullmatch(r"(?:nodule|tumou?r)s?(\d*)", stem), path) for stem, path in images.items()]
+    return [
+        MaskSource(role="nodules", path=path, nodule=int(match[1] or 0)) for match, path in found if match
+    ]
 
 
 def text_poses(folder: Path, grid: Grid) -> TextPoses:

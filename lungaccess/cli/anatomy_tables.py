@@ -8,6 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from lungaccess.cli import terminal
+from lungaccess.problem.nodules import nodules_of
 
 MOTION_WORDS = {
     "landmark_pairs": "pairs of landmarks",
@@ -60,6 +61,21 @@ def organ_record(lung: Organ) -> dict[str, Any]:
         "targets_lps": [point.tolist() for point in lung.targets_lps],
         "target_names": list(lung.target_names),
         **(_airways(lung) if isinstance(lung, Lung) else {}),
+        "nodules": [
+            {
+                "number": each.number,
+                "is_label": each.is_label,
+                "volume_ml": each.volume_ml,
+                "diameter_mm": each.diameter_mm,
+                "centre_lps": each.centre_lps.tolist(),
+                **(
+                    {"segment": lung.segment_at(each.centre_lps), "lobe": lung.lobe_at(each.centre_lps)}
+                    if isinstance(lung, Lung)
+                    else {}
+                ),
+            }
+            for each in nodules_of(lung)
+        ],
         "sources": dict(lung.sources),
         "warnings": list(lung.warnings),
     }
@@ -86,6 +102,14 @@ def _airways(lung: Lung) -> dict[str, Any]:
             "branches": tree.n_branches,
             "carina_lps": tree.carina_lps.tolist(),
             "branches_by_generation": np.bincount(tree.generation).tolist(),
+            "bronchi": [
+                {
+                    "name": tree.bronchi.names[branch],
+                    "branch": branch,
+                    "confidence": float(tree.bronchi.confidence[branch]),
+                }
+                for branch in np.flatnonzero(tree.bronchi.starts).tolist()
+            ],
             "components_dropped": report.components_dropped,
             "voxels_dropped": report.voxels_dropped,
             "repairs": [
@@ -130,6 +154,7 @@ def anatomy_tables(lung: Organ) -> list[Table]:
     made = [
         terminal.table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
+        _nodule_table(lung),
         *(_tree_tables(lung) if isinstance(lung, Lung) else ()),
         *(_motion_tables(lung) if isinstance(lung, Lung) else ()),
         terminal.table("Starts and targets", ("name", "LPS, mm"), _place_rows(lung)),
@@ -140,8 +165,49 @@ def anatomy_tables(lung: Organ) -> list[Table]:
     return [each for each in made if each.row_count]
 
 
+def _nodule_table(lung: Organ) -> Table:
+    from anatomy.lung import Lung
+
+    found = nodules_of(lung)
+    labelled = bool(found) and found[0].is_label
+    rows = [
+        (
+            f"{each.number}",
+            f"{each.diameter_mm:.1f}",
+            f"{each.volume_ml:.2f}",
+            ", ".join(f"{c:.1f}" for c in each.centre_lps),
+            lung.region_at(each.centre_lps) if isinstance(lung, Lung) else "",
+        )
+        for each in found
+    ]
+    number = "label in the mask" if labelled else "number, by size"
+    headings = (number, "diameter of a ball as large, mm", "volume, ml", "centre, LPS mm", "place")
+    return terminal.table("Nodules, for --nodule", headings, rows)
+
+
+def _bronchus_rows(lung: Lung) -> list[terminal.Row]:
+    """Return the named bronchi in the order of the tree, with what is measured of each."""
+    tree, named = lung.tree, lung.tree.bronchi
+    return [
+        (
+            named.names[branch],
+            f"{branch}",
+            f"{tree.generation[branch]}",
+            f"{2.0 * tree.branch_mean_radius_mm[branch]:.1f}",
+            f"{tree.branch_length_mm[branch]:.1f}",
+            f"{100.0 * named.confidence[branch]:.0f} %",
+        )
+        for branch in np.flatnonzero(named.starts).tolist()
+    ]
+
+
 def _tree_tables(lung: Lung) -> list[Table]:
     return [
+        terminal.table(
+            "Bronchi with a name",
+            ("bronchus", "branch", "generation", "mean diameter, mm", "length, mm", "confidence"),
+            _bronchus_rows(lung),
+        ),
         terminal.table(
             "Airway tree",
             ("generation", "branches", "mean radius, mm", "least radius, mm", "mean length, mm"),

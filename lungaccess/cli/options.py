@@ -122,7 +122,8 @@ class TargetOptions:
         Whole | None,
         Parameter(
             metavar="[INT]",
-            help="Go to the centre of this nodule of the nodule mask; 1, the largest, if no number follows.",
+            help="Go to the centre of this nodule: its label in the nodule mask, else 1 for the largest and "
+            "so on, see info; the largest if no number follows.",
         ),
     ] = None
 

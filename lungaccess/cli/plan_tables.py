@@ -14,6 +14,7 @@ from rich.text import Text
 
 from lungaccess.cli import terminal
 from lungaccess.judging.appraisal.grade import Grade
+from lungaccess.problem.nodules import target_words
 from stages.needle import Objective
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def steps_table(plan: Plan, lung: Lung) -> Table:
 
 
 def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
-    scope, tube, lobe = plan.scope, plan.tube, lung.lobe_at(plan.target_lps)
+    scope, tube, place = plan.scope, plan.tube, target_words(lung, plan.target_lps)
     way = plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"
     return [
         (
@@ -86,7 +87,7 @@ def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
             f"{plan.rotations}, {plan.insertions} beyond the scope; "
             f"through the wall of branch {lung.branch_words(tube.exit.branch)}",
         ),
-        ("needle", way + (f" in the {lobe}" if lobe else "")),
+        ("needle", way + (f": {place}" if place else "")),
     ]
 
 

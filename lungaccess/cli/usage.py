@@ -97,10 +97,10 @@ def asks_json(words: Sequence[str]) -> bool:
 
 
 def with_nodule_number(words: Sequence[str]) -> list[str]:
-    """Let `--nodule` stand alone for `--nodule 1`: it is the only option whose value may be left out."""
+    """Let `--nodule` stand alone for `--nodule 0`, the largest nodule: no other option may be without value."""
     completed: list[str] = []
     for word, following in zip(words, [*words[1:], ""], strict=False):
         completed.append(word)
         if word == "--nodule" and not following.lstrip("+-").isdigit():
-            completed.append("1")
+            completed.append("0")
     return completed

@@ -156,14 +156,15 @@ def branch_label(tree: AirwayTree, branch: int) -> str:
     """Return the short name of a branch."""
     if branch == 0:
         return "trachea"
-    return f"{_side(tree, branch)} main" if tree.mediastinal[branch] else f"branch {branch}"
+    if tree.mediastinal[branch]:
+        return f"{_side(tree, branch)} main"
+    return tree.bronchi.names[branch] or f"branch {branch}"
 
 
 def branch_name(lung: Lung, branch: int) -> str:
     """Return what is known of a branch: number and generation, a main bronchus by its side, else its lobe.
 
-    The tree has no names of segments, so none is given.  A lobe is named only where all ends of the branch
-    and of those beyond it lie in it.
+    A lobe is named only where the bronchus has no name, and all ends at or beyond the branch lie in it.
     """
     tree = lung.tree
     known = f"branch {branch}, generation {int(tree.generation[branch])}"
@@ -171,6 +172,8 @@ def branch_name(lung: Lung, branch: int) -> str:
         return f"the trachea ({known})"
     if tree.mediastinal[branch]:
         return f"the {_side(tree, branch)} main bronchus ({known})"
+    if words := tree.bronchi.words(branch):
+        return f"{words} ({known})"
     lobes = {_lobe(lung, end) for end in _ends(tree, branch)}
     return f"{known}, to the {lobes.pop()}" if len(lobes) == 1 and "" not in lobes else known
 

@@ -6,13 +6,13 @@ import numpy as np
 
 from anatomy.base.errors import TargetError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float, Int
-from anatomy.grid import Volume, read_only
+from anatomy.base.typed import Float
+from anatomy.grid import read_only
 from anatomy.io.frames import MOST_COORDINATE_MM
 from anatomy.lung import Lung
-from anatomy.morphology import components
 from anatomy.organ import Organ
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
+from lungaccess.problem.nodules import find_nodule
 
 
 @frozen_record
@@ -39,7 +39,7 @@ class StatedTarget:
     lps_mm : (3,) float64 or None
         A point, LPS mm; None for a nodule.
     nodule : int
-        Number of a nodule, 1 for the largest, if there is no point.
+        Number of a nodule, 0 for the largest one, if there is no point.
     origin : str
         What the user wrote.
     name : str
@@ -135,8 +135,8 @@ def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = No
     text : str, optional
         A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm; or as `stated_target` takes it.
     nodule : int, optional
-        Number of a nodule, 1 for the largest.  The target is its centroid where a needle may end
-        there, else its voxel farthest from every obstacle.
+        Its label in the files, else its rank by size; 0, the default, for the largest.  The target is its
+        centroid where a needle may end there, else its voxel farthest from every obstacle.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = No
         If there is no such nodule, or the point lies outside the lung or inside an obstacle.
     """
     if text is None and nodule is None:
-        nodule = 1
+        nodule = 0
     return stated_target(text, None if text is not None else nodule).resolve(lung)
 
 
@@ -170,40 +170,21 @@ def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target
 
 
 def nodule_target(lung: Organ, number: int) -> Target:
-    """Return a target in the nodule `number`, counted from 1 by decreasing size.
+    """Return a target in a nodule, by its number as of `lungaccess.problem.nodules`; 0 is the largest one.
 
     Raises
     ------
     TargetError
         If there is no such nodule or none of it can be entered.
     """
-    if lung.nodules is None or not lung.nodules.array.any():
-        raise TargetError(
-            f"Patient {lung.name} has no nodule mask",
-            expected="a nodule mask among the patient's files",
-            remedy="Name a point with --target ras:x,y,z or lps:x,y,z",
-        )
-    voxels = _nodule_voxels(lung.nodules, number)
-    centres = lung.nodules.grid.lps(voxels)
+    nodule = find_nodule(lung, number)
+    centres = lung.grid.lps(nodule.voxels)
     clearance = lung.obstacle_field(with_fissures=True).lower_bound_mm(centres)
     nearest = centres[np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1))]
     is_free = lung.label_at(nearest) & (OUTSIDE | VESSEL | AIRWAY) == 0
     point = nearest if is_free else centres[int(np.argmax(clearance))]
     require_free(lung, point)
-    return Target(lps_mm=read_only(point), origin=f"nodule {number}")
-
-
-def _nodule_voxels(nodules: Volume, number: int) -> Int:
-    voxels, part = components(nodules.array)
-    sizes = np.bincount(part)
-    count = len(sizes)
-    if not 1 <= number <= count:
-        raise TargetError(
-            f"There is no nodule {number}",
-            expected=f"a number from 1 to {count}, 1 being the largest",
-            remedy="Choose one of these numbers, or name a point with --target",
-        )
-    return np.asarray(voxels[part == np.argsort(-sizes, kind="stable")[number - 1]])
+    return Target(lps_mm=read_only(point), origin=f"nodule {nodule.number}")
 
 
 def require_free(lung: Organ, point: Float, origin: str = "") -> None:

@@ -144,7 +144,10 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         breath_hold=None,
         motion=None,
         lobes=None,
+        nodule_labels=None,
         lobe_at=lambda point_lps: "left lower lobe" if point_lps[0] > 0.0 else "",
+        segment_at=lambda _point_lps: "",
+        region_at=lambda point_lps: "left lower lobe" if point_lps[0] > 0.0 else "",
         branch_words=lambda branch: f"{branch} (left lower lobe)",
         warnings=("The toy is [made by hand].",),
     )

@@ -119,6 +119,7 @@ def record(reach: ReachMap) -> dict[str, object]:
         "deployments": reach.entries,
         "lungs_are_separate": reach.regions.lungs_are_separate,
         "regions": [_plain(row) for row in reach.by_region()],
+        "segments": [_plain(row) for row in reach.by_segment()],
         "phases": None if reach.phases is None else list(reach.phases),
         "resumed_layers": reach.resumed_layers,
         "timing": {"scan_s": reach.scan_s, "atlas_s": reach.atlas_s},
@@ -149,7 +150,7 @@ def _region_table(reach: ReachMap) -> Table:
             f"{row.median_cost:.2f}",
             f"{row.median_clearance_mm:.2f}",
         )
-        for row in reach.by_region()
+        for row in (*reach.by_region(), *reach.by_segment())
     ]
     headings = ("", "mL", *(f"{state}, mL" for state in STATES), "median cost", "median clearance, mm")
     during = "" if reach.phases is None else ", phases {:g} to {:g}".format(*reach.phases)

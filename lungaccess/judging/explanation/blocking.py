@@ -252,10 +252,12 @@ def _blockings(arcs: DirectArcs, found: Float, labels: Int) -> Iterator[Blocking
 
 def _structure(arcs: DirectArcs, point: Float, label: int) -> Structure:
     lung = arcs.task.lung
-    kind, name = blocker_name(label), f"in the {region_of(lung, point)}"
+    segment = lung.segment_at(point)
+    name = f"in {segment}, {region_of(lung, point)}" if segment else f"in the {region_of(lung, point)}"
+    kind = blocker_name(label)
     branch = (label >> BRANCH_SHIFT) - 1
     if kind == "an airway" and label & AIRWAY and branch >= 0:
-        name = f"(branch {branch}, generation {int(lung.tree.generation[branch])}) {name}"
+        name = f"(branch {lung.branch_words(branch)}, generation {int(lung.tree.generation[branch])}) {name}"
     away = float(np.linalg.norm(point - arcs.task.target.lps_mm))
     return Structure(kind=kind, name=name, lps_mm=np.array(point), from_target_mm=away)
 

@@ -141,6 +141,10 @@ class ReachMap:
         """Return what is reached of each lung, of each lobe if they are known, and of all of them last."""
         return *(self._reach(name, where) for name, where in self.regions.parts()), self.total
 
+    def by_segment(self) -> tuple[RegionReach, ...]:
+        """Return what is reached of each segment whose bronchus is named, see `anatomy.tree.naming`."""
+        return tuple(self._reach(name, where) for name, where in self.regions.segment_parts())
+
     @property
     def total(self) -> RegionReach:
         """What is reached of the whole lung."""

@@ -26,11 +26,14 @@ class Regions:
 
     If `lungs_are_separate`, the two are parts of the mask without a bridge; else the plane through the carina
     divides them.  `lobes` has the numbers of `anatomy.lobes.LOBES`; None if the patient came without lobes.
+    `segments` has 1 for the first of `segment_names` and so on, by the nearest bronchus; 0 where it has none.
     """
 
     volume: Volume
     names: Mapping[int, str]
     lungs_are_separate: bool
+    segments: Volume
+    segment_names: tuple[str, ...]
     lobes: Volume | None = None
 
     def parts(self) -> Iterator[tuple[str, Mask]]:
@@ -40,6 +43,11 @@ class Regions:
         if self.lobes is not None:
             for code, name in LOBES.items():
                 yield name, self.lobes.array == code
+
+    def segment_parts(self) -> Iterator[tuple[str, Mask]]:
+        """Yield the name and the voxels of each segment that has a named bronchus."""
+        for code, name in enumerate(self.segment_names, start=1):
+            yield name, self.segments.array == code
 
 
 def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
@@ -72,11 +80,17 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
         array[tuple(ijk.T)] = values
         return Volume(grid=grid, array=array)
 
+    segments = np.array(lung.tree.bronchi.segments)
+    names = sorted({*segments.tolist()} - {""}, key=lambda name: (name[0], int(name[2:].partition("+")[0])))
+    nearest = lung.tree.branch_of_point[lung.tree.nearest_point_index.query(points)[1]]
+    of_branch = np.array([names.index(name) + 1 if name else 0 for name in segments], dtype=np.uint8)
     return Regions(
         volume=on_grid(codes),
         names=NAMES,
         lungs_are_separate=lungs_are_separate,
         lobes=None if lung.lobes is None else on_grid(lung.lobes.array[voxels]),
+        segments=on_grid(of_branch[nearest]),
+        segment_names=tuple(names),
     )
 
 

@@ -112,7 +112,7 @@ class Answers:
         yield Part(
             {
                 "answer": "place", "lps_mm": place.lps_mm.tolist(), "tissue": place.tissue,
-                "lobe": place.lobe, "distance_mm": dict(place.distance_mm),
+                "lobe": self.lung.region_at(place.lps_mm), "distance_mm": dict(place.distance_mm),
                 "generation": place.generation, "may_be_target": place.may_be_target,
             }
         )  # fmt: skip

@@ -12,7 +12,8 @@ from anatomy.base.errors import LungaccessError
 from anatomy.base.typed import Float, Float32
 from anatomy.grid import Volume
 from anatomy.lung import Lung
-from lungaccess.problem import System, Target, load_system, nodule_target, preset_names, resolve_target
+from lungaccess.problem import System, Target, load_system, preset_names, resolve_target
+from lungaccess.problem.nodules import nodules_of
 from lungaccess.showing.explorer.worker import PatientSource
 from lungaccess.showing.report.html.meshes import structure_meshes
 from lungaccess.showing.report.html.volumes import CODES, page_image, read_ct
@@ -20,7 +21,7 @@ from lungaccess.showing.report.reach import COLOURS
 
 MOST_NODULES = 50
 NODULE = "nodule"
-"""The target `nodule 2` is the second largest nodule."""
+"""The target `nodule 2` is the nodule with this number, see `lungaccess.problem.nodules`."""
 
 
 def target_of(lung: Lung, text: str) -> Target:
@@ -67,26 +68,19 @@ def _box(lung: Lung) -> tuple[Float, Float]:
 
 
 def _targets(lung: Lung) -> list[dict[str, Any]]:
-    """Return nodules, the largest first, then the targets that came with the patient."""
+    """Return nodules with their sizes, then the targets that came with the patient, and where they lie."""
+    sizes = {f"{NODULE} {each.number}": each.diameter_mm for each in nodules_of(lung)[:MOST_NODULES]}
     found = []
-    for number in range(1, MOST_NODULES + 1):
+    for text in (*sizes, *lung.target_names):
         try:
-            target = nodule_target(lung, number)
-        except LungaccessError:
-            break
-        found.append(
-            {
-                "text": f"{NODULE} {number}",
-                "lps_mm": target.lps_mm.tolist(),
-                "lobe": lung.lobe_at(target.lps_mm),
-            }
-        )
-    for name in lung.target_names:
-        try:
-            target = resolve_target(lung, text=name)
+            point = target_of(lung, text).lps_mm
         except LungaccessError:
             continue
-        found.append({"text": name, "lps_mm": target.lps_mm.tolist(), "lobe": lung.lobe_at(target.lps_mm)})
+        place = lung.region_at(point)
+        words = [f"{sizes[text]:.0f} mm"] if text in sizes else []
+        found.append(
+            {"text": text, "lps_mm": point.tolist(), "lobe": ", ".join([*([place] if place else []), *words])}
+        )
     return found
 
 

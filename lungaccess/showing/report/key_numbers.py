@@ -9,6 +9,7 @@ import numpy as np
 from anatomy.base.words import plural
 from lungaccess.judging.appraisal.limits import SHOWN_LIMITS
 from lungaccess.plans.costs import costs_in_words, known_costs
+from lungaccess.problem.nodules import target_words
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -38,7 +39,7 @@ def _general_rows(plan: Plan, lung: Lung) -> list[Row]:
         ("system", plan.system.name),
         ("target, LPS mm", f"{x:.1f}, {y:.1f}, {z:.1f}"),
         ("target, RAS mm", f"{-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}"),
-        *((("lobe of the target", lobe),) if (lobe := lung.lobe_at(plan.target_lps)) else ()),
+        *((("place of the target", place),) if (place := target_words(lung, plan.target_lps)) else ()),
         ("fissures", _fissures(plan)),
         ("breath hold", plan.breath_hold or "not stated"),
         ("method, seed", f"{plan.method}, {plan.seed}"),

@@ -123,7 +123,7 @@ def volumes_section(maps: Sequence[ReachMap]) -> str:
                 words.number(row.median_cost),
                 words.number(row.median_clearance_mm),
             )
-            for row in each.by_region()
+            for row in (*each.by_region(), *each.by_segment())
         ]
         tables.append(words.table(each.system.name, headings, rows))
     note = "The patient came without lobes." if any(each.regions.lobes is None for each in maps) else ""

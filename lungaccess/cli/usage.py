@@ -97,7 +97,7 @@ def asks_json(words: Sequence[str]) -> bool:
 
 
 def with_nodule_number(words: Sequence[str]) -> list[str]:
-    """Let `--nodule` stand alone for `--nodule 0`, the largest nodule: no other option may be without value."""
+    """Let `--nodule` stand alone for `--nodule 0`, the largest: its value alone may be left out."""
     completed: list[str] = []
     for word, following in zip(words, [*words[1:], ""], strict=False):
         completed.append(word)

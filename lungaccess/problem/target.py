@@ -94,7 +94,8 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
             remedy="Add --nodule for the largest nodule, or a point such as --target ras:-41.5,22,-110",
         )
     if text is None:
-        return StatedTarget(lps_mm=None, nodule=nodule or 0, origin=f"nodule {nodule}")
+        origin = f"nodule {nodule}" if nodule else "the largest nodule"
+        return StatedTarget(lps_mm=None, nodule=nodule or 0, origin=origin)
     from anatomy.io.markups import parse_reference, read_named_point
 
     saved = parse_reference(text)

@@ -204,8 +204,8 @@ def test_an_interruption_keeps_the_best_plan(
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--nodule"], "nodule 1"),
-        (["--nodule", "--seed", "4"], "nodule 1"),
+        (["--nodule"], "the largest nodule"),
+        (["--nodule", "--seed", "4"], "the largest nodule"),
         (["--nodule", "2"], "nodule 2"),
         (["--nodule=3"], "nodule 3"),
         (["--target", "ras:-1,2,3"], "point ras:-1,2,3"),

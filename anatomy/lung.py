@@ -14,6 +14,7 @@ from anatomy.morphology import voxels_in
 from anatomy.motion.motion import Motion
 from anatomy.organ import Organ
 from anatomy.structures import AIRWAY, OUTSIDE
+from anatomy.tree.naming import SEGMENT_LOBES
 
 HEIGHT_STEP = 4
 """Every fourth voxel is looked at to find apex and base: within 2 mm or so of 250 mm."""
@@ -108,7 +109,10 @@ class Lung(Organ):
 
     def region_at(self, point_lps: Float) -> str:
         """Return segment and lobe at a point `(3,)` LPS mm, as far as known: "RS6, right lower lobe"."""
-        return ", ".join(each for each in (self.segment_at(point_lps), self.lobe_at(point_lps)) if each)
+        segment, lobe = self.segment_at(point_lps), self.lobe_at(point_lps)
+        if segment and not lobe:
+            lobe = LOBES[SEGMENT_LOBES[segment[0]][int(segment[2:].partition("+")[0])]]
+        return ", ".join(each for each in (segment, lobe) if each)
 
     def branch_words(self, branch: int) -> str:
         """Return the number of an airway branch, with its name, else the lobe in which it ends, if known."""

@@ -8,7 +8,6 @@ import numpy as np
 from rich.table import Table
 
 from lungaccess.cli import terminal
-from lungaccess.problem.nodules import nodules_of
 
 MOTION_WORDS = {
     "landmark_pairs": "pairs of landmarks",
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
 def organ_record(lung: Organ) -> dict[str, Any]:
     """Return what was understood of a patient; a liver has neither tree nor lobes."""
     from anatomy.lung import Lung
+    from lungaccess.problem.nodules import nodules_of
 
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
@@ -167,6 +167,7 @@ def anatomy_tables(lung: Organ) -> list[Table]:
 
 def _nodule_table(lung: Organ) -> Table:
     from anatomy.lung import Lung
+    from lungaccess.problem.nodules import nodules_of
 
     found = nodules_of(lung)
     labelled = bool(found) and found[0].is_label

@@ -14,7 +14,6 @@ from rich.text import Text
 
 from lungaccess.cli import terminal
 from lungaccess.judging.appraisal.grade import Grade
-from lungaccess.problem.nodules import target_words
 from stages.needle import Objective
 
 if TYPE_CHECKING:
@@ -74,6 +73,8 @@ def steps_table(plan: Plan, lung: Lung) -> Table:
 
 
 def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
+    from lungaccess.problem.nodules import target_words
+
     scope, tube, place = plan.scope, plan.tube, target_words(lung, plan.target_lps)
     way = plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"
     return [

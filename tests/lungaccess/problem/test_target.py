@@ -9,9 +9,12 @@ import pytest
 
 import lungaccess as la
 from anatomy.base.errors import FrameError, TargetError
+from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom
 from anatomy.structures import OUTSIDE, VESSEL
+from lungaccess.problem.nodules import nodules_of as nodules_of_patient
+from lungaccess.problem.nodules import target_words
 from lungaccess.problem.target import nodule_target, point_target
 from tests.stages.scenes import Canvas, nodules_of
 
@@ -147,3 +150,25 @@ def test_the_nodules_of_the_phantom_are_where_it_grew_them(small_lung: Lung, sma
     for number, nodule in enumerate(by_size, start=1):
         target = nodule_target(small_lung, number)
         assert np.linalg.norm(target.lps_mm - nodule.centre_lps) < 1.25
+
+
+def test_a_nodule_is_called_by_its_label(lung: Lung) -> None:
+    """Of two nodules that touch, each is one of its own; sizes do not change the labels."""
+    canvas = Canvas.empty([-20, -20, -20], [20, 20, 20], 1.0)
+    large, small = canvas.ball([0, 0, -10], 4.0), canvas.ball([0, 0, -4], 2.5)
+    labels = np.where(large, 7, np.where(small, 2, 0)).astype(np.uint16)
+    patient = replace(
+        lung, nodules=nodules_of(canvas, large | small), nodule_labels=Volume(grid=lung.grid, array=labels)
+    )
+    assert [each.number for each in nodules_of_patient(patient)] == [2, 7]
+    assert np.linalg.norm(nodule_target(patient, 2).lps_mm - [0, 0, -4]) < 1.5
+    assert nodule_target(patient, 7).origin == "nodule 7" == la.resolve_target(patient).origin
+    diameters = [each.diameter_mm for each in nodules_of_patient(patient)]
+    assert diameters == pytest.approx([5.0, 8.0], rel=0.15)
+    with pytest.raises(TargetError, match="one of the labels 2, 7"):
+        nodule_target(patient, 1)
+
+
+def test_a_target_is_put_in_words(lung: Lung) -> None:
+    assert target_words(lung, nodule_target(lung, 1).lps_mm) == "nodule 1, 6 mm"
+    assert target_words(lung, np.array([0.0, 0.0, 0.0])) == ""

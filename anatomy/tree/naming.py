@@ -8,7 +8,7 @@ the probability of every name, exactly and without drawing anything at random.
 
 References
 ----------
-[Boyden1955], [Javed2024], [Huang2019], [Tschirren2005]
+[Boyden1955], [Javed2024], [Javed2024a], [Huang2019], [Tschirren2005]
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ DIRECTIONS: Mapping[str, Mapping[int, tuple[float, float, float]]] = MappingProx
 )
 """Where each segment lies from its bronchus: outwards, backwards and upwards, as anatomy puts it in words.
 
-A word counts 1, "slightly" counts a half [Boyden1955].  Left 1 stands for 1+2, and left 8 for 7+8, because
-the left medial basal segment has a bronchus of its own in few patients [Javed2024b].
+A word counts 1, "slightly" counts a half [Boyden1955].  Left 1 stands for 1+2, and left 8 for 7+8, because B7
+leaves B8 in most left lungs.
 """
 STEMS: Mapping[str, Mapping[_Segments, float]] = MappingProxyType(
     {
@@ -149,6 +149,8 @@ The probability falls to 1/e for every such share of all airways of the lung tha
 """
 SIZE_SPREAD = 1.0
 """Segments have equal shares of a lung's airways within a factor of e, as masks end early or late."""
+TRACHEA_SHARE, LUNG_SHARE = 0.7, 0.15
+"""The trachea goes on in a branch that leads to most airways, and to two lungs of at least this share each."""
 DIVIDED_SHARE = 0.01
 """A branch with a smaller share of a lung's airways does not lead to several segments."""
 LEAST_CONFIDENCE = 0.7
@@ -351,10 +353,13 @@ def name_bronchi(tree: AirwayTree) -> BronchialNames:
     shape = _Shape.of(tree)
     names = [""] * tree.n_branches
     confidence, lobes = np.zeros(tree.n_branches), np.zeros(tree.n_branches, dtype=np.int64)
-    on_left = shape.middle[:, 0] > tree.carina_lps[0]
-    names[0], confidence[0] = "trachea", 1.0
+    trachea = _trachea(tree, shape)
+    on_left = shape.middle[:, 0] > tree.points_lps[tree.branch_start[trachea[-1] + 1] - 1, 0]
+    for branch in trachea:
+        names[branch], confidence[branch] = "trachea", 1.0
+    leaving = np.setdiff1d(np.flatnonzero(np.isin(tree.branch_parent, trachea)), trachea)
     for side in (RIGHT, LEFT):
-        roots = [int(each) for each in tree.children(0) if on_left[each] == (side == LEFT)]
+        roots = [int(each) for each in leaving if on_left[each] == (side == LEFT)]
         if roots:
             _name_lung(side, tree, _Lung(side, tree, shape, roots), names, confidence, lobes)
     above = [names[max(int(parent), 0)] for parent in tree.branch_parent]
@@ -365,6 +370,19 @@ def name_bronchi(tree: AirwayTree) -> BronchialNames:
         ]
     )
     return BronchialNames(names=tuple(names), starts=starts, confidence=confidence, lobes=lobes)
+
+
+def _trachea(tree: AirwayTree, shape: _Shape) -> list[int]:
+    """Return the branches of the trachea: more than one where a bronchus leaves it above the carina."""
+    branches, whole_mm = [0], float(shape.beyond_mm[0])
+    for branch in range(1, tree.n_branches):
+        if int(tree.branch_parent[branch]) == branches[-1]:
+            below = tree.children(branch)
+            on_left = shape.middle[below, 0] > tree.points_lps[tree.branch_start[branch + 1] - 1, 0]
+            sides_mm = [shape.beyond_mm[below[on_left]].sum(), shape.beyond_mm[below[~on_left]].sum()]
+            if shape.beyond_mm[branch] >= TRACHEA_SHARE * whole_mm and min(sides_mm) >= LUNG_SHARE * whole_mm:
+                branches.append(branch)
+    return branches
 
 
 def _name_lung(

@@ -127,6 +127,24 @@ def test_a_turned_tree_is_less_sure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert on_side.confidence.mean() < tree.bronchi.confidence.mean()
 
 
+def test_a_bronchus_of_the_trachea_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The apical bronchus may leave the trachea above the carina, which is then no end of the trachea."""
+    _tree, drawn = varied(0, monkeypatch)
+    moved = np.zeros(drawn.n_branches, dtype=np.bool_)
+    apical = drawn.names.index("RB1")
+    moved[apical] = True
+    for branch in range(apical + 1, drawn.n_branches):
+        moved[branch] = moved[drawn.branch_parent[branch]]
+    points = drawn.points_lps.copy()
+    of_point = np.repeat(moved, np.diff(drawn.branch_start))
+    onto = points[drawn.branch_start[1] * 3 // 4]
+    points[of_point] += onto - points[drawn.branch_start[apical]]
+    tree = tree_from_graph(points, drawn.radius_mm, drawn.edges)
+    found = compared(tree, replace(drawn, points_lps=points))
+    assert found["segment right"] >= 17
+    assert found["segment wrong"] == found["lobe wrong"] == 0
+
+
 def test_a_tree_of_one_branch_is_a_trachea() -> None:
     points = np.column_stack([np.zeros(20), np.zeros(20), -np.arange(20.0)])
     fork = np.array([[-8.0, 0.0, -25.0], [8.0, 0.0, -25.0]])

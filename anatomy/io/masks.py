@@ -177,12 +177,12 @@ def _read_file(
     else:
         volume = read_volume(path, frame=frame)
         require_numbers(volume.array, path)
-        apart = [each for source in sources for each in _nodules_apart(source, volume.array)]
-        parts = [(source, select(volume.array, source.labels)) for source in apart]
+        expanded = [each for source in sources for each in _by_label(source, volume.array)]
+        parts = [(source, select(volume.array, source.labels)) for source in expanded]
     return volume.grid, parts, sha256(path)
 
 
-def _nodules_apart(source: MaskSource, values: Array) -> list[MaskSource]:
+def _by_label(source: MaskSource, values: Array) -> list[MaskSource]:
     """Return a source for each nodule that the labels of a file tell apart; the source itself if none are."""
     if source.role != "nodules":
         return [source]

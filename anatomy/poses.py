@@ -61,6 +61,12 @@ def _unit(vector: Float, name: str) -> Float:
     return vector / length
 
 
+def unit(vector: Float) -> Float:
+    """Scale vectors `(..., 3)` to length one (zero stays zero)."""
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.asarray(vector / np.maximum(length, 1e-12))
+
+
 def spread_directions(count: int) -> Float:
     """Return unit vectors `(count, 3)`, evenly spread over the sphere on a golden spiral about +z."""
     n = np.arange(count) + 0.5

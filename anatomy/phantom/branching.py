@@ -9,12 +9,7 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.grid import freeze_arrays
-
-
-def unit(vector: Float) -> Float:
-    """Scale vectors `(..., 3)` to length one (zero stays zero)."""
-    length = np.linalg.norm(vector, axis=-1, keepdims=True)
-    return np.asarray(vector / np.maximum(length, 1e-12))
+from anatomy.poses import unit
 
 
 def bent_line(start: Float, leaving: Float, end: Float, step_mm: float, bend: float = 0.35) -> Float:

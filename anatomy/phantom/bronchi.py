@@ -15,11 +15,12 @@ import numpy as np
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.phantom.branching import Sprouts, bent_line, unit
+from anatomy.phantom.branching import Sprouts, bent_line
 from anatomy.phantom.chest import LOBES
 from anatomy.phantom.growth import STEP_MM, GrowthRule, grow, limit_turn
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits
+from anatomy.poses import unit
 
 TRACHEA_LENGTH_MM = 110.0
 """This is the part that lies in the chest of an adult [Weibel1963]."""

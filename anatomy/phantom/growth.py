@@ -12,8 +12,9 @@ import numpy as np
 
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
-from anatomy.phantom.branching import Sprouts, bent_line, unit
+from anatomy.phantom.branching import Sprouts, bent_line
 from anatomy.phantom.territory import Territory
+from anatomy.poses import unit
 
 Clearance = Callable[[Float], Float]
 

@@ -7,9 +7,10 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.phantom.branching import Sprouts, smooth_line, unit
+from anatomy.phantom.branching import Sprouts, smooth_line
 from anatomy.phantom.growth import STEP_MM, Clearance, GrowthRule, grow, overlap_mm
 from anatomy.phantom.territory import Territory
+from anatomy.poses import unit
 
 TRUNK_KNOTS = ((14.0, -46.0, -58.0), (10.0, -40.0, -40.0), (6.0, -31.0, -23.0))
 """Points of the central vessels of an adult, LPS mm from the carina, as in atlases."""

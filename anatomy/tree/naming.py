@@ -24,6 +24,7 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
+from anatomy.poses import unit
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
@@ -336,11 +337,6 @@ class _Shape:
     def middle_of(self, group: list[int]) -> Float:
         """Return the mean place `(3,)` LPS mm of the airways at and beyond some branches."""
         return np.asarray(np.average(self.middle[group], axis=0, weights=self.beyond_mm[group]))
-
-
-def unit(vector: Float) -> Float:
-    """Scale vectors `(..., 3)` to length one; zero stays zero."""
-    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12))
 
 
 def _log_density(cosine: Float, concentration: Float) -> Float:

@@ -151,7 +151,7 @@ The probability falls to 1/e for every such share of all airways of the lung tha
 SIZE_SPREAD = 1.0
 """Segments have equal shares of a lung's airways within a factor of e, as masks end early or late."""
 TRACHEA_SHARE, LUNG_SHARE = 0.7, 0.15
-"""The trachea goes on in a branch that leads to most airways, and to two lungs with this share of them each."""
+"""The trachea goes on in a branch that leads to most airways, and to two lungs of at least this share."""
 DIVIDED_SHARE = 0.01
 """A branch with a smaller share of a lung's airways does not lead to several segments."""
 LEAST_CONFIDENCE = 0.7

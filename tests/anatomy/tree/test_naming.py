@@ -31,17 +31,24 @@ VARIANTS: tuple[tuple[dict[str, str], tuple[str, ...]], ...] = (
     ({"RB1": "right main bronchus"}, ()),
 )  # fmt: skip
 """Other parents of bronchi, and missing bronchi: trifurcations, no RB7, RB6 and RB1 one fork higher."""
-JITTERS = (0.07, 0.12, 0.18)
-"""Standard deviations of the directions of named bronchi: as in other phantoms, and up to ten degrees."""
+FURTHER_JITTER = (0.0, 0.1, 0.16)
+"""Standard deviations of the directions of named bronchi beside those of any phantom: up to nine degrees."""
 
 
 def varied(seed: int, monkeypatch: pytest.MonkeyPatch) -> tuple[AirwayTree, Centerlines]:
     """Return the tree of a phantom of another build, and what was drawn."""
     rng, moved = np.random.default_rng(seed), VARIANTS[seed % len(VARIANTS)]
     kept = (each for each in bronchi.TEMPLATE if each.name not in moved[1])
-    template = tuple(replace(each, parent=moved[0].get(each.name, each.parent)) for each in kept)
+    spread = FURTHER_JITTER[seed % len(FURTHER_JITTER)]
+    template = tuple(
+        replace(
+            each,
+            parent=moved[0].get(each.name, each.parent),
+            direction=tuple(each.direction + spread * rng.normal(size=3)),
+        )
+        for each in kept
+    )
     monkeypatch.setattr(bronchi, "TEMPLATE", template)
-    monkeypatch.setattr(bronchi, "DIRECTION_JITTER", JITTERS[seed % len(JITTERS)])
     traits = Traits(flow_exponent=(2.0, 2.8)[seed % 2], bronchus_length=rng.uniform(0.85, 1.3))
     scale = rng.uniform(0.65, 1.15)
     sprouts, _rule = bronchi.grow_airways(make_territory(make_chest(rng, scale), rng), scale, rng, traits)

@@ -17,7 +17,7 @@ import itertools
 from collections.abc import Mapping
 from functools import cache, cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -25,9 +25,6 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.poses import unit
-
-if TYPE_CHECKING:
-    from anatomy.airway_tree import AirwayTree
 
 _Segments = tuple[int, ...]
 
@@ -158,6 +155,24 @@ LEAST_CONFIDENCE = 0.7
 """A name is given if it is at least this probable; it must exceed one half, or names could contradict."""
 
 
+class BranchedTree(Protocol):
+    """What is read of an `anatomy.airway_tree.AirwayTree`, which knows this module and is not known to it."""
+
+    @property
+    def points_lps(self) -> Float: ...
+    @property
+    def parent_point(self) -> Int: ...
+    @property
+    def branch_start(self) -> Int: ...
+    @property
+    def branch_parent(self) -> Int: ...
+    @property
+    def distance_from_root_mm(self) -> Float: ...
+    @property
+    def n_branches(self) -> int: ...
+    def children(self, branch: int) -> Int: ...
+
+
 @frozen_record
 class BronchialNames:
     """The names of the B branches of an airway tree.
@@ -232,7 +247,7 @@ class _Lung:
     A node holds one branch, or several that part together.  All probabilities are logarithms.
     """
 
-    def __init__(self, side: str, tree: AirwayTree, shape: _Shape, roots: list[int]) -> None:
+    def __init__(self, side: str, tree: BranchedTree, shape: _Shape, roots: list[int]) -> None:
         self.atlas, self._tree, self._shape = _atlas(side), tree, shape
         whole_mm = float(shape.beyond_mm[roots].sum())
         self.groups, self._children = [roots], []
@@ -315,7 +330,7 @@ class _Shape:
     direction: Float
 
     @classmethod
-    def of(cls, tree: AirwayTree) -> _Shape:
+    def of(cls, tree: BranchedTree) -> _Shape:
         above = np.maximum(tree.parent_point, 0)
         length = np.maximum(tree.distance_from_root_mm - tree.distance_from_root_mm[above], 1e-6)
         moment = np.column_stack([length, length[:, None] * tree.points_lps])
@@ -344,7 +359,7 @@ def _log_density(cosine: Float, concentration: Float) -> Float:
     return np.asarray(concentration * cosine + np.log(concentration / np.sinh(concentration)))
 
 
-def name_bronchi(tree: AirwayTree) -> BronchialNames:
+def name_bronchi(tree: BranchedTree) -> BronchialNames:
     """Return the names of the branches of an airway tree; left and right are those of the carina."""
     shape = _Shape.of(tree)
     names = [""] * tree.n_branches
@@ -368,7 +383,7 @@ def name_bronchi(tree: AirwayTree) -> BronchialNames:
     return BronchialNames(names=tuple(names), starts=starts, confidence=confidence, lobes=lobes)
 
 
-def _trachea(tree: AirwayTree, shape: _Shape) -> list[int]:
+def _trachea(tree: BranchedTree, shape: _Shape) -> list[int]:
     """Return the branches of the trachea: more than one where a bronchus leaves it above the carina."""
     branches, whole_mm = [0], float(shape.beyond_mm[0])
     for branch in range(1, tree.n_branches):
@@ -382,7 +397,7 @@ def _trachea(tree: AirwayTree, shape: _Shape) -> list[int]:
 
 
 def _name_lung(
-    side: str, tree: AirwayTree, lung: _Lung, names: list[str], confidence: Float, lobes: Int
+    side: str, tree: BranchedTree, lung: _Lung, names: list[str], confidence: Float, lobes: Int
 ) -> None:
     """Write the names of one lung's branches, their confidence and lobes."""
     atlas, lobe_of = lung.atlas, SEGMENT_LOBES[side]

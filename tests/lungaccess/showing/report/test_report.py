@@ -182,7 +182,7 @@ def test_the_key_numbers_state_target_in_both_frames_and_every_distance(toy_plan
     x, y, z = toy_plan.target_lps
     assert rows["target, LPS mm"] == f"{x:.1f}, {y:.1f}, {z:.1f}"
     assert rows["target, RAS mm"] == f"{-x:.1f}, {-y:.1f}, {z:.1f}"
-    assert rows["lobe of the target"] == "left lower lobe"
+    assert rows["place of the target"] == "left lower lobe"
     assert rows["pierced branch"].endswith(" (left lower lobe)")
     assert rows["needle to vessel"] == "1.60 / 1.00 mm"
     assert rows["needle to outside of the lung"] == "7.00 / 1.00 mm"

@@ -75,8 +75,8 @@ def build_lung(
     key : str, optional
         Key of the inputs; made from `images.sources` if None.
     keep : callable, optional
-        Takes the name and values of each large array as soon as it is made and returns the array to
-        use, for instance the same values mapped from a file.
+        Takes the name, as of `taken_apart`, and values of each large array as soon as it is made and returns
+        the array to use, for instance the same values mapped from a file.
     progress : callable, optional
         Told each step as it begins.
 
@@ -133,7 +133,7 @@ def _motion(
 
     motion = prepare_motion(source, labels, grid, float(tree.carina_lps[0]))
     warnings += motion.warnings
-    return replace(motion, nodes=keep("motion", motion.nodes))
+    return replace(motion, nodes=keep("motion.nodes", motion.nodes))
 
 
 def _require_tissue(images: PatientImages) -> None:
@@ -232,7 +232,7 @@ def clearance_fields(
     """
     geometry = corner_geometry(grid)
     return {
-        name: DistanceField(name=name, corners=keep(name, corners), geometry=geometry)
+        name: DistanceField(name=name, corners=keep(f"fields.{name}.corners", corners), geometry=geometry)
         for name, corners in _field_arrays(labels, grid, fissures, tell)
     }
 
@@ -263,9 +263,11 @@ def _lumen_depth(lumen: Volume, keep: Keep) -> DistanceField:
     solid = np.ones(grid.shape, dtype=bool, order="F")
     solid[1:-1, 1:-1, 1:-1] = ~lumen.array[window(low, high)]
     field = distance_field("lumen_depth", solid, grid)
-    stored = keep("lumen_depth", field.corners)
+    stored = keep("lumen_depth.corners", field.corners)
     return DistanceField(name=field.name, corners=stored, geometry=field.geometry)
 
 
 def _cut_volume(volume: Volume | None, box: WorkingBox, name: str, keep: Keep) -> Volume | None:
-    return None if volume is None else Volume(grid=box.grid, array=keep(name, box.cut(volume.array)))
+    return (
+        None if volume is None else Volume(grid=box.grid, array=keep(f"{name}.array", box.cut(volume.array)))
+    )

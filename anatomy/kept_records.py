@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from anatomy.base.cache_entries import make_room, note_use
 from anatomy.base.checksums import array_checksum, values_checksum, warn_of_damage
 from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.files import DAMAGE, atomic_write, write_text
+from anatomy.base.records import put_together, taken_apart
 from anatomy.base.unfinished import clear_place
 from anatomy.grid import read_only
 
@@ -32,10 +33,9 @@ def kept_record(
     kind: str,
     version: str,
     depends_on: Mapping[str, Any],
+    cls: type[T],
     *,
     make: Callable[[], T],
-    parts: Callable[[T], Mapping[str, Any]],
-    rebuilt: Callable[[dict[str, Any]], T],
     cache: str | os.PathLike[str] | None = None,
     name: str = "",
     in_use: tuple[Path, ...] = (),
@@ -50,8 +50,8 @@ def kept_record(
         Another one where `make` returns something else for the same `depends_on`, as other kernels may.
     depends_on : mapping
         Plain values.
-    parts, rebuilt : callable
-        Returns the arrays and the plain values of a record by name, and the record from them.
+    cls : type
+        Class of the record, of arrays, plain values, and records of such.
     cache : path, optional
         Folder of the cache; `anatomy.base.cache.default_cache()` if None.
     name : str
@@ -67,13 +67,13 @@ def kept_record(
         If the limit of the cache is no size.
     """
     path = record_path(kind, version, depends_on, cache)
-    stored = _stored(path, rebuilt) if path.exists() else None
+    stored = _stored(path, cls) if path.exists() else None
     if stored is not None:
         note_use(path)
         return stored
     most_bytes = cache_limit_bytes()
     made = make()
-    _save(kind, {"format": version, "name": name, **parts(made)}, path)
+    _save(kind, {"format": version, "name": name}, made, path)
     make_room(path.parent, most_bytes, {kind: version}, keep=(path, *in_use))
     return made
 
@@ -86,14 +86,14 @@ def record_path(
     return Path(cache or default_cache()) / f"{kind}-{hashlib.sha256(text.encode()).hexdigest()}.npz"
 
 
-def _stored(path: Path, rebuilt: Callable[[dict[str, Any]], T]) -> T | None:
+def _stored(path: Path, cls: type[T]) -> T | None:
     """Return the record in a file; None if it is damaged, or belongs elsewhere."""
     try:
         with path.open("rb") as stream, np.load(stream) as stored:
             arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
             rest = json.loads(str(stored["rest"]))
         if rest.pop("checksum") == _checksum(path, rest, arrays):
-            return rebuilt(arrays | rest)
+            return cast(T, put_together(cls, rest["values"], arrays))
     except (*DAMAGE, LungaccessError):
         pass
     warn_of_damage(path)
@@ -106,10 +106,9 @@ def _checksum(path: Path, rest: Mapping[str, Any], arrays: Mapping[str, Any]) ->
     return values_checksum({"file": path.name, "rest": rest, "arrays": parts})
 
 
-def _save(kind: str, values: Mapping[str, Any], path: Path) -> None:
-    arrays: dict[str, Any] = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-    plain = {name: value for name, value in values.items() if name not in arrays}
-    rest = json.loads(json.dumps(plain))
+def _save(kind: str, header: dict[str, str], made: object, path: Path) -> None:
+    arrays: dict[str, Any] = {}
+    rest = json.loads(json.dumps(header | {"values": taken_apart(made, "", arrays)}))
     rest["checksum"] = _checksum(path, rest, arrays)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -5,38 +5,28 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree
 from anatomy.base.cache import LUNG_FILE, cache_limit_bytes, default_cache
 from anatomy.base.cache_entries import make_room, note_use, remove_abandoned
 from anatomy.base.checksums import are_unchanged, file_states, values_checksum, warn_of_damage
 from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.files import DAMAGE
-from anatomy.base.typed import Array, Float
+from anatomy.base.records import put_together, taken_apart
+from anatomy.base.typed import Array
 from anatomy.base.unfinished import clear_place, filled_folder
 from anatomy.build import FORMAT, build_lung, lung_key
-from anatomy.fields import DistanceField, corner_geometry
-from anatomy.grid import Grid, Volume, read_only
+from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
-from anatomy.motion.motion import stored_motion
 from anatomy.patient import PatientImages
-from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 
 META = LUNG_FILE
-REPORT_RECORDS: dict[str, Any] = {
-    "gaps_bridged": GapBridged,
-    "spurs_pruned": SpurPruned,
-    "loops_opened": LoopOpened,
-}
-FIELD_NAMES = ("airway", "vessel", "pleura", "fissure", "obstacle", "obstacle_fissure")
-KEPT = 1
-"""Version of what is kept of a lung: it is raised when more is kept, and the lung itself is the same."""
+LAYOUT = 2
+"""Raise it when the files of a stored lung change, and the lung itself does not."""
 
 
 def open_lung(
@@ -80,7 +70,7 @@ def open_lung(
 
 def stored_format() -> str:
     """Return what tells stored lungs of this version and these kernels from all others."""
-    return f"{FORMAT}.{KEPT}-{kernel_digest('anatomy')}"
+    return f"{FORMAT}-{LAYOUT}-{kernel_digest('anatomy')}"
 
 
 def folder_name(key: str) -> str:
@@ -158,35 +148,11 @@ def _publish(work: Path, folder: Path) -> None:
 
 def _save_rest(lung: Lung, folder: Path) -> None:
     """Write everything but the large arrays; the description last."""
-    tree_arrays = {
-        f.name: getattr(lung.tree, f.name)
-        for f in dataclass_fields(AirwayTree)
-        if isinstance(getattr(lung.tree, f.name), np.ndarray)
-    }
-    np.savez(folder / "tree.npz", **tree_arrays)
-    meta = {
-        "format": stored_format(),
-        "name": lung.name,
-        "kind": lung.kind,
-        "key": lung.key,
-        "shape": lung.grid.shape,
-        "lps_from_ijk": lung.grid.lps_from_ijk.tolist(),
-        "lumen_geometry": lung.lumen_depth.geometry.tolist(),
-        "fields": [name for name in FIELD_NAMES if name in lung.fields],
-        "tree_report": _report_to_json(lung.tree.report),
-        "nodules": lung.nodules is not None,
-        "nodule_labels": lung.nodule_labels is not None,
-        "cost": lung.cost is not None,
-        "lobes": lung.lobes is not None,
-        **({} if lung.motion is None else {"motion": lung.motion.record()}),
-        "starts": [pose.tolist() for pose in lung.starts],
-        "targets_lps": [point.tolist() for point in lung.targets_lps],
-        "start_names": lung.start_names,
-        "target_names": lung.target_names,
-        "breath_hold": lung.breath_hold,
-        "sources": dict(lung.sources),
-        "warnings": lung.warnings,
-    }
+    arrays: dict[str, Array] = {}
+    described = taken_apart(lung, "", arrays)
+    small = {name: array for name, array in arrays.items() if not (folder / f"{name}.npy").exists()}
+    np.savez(folder / "arrays.npz", **small)
+    meta = {"format": stored_format(), "name": lung.name, "key": lung.key, "lung": described}
     meta["files"] = file_states(folder, sorted(path.name for path in folder.iterdir()))
     meta = json.loads(json.dumps(meta))
     meta["checksum"] = values_checksum(meta)
@@ -213,39 +179,10 @@ def _load(folder: Path, *, warn: bool = False) -> Lung | None:
 
 
 def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
-    def array(name: str) -> Array:
-        return _mapped(folder, name)
-
-    grid = Grid(shape=tuple(meta["shape"]), lps_from_ijk=np.array(meta["lps_from_ijk"]))
-    geometry = corner_geometry(grid)
-    fields = {
-        name: DistanceField(name=name, corners=array(name), geometry=geometry) for name in meta["fields"]
-    }
-    lumen = DistanceField(
-        name="lumen_depth", corners=array("lumen_depth"), geometry=np.array(meta["lumen_geometry"])
-    )
-    lung = Lung(
-        name=meta["name"],
-        kind=meta["kind"],
-        key=meta["key"],
-        grid=grid,
-        labels=array("labels"),
-        fields=fields,
-        lumen_depth=lumen,
-        tree=_load_tree(folder, meta["tree_report"]),
-        nodules=Volume(grid=grid, array=array("nodules")) if meta["nodules"] else None,
-        nodule_labels=Volume(grid=grid, array=array("nodule_labels")) if meta["nodule_labels"] else None,
-        cost=Volume(grid=grid, array=array("cost")) if meta["cost"] else None,
-        lobes=Volume(grid=grid, array=array("lobes")) if meta["lobes"] else None,
-        motion=stored_motion(meta["motion"], array("motion")) if "motion" in meta else None,
-        starts=tuple(_frozen(pose) for pose in meta["starts"]),
-        targets_lps=tuple(_frozen(point) for point in meta["targets_lps"]),
-        start_names=tuple(meta["start_names"]),
-        target_names=tuple(meta["target_names"]),
-        breath_hold=meta["breath_hold"],
-        sources=meta["sources"],
-        warnings=tuple(meta["warnings"]),
-    )
+    with open(folder / "arrays.npz", "rb") as stream, np.load(stream) as small:
+        arrays = {name: read_only(small[name]) for name in small.files}
+    arrays |= {path.stem: _mapped(folder, path.stem) for path in folder.glob("*.npy")}
+    lung: Lung = put_together(Lung, meta["lung"], arrays)
     object.__setattr__(lung, "folder", folder)
     return lung
 
@@ -253,36 +190,3 @@ def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
 def _mapped(folder: Path, name: str) -> Array:
     """Open a stored array without reading it, as a plain read-only array."""
     return read_only(np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")))
-
-
-def _frozen(values: list[Any]) -> Float:
-    return read_only(np.array(values, dtype=np.float64))
-
-
-def _load_tree(folder: Path, report: dict[str, Any]) -> AirwayTree:
-    with open(folder / "tree.npz", "rb") as stream, np.load(stream) as arrays:
-        return AirwayTree(**dict(arrays), report=_report_from_json(report))
-
-
-def _report_to_json(report: TreeReport) -> dict[str, Any]:
-    """Return a tree report as plain values."""
-
-    def plain(record: Any) -> dict[str, Any]:
-        values = ((f.name, getattr(record, f.name)) for f in dataclass_fields(record))
-        return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values}
-
-    out = plain(report)
-    for name in REPORT_RECORDS:
-        out[name] = [plain(record) for record in out[name]]
-    return out
-
-
-def _report_from_json(values: dict[str, Any]) -> TreeReport:
-    """Restore a tree report from `_report_to_json`."""
-    restored = dict(values)
-    for name, record in REPORT_RECORDS.items():
-        restored[name] = tuple(
-            record(**(item | {"position_lps": _frozen(item["position_lps"])})) for item in values[name]
-        )
-    restored["warnings"] = tuple(values["warnings"])
-    return TreeReport(**restored)

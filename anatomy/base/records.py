@@ -1,7 +1,11 @@
 """Frozen classes of keyword-only fields: what functions return, and what they are given as one thing."""
 
-from dataclasses import dataclass
-from typing import TypeVar, dataclass_transform
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from types import UnionType
+from typing import Any, TypeVar, dataclass_transform, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 T = TypeVar("T")
 LEFT_OUT_IF_EMPTY = "left out if empty"
@@ -18,3 +22,44 @@ def frozen_record(cls: type[T]) -> type[T]:
 def frozen_value(cls: type[T]) -> type[T]:
     """Make a class of annotated fields a frozen dataclass of plain values, compared by its fields."""
     return dataclass(frozen=True, kw_only=True)(cls)
+
+
+def taken_apart(value: Any, name: str, arrays: dict[str, Any]) -> Any:
+    """Return a record as values that can be written as JSON; an array is its key in `arrays`.
+
+    Parameters
+    ----------
+    name : str
+        Begins the keys of the arrays, which are those of the fields joined by points, such as
+        `tree.points_lps`; it may be empty.
+    arrays : dict
+        The arrays of the record are added to it.
+    """
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+        return name
+    if is_dataclass(value):
+        value = {each.name: getattr(value, each.name) for each in fields(value) if each.init}
+    elif isinstance(value, tuple | list):
+        return [taken_apart(each, f"{name}.{n}", arrays) for n, each in enumerate(value)]
+    if isinstance(value, Mapping):
+        return {key: taken_apart(each, f"{name}.{key}".lstrip("."), arrays) for key, each in value.items()}
+    return value
+
+
+def put_together(kind: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
+    """Return the record that `taken_apart` took apart; `kind` is its class, or the type of a field."""
+    if get_origin(kind) is UnionType and value is not None:
+        kind = next(each for each in get_args(kind) if each is not type(None))
+    if is_dataclass(kind):
+        hints: Any = get_type_hints(kind)
+        return kind(**{name: put_together(hints[name], each, arrays) for name, each in value.items()})
+    if get_origin(kind) is np.ndarray:
+        return arrays[value]
+    if isinstance(value, list):
+        kinds = get_args(kind)
+        kinds = kinds[:1] * len(value) if kinds[1:] == (...,) else kinds
+        return tuple(put_together(each, one, arrays) for each, one in zip(kinds, value, strict=True))
+    if isinstance(value, dict):
+        return {key: put_together(get_args(kind)[1], each, arrays) for key, each in value.items()}
+    return value

@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -121,24 +120,6 @@ class Motion:
         low, high = self.cells[side, ..., 0], self.cells[side, ..., 1]
         begin, end = self.share(0.0), self.share(1.0)
         return np.asarray(np.minimum(1.0, np.minimum(1.0 + end * low, 1.0 + begin * high)))
-
-    def record(self) -> dict[str, Any]:
-        """Return everything but the nodes as plain values, from which `stored_motion` restores it."""
-        names = ["middle_x_mm", "masks_phase", "amplitude", "source", "warning_only", "warnings"]
-        names.append("hysteresis")
-        return {
-            **{name: getattr(self, name) for name in names},
-            "figures": dict(self.figures),
-            "shape": self.grid.shape,
-            "lps_from_ijk": self.grid.lps_from_ijk.tolist(),
-        }
-
-
-def stored_motion(record: Mapping[str, Any], nodes: Float) -> Motion:
-    """Return the motion of a `record` and its nodes."""
-    rest = dict(record)
-    grid = Grid(shape=tuple(rest.pop("shape")), lps_from_ijk=np.array(rest.pop("lps_from_ijk")))
-    return Motion(grid=grid, nodes=nodes, **rest | {"warnings": tuple(rest["warnings"])})
 
 
 def require_phase(phase: float) -> float:

@@ -3,8 +3,8 @@
 import hashlib
 import os
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -105,7 +105,7 @@ def _coarser(shapes: TubeShapes, stride: int) -> tuple[Int, TubeShapes, ShapeTre
     return members, chosen, tree_of_shapes(chosen)
 
 
-SHAPES_FORMAT = 2
+SHAPES_FORMAT = 3
 """Raise it when shapes change: stored ones of another format are made anew."""
 
 
@@ -127,23 +127,5 @@ def open_shapes(
     `anatomy.kept_records.kept_record`.
     """
     limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
-
-    def rebuilt(values: dict[str, Any]) -> TubeShapes:
-        stored = {name: value for name, value in values.items() if name not in ("format", "name")}
-        return TubeShapes(tubes=tuple(tubes), limits=limits, grid=grid, **stored)
-
-    return kept_record(
-        "shapes",
-        shapes_format(),
-        _design(tubes, limits, grid),
-        make=lambda: tube_shapes(tubes, limits, grid),
-        parts=_parts,
-        rebuilt=rebuilt,
-        cache=cache,
-    )
-
-
-def _parts(shapes: TubeShapes) -> dict[str, Any]:
-    values = {field.name: getattr(shapes, field.name) for field in fields(shapes)}
-    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-    return {"candidates": shapes.candidates, "refused": shapes.refused, **arrays}
+    design, made = _design(tubes, limits, grid), partial(tube_shapes, tubes, limits, grid)
+    return kept_record("shapes", shapes_format(), design, TubeShapes, make=made, cache=cache)

@@ -265,12 +265,13 @@ def test_arrays_are_replaced_by_what_is_kept() -> None:
         return kept[name]
 
     lung = build_lung(toy(), keep=keep)
-    assert set(kept) == {"labels", "lumen_depth", "nodules", "cost", *FIELD_BITS}
+    fields = {f"fields.{name}.corners" for name in FIELD_BITS}
+    assert set(kept) == {"labels", "lumen_depth.corners", "nodules.array", "cost.array", *fields}
     assert np.shares_memory(lung.labels, kept["labels"])
-    assert np.shares_memory(lung.lumen_depth.corners, kept["lumen_depth"])
-    assert lung.nodules is not None and np.shares_memory(lung.nodules.array, kept["nodules"])
+    assert np.shares_memory(lung.lumen_depth.corners, kept["lumen_depth.corners"])
+    assert lung.nodules is not None and np.shares_memory(lung.nodules.array, kept["nodules.array"])
     for name, field in lung.fields.items():
-        assert np.shares_memory(field.corners, kept[name])
+        assert np.shares_memory(field.corners, kept[f"fields.{name}.corners"])
 
 
 def test_progress_names_the_steps() -> None:

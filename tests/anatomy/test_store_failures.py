@@ -57,25 +57,23 @@ def _set_meta(**values: Any) -> Callable[[Path], None]:
         (META, lambda file: file.write_text('{"format": 0}')),
         (META, lambda file: file.write_bytes(b"\xff\xfe\x00")),
         (META, _set_meta(format=-1)),
-        (META, _set_meta(shape=[1, 2])),
-        (META, _set_meta(shape=[1, 2, 3])),
-        (META, _set_meta(lps_from_ijk=[[0.0]])),
-        (META, _set_meta(fields=3)),
-        (META, _set_meta(tree_report=None)),
-        (META, _set_meta(tree_report={"gaps_bridged": [1]})),
+        (META, _set_meta(lung=3)),
+        (META, _set_meta(lung=None)),
+        (META, _set_meta(lung={"name": "Toy", "fields": 3})),
+        (META, _set_meta(lung={"tree": {"report": {"gaps_bridged": [1]}}})),
         ("labels.npy", Path.unlink),
         ("labels.npy", _truncate),
         ("labels.npy", lambda file: file.write_bytes(b"")),
         ("labels.npy", _other_shape),
-        ("obstacle.npy", Path.unlink),
-        ("obstacle.npy", _truncate),
-        ("obstacle.npy", _other_shape),
-        ("nodules.npy", _other_shape),
-        ("lumen_depth.npy", Path.unlink),
-        ("tree.npz", Path.unlink),
-        ("tree.npz", _truncate),
-        ("tree.npz", lambda file: file.write_bytes(b"")),
-        ("tree.npz", lambda file: np.savez(file, points_lps=np.zeros((2, 3)))),
+        ("fields.obstacle.corners.npy", Path.unlink),
+        ("fields.obstacle.corners.npy", _truncate),
+        ("fields.obstacle.corners.npy", _other_shape),
+        ("nodules.array.npy", _other_shape),
+        ("lumen_depth.corners.npy", Path.unlink),
+        ("arrays.npz", Path.unlink),
+        ("arrays.npz", _truncate),
+        ("arrays.npz", lambda file: file.write_bytes(b"")),
+        ("arrays.npz", lambda file: np.savez(file, points_lps=np.zeros((2, 3)))),
     ],
 )
 def test_damage_is_repaired(
@@ -95,22 +93,24 @@ def test_damage_is_repaired(
 
 
 def _shift_starts(folder: Path) -> None:
-    meta = json.loads((folder / META).read_text())
-    meta["starts"][0][0][3] += 5.0
-    (folder / META).write_text(json.dumps(meta, indent=1))
+    _shift(folder, "starts.0")
 
 
 def _open_way(folder: Path) -> None:
     """Take an obstacle away without another size or type."""
-    distances = np.load(folder / "obstacle.npy", mmap_mode="r+")
+    distances = np.load(folder / "fields.obstacle.corners.npy", mmap_mode="r+")
     distances[...] = distances.max()
     distances.flush()
 
 
 def _shift_tree(folder: Path) -> None:
-    with np.load(folder / "tree.npz") as stored:
+    _shift(folder, "tree.points_lps")
+
+
+def _shift(folder: Path, name: str) -> None:
+    with np.load(folder / "arrays.npz") as stored:
         arrays = dict(stored)
-    np.savez(folder / "tree.npz", **(arrays | {"points_lps": arrays["points_lps"] + 1.0}))
+    np.savez(folder / "arrays.npz", **(arrays | {name: arrays[name] + 1.0}))
 
 
 def _become_another(folder: Path) -> None:

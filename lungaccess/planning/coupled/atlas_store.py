@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
-from typing import Any, get_type_hints
+from dataclasses import fields
+from typing import Any
 
+from anatomy.base.records import frozen_record
 from anatomy.base.settings import to_mapping
 from anatomy.kept_records import kept_record, record_path
 from anatomy.lung import Lung
@@ -18,8 +19,18 @@ from stages.needle import StartIndex
 from stages.scope import ScopeMotions, prover_of
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM, Deployments, shapes_at_hand, shapes_digest
 
-FORMAT = 10
+FORMAT = 11
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
+
+
+@frozen_record
+class _StoredAtlas:
+    """The fields of an `Atlas` that are kept: the others are at hand, or follow from them."""
+
+    with_fissures: bool
+    motions: ScopeMotions
+    deployments: Deployments
+    build_s: float
 
 
 def atlas_format() -> str:
@@ -47,8 +58,8 @@ def open_atlas(
     prover_of(lung, system.scope)  # Here: the first plan does not wait for it.
     depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
 
-    def make() -> Atlas:
-        return build_atlas(
+    def make() -> _StoredAtlas:
+        made = build_atlas(
             lung,
             system,
             rotations=rotations,
@@ -56,31 +67,21 @@ def open_atlas(
             site_spacing_mm=site_spacing_mm,
             progress=progress,
         )
-
-    def rebuilt(values: dict[str, Any]) -> Atlas:
-        deployments = _rebuilt(Deployments, "deployments", values)
-        return Atlas(
-            lung=lung,
-            system=system,
-            with_fissures=values["with_fissures"],
-            motions=_rebuilt(ScopeMotions, "motions", values),
-            deployments=deployments,
-            index=StartIndex(deployments.positions, deployments.tangents),
-            build_s=values["build_s"],
-        )
+        return _StoredAtlas(**{each.name: getattr(made, each.name) for each in fields(_StoredAtlas)})
 
     in_use = () if lung.folder is None else (lung.folder,)
-    return kept_record(
+    stored = kept_record(
         "atlas",
         atlas_format(),
         depends_on,
+        _StoredAtlas,
         make=make,
-        parts=_parts,
-        rebuilt=rebuilt,
         cache=cache,
         name=lung.name,
         in_use=in_use,
     )
+    index = StartIndex(stored.deployments.positions, stored.deployments.tangents)
+    return Atlas(lung=lung, system=system, index=index, **vars(stored))
 
 
 def atlas_is_kept(
@@ -116,32 +117,3 @@ def _depends_on(
         "stop_mm": stop_spacing_mm,
         "site_mm": site_spacing_mm,
     }
-
-
-def _parts(atlas: Atlas) -> dict[str, Any]:
-    return {
-        "with_fissures": atlas.with_fissures,
-        "build_s": atlas.build_s,
-        **_flat(atlas.motions, "motions"),
-        **_flat(atlas.deployments, "deployments"),
-    }
-
-
-def _flat(record: Any, name: str) -> dict[str, Any]:
-    """Return the fields of a record, and of the records in it, by dotted names."""
-    flat: dict[str, Any] = {}
-    for field in fields(record):
-        value, key = getattr(record, field.name), f"{name}.{field.name}"
-        flat |= _flat(value, key) if is_dataclass(value) else {key: value}
-    return flat
-
-
-def _rebuilt(cls: Any, name: str, values: dict[str, Any]) -> Any:
-    """Return the record that `_flat` took apart."""
-    hints = get_type_hints(cls)
-    parts: dict[str, Any] = {}
-    for field in fields(cls):
-        key = f"{name}.{field.name}"
-        value = _rebuilt(hints[field.name], key, values) if is_dataclass(hints[field.name]) else values[key]
-        parts[field.name] = tuple(value) if isinstance(value, list) else value
-    return cls(**parts)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from anatomy.base.errors import AnatomyError, FrameError, SettingsError
+from anatomy.base.records import taken_apart
 from anatomy.build import build_lung
 from anatomy.grid import Grid
 from anatomy.lung import Lung
@@ -204,11 +205,12 @@ def test_a_stored_lung_breathes_as_before(tmp_path: Path) -> None:
     again = open_lung({"a": "b"}, lambda: pytest.fail("it is in the cache"), cache=tmp_path)
     assert built.motion is not None and stored.motion is not None and again.motion is not None
     assert built.motion.key == stored.motion.key == again.motion.key
-    assert again.motion.record() == built.motion.record()
+    again_plain, built_plain = (taken_apart(each.motion, "", {}) for each in (again, built))
+    assert again_plain == built_plain
     assert np.array_equal(built.labels, build_lung(toy()).labels)
 
 
-def test_a_lung_without_motion_is_stored_as_before(tmp_path: Path) -> None:
+def test_a_lung_without_motion_is_stored_without(tmp_path: Path) -> None:
     lung = open_lung(SOURCES, toy, cache=tmp_path)
     assert lung.motion is None
-    assert '"motion"' not in (tmp_path / folder_name(lung.key) / "lung.json").read_text()
+    assert '"motion": null' in (tmp_path / folder_name(lung.key) / "lung.json").read_text()

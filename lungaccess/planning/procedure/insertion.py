@@ -18,8 +18,12 @@ from lungaccess.planning.procedure.truth import (
     ARCS,
     Attempt,
     Steered,
+    as_pieces,
+    ends_of,
+    fitted_to,
     insert_needle,
-    needle_pieces,
+    rows_of,
+    turned_about,
     unknown_of,
 )
 from lungaccess.plans import curves
@@ -29,7 +33,7 @@ from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import NeedleSteering
 from lungaccess.uncertainty.risk import RiskAssessor, Share
 from lungaccess.uncertainty.risk.breathing import model_for
-from lungaccess.uncertainty.risk.deviations import Deviations
+from lungaccess.uncertainty.risk.deviations import deviated_pieces
 from stages.needle import (
     ArcPath,
     Failure,
@@ -216,11 +220,10 @@ def insert_plan(
     plan.system.require_needle("A simulated insertion")
     model = model_for(errors or load_errors(), plan, lung)
     inserter = _Inserter(plan, lung, steering, model, believed or model, tolerance_mm)
-    drawn = inserter.draw(samples, seed)
+    open_loop, closed_loop = inserter.in_both_ways(samples, seed)
     return InsertionStudy(
         steering=steering, errors=inserter.errors, seed=seed, tolerance_mm=tolerance_mm, query=inserter.query,
-        path=inserter.path, open_loop=Summary.of(map(inserter.in_open_loop, drawn)),
-        closed_loop=Summary.of(inserter.watched(each, (seed, n)) for n, each in enumerate(drawn)),
+        path=inserter.path, open_loop=open_loop, closed_loop=closed_loop,
     )  # fmt: skip
 
 
@@ -255,47 +258,53 @@ class _Inserter:
             lps_from_start=start, target=np.asarray(plan.end_lps), branch=plan.exemption.branch
         )
 
-    def draw(self, samples: int, seed: int) -> list[Attempt]:
-        """Return the errors of so many needles."""
+    def in_both_ways(self, samples: int, seed: int) -> tuple[Summary, Summary]:
+        """Insert needles blindly, and the same ones with the tracker."""
+        plan, n_arcs = self.plan, len(self.path.arcs)
         errors = self._assessor.draws(samples, seed, n_arcs=ARCS).deviations(self.errors)
-        frame = np.asarray(self.plan.scope.lps_from_scope_tip)
-        start = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
-        rows = [slice(n, n + 1) for n in range(samples)]
-        each = [Deviations(**{name: values[row] for name, values in vars(errors).items()}) for row in rows]
-        aim = self.query.target
-        return [Attempt(errors=one, start=start, target_lps=aim + one.target_mm[0]) for one in each]
+        pieces = deviated_pieces(plan, fitted_to(n_arcs, errors))
+        tubes, needles = pieces[:, :-n_arcs], pieces[:, -n_arcs:]
+        # Tubes that are turned too far do not take the needle along, which is turned from outside.
+        rolled = needles[:, 0, 1] - self.path.arcs[0, 1] - errors.roll_rad[:, 0]
+        ends = ends_of(np.tile(np.asarray(plan.scope.lps_from_scope_tip), (samples, 1, 1)), tubes)
+        tips = turned_about(ends, rolled)
+        blind, watched = [], []
+        for n in range(samples):
+            attempt = Attempt(
+                errors=rows_of(errors, np.array([n])), target_lps=self.query.target + errors.target_mm[n]
+            )
+            blind.append(self._checked(attempt, tubes[n], needles[n], ends[n], None))
+            found = self._watched(attempt, tips[n], (seed, n))
+            arcs = np.array(found.arcs)
+            arcs[:1, 1] += rolled[n]
+            (needle,) = as_pieces(arcs[None], plan.system.track_radius_mm)
+            watched.append(self._checked(attempt, tubes[n], needle, ends[n], found))
+        return Summary.of(blind), Summary.of(watched)
 
-    def in_open_loop(self, attempt: Attempt) -> Insertion:
-        """Carry out the plan as it stands."""
-        return self._checked(attempt, attempt.pieces(self.plan), None)
-
-    def watched(self, attempt: Attempt, luck: tuple[int, int]) -> Insertion:
+    def _watched(self, attempt: Attempt, tip: Float, luck: tuple[int, int]) -> Steered:
         """Insert the needle with the tracker; `luck` is the seed and the number of the needle."""
-        pieces = attempt.pieces(self.plan)
-        tip, rolled = attempt.needle_tip(self.plan, pieces)
         replanner = Replanner(
             self._environment, self.query, self.path, objective=Objective.of(self.plan.objective),
             settings=ReplanSettings(largest_miss_mm=min(self._assessor.radius_mm, 10.0)),
             iterations=ITERATIONS, seed=luck[1],
         )  # fmt: skip
         rng = np.random.default_rng(np.random.SeedSequence(luck[0], spawn_key=(_MEASURING, luck[1])))
-        found = insert_needle(
+        return insert_needle(
             self._environment, self.query, self.path, replanner, attempt, tip, self.steering, self._unknown,
             rng,
         )  # fmt: skip
-        arcs = np.array(found.arcs)
-        arcs[:1, 1] += rolled
-        needle = needle_pieces(arcs, self.plan.system.track_radius_mm)
-        return self._checked(attempt, np.concatenate([pieces[: -len(self.path.arcs)], needle]), found)
 
-    def _checked(self, attempt: Attempt, pieces: Float, steered: Steered | None) -> Insertion:
-        """Return what a chain of true arcs has come to."""
-        n_tube = len(attempt.pieces(self.plan)) - len(self.path.arcs)
-        flags = int(self._assessor.follow(attempt.start[None], pieces[None], n_tube)[0][0])
+    def _checked(
+        self, attempt: Attempt, tubes: Float, needle: Float, end: Float, steered: Steered | None
+    ) -> Insertion:
+        """Return what true arcs have come to; `end` is the frame behind those of the tubes."""
+        frame = np.asarray(self.plan.scope.lps_from_scope_tip)
+        start = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
+        chain = np.concatenate([tubes, needle])
+        flags = int(self._assessor.follow(start[None], chain[None], len(tubes))[0][0])
         structures = self._assessor.structures
         touched = tuple(name for name in self._assessor.forbidden if flags & structures[name])
-        tip = poses.poses_on_pieces(attempt.frame(), pieces[:n_tube, :3], math.inf)[0][-1]
-        frames, lengths = poses.poses_on_pieces(tip, pieces[n_tube:, :3], SHOWN_STEP_MM)
+        frames, lengths = poses.poses_on_pieces(end, needle[:, :3], SHOWN_STEP_MM)
         error = float(np.linalg.norm(frames[-1][:3, 3] - attempt.target_lps))
         stopped = None if steered is None else steered.stopped
         outcome = Outcome.MISSED if stopped is None else Outcome.NO_PATH

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from multiprocessing.connection import Connection
 from types import MappingProxyType
 from typing import NamedTuple
@@ -22,7 +21,9 @@ from lungaccess.planning.procedure.steering import steered
 from lungaccess.planning.procedure.truth import (
     ARCS,
     Attempt,
+    as_pieces,
     ends_of,
+    fitted_to,
     needles_carried_out,
     rows_of,
     tube_pieces,
@@ -176,9 +177,7 @@ class _Run:
 
     def _open_loop(self) -> _Found:
         """Carry out the plan as it stands, as `assess` does."""
-        errors, arcs = self._attempts[0], self.assessor.n_arcs
-        fitted = replace(errors, roll_rad=errors.roll_rad[:, :arcs], stop_mm=errors.stop_mm[:, :arcs])
-        outcomes = self.assessor.outcomes(fitted)
+        outcomes = self.assessor.outcomes(fitted_to(self.assessor.n_arcs, self._attempts[0]))
         ones = np.ones(self.samples, dtype=np.int64)
         return _Found(outcomes.touched, outcomes.miss_mm, np.zeros(self.samples, dtype=bool), ones, {})
 
@@ -245,7 +244,7 @@ class _Run:
                 stage = procedure.tubes
                 seen = as_measured(true_tips, stage.position_mm, stage.direction_deg, went.noise[:, 0])
                 tips = policy.tips_measured(chosen, seen)
-                ends = ends_of(tips, _as_pieces(chosen.arcs, 0.0))[:, :3, 3]
+                ends = ends_of(tips, as_pieces(chosen.arcs, 0.0))[:, :3, 3]
                 chosen = policy.from_tubes(chosen, tips, targets)
                 corrected = np.linalg.norm(ends - targets, axis=1)
                 found.decided["tube"].append(_Decided(~policy.goes_on(chosen.chances, 0), corrected))
@@ -254,7 +253,7 @@ class _Run:
                 arcs = self._steered(went, chosen, done, true_tips, targets, at, found)
             else:
                 arcs = needles_carried_out(chosen.arcs, chosen.found[:, 1], errors, self._longest_mm)
-            pieces = _as_pieces(arcs, plan.system.track_radius_mm)
+            pieces = as_pieces(arcs, plan.system.track_radius_mm)
             pieces[:, 0, kernel.ROLL] -= rolled
             pieces = np.concatenate([tubes, pieces], axis=1)
         touched, ends = self.assessor.follow(went.starts, pieces, n_tube)
@@ -292,10 +291,7 @@ class _Run:
             path = ArcPath(lps_from_start=chosen.tips[n], arcs=chosen.arcs[n, : chosen.found[n, 1]])
             key = (_MEASURING, int(went.rows[n]))
             errors = rows_of(went.errors, np.array([n]))
-            attempt = Attempt(
-                errors=errors, start=went.starts[n],
-                target_lps=self._policy.plan.target_lps + errors.target_mm[0],
-            )  # fmt: skip
+            attempt = Attempt(errors=errors, target_lps=self._policy.plan.target_lps + errors.target_mm[0])
             one = steered(
                 self._policy, path, int(chosen.found[n, 2]), true_tips[n], targets[n], attempt,
                 self._policy.doubt_of(chosen.frames[n], chosen.tips[n]),
@@ -317,11 +313,6 @@ class _Went:
     def __init__(self, chosen: Chosen, errors: Deviations, starts: Float, noise: Float, rows: Int) -> None:
         self.chosen, self.errors, self.starts, self.noise, self.rows = chosen, errors, starts, noise, rows
         self.stopped = np.zeros(len(rows), dtype=bool)
-
-
-def _as_pieces(arcs: Float, radius_mm: float) -> Float:
-    """Return arcs `(N, A, 3)` of needles as the kernel takes them, `(N, A, 4)`."""
-    return np.concatenate([arcs, np.full((*arcs.shape[:2], 1), radius_mm)], axis=2)
 
 
 def _joined(parts: Iterable[_Found]) -> _Found:

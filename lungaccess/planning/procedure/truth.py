@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy import poses
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.procedure.fusion import as_measured
@@ -16,7 +15,7 @@ from lungaccess.planning.procedure.policy import Chosen
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import NeedleSteering
-from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, in_rows
+from lungaccess.uncertainty.risk.deviations import Deviations, in_rows
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
 from lungaccess.uncertainty.risk.twisted import twisted_shapes
@@ -30,7 +29,6 @@ from stages.needle import (
     Replanner,
     TrueNeedle,
     Unknown,
-    arc_transform,
     steer,
 )
 
@@ -40,45 +38,20 @@ ARCS = 12
 
 @frozen_record
 class Attempt:
-    """The errors of one attempt: one row of `Deviations` with ARCS arcs, and the true scope tip."""
+    """The errors of one attempt, one row of `Deviations` with ARCS arcs, and where its target really is."""
 
     errors: Deviations
-    start: Float
     target_lps: Float
-
-    def frame(self) -> Float:
-        """Return the true pose of the scope's tip, LPS."""
-        return poses.pose(self.start[:3], self.start[3:6], self.start[6:])
-
-    def pieces(self, plan: Plan) -> Float:
-        """Return the arcs `(P, 4)` of tubes and needle that carry out a plan, see `deviated_pieces`."""
-        columns = np.arange(0 if plan.needle is None else len(plan.needle.arcs)) % ARCS
-        fitted = replace(
-            self.errors, roll_rad=self.errors.roll_rad[:, columns], stop_mm=self.errors.stop_mm[:, columns]
-        )
-        return np.asarray(deviated_pieces(plan, fitted)[0])
-
-    def needle_tip(self, plan: Plan, pieces: Float) -> tuple[Float, float]:
-        """Return the true frame in which the needle of a plan begins behind its true arcs, see `pieces`.
-
-        The needle is turned from outside: tubes that are turned too far do not take it along, and by that
-        angle, the second result, its first arc in `pieces` is rolled farther than from this frame.
-        """
-        arcs = () if plan.needle is None else plan.needle.arcs
-        n_tube = len(pieces) - len(arcs)
-        rolled = float(pieces[n_tube, 1]) - arcs[0].roll_rad - self.roll_rad(0)
-        return end_of(self.frame(), pieces[:n_tube]) @ arc_transform(0.0, rolled, 0.0), rolled
 
     def roll_rad(self, number: int) -> float:
         """Return the error of the angle of the needle's arc with a number."""
         return float(self.errors.roll_rad[0, number % ARCS])
 
 
-def end_of(frame: Float, pieces: Float) -> Float:
-    """Return the frame `(4, 4)` at the end of arcs `(P, 4)` from a frame."""
-    for length, roll, curvature, _radius in pieces:
-        frame = frame @ arc_transform(length, roll, curvature)
-    return np.asarray(frame)
+def fitted_to(n_arcs: int, errors: Deviations) -> Deviations:
+    """Return errors of needles with a number of arcs, from those of needles with ARCS arcs."""
+    columns = np.arange(n_arcs) % ARCS
+    return replace(errors, roll_rad=errors.roll_rad[:, columns], stop_mm=errors.stop_mm[:, columns])
 
 
 def rows_of(errors: Deviations, numbers: Int) -> Deviations:
@@ -261,9 +234,6 @@ def with_stop(arcs: Float, error_mm: float) -> Float:
     return np.column_stack([np.diff(kept, prepend=0.0), arcs[:, 1:]])
 
 
-def needle_pieces(arcs: Float, radius_mm: float) -> Float:
-    """Return arcs `(A, 3)` of a needle as the kernel takes them, `(A, 4)`."""
-    pieces = np.zeros((len(arcs), kernel.N_PIECE))
-    pieces[:, [kernel.LENGTH, kernel.ROLL, kernel.CURVATURE]] = arcs
-    pieces[:, kernel.RADIUS] = radius_mm
-    return pieces
+def as_pieces(arcs: Float, radius_mm: float) -> Float:
+    """Return arcs `(N, A, 3)` of needles as the kernel takes them, `(N, A, 4)`."""
+    return np.concatenate([arcs, np.full((*arcs.shape[:2], 1), radius_mm)], axis=2)

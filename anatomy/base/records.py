@@ -52,8 +52,9 @@ def put_together(kind: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
     if get_origin(kind) is UnionType and value is not None:
         kind = next(each for each in get_args(kind) if each is not type(None))
     if is_dataclass(kind):
-        hints: Any = get_type_hints(kind)
-        return kind(**{name: put_together(hints[name], each, arrays) for name, each in value.items()})
+        cls: Any = kind
+        hints = get_type_hints(cls)
+        return cls(**{name: put_together(hints[name], each, arrays) for name, each in value.items()})
     if get_origin(kind) is np.ndarray:
         return arrays[value]
     if isinstance(value, list):

@@ -246,7 +246,7 @@ def prove_starts(environment: NeedleEnvironment, query: Query, path: ArcPath) ->
         The planned path from the query's start: its corners are what the proved paths may go through.
     """
     limits, branch = environment.limits, query.branch
-    families = [_Family(environment, query, vias) for vias in _vias_of(path, query.target)]
+    families = [_Family(environment, query, vias) for vias in _vias_of(path)]
     most = proof_kernel.SEARCHED_MM * max(
         each.factor(limits, branch, proof_kernel.SEARCHED_MM, 0.0) for each in families
     )
@@ -278,7 +278,7 @@ def proved_factor(
         The whole deviation, such as three times the errors that are expected; above 0.
     """
     limits, branch = environment.limits, query.branch
-    families = (_Family(environment, query, vias) for vias in _vias_of(path, query.target))
+    families = (_Family(environment, query, vias) for vias in _vias_of(path))
     return max(each.factor(limits, branch, offset_mm, tilt_rad) for each in families)
 
 
@@ -312,7 +312,7 @@ class _Family:
         return tilts
 
 
-def _vias_of(path: ArcPath, target: Float) -> list[Float]:
+def _vias_of(path: ArcPath) -> list[Float]:
     """Return the sets of via points `(V, 3)` that the proved paths may go through."""
     # Ends of arcs of the plan that the proved family may go through: plans have one to three arcs.
     corners = path.frames()[1:-1, :3, 3][-4:]

@@ -216,7 +216,7 @@ class _Run:
         went = _Went(
             chosen, rows_of(errors, goes), np.ascontiguousarray(starts[goes]), noise[goes, 1:], rows[goes]
         )
-        complete = self._devices_out(went, attempt, left, active[goes], found)
+        complete = self._devices_out(went, left, active[goes], found)
         over = np.zeros(len(rows), dtype=bool)
         over[goes] = complete
         return over
@@ -227,7 +227,7 @@ class _Run:
         planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip)) @ np.append(plan.end_lps, 1.0)
         return np.asarray(np.linalg.norm((likely @ planned)[:, :3] - plan.target_lps, axis=1))
 
-    def _devices_out(self, went: _Went, attempt: int, left: int, at: Int, found: _Found) -> Bool:
+    def _devices_out(self, went: _Went, left: int, at: Int, found: _Found) -> Bool:
         """Let tubes and needles out, and note what came of it; tell which needles were inserted."""
         policy, plan, procedure = self._policy, self._policy.plan, self._policy.procedure
         chosen, errors = went.chosen, went.errors

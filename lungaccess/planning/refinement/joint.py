@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+import numpy as np
+
+from anatomy import poses
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Float
+from lungaccess.planning.refinement.curve import aimed, path_of
 from lungaccess.planning.refinement.problem import ARC_COUNTS, Problem, Weights, program_weights
-from lungaccess.planning.refinement.reconstruction import Reconstruction
+from lungaccess.planning.refinement.shape_model import joints_of
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
+from stages.scope import ScopeTip
+from stages.tube import Deployment
+
+SHARES = (1.0, 0.85, 0.7, 0.5, 0.35, 0.2, 0.1)
+"""Shares of the step from the candidate to what the program found that are tried until one is proved."""
+MOVED_PLACEMENTS = 2
+"""So many proved placements besides the candidate's own get a program for the needle alone, to save time."""
 
 ITERATIONS = 40
 """Most steps of IPOPT by default; docs/explanation/refinement.md has what they save."""
@@ -66,3 +81,76 @@ def _refined(
                 return new
             break
     return None
+
+
+@frozen_record
+class Placement:
+    """Proved scope and tubes, and the program's variables there.
+
+    Parameters
+    ----------
+    share : float
+        Share of the step from the candidate (0) to what the program found (1).
+    x : (n,) float64
+        The site counts from `tip`.
+    """
+
+    share: float
+    x: Float
+    tip: ScopeTip
+    deployment: Deployment
+
+
+class Reconstruction:
+    """Puts variables of a problem back into the numbers of a plan, and proves them."""
+
+    def __init__(self, evaluator: CandidateEvaluator, problem: Problem) -> None:
+        self._evaluator, self._problem = evaluator, problem
+
+    def placements(self, found: Float) -> Iterator[Placement]:
+        """Yield proved tubes: the nearest to `found`, some at most half as far, those of the candidate."""
+        farthest, left = 1.0, MOVED_PLACEMENTS
+        for share in SHARES:
+            moved = self.placement(found, share) if left and share <= farthest else None
+            if moved is not None:
+                farthest, left = 0.5 * share, left - 1
+                yield moved
+        own = self.placement(found, 0.0)
+        if own is not None:
+            yield own
+
+    def placement(self, found: Float, share: float) -> Placement | None:
+        """Return the tubes at a share of the step from the candidate to `found`, None if they are refused."""
+        at = self._problem.layout.variables
+        x = self._problem.start + share * (found - self._problem.start)
+        tip = self._problem.axis.tip(float(x[at["site"]]))
+        deployment = None if tip is None else self._deployment(tip, x)
+        if tip is None or deployment is None or isinstance(deployment, str):
+            return None
+        x[at["site"]] = 0.0
+        x[at["outer"]], x[at["inner"]] = deployment.outer_mm, deployment.inner_mm
+        x[self._problem.layout.joints] = joints_of(self._problem.design, deployment.shape)
+        x[at["exit"]] = deployment.exit_mm
+        return Placement(share=share, x=x, tip=tip, deployment=deployment)
+
+    def candidate(self, placement: Placement, x: Float) -> Candidate | None:
+        """Return the candidate with the needle of `x`, aimed anew, None if its proof fails."""
+        needle = self._evaluator.task.system.require_needle("The joint refinement")
+        at, kappa = self._problem.layout.variables, needle.max_curvature_per_mm
+        start = placement.deployment.lps_from_tip
+        rows = np.stack([x[at["lengths"]], kappa * x[at["bend_x"]], kappa * x[at["bend_y"]]], axis=1)
+        aim = aimed(start, rows, self._evaluator.task.target.lps_mm, kappa)
+        if aim is None:
+            return None
+        found = Candidate(tip=placement.tip, deployment=placement.deployment, path=path_of(start, aim))
+        return found if self._evaluator.proves(found.deployment, found.path) else None
+
+    def _deployment(self, tip: ScopeTip, x: Float) -> Deployment | str:
+        """Return the tubes of `x`, or why they are refused; the rotation counts from the tip's own +x."""
+        at, frame = self._problem.layout.variables, tip.lps_from_scope_tip
+        smooth = poses.pose(frame[:3, 3], frame[:3, 2], self._problem.sideways)
+        bend = poses.bending_directions(smooth, x[at["rotation"]])[0]
+        shape = self._problem.model.shape_at(x[self._problem.layout.joints])
+        if shape is None:
+            return "the shape of the tubes keeps no limits"
+        return self._evaluator.tubes.validate_shape(frame, poses.roll_towards(frame, bend), shape)

@@ -126,21 +126,6 @@ class Program:
         self._evaluate()
         return float(self._cost[0]), self._values.copy()
 
-    def derivatives(
-        self, x: Float, numbers: Numbers, boxes: tuple[FieldBox, ...]
-    ) -> tuple[Float, Float, Float]:
-        """Return the objective's gradient `(n,)`, the constraints' Jacobian `(m, n)`, and a Hessian `(n, n)`.
-
-        The Hessian is that of the objective and all constraints added up.
-        """
-        self._fill(x, numbers, boxes)
-        point, parameters = self._inputs[:2]
-        gradient = self._functions["grad_f"](point, parameters)[1]
-        jacobian = self._functions["jac_g"](point, parameters)[1]
-        upper = self._functions["hess_lag"](point, parameters, 1.0, np.ones(self.layout.n_constraints))
-        whole = np.asarray(casadi.triu2symm(upper))
-        return np.asarray(gradient).ravel(), np.asarray(casadi.densify(jacobian)), whole
-
     def _fill(self, x: Float, numbers: Numbers, boxes: tuple[FieldBox, ...]) -> None:
         start, parameters, lower, upper, least, most = self._inputs[:6]
         start[:], lower[:], upper[:] = x, numbers.lower, numbers.upper

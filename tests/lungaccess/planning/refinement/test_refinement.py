@@ -16,12 +16,11 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES
 from lungaccess.planning.refinement import boxes, refine
-from lungaccess.planning.refinement.axis import LocalAxis
 from lungaccess.planning.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.planning.refinement.geometry import Geometry
-from lungaccess.planning.refinement.problem import Problem, program_weights
+from lungaccess.planning.refinement.joint import Reconstruction
+from lungaccess.planning.refinement.problem import LocalAxis, Problem, program_weights
 from lungaccess.planning.refinement.program import Program, program
-from lungaccess.planning.refinement.reconstruction import Reconstruction
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -151,6 +150,19 @@ def tip_moved_mm(old: Candidate, new: Candidate) -> float:
     return float(np.linalg.norm((new.tip.lps_from_scope_tip - old.tip.lps_from_scope_tip)[:3, 3]))
 
 
+def derivatives(
+    solver: Program, x: np.ndarray, problem: Problem
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return gradient and Jacobian, and the Hessian of the objective and all constraints added up."""
+    solver.evaluate(x, problem.numbers, problem.boxes)  # Fills the inputs.
+    point, parameters = solver._inputs[:2]
+    gradient = solver._functions["grad_f"](point, parameters)[1]
+    jacobian = solver._functions["jac_g"](point, parameters)[1]
+    upper = solver._functions["hess_lag"](point, parameters, 1.0, np.ones(solver.layout.n_constraints))
+    whole = np.asarray(casadi.triu2symm(upper))
+    return np.asarray(gradient).ravel(), np.asarray(casadi.densify(jacobian)), whole
+
+
 def set_up(case: Case, which: int = 1, task: Task | None = None) -> tuple[Problem, Program]:
     task = task or case.task
     weights = program_weights(task)
@@ -204,7 +216,7 @@ class TestProgram:
         problem, solver = set_up(case)
         rng = np.random.default_rng(4)
         x = problem.start + 0.01 * rng.standard_normal(len(problem.start))
-        gradient, jacobian, hessian = solver.derivatives(x, problem.numbers, problem.boxes)
+        gradient, jacobian, hessian = derivatives(solver, x, problem)
         weights = np.ones(len(jacobian))
         for n in range(len(x)):
             step = np.zeros(len(x))
@@ -214,7 +226,7 @@ class TestProgram:
             np.testing.assert_allclose((ends[0][1] - ends[1][1]) / 2e-5, jacobian[:, n], rtol=1e-4, atol=1e-4)
             slopes = []
             for s in (1.0, -1.0):
-                g, j, _h = solver.derivatives(x + s * step, problem.numbers, problem.boxes)
+                g, j, _h = derivatives(solver, x + s * step, problem)
                 slopes.append(g + weights @ j)
             np.testing.assert_allclose((slopes[0] - slopes[1]) / 2e-5, hessian[n], rtol=1e-3, atol=1e-2)
 

@@ -10,30 +10,9 @@ if TYPE_CHECKING:
     from lungaccess.problem.patients import load_organ, load_patient
     from lungaccess.problem.peripheral import peripheral_targets
     from lungaccess.problem.place import Place, describe_place
-    from lungaccess.problem.preset_order import (
-        Invasiveness,
-        invasiveness,
-        least_invasive_first,
-        presets_by_invasiveness,
-    )
-    from lungaccess.problem.system import (
-        System,
-        load_system,
-        needle_preset_names,
-        preset_names,
-        shipped_names,
-        system_fingerprint,
-        tube_preset_names,
-    )
-    from lungaccess.problem.target import (
-        StatedTarget,
-        Target,
-        nodule_target,
-        point_target,
-        require_free,
-        resolve_target,
-        stated_target,
-    )
-    from lungaccess.problem.task import Task, fissures_are_obstacles, objective_of
+    from lungaccess.problem.preset_order import presets_by_invasiveness
+    from lungaccess.problem.system import System, load_system, preset_names, shipped_names
+    from lungaccess.problem.target import Target, nodule_target, point_target, resolve_target
+    from lungaccess.problem.task import Task, fissures_are_obstacles
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

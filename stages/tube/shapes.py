@@ -167,10 +167,6 @@ class TubeShapes:
             first_arc=read_only(np.concatenate([[0], np.cumsum(counts)])),
         )
 
-    def beside_mm(self) -> Float:
-        """Return what has to be free around each shape beside its radius and the margins `(S,)`, mm."""
-        return np.asarray(self.lateral_sweep_mm + self.arc_error_mm)
-
 
 def tube_shapes(
     tubes: Sequence[Tube], limits: ShapeLimits | None = None, grid: ShapeGrid | None = None

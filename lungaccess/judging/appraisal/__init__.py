@@ -7,14 +7,13 @@ from anatomy.base.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.judging.appraisal.appraiser import (
         DRAWS,
-        MEASURED_DRAWS,
         SEED,
         Appraisal,
         Appraiser,
         appraise,
         plan_record,
     )
-    from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+    from lungaccess.judging.appraisal.grade import Grade
     from lungaccess.judging.appraisal.headline import Geometry, Headline
     from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 

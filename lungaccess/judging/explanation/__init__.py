@@ -11,6 +11,6 @@ if TYPE_CHECKING:
     from lungaccess.judging.explanation.neighbours import Neighbour, ReachedShare
     from lungaccess.judging.explanation.record import explanation_record, save_explanation
     from lungaccess.judging.explanation.starts import FAILS, StartMap
-    from lungaccess.judging.explanation.words import Section, sections
+    from lungaccess.judging.explanation.words import sections
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -9,14 +9,8 @@ from anatomy.base.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.planning.coupled.atlas import Atlas, atlas_part, build_atlas
     from lungaccess.planning.coupled.atlas_store import atlas_is_kept, open_atlas
-    from lungaccess.planning.coupled.counterfactuals import (
-        Counterfactual,
-        find_counterfactuals,
-        needle_changes,
-        scope_changes,
-    )
+    from lungaccess.planning.coupled.counterfactuals import Counterfactual, needle_changes, scope_changes
     from lungaccess.planning.coupled.exits import FeasibleExits, feasible_exits
-    from lungaccess.planning.coupled.explanation import explain
     from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
     from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes
     from lungaccess.planning.coupled.search.atlas_search import AtlasSearch

@@ -11,27 +11,15 @@ if TYPE_CHECKING:
     from lungaccess.planning.one_stage.needle import (
         NeedleAnswer,
         NeedleQuestion,
-        begins_at_wall,
         needle_question,
         pierced_branches,
         plan_needle,
     )
     from lungaccess.planning.one_stage.needle_search import PathSearch, search_path
-    from lungaccess.planning.one_stage.obstruction import (
-        obstruction_record,
-        obstruction_rows,
-        point_in_words,
-        reason_in_words,
-    )
+    from lungaccess.planning.one_stage.obstruction import obstruction_rows, reason_in_words
     from lungaccess.planning.one_stage.replan import measured_pose, replan_from_scope, replan_from_tube
     from lungaccess.planning.one_stage.rest import RestOfPlan
-    from lungaccess.planning.one_stage.route import (
-        RouteSource,
-        open_source,
-        read_drawing,
-        route_record,
-        widest_end,
-    )
+    from lungaccess.planning.one_stage.route import RouteSource, open_source, route_record, widest_end
     from lungaccess.planning.one_stage.scope import (
         ADVICE_FILE,
         CAMERA_FILE,

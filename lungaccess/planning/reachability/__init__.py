@@ -9,7 +9,6 @@ from anatomy.base.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.planning.reachability.open_places import OpenPlace
     from lungaccess.planning.reachability.reach_map import (
-        DEFAULT_SPACING_MM,
         KINDS,
         NOT_COUNTED,
         STATES,
@@ -17,10 +16,9 @@ if TYPE_CHECKING:
         RegionReach,
         compare_reach,
         map_reach,
-        reach_grid,
     )
-    from lungaccess.planning.reachability.reach_stream import STREAM_SPACING_MM, ReachPart, ReachStream
-    from lungaccess.planning.reachability.regions import Regions, lung_regions
+    from lungaccess.planning.reachability.reach_stream import ReachPart, ReachStream
+    from lungaccess.planning.reachability.regions import Regions
     from lungaccess.planning.reachability.unreachable import MOST_BOXES, ReachVerdict, UnreachableProof
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

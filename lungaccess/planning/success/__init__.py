@@ -7,6 +7,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.success.estimate import MEASURED_PROCEDURE, Estimate, chance_of, estimate_success
+    from lungaccess.planning.success.estimate import Estimate, chance_of, estimate_success
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from lungaccess.uncertainty.risk.draws import Draws
     from lungaccess.uncertainty.risk.rare import RareShare, rare_share
     from lungaccess.uncertainty.risk.resting import RestingRow, resting_rows, resting_tip
-    from lungaccess.uncertainty.risk.sensitivity import Sensitivity, sensitivities
+    from lungaccess.uncertainty.risk.sensitivity import Sensitivity
     from lungaccess.uncertainty.risk.start_region import proved_body, safe_start_region, tried_body
     from lungaccess.uncertainty.risk.statistics import Share
     from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances

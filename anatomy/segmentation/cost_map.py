@@ -77,11 +77,6 @@ def cost_map(
     return Volume(grid=grid, array=np.where(barred, np.float32(np.inf), values))
 
 
-def obstacles_of(cost: Volume) -> Mask:
-    """Return the voxels that a cost map calls obstacles: those of infinite cost."""
-    return np.isposinf(cost.array)
-
-
 ROUNDING = 1e-6
 """Relative: quotients and squared distances are whole numbers and fractions of small ones."""
 

@@ -148,7 +148,7 @@ def _publish(work: Path, folder: Path) -> None:
 
 def _save_rest(lung: Lung, folder: Path) -> None:
     """Write everything but the large arrays; the description last."""
-    arrays: dict[str, Array] = {}
+    arrays: dict[str, Any] = {}
     described = taken_apart(lung, "", arrays)
     small = {name: array for name, array in arrays.items() if not (folder / f"{name}.npy").exists()}
     np.savez(folder / "arrays.npz", **small)

@@ -7,7 +7,7 @@ import time
 import lungaccess as la
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
-from lungaccess.planning.procedure import Simulator
+from lungaccess.planning.procedure import simulated
 from lungaccess.uncertainty.risk import RiskAssessor
 
 DEVIATED = 1_000_000
@@ -34,8 +34,8 @@ class Chances:
         plan = next(la.plan(self.lung, self.system, self.target, atlas=self.atlas, goal="default"))
         self.assessor = RiskAssessor(plan, self.lung, radius_mm=RADIUS_MM)
         procedure = la.load_procedure("measured-tip")
-        self.simulator = Simulator(plan, self.lung, self.errors, procedure, radius_mm=RADIUS_MM)
-        self.simulator.report(2, 1)
+        self.policy = la.Policy(plan, self.lung, self.errors, procedure, radius_mm=RADIUS_MM)
+        simulated(self.policy, 2, 1)
         self.time_plan_for_success()
 
     def time_deviated_plans(self) -> None:
@@ -44,7 +44,7 @@ class Chances:
 
     def time_procedures(self) -> None:
         """Fifty procedures that measure scope and tubes and plan the rest again."""
-        self.simulator.report(PROCEDURES, 0)
+        simulated(self.policy, PROCEDURES, 0)
 
     def time_plan_for_success(self) -> None:
         """The first plan that states its chance, in open loop, from the atlas."""

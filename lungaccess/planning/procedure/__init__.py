@@ -12,6 +12,6 @@ if TYPE_CHECKING:
     from lungaccess.planning.procedure.policy import Policy
     from lungaccess.planning.procedure.record import ProcedureRecord
     from lungaccess.planning.procedure.report import ProcedureReport, StageReport
-    from lungaccess.planning.procedure.simulation import Simulator, simulate_procedure
+    from lungaccess.planning.procedure.simulation import simulate_procedure, simulated
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

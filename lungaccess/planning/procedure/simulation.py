@@ -30,9 +30,8 @@ from lungaccess.planning.procedure.truth import (
     turned_about,
 )
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel
-from lungaccess.problem.procedures import Procedure, load_procedure
+from lungaccess.problem.procedures import Procedure
 from lungaccess.uncertainty.risk import MISSES, Deviations, Share
 from lungaccess.uncertainty.risk.assessment import MISS_QUANTILES
 from lungaccess.uncertainty.risk.deviations import deviated_starts
@@ -108,39 +107,15 @@ def simulate_procedure(
     PlanFileError, SettingsError
         See `RiskAssessor`; also if there are no samples or processes.
     """
-    model, followed = errors or load_errors(), procedure or load_procedure()
-    return Simulator(plan, lung, model, followed, radius_mm=radius_mm).report(samples, seed, processes)
+    return simulated(Policy(plan, lung, errors, procedure, radius_mm=radius_mm), samples, seed, processes)
 
 
-class Simulator:
-    """Simulates procedures of one plan, see `simulate_procedure`; what it prepares serves all draws.
-
-    Attributes
-    ----------
-    policy : Policy
-    assessor : RiskAssessor
-    errors : ErrorModel
-    procedure : Procedure
-    """
-
-    def __init__(
-        self,
-        plan: Plan,
-        lung: Lung,
-        errors: ErrorModel,
-        procedure: Procedure,
-        *,
-        radius_mm: float | None = None,
-    ) -> None:
-        self.policy = Policy(plan, lung, errors, procedure, radius_mm=radius_mm)
-        self.assessor, self.errors, self.procedure = self.policy.assessor, self.policy.errors, procedure
-
-    def report(self, samples: int, seed: int, processes: int = 1) -> ProcedureReport:
-        """Return what comes of so many procedures."""
-        if processes < 1:
-            raise SettingsError(f"{processes} processes are asked for", expected="at least 1")
-        found = _Run(self.policy, samples, seed).all(processes)
-        return _report(self, found, samples, seed)
+def simulated(policy: Policy, samples: int, seed: int, processes: int = 1) -> ProcedureReport:
+    """Return what comes of procedures under a policy, see `simulate_procedure`; it serves all draws."""
+    if processes < 1:
+        raise SettingsError(f"{processes} processes are asked for", expected="at least 1")
+    found = _Run(policy, samples, seed).all(processes)
+    return _report(policy, found, samples, seed)
 
 
 class _Run:
@@ -322,8 +297,8 @@ def _joined(parts: Iterable[_Found]) -> _Found:
     return _Found(touched, miss_mm, stopped, placements, decided)
 
 
-def _report(simulator: Simulator, found: _Found, samples: int, seed: int) -> ProcedureReport:
-    assessor, procedure = simulator.assessor, simulator.procedure
+def _report(policy: Policy, found: _Found, samples: int, seed: int) -> ProcedureReport:
+    assessor, procedure = policy.assessor, policy.procedure
     reaches = found.miss_mm <= assessor.radius_mm
     touched = {name: (found.touched & flag) != 0 for name, flag in assessor.structures.items()}
     inserted = found.miss_mm[np.isfinite(found.miss_mm)]
@@ -335,7 +310,7 @@ def _report(simulator: Simulator, found: _Found, samples: int, seed: int) -> Pro
         ends[name] = share_of(left & mask)
         left = left & ~mask
     return ProcedureReport(
-        model=simulator.errors,
+        model=policy.errors,
         procedure=procedure,
         samples=samples,
         seed=seed,

@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
-from lungaccess.planning.procedure import Simulator
+from lungaccess.planning.procedure import Policy, simulated
 from lungaccess.planning.procedure.spread import Spread
 from lungaccess.planning.success.estimate import FRESH_SEED, MEASURED_PROCEDURE, chance_of, estimate_success
 from lungaccess.plans.plan import Plan
@@ -135,14 +135,14 @@ class ChanceRating:
                 return assessor.success(assessor.draws(draws, self._batch_seed(batch)), errors).count
 
             return deviated
-        simulator = Simulator(plan, self._lung, self.errors, self.procedure, radius_mm=self._radius_mm)
+        policy = Policy(plan, self._lung, self.errors, self.procedure, radius_mm=self._radius_mm)
 
-        def simulated(batch: int, draws: int, _factor: float) -> float:
+        def counted(batch: int, draws: int, _factor: float) -> float:
             # Procedures that several processes share: fewer take less time than to begin processes.
             processes = self._processes if draws >= 400 else 1
-            return simulator.report(draws, self._batch_seed(batch), processes).succeeds.count
+            return simulated(policy, draws, self._batch_seed(batch), processes).succeeds.count
 
-        return simulated
+        return counted
 
     def _model(self, plan: Plan) -> ErrorModel:
         return model_for(self.errors, plan, self._lung)

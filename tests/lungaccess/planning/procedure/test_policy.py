@@ -17,7 +17,7 @@ from anatomy.base.errors import LungaccessError, PlanFileError, SettingsError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.planning.one_stage import ScopeReplanner
-from lungaccess.planning.procedure import Simulator
+from lungaccess.planning.procedure import simulated
 from lungaccess.planning.procedure.fusion import as_measured, fused, fused_share, scope_moves, tip_moves
 from lungaccess.planning.procedure.residuals import Residuals, fused_size
 from lungaccess.plans.no_plan import NoPlan
@@ -139,15 +139,15 @@ def test_fewer_rotations_are_some_of_all(plan: Plan, small_lung: Lung) -> None:
 def test_foreseen_chances_are_those_of_procedures(plan: Plan, small_lung: Lung) -> None:
     """The mean chance over placements is near the share of procedures that succeed with one placement."""
     procedure = Procedure(scope=ScopePlacing(measured=True, position_mm=0.7, direction_deg=1.0, placements=2))
-    simulator = Simulator(plan, small_lung, ERRORS, procedure, radius_mm=5.0)
-    worth = simulator.policy.worth
+    chosen = la.Policy(plan, small_lung, ERRORS, procedure, radius_mm=5.0)
+    worth = chosen.worth
     assert worth[0] == 0.0 < worth[1] < 1.0
     once = Procedure(scope=ScopePlacing(measured=True, position_mm=0.7, direction_deg=1.0))
     counted = la.simulate_procedure(
         plan, small_lung, errors=ERRORS, procedure=once, samples=200, radius_mm=5.0
     )
     assert abs(worth[1] - counted.succeeds.value) < 0.2
-    twice = simulator.report(200, 0)
+    twice = simulated(chosen, 200, 0)
     assert twice.placements > 1.0 and twice.succeeds.count >= counted.succeeds.count
 
 

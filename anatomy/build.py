@@ -75,7 +75,7 @@ def build_lung(
     key : str, optional
         Key of the inputs; made from `images.sources` if None.
     keep : callable, optional
-        Takes the name, as of `taken_apart`, and values of each large array as soon as it is made and returns
+        Takes the name, as of `plain_values`, and values of each large array as soon as it is made and returns
         the array to use, for instance the same values mapped from a file.
     progress : callable, optional
         Told each step as it begins.

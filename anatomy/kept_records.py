@@ -18,7 +18,7 @@ from anatomy.base.cache_entries import make_room, note_use
 from anatomy.base.checksums import array_checksum, values_checksum, warn_of_damage
 from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.files import DAMAGE, atomic_write, write_text
-from anatomy.base.records import put_together, taken_apart
+from anatomy.base.records import plain_values, record_from
 from anatomy.base.unfinished import clear_place
 from anatomy.grid import read_only
 
@@ -93,7 +93,7 @@ def _stored(path: Path, cls: type[T]) -> T | None:
             arrays = {name: read_only(stored[name]) for name in stored.files if name != "rest"}
             rest = json.loads(str(stored["rest"]))
         if rest.pop("checksum") == _checksum(path, rest, arrays):
-            return cast(T, put_together(cls, rest["values"], arrays))
+            return cast(T, record_from(cls, rest["values"], arrays))
     except (*DAMAGE, LungaccessError):
         pass
     warn_of_damage(path)
@@ -108,7 +108,7 @@ def _checksum(path: Path, rest: Mapping[str, Any], arrays: Mapping[str, Any]) ->
 
 def _save(kind: str, header: dict[str, str], made: object, path: Path) -> None:
     arrays: dict[str, Any] = {}
-    rest = json.loads(json.dumps(header | {"values": taken_apart(made, "", arrays)}))
+    rest = json.loads(json.dumps(header | {"values": plain_values(made, "", arrays)}))
     rest["checksum"] = _checksum(path, rest, arrays)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from anatomy.base.cache_entries import make_room, note_use, remove_abandoned
 from anatomy.base.checksums import are_unchanged, file_states, values_checksum, warn_of_damage
 from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.files import DAMAGE
-from anatomy.base.records import put_together, taken_apart
+from anatomy.base.records import plain_values, record_from
 from anatomy.base.typed import Array
 from anatomy.base.unfinished import clear_place, filled_folder
 from anatomy.build import FORMAT, build_lung, lung_key
@@ -149,7 +149,7 @@ def _publish(work: Path, folder: Path) -> None:
 def _save_rest(lung: Lung, folder: Path) -> None:
     """Write everything but the large arrays; the description last."""
     arrays: dict[str, Any] = {}
-    described = taken_apart(lung, "", arrays)
+    described = plain_values(lung, "", arrays)
     small = {name: array for name, array in arrays.items() if not (folder / f"{name}.npy").exists()}
     np.savez(folder / "arrays.npz", **small)
     meta = {"format": stored_format(), "name": lung.name, "key": lung.key, "lung": described}
@@ -182,7 +182,7 @@ def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
     with open(folder / "arrays.npz", "rb") as stream, np.load(stream) as small:
         arrays = {name: read_only(small[name]) for name in small.files}
     arrays |= {path.stem: _mapped(folder, path.stem) for path in folder.glob("*.npy")}
-    lung: Lung = put_together(Lung, meta["lung"], arrays)
+    lung: Lung = record_from(Lung, meta["lung"], arrays)
     object.__setattr__(lung, "folder", folder)
     return lung
 

@@ -24,7 +24,7 @@ def frozen_value(cls: type[T]) -> type[T]:
     return dataclass(frozen=True, kw_only=True)(cls)
 
 
-def taken_apart(value: Any, name: str, arrays: dict[str, Any]) -> Any:
+def plain_values(value: Any, name: str, arrays: dict[str, Any]) -> Any:
     """Return a record as values that can be written as JSON; an array is its key in `arrays`.
 
     Parameters
@@ -41,26 +41,26 @@ def taken_apart(value: Any, name: str, arrays: dict[str, Any]) -> Any:
     if is_dataclass(value):
         value = {each.name: getattr(value, each.name) for each in fields(value) if each.init}
     elif isinstance(value, tuple | list):
-        return [taken_apart(each, f"{name}.{n}", arrays) for n, each in enumerate(value)]
+        return [plain_values(each, f"{name}.{n}", arrays) for n, each in enumerate(value)]
     if isinstance(value, Mapping):
-        return {key: taken_apart(each, f"{name}.{key}".lstrip("."), arrays) for key, each in value.items()}
+        return {key: plain_values(each, f"{name}.{key}".lstrip("."), arrays) for key, each in value.items()}
     return value
 
 
-def put_together(kind: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
-    """Return the record that `taken_apart` took apart; `kind` is its class, or the type of a field."""
+def record_from(kind: Any, value: Any, arrays: Mapping[str, Any]) -> Any:
+    """Return the record that `plain_values` made plain; `kind` is its class, or the type of a field."""
     if get_origin(kind) is UnionType and value is not None:
         kind = next(each for each in get_args(kind) if each is not type(None))
     if is_dataclass(kind):
         cls: Any = kind
         hints = get_type_hints(cls)
-        return cls(**{name: put_together(hints[name], each, arrays) for name, each in value.items()})
+        return cls(**{name: record_from(hints[name], each, arrays) for name, each in value.items()})
     if get_origin(kind) is np.ndarray:
         return arrays[value]
     if isinstance(value, list):
         kinds = get_args(kind)
         kinds = kinds[:1] * len(value) if kinds[1:] == (...,) else kinds
-        return tuple(put_together(each, one, arrays) for each, one in zip(kinds, value, strict=True))
+        return tuple(record_from(each, one, arrays) for each, one in zip(kinds, value, strict=True))
     if isinstance(value, dict):
-        return {key: put_together(get_args(kind)[1], each, arrays) for key, each in value.items()}
+        return {key: record_from(get_args(kind)[1], each, arrays) for key, each in value.items()}
     return value

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from anatomy.base.errors import AnatomyError, FrameError, SettingsError
-from anatomy.base.records import taken_apart
+from anatomy.base.records import plain_values
 from anatomy.build import build_lung
 from anatomy.grid import Grid
 from anatomy.lung import Lung
@@ -205,7 +205,7 @@ def test_a_stored_lung_breathes_as_before(tmp_path: Path) -> None:
     again = open_lung({"a": "b"}, lambda: pytest.fail("it is in the cache"), cache=tmp_path)
     assert built.motion is not None and stored.motion is not None and again.motion is not None
     assert built.motion.key == stored.motion.key == again.motion.key
-    again_plain, built_plain = (taken_apart(each.motion, "", {}) for each in (again, built))
+    again_plain, built_plain = (plain_values(each.motion, "", {}) for each in (again, built))
     assert again_plain == built_plain
     assert np.array_equal(built.labels, build_lung(toy()).labels)
 

@@ -220,7 +220,7 @@ def insert_plan(
     plan.system.require_needle("A simulated insertion")
     model = model_for(errors or load_errors(), plan, lung)
     inserter = _Inserter(plan, lung, steering, model, believed or model, tolerance_mm)
-    open_loop, closed_loop = inserter.blind_and_watched(samples, seed)
+    open_loop, closed_loop = inserter.open_and_closed_loop(samples, seed)
     return InsertionStudy(
         steering=steering, errors=inserter.errors, seed=seed, tolerance_mm=tolerance_mm, query=inserter.query,
         path=inserter.path, open_loop=open_loop, closed_loop=closed_loop,
@@ -258,7 +258,7 @@ class _Inserter:
             lps_from_start=start, target=np.asarray(plan.end_lps), branch=plan.exemption.branch
         )
 
-    def blind_and_watched(self, samples: int, seed: int) -> tuple[Summary, Summary]:
+    def open_and_closed_loop(self, samples: int, seed: int) -> tuple[Summary, Summary]:
         """Insert needles blindly, and the same ones with the tracker."""
         plan, n_arcs = self.plan, len(self.path.arcs)
         errors = self._assessor.draws(samples, seed, n_arcs=ARCS).deviations(self.errors)

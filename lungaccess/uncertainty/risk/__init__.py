@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.uncertainty.risk.assessment import MISSES, RiskReport, assess, rare_touch
+    from lungaccess.uncertainty.risk.assessment import MISSES, DrawnReport, RiskReport, assess, rare_touch
     from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
     from lungaccess.uncertainty.risk.deviations import Deviations
     from lungaccess.uncertainty.risk.draws import Draws

@@ -30,8 +30,8 @@ MISSES = "misses the goal"
 
 
 @frozen_value
-class RiskReport:
-    """The risk of one plan under an error model.
+class DrawnReport:
+    """What came of a plan in many draws of an error model.
 
     Parameters
     ----------
@@ -39,16 +39,35 @@ class RiskReport:
         Radius of the goal about the target, and where the radius came from.
     succeeds : Share
         Ends within the radius, leaves the airway, and touches nothing that is forbidden.
-    reaches : Share
-        Ends within the radius, whatever it touches.
     touches : mapping of str to Share
         By the names of `STRUCTURES`; a fissure only where there is a mask of them.
-    forbidden : tuple of str
-        The names of `touches` that a success must not have.
     miss_mm : mapping of float to float
-        Distance of the tip from the target that a share of the samples does not exceed, by the share.
+        Distance of the tip from the target that a share of the needles does not exceed, by the share.
     with_needle : bool
         Whether the plan has a needle; its tubes end at the target where it has none.
+    """
+
+    model: ErrorModel
+    samples: int
+    seed: int
+    radius_mm: float
+    radius_origin: str
+    succeeds: Share
+    touches: Mapping[str, Share]
+    miss_mm: Mapping[float, float]
+    with_needle: bool = True
+
+
+@frozen_value
+class RiskReport(DrawnReport):
+    """The risk of one plan that is carried out as it stands.
+
+    Parameters
+    ----------
+    reaches : Share
+        Ends within the radius, whatever it touches.
+    forbidden : tuple of str
+        The names of `touches` that a success must not have.
     alone : mapping of str to Share
         Successes if there were errors of one kind only, by kind; empty if that was not asked for.
     sensitivity : tuple of Sensitivity
@@ -58,18 +77,9 @@ class RiskReport:
         enough; empty if that was not asked for.
     """
 
-    model: ErrorModel
-    samples: int
-    seed: int
-    radius_mm: float
-    radius_origin: str
-    succeeds: Share
     reaches: Share
-    touches: Mapping[str, Share]
     forbidden: tuple[str, ...]
-    miss_mm: Mapping[float, float]
     alone: Mapping[str, Share]
-    with_needle: bool = True
     sensitivity: tuple[Sensitivity, ...] = ()
     rare: Mapping[str, RareShare] = field(default_factory=lambda: MappingProxyType({}))
 

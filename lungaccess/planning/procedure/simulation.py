@@ -227,7 +227,8 @@ class _Run:
             if procedure.needle.closed_loop:
                 arcs = self._steered(went, chosen, done, true_tips, targets, at, found)
             else:
-                arcs = needles_carried_out(chosen.arcs, chosen.found[:, 1], errors, self._longest_mm)
+                longest_mm = plan.system.require_needle("A procedure").max_length_mm
+                arcs = needles_carried_out(chosen.arcs, chosen.found[:, 1], errors, longest_mm)
             pieces = as_pieces(arcs, plan.system.track_radius_mm)
             pieces[:, 0, kernel.ROLL] -= rolled
             pieces = np.concatenate([tubes, pieces], axis=1)
@@ -242,10 +243,6 @@ class _Run:
         found.miss_mm[at[done]] = miss[done]
         found.stopped[at[done]] &= went.stopped[done]
         return done
-
-    @property
-    def _longest_mm(self) -> float:
-        return float(self._policy.plan.system.require_needle("A procedure").max_length_mm)
 
     def _steered(
         self,

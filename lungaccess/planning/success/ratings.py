@@ -128,7 +128,8 @@ class ChanceRating:
     def scorer(self, plan: Plan) -> Scorer:
         """Return what counts the successes of a plan in a batch of draws that all plans have in common."""
         if self.procedure.is_open_loop:
-            assessor, model = RiskAssessor(plan, self._lung, radius_mm=self._radius_mm), self._model(plan)
+            assessor = RiskAssessor(plan, self._lung, radius_mm=self._radius_mm)
+            model = model_for(self.errors, plan, self._lung)
 
             def deviated(batch: int, draws: int, factor: float) -> float:
                 errors = model if factor == 1.0 else model.scaled(factor)
@@ -143,9 +144,6 @@ class ChanceRating:
             return simulated(policy, draws, self._batch_seed(batch), processes).succeeds.count
 
         return counted
-
-    def _model(self, plan: Plan) -> ErrorModel:
-        return model_for(self.errors, plan, self._lung)
 
     def _batch_seed(self, batch: int) -> int:
         return self._seed + BATCH_SEED * (batch + 1)

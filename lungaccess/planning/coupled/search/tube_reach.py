@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.typed import Float, Int, UInt64
-from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
+from anatomy.structures import FIELD_BITS
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.aimed_tubes import COST
 from lungaccess.planning.coupled.search.aimed_tubes import (
@@ -33,8 +33,6 @@ STEP_MM = 0.25
 """Spacing of the points at which the clearance of the tubes is looked up; half of it is taken off."""
 CLEARANCE_CAP_MM = 5.0
 """Clearances below this are exact: larger ones never limit a plan."""
-FIELD_BITS = {"airway": AIRWAY, "vessel": VESSEL, "pleura": OUTSIDE, "fissure": FISSURE}
-"""The clearance fields, and the structure of each in the labels."""
 
 
 class TubeReachScan:

@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import math
+from dataclasses import asdict, replace
+from itertools import combinations
 
 import numpy as np
+from numpy.linalg import norm
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LOBES
 from anatomy.lung import Lung
-from lungaccess.plans.clock_face import STRAIGHT_AHEAD, clock_hour, clock_words
-from stages.scope import ScopeMotion
+from lungaccess.plans.picture import (
+    STRAIGHT_AHEAD,
+    Picture,
+    branches_beyond,
+    clock_hour,
+    clock_words,
+    lps_from_camera,
+)
+from lungaccess.problem.system import System
+from stages.scope import ScopeMotion, prover_of
 
-BEFORE_MM = 5.0
-"""The tip is stopped so far before a bifurcation: both openings are then in a picture of 96 degrees."""
-OPENING_MM = 5.0
-"""An opening is where its branch is so far beyond the bifurcation, or at its end if it is shorter."""
+SEEN_FROM_MM, VIEWS = 25.0, 10
+"""A bifurcation is looked at from at most so far before it, in so many states at most."""
+LOOKED_PIXELS, SHOWN_PIXELS = 32, 80
+"""Pictures among which one is chosen have as many pixels along an edge, and the chosen one."""
+LEAST_CLARITY = 0.0005
+"""Openings are in view if each fills 0.2 % of the picture where they are 15 degrees apart, or the like."""
+LOOK_DEG = 15.0
+"""Bends of the tip that are tried in order to see all openings are so far apart."""
 TOGETHER_MM = 10.0
 """Branches of the same parent that part within so many mm are openings of one bifurcation."""
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
@@ -25,7 +40,7 @@ ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
 
 @frozen_value
 class Opening:
-    """One way on at a bifurcation.
+    """One way on at a bifurcation: the dark region of the picture through which the airway goes on.
 
     Parameters
     ----------
@@ -36,13 +51,16 @@ class Opening:
     name : str
         Number and generation, and what the tree and the lobes of the patient support beyond them.
     place_lps : tuple of float
-        Centre of the lumen in the opening, LPS mm.
+        A place in the opening that is seen in the middle of its dark region, LPS mm; in the lumen of the
+        branch where the picture does not show it.
     hour : int
         Where it is in the picture on a clock, 1 to 12; 0 is straight ahead.
     side : str
         "on the left", "on the right", "at the top" or "at the bottom" of the picture, or "straight ahead".
     order : int
-        Place among the openings of its side, the nearest to the scope first; 0 if it is alone there.
+        Place among the openings of its side, the nearest to the camera first; 0 if it is alone there.
+    in_view : bool
+        Whether the picture shows it.
     taken : bool
         Whether the plan goes there.
     """
@@ -54,6 +72,7 @@ class Opening:
     hour: int
     side: str
     order: int
+    in_view: bool
     taken: bool
 
     @property
@@ -61,7 +80,8 @@ class Opening:
         """Where it is, and what it is."""
         which = f"the {ORDINALS[min(self.order, len(ORDINALS)) - 1]} " if self.order else "the one "
         at = "" if self.side == STRAIGHT_AHEAD else f", {clock_words(self.hour)}"
-        return f"{which}{self.side}{at}: {self.name}"
+        hidden = "" if self.in_view else ", out of view"
+        return f"{which}{self.side}{at}{hidden}: {self.name}"
 
 
 @frozen_value
@@ -75,11 +95,14 @@ class Bifurcation:
     from_carina_mm : float
         Where it is along the tree; 0 is the carina itself.
     state : int
-        State of the motion in which the tip stands before it.
+        State of the motion in which the tip stands before it, and the picture shows all openings best.
     entered_state : int
         First state in which the tip is past it; the last one if it never is.
     inserted_mm : float
         Advance of the scope there.
+    held_bend_deg, bend_deg : float
+        Bend of the tip in that state, and in the picture of the openings: the tip is bent where only that, by
+        a proved motion, brings all of them into view.
     openings : tuple of Opening
         The one that is taken first.
     """
@@ -90,6 +113,8 @@ class Bifurcation:
     state: int
     entered_state: int
     inserted_mm: float
+    held_bend_deg: float
+    bend_deg: float
     openings: tuple[Opening, ...]
 
     @property
@@ -100,9 +125,12 @@ class Bifurcation:
             f"{self.from_carina_mm:.0f} mm beyond the carina" if round(self.from_carina_mm) else "the carina"
         )
         rest = f" Not {'; not '.join(one.words for one in others)}." if others else ""
+        up = "up" if self.bend_deg > 0.0 else "down"
+        look = f"bend the tip to {abs(self.bend_deg):.0f}° {up} to see all openings, and "
+        look = "" if self.bend_deg == self.held_bend_deg else look
         return (
             f"Bifurcation {self.number} of {self.count}, {where}, {self.inserted_mm:.0f} mm inserted: "
-            f"take {taken.words}.{rest}"
+            f"{look}take {taken.words}.{rest}"
         )
 
     def as_json(self) -> dict[str, object]:
@@ -110,11 +138,13 @@ class Bifurcation:
         return {**asdict(self), "text": self.text}
 
 
-def route_bifurcations(motion: ScopeMotion, branches: Int, lung: Lung) -> tuple[Bifurcation, ...]:
+def route_bifurcations(
+    motion: ScopeMotion, branches: Int, lung: Lung, system: System
+) -> tuple[Bifurcation, ...]:
     """Return the bifurcations on a route, from the trachea on.
 
-    Hours are those of the picture, whose top is where a positive bend turns the tip, in the state in which
-    the tip is first `BEFORE_MM` before the bifurcation, or as soon as it is past the one before.
+    Each is told in the picture that shows the smallest of its openings largest, from where the one before is
+    told to where the tip is past it.  Where not even that one shows all of them, the tip is bent for a look.
 
     Parameters
     ----------
@@ -122,29 +152,70 @@ def route_bifurcations(motion: ScopeMotion, branches: Int, lung: Lung) -> tuple[
         With so many states that the tip moves little between them.
     branches : (B,) int64
         Of the airway tree, from the trachea to where the tip ends.
+    lung : Lung
+    system : System
+        The scope of the motion, and the tubes in its channel, beside which the camera is.
     """
-    tree, tips = lung.tree, motion.tips
+    tree, tips, state = lung.tree, motion.tips, 0
     depth = tree.distance_from_root_mm
     passed = depth[_places(tree, int(branches[-1]), tips[:, :3, 3])]
-    forks = [_fork(tree, int(branch)) for branch in branches[1:]]
-    found, entered = [], 0
-    for number, (fork, parent, child) in enumerate(
-        zip(forks, branches[:-1], branches[1:], strict=True), start=1
-    ):
-        state = max(_first(passed >= depth[fork] - BEFORE_MM), entered)
+    found = []
+    for number, (parent, child) in enumerate(zip(branches[:-1].tolist(), branches[1:].tolist(), strict=True)):
+        ways, fork = _ways(tree, parent, child), _fork(tree, child)
         entered = max(_first(passed >= depth[fork]), state)
+        from_state = max(_first(passed >= depth[fork] - SEEN_FROM_MM), state)
+        views = np.unique(np.linspace(from_state, entered, VIEWS).round().astype(int)).tolist()
+        clear = [_clarity(lung, system, tips[n], ways) for n in views]
+        state = views[int(np.argmax(clear))]
+        seen = replace(motion, states=motion.states[: state + 1])
+        if max(clear) < LEAST_CLARITY:
+            seen = _look(seen, lung, system, ways)
         found.append(
             Bifurcation(
-                number=number,
-                count=len(forks),
+                number=number + 1,
+                count=len(branches) - 1,
                 from_carina_mm=float(depth[fork] - depth[tree.carina_point]),
                 state=state,
                 entered_state=entered,
                 inserted_mm=float(motion.states[state, 0]),
-                openings=_openings(lung, tips[state], int(parent), int(child)),
+                held_bend_deg=float(np.degrees(motion.states[state, 2])),
+                bend_deg=float(np.degrees(seen.states[-1, 2])),
+                openings=_openings(lung, lps_from_camera(system, seen.tips[-1]), ways),
             )
         )
     return tuple(found)
+
+
+def _ways(tree: AirwayTree, parent: int, child: int) -> list[int]:
+    """Return the first point of each way on at a bifurcation, that to a child first, the parent's last."""
+    depth, fork, last = tree.distance_from_root_mm, _fork(tree, child), int(tree.branch_start[parent + 1]) - 1
+    others = [
+        each
+        for each in tree.children(parent).tolist()
+        if each != child and abs(depth[_fork(tree, each)] - depth[fork]) <= TOGETHER_MM
+    ]
+    goes_on = fork < last and all(_fork(tree, each) < last for each in others)
+    return [*(int(tree.branch_start[each]) for each in (child, *others)), *([fork + 1] if goes_on else [])]
+
+
+def _clarity(lung: Lung, system: System, lps_from_tip: Float, ways: list[int]) -> float:
+    """Return how well a picture tells openings apart: share of the smallest times least angle between any."""
+    eye = lps_from_camera(system, lps_from_tip)
+    holes = Picture(lung, eye, LOOKED_PIXELS).holes(ways)
+    rays = [hole.place_lps - eye[:3, 3] for hole in holes]
+    angles = [math.acos(min(a @ b / (norm(a) * norm(b)), 1.0)) for a, b in combinations(rays, 2)]
+    return min(hole.share for hole in holes) * min(angles, default=1.0)
+
+
+def _look(held: ScopeMotion, lung: Lung, system: System, ways: list[int]) -> ScopeMotion:
+    """Return a motion with the least proved change of bend that shows all ways, the same if there is none."""
+    prover = prover_of(lung, system.scope)
+    for change in sorted(np.radians(np.arange(-180.0, 181.0, LOOK_DEG)).tolist(), key=abs):
+        looking = replace(held, states=np.append(held.states, held.states[-1:] + [0.0, 0.0, change], axis=0))
+        is_clear = _clarity(lung, system, looking.tips[-1], ways) >= LEAST_CLARITY
+        if is_clear and not isinstance(prover.prove(looking), str):
+            return looking
+    return held
 
 
 def _first(true: Bool) -> int:
@@ -185,10 +256,7 @@ def _side(tree: AirwayTree, branch: int) -> str:
 
 def _ends(tree: AirwayTree, branch: int) -> Float:
     """Return the last points `(N, 3)` of the branches without children at or beyond a branch."""
-    beyond = np.zeros(tree.n_branches, dtype=np.bool_)
-    beyond[branch] = True
-    for each in range(branch + 1, tree.n_branches):
-        beyond[each] = beyond[tree.branch_parent[each]]
+    beyond = branches_beyond(tree, int(tree.branch_start[branch]))
     leaves = tree.leaf_branches[beyond[tree.leaf_branches]]
     return tree.points_lps[tree.branch_start[leaves + 1] - 1]
 
@@ -211,42 +279,25 @@ def _places(tree: AirwayTree, last: int, tips_lps: Float) -> Int:
     return np.asarray(route[np.maximum.accumulate(np.argmin(away, axis=1))])
 
 
-def _openings(lung: Lung, lps_from_tip: Float, parent: int, child: int) -> tuple[Opening, ...]:
-    tree = lung.tree
-    depth, fork = tree.distance_from_root_mm, _fork(tree, child)
-    others = [
-        each
-        for each in tree.children(parent).tolist()
-        if each != child and abs(depth[_fork(tree, each)] - depth[fork]) <= TOGETHER_MM
-    ]
-    firsts = [(each, _fork(tree, each), int(tree.branch_start[each])) for each in (child, *others)]
-    if fork + 1 < tree.branch_start[parent + 1] and not any(
-        _fork(tree, each) == tree.branch_start[parent + 1] - 1 for each in others
-    ):
-        firsts.append((parent, fork, fork + 1))
-    seen = []
-    for branch, from_point, first in firsts:
-        points = np.arange(first, tree.branch_start[branch + 1])
-        near = points[depth[points] <= depth[from_point] + OPENING_MM]
-        place = tree.points_lps[near[-1] if len(near) else first]
-        seen.append((branch, float(depth[from_point]), place, clock_hour(lps_from_tip, place)))
-    sides = [_side_of_picture(hour) for *_, hour in seen]
+def _openings(lung: Lung, lps_from_eye: Float, ways: list[int]) -> tuple[Opening, ...]:
+    holes = Picture(lung, lps_from_eye, SHOWN_PIXELS).holes(ways)
+    hours = [clock_hour(lps_from_eye, hole.place_lps) for hole in holes]
+    sides = [_side_of_picture(hour) for hour in hours]
     made = []
-    for (branch, _depth, place, hour), side in zip(seen, sides, strict=True):
-        same = sorted(
-            (other[1], n) for n, (other, its) in enumerate(zip(seen, sides, strict=True)) if its == side
-        )
-        order = [seen[n][0] for _, n in same].index(branch) + 1 if len(same) > 1 else 0
+    for n, (point, hole, side) in enumerate(zip(ways, holes, sides, strict=True)):
+        branch, (x, y, z) = int(lung.tree.branch_of_point[point]), hole.place_lps.tolist()
+        same = sorted((holes[k].rim_mm, k) for k, other in enumerate(sides) if other == side)
         made.append(
             Opening(
                 branch=branch,
                 label=branch_label(lung.tree, branch),
                 name=branch_name(lung, branch),
-                place_lps=(float(place[0]), float(place[1]), float(place[2])),
-                hour=hour,
+                place_lps=(x, y, z),
+                hour=hours[n],
                 side=side,
-                order=order,
-                taken=branch == child,
+                order=same.index((hole.rim_mm, n)) + 1 if len(same) > 1 else 0,
+                in_view=hole.share > 0.0,
+                taken=n == 0,
             )
         )
     return tuple(made)

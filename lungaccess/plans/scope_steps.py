@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
 
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_value
-from anatomy.base.typed import Float
+from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from lungaccess.plans.bifurcations import route_bifurcations
-from lungaccess.plans.clock_face import STRAIGHT_AHEAD, clock_hour
 from lungaccess.plans.insertion import scope_motion, shown_motion
+from lungaccess.plans.picture import STRAIGHT_AHEAD, Picture, clock_hour, lps_from_camera
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion, prover_of
 
 AHEAD_MM = 12.0
-"""Where the way goes on is told by the place of the tip after so much more advance: about a branch on."""
+"""Where the way goes on is told by what the picture shows of the airway from so far ahead on."""
+AHEAD_PIXELS = 48
+"""Along an edge of the picture in which that is looked for."""
 MOST_DECIMALS = 6
 """Steps are written with as many decimals as their proof takes, at most so many: no motor is finer."""
 NEAR_MM, NEAR_RAD = 0.1, math.radians(0.1)
@@ -169,7 +172,15 @@ def written_motion(plan: Plan, lung: Lung) -> ScopeMotion:
 def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
     """Return the motion of a plan's bronchoscope as steps, each from one proved state to the next."""
     motion = written_motion(plan, lung)
-    return steps_of(motion, lung.tree, prover_of(lung, plan.system.scope).tolerances(motion))
+    allowed = prover_of(lung, plan.system.scope).tolerances(motion)
+    eyes = lps_from_camera(plan.system, motion.tips)
+    places = lung.tree.route(int(lung.tree.branch_start[plan.scope.branches[-1] + 1]) - 1)
+
+    def goes_on(state: int) -> str:
+        """Say where in the picture of a state the airway goes on."""
+        return _goes_on(lung, places, eyes[state])
+
+    return steps_of(motion, lung.tree, allowed, goes_on)
 
 
 def steps_note(plan: Plan, lung: Lung) -> str:
@@ -179,7 +190,9 @@ def steps_note(plan: Plan, lung: Lung) -> str:
     return f"{said} {DIRECTIONS}"
 
 
-def steps_of(motion: ScopeMotion, tree: AirwayTree, allowed: Float) -> tuple[ScopeStep, ...]:
+def steps_of(
+    motion: ScopeMotion, tree: AirwayTree, allowed: Float, goes_on: Callable[[int], str]
+) -> tuple[ScopeStep, ...]:
     """Return a motion as steps; where nothing changes there is none.
 
     Parameters
@@ -188,9 +201,11 @@ def steps_of(motion: ScopeMotion, tree: AirwayTree, allowed: Float) -> tuple[Sco
         As it is written, M states.
     allowed : (M - 1, 3) float64
         Its tolerances, see `stages.scope.MotionProver.tolerances`.
+    goes_on : function of a state
+        Says where in its picture the airway goes on.
     """
-    tips, advance = motion.tips, motion.states[:, 0]
-    written = np.round(np.column_stack([advance, np.degrees(motion.states[:, 1:])]), MOST_DECIMALS)
+    tips, degrees = motion.tips, np.degrees(motion.states[:, 1:])
+    written = np.round(np.column_stack([motion.states[:, 0], degrees]), MOST_DECIMALS)
     moved = np.round(np.diff(written, axis=0), MOST_DECIMALS)
     places = np.linalg.norm(tips[:, None, :3, 3] - tree.points_lps[None], axis=2).argmin(axis=1)
     branches = tree.branch_of_point[places]
@@ -205,7 +220,7 @@ def steps_of(motion: ScopeMotion, tree: AirwayTree, allowed: Float) -> tuple[Sco
             advance_tolerance_mm=float(allowed[end - 1, 0]),
             twist_tolerance_deg=float(np.degrees(allowed[end - 1, 1])),
             bend_tolerance_deg=float(np.degrees(allowed[end - 1, 2])),
-            goes_on=_goes_on(tips, advance, end - 1),
+            goes_on=goes_on(end - 1),
             branch=int(branches[end]),
             generation=int(tree.generation[branches[end]]),
             state=end,
@@ -242,7 +257,8 @@ def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
             for one in scope_steps(plan, lung)
         ],
         "bifurcations": [
-            one.as_json() for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)
+            one.as_json()
+            for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung, plan.system)
         ],
         "states": [
             {"advance_mm": float(a), "twist_deg": float(t), "bend_deg": float(b)}
@@ -255,8 +271,15 @@ def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
     }
 
 
-def _goes_on(tips: Float, advance: Float, state: int) -> str:
-    """Say where in the picture of a state the tip will be after some more advance."""
-    later = min(int(np.searchsorted(advance, advance[state] + AHEAD_MM)), len(tips) - 1)
-    hour = clock_hour(tips[state], tips[later, :3, 3])
+def _goes_on(lung: Lung, route: Int, lps_from_eye: Float) -> str:
+    """Say where a picture shows that the route over points of the tree goes on."""
+    points, depth = lung.tree.points_lps[route], lung.tree.distance_from_root_mm[route]
+    here = int(np.linalg.norm(points - lps_from_eye[:3, 3], axis=1).argmin())
+    ahead = min(int(np.searchsorted(depth, depth[here] + AHEAD_MM)), len(route) - 1)
+    (hole,) = Picture(lung, lps_from_eye, AHEAD_PIXELS).holes([int(route[ahead])])
+    return goes_on_words(clock_hour(lps_from_eye, hole.place_lps))
+
+
+def goes_on_words(hour: int) -> str:
+    """Say that the airway goes on at an hour of `lungaccess.plans.picture.clock_hour`."""
     return f"towards {hour} o'clock in the picture" if hour else STRAIGHT_AHEAD

@@ -17,8 +17,16 @@ from lungaccess.cli.plan_tables import steps_table
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.space import not_lumen
 from lungaccess.plans.insertion import scope_insertion, scope_motion, with_simplest_motion
+from lungaccess.plans.picture import clock_hour
 from lungaccess.plans.plan import Plan
-from lungaccess.plans.scope_steps import handle_factor, handle_words, motion_record, steps_note, steps_of
+from lungaccess.plans.scope_steps import (
+    goes_on_words,
+    handle_factor,
+    handle_words,
+    motion_record,
+    steps_note,
+    steps_of,
+)
 from lungaccess.showing.report.html.tables import instructions_section
 from stages.scope import ScopeMotion, find_motions, prover_of
 from tests.lungaccess.literal_steps import carried_out, least_room_mm, off, states_of_json, states_of_texts
@@ -39,7 +47,11 @@ def motion(states: list[list[float]]) -> ScopeMotion:
 def steps(moving: ScopeMotion, decimals: int = 0) -> tuple[Any, ...]:
     """Return the steps of a motion as it is written, with errors of 0.25 mm, 3 and 120 degrees allowed."""
     allowed = np.tile([0.25, np.radians(3.0), np.radians(120.0)], (len(moving.states) - 1, 1))
-    return steps_of(moving.written(decimals), TREE, allowed)
+
+    def goes_on(state: int) -> str:
+        return goes_on_words(clock_hour(moving.tips[state], moving.tips[-1, :3, 3]))
+
+    return steps_of(moving.written(decimals), TREE, allowed, goes_on)
 
 
 def test_up_is_towards_the_top_of_the_picture() -> None:
@@ -92,7 +104,8 @@ def test_twist_and_bend_that_change_together_are_one_step() -> None:
 
 
 def test_room_for_less_than_is_written_is_said() -> None:
-    (only,) = steps_of(motion([[0, 0, 0], [5, 0, 0]]), TREE, np.array([[0.09, 0.001, 1.0]]))
+    moving = motion([[0, 0, 0], [5, 0, 0]])
+    (only,) = steps_of(moving, TREE, np.array([[0.09, 0.001, 1.0]]), lambda _state: "straight ahead")
     assert "an error of less than 0.1 mm, less than 0.1° of twist or 57.2° of bend" in only.text
 
 

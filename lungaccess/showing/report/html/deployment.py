@@ -11,12 +11,14 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
+from anatomy.kernels.sight import follow_rays
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
 from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
 from lungaccess.plans.insertion import SHOWN_STEP_MM, shown_motion
+from lungaccess.plans.picture import HALF_ANGLE_RAD, camera_aside_mm
 from lungaccess.showing.report.pack import Packed, pack
 from stages.needle import Objective
 from stages.scope import ScopeMotion
@@ -39,8 +41,8 @@ NOT_MEASURED = -1.0
 """Stands where no clearance to the airway is asked for; no distance is negative."""
 DIRECTIONS = 90
 """Rays around the tip, every 4 degrees."""
-RAY_STEP_MM, FARTHEST_MM = 0.05, 20.0
-"""The border of the lumen is found to one step along each ray, as far as the radius of a wide trachea."""
+FARTHEST_MM = 20.0
+"""The border of the lumen is looked for along each ray as far as the radius of a wide trachea."""
 
 
 def packed_plan(plan: Plan, lung: Lung, name: str, *, cross_sections: bool = True) -> Packed:
@@ -79,7 +81,7 @@ def device_points(plan: Plan) -> Float:
 
 
 def _scope(plan: Plan, lung: Lung) -> Packed:
-    """Return the scope in its states: tips, camera, sections and the shaft.
+    """Return the scope in its states: tips, sections and the shaft; and its camera, aside of the tip.
 
     "bifurcations" are those of the route, each with how far the scope has moved when it stands before it.
     """
@@ -101,10 +103,12 @@ def _scope(plan: Plan, lung: Lung) -> Packed:
         "shaft": pack(shaft[:, :3, 3], "f4"),
         "shaft_mm": pack(shaft_mm, "f4"),
         "from_carina_mm": float(plan.scope.length_from_carina_mm),
+        "camera_aside_mm": camera_aside_mm(plan.system),
+        "half_angle_rad": HALF_ANGLE_RAD,
         "bifurcations": [
             one.as_json()
             | {"moved_mm": float(moved[one.state]), "entered_mm": float(moved[one.entered_state])}
-            for one in route_bifurcations(moving, plan.scope.branches, lung)
+            for one in route_bifurcations(moving, plan.scope.branches, lung, plan.system)
         ],
     }
 
@@ -297,13 +301,8 @@ def tip_sections(lung: Lung, lps_from_tip: Float, radius_mm: float) -> TipSectio
     rays = np.cos(angle)[None, :, None] * up[:, None] + np.sin(angle)[None, :, None] * right[:, None]
     rays = rays.reshape(-1, 3)
     starts = np.repeat(axes, DIRECTIONS, axis=0)
-    away = np.zeros(len(rays))
-    going = np.flatnonzero(lung.labels_at(starts) & LUMEN)
-    while len(going):
-        away[going] += RAY_STEP_MM
-        ahead = starts[going] + away[going, None] * rays[going]
-        going = going[(lung.labels_at(ahead) & LUMEN) != 0]
-        going = going[away[going] < FARTHEST_MM]
+    away, ends = np.zeros(len(rays)), np.zeros(len(rays), dtype=np.int64)
+    follow_rays(lung.labels, lung.geometry, LUMEN, starts, rays, FARTHEST_MM, away, ends)
     border = away.reshape(-1, DIRECTIONS)
     return TipSections(
         border_mm=border,

@@ -163,7 +163,8 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     from lungaccess.plans.scope_steps import handle_words, scope_steps, steps_note
 
     texts = [*(one.text for one in scope_steps(plan, lung)), handle_words(plan)]
-    ways = [one.text for one in route_bifurcations(shown_motion(plan), plan.scope.branches, lung)]
+    found = route_bifurcations(shown_motion(plan), plan.scope.branches, lung, plan.system)
+    ways = [one.text for one in found]
     return (
         f"<h3>Which way at each bifurcation</h3>{words.steps(ways)}"
         f"<h3>With the hands</h3>{words.steps(texts)}<p class='note'>{words.text(steps_note(plan, lung))}</p>"

@@ -1,10 +1,8 @@
 // What the camera at the tip of the scope sees: the airway's surface from inside, the devices ahead, and which way to go.
 import { DEVICE_COLOURS } from "./colours.js";
-import { SCOPE_HALF_ANGLE } from "./scene.js";
 import { Solids } from "./solids.js";
 import { add, cross, dot, minus, norm, rgb, times } from "./vectors.js";
 
-const ROOM_MM = 0.35;
 // Openings are named from so far on, and where they are not too near to the border of the round picture.
 const NAMED_MM = 45, NAMED_SHARE = 0.92;
 const TAKEN = "#7DF0B5", OTHER_WAY = "#F2F2F2";
@@ -15,11 +13,10 @@ export class Bronchoscopy {
     Object.assign(this, { scene, canvas, caption, prompt });
   }
 
-  // Draw the view at a state of a motion.  The camera is beside the channel, within the scope.
+  // Draw the view at a state of a motion, by the camera that the plan's instructions are told for.
   draw(state, motion) {
-    const radius = motion.plan.radius_mm;
-    const aside = Math.min(Math.max(0.7 * radius.scope, radius.outer + ROOM_MM), 0.9 * radius.scope);
-    const pose = { ...state.camera, eye: add(state.camera.eye, times(state.camera.up, aside)) };
+    const radius = motion.plan.radius_mm, { camera_aside_mm: aside, half_angle_rad: halfAngle } = motion.plan.scope;
+    const pose = { ...state.camera, eye: add(state.camera.eye, times(state.camera.up, aside)), halfAngle };
     const solids = new Solids();
     for (const key of ["outer", "inner"]) solids.tube(state[key], radius[key], rgb(DEVICE_COLOURS[key]));
     solids.tube(state.needle, radius.needle, state.needleColours);
@@ -38,10 +35,10 @@ export class Bronchoscopy {
   }
 
   // Write the name of an opening onto it, and return whether it is in the picture.
-  name({ place_lps: place, label, taken, hour }, { eye, forward, up }) {
-    const away = minus(place, eye), depth = dot(away, forward), tangent = depth * Math.tan(SCOPE_HALF_ANGLE);
+  name({ place_lps: place, label, taken, in_view: inView }, { eye, forward, up, halfAngle }) {
+    const away = minus(place, eye), depth = dot(away, forward), tangent = depth * Math.tan(halfAngle);
     const [x, y] = [dot(away, cross(forward, up)) / tangent, dot(away, up) / tangent];
-    if (depth <= 0 || norm(away) > NAMED_MM || Math.hypot(x, y) > NAMED_SHARE) return false;
+    if (!inView || depth <= 0 || norm(away) > NAMED_MM || Math.hypot(x, y) > NAMED_SHARE) return false;
     const pen = this.canvas.getContext("2d"), half = this.canvas.width / 2, at = [half * (1 + x), half * (1 - y)];
     pen.strokeStyle = pen.fillStyle = taken ? TAKEN : OTHER_WAY;
     pen.lineWidth = taken ? 5 : 2;
@@ -50,7 +47,7 @@ export class Bronchoscopy {
     pen.stroke();
     pen.font = `${taken ? "bold " : ""}19px system-ui, sans-serif`;
     pen.textBaseline = "middle";
-    const words = `${taken ? "→ " : ""}${label}${hour ? `, ${hour} h` : ""}`, width = pen.measureText(words).width;
+    const words = `${taken ? "→ " : ""}${label}`, width = pen.measureText(words).width;
     const [low, high] = [half - Math.sqrt(half ** 2 - (at[1] - half) ** 2), half + Math.sqrt(half ** 2 - (at[1] - half) ** 2)];
     const below = at[1] + (at[1] > 1.6 * half ? -26 : 26), left = Math.min(Math.max(at[0] - width / 2, low + 12), Math.max(high - width - 12, low + 12));
     pen.textAlign = "left";

@@ -7,7 +7,6 @@ import { coarser, facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfac
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
-export const SCOPE_HALF_ANGLE = (48 * Math.PI) / 180;
 const RIM = 0.55, FAINT_GAIN = 1.5, DARK_GAIN = 1.4, DARK_FAINT_GAIN = 3.2, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
 const INSIDE = "inside";
 const NO_CUT = [0, 0, 0, 0];
@@ -334,7 +333,7 @@ export class Scene {
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
     const view = {
-      eye: eyeFromLps(pose.eye, pose.forward, pose.up), clip: perspective(SCOPE_HALF_ANGLE, 1, 0.2, 400), span: [0.2, 400],
+      eye: eyeFromLps(pose.eye, pose.forward, pose.up), clip: perspective(pose.halfAngle, 1, 0.2, 400), span: [0.2, 400],
     };
     if (surface) {
       this.use(this.programs.inside, view);

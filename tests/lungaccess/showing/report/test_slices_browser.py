@@ -320,10 +320,11 @@ def test_hours_of_the_prompts_are_those_of_the_picture(
     stored, plan = data["plans"][0]["scope"]["bifurcations"], plans[0]
     assert [each["openings"][0]["branch"] for each in stored] == plan.scope.branches[1:].tolist()
     tips = shown_motion(plan).tips
+    aside = data["plans"][0]["scope"]["camera_aside_mm"]
     for each in stored:
         tip = tips[each["state"]]
-        for opening in each["openings"]:
-            away = np.array(opening["place_lps"]) - tip[:3, 3]
+        for opening in each["openings"] if each["bend_deg"] == each["held_bend_deg"] else ():
+            away = np.array(opening["place_lps"]) - tip[:3, 3] - aside * tip[:3, 0]
             forward, up = tip[:3, 2], tip[:3, 0]
             right = np.cross(forward, up)
             angle = np.degrees(np.arctan2(away @ right, away @ up)) % 360
@@ -390,6 +391,7 @@ def test_openings_are_named_where_they_are(fresh: browser.Browser, data: dict[st
     plan = data["plans"][0]
     radius, half, tangent = plan["radius_mm"], 220.0, np.tan(np.radians(48.0))
     aside = min(max(0.7 * radius["scope"], radius["outer"] + 0.35), 0.9 * radius["scope"])
+    assert plan["scope"]["camera_aside_mm"] == pytest.approx(aside)
     ringed = 0
     for tick in fresh.state()["pauses"]:
         fresh.run("window.lungaccessReport.set(arguments[0])", tick / 1000)
@@ -402,7 +404,12 @@ def test_openings_are_named_where_they_are(fresh: browser.Browser, data: dict[st
                 away = np.array(opening["place_lps"]) - eye
                 depth = away @ forward
                 place = np.array([away @ np.cross(forward, up), away @ up]) / (depth * tangent)
-                if depth <= 0 or np.linalg.norm(away) > 45.0 or np.linalg.norm(place) > 0.92:
+                if (
+                    not opening["in_view"]
+                    or depth <= 0
+                    or np.linalg.norm(away) > 45.0
+                    or np.linalg.norm(place) > 0.92
+                ):
                     continue
                 wanted.append(opening["branch"])
                 if opening["taken"]:

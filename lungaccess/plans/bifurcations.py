@@ -25,7 +25,7 @@ from lungaccess.plans.picture import (
 from lungaccess.problem.system import System
 from stages.scope import ScopeMotion, prover_of
 
-SEEN_FROM_MM, VIEWS = 25.0, 10
+SEEN_FROM_MM, VIEWS = 25.0, 8
 """A bifurcation is looked at from at most so far before it, in so many states at most."""
 LOOKED_PIXELS, SHOWN_PIXELS = 32, 80
 """Pictures among which one is chosen have as many pixels along an edge, and the chosen one."""
@@ -167,9 +167,10 @@ def route_bifurcations(
         views = np.unique(np.linspace(from_state, entered, VIEWS).round().astype(int)).tolist()
         clear = [_clarity(lung, system, tips[n], ways) for n in views]
         state = views[int(np.argmax(clear))]
-        seen = replace(motion, states=motion.states[: state + 1])
+        tip, bend_rad = tips[state], float(motion.states[state, 2])
         if max(clear) < LEAST_CLARITY:
-            seen = _look(seen, lung, system, ways)
+            held = replace(motion, states=motion.states[: state + 1])
+            tip, bend_rad = _look(held, lung, system, ways)
         found.append(
             Bifurcation(
                 number=number + 1,
@@ -178,9 +179,9 @@ def route_bifurcations(
                 state=state,
                 entered_state=entered,
                 inserted_mm=float(motion.states[state, 0]),
-                held_bend_deg=float(np.degrees(motion.states[state, 2])),
-                bend_deg=float(np.degrees(seen.states[-1, 2])),
-                openings=_openings(lung, lps_from_camera(system, seen.tips[-1]), ways),
+                held_bend_deg=math.degrees(motion.states[state, 2]),
+                bend_deg=math.degrees(bend_rad),
+                openings=_openings(lung, lps_from_camera(system, tip), ways),
             )
         )
     return tuple(found)
@@ -207,15 +208,15 @@ def _clarity(lung: Lung, system: System, lps_from_tip: Float, ways: list[int]) -
     return min(hole.share for hole in holes) * min(angles, default=1.0)
 
 
-def _look(held: ScopeMotion, lung: Lung, system: System, ways: list[int]) -> ScopeMotion:
-    """Return a motion with the least proved change of bend that shows all ways, the same if there is none."""
+def _look(held: ScopeMotion, lung: Lung, system: System, ways: list[int]) -> tuple[Float, float]:
+    """Return tip and bend in rad after the least proved change that shows all ways, or those held."""
     prover = prover_of(lung, system.scope)
     for change in sorted(np.radians(np.arange(-180.0, 181.0, LOOK_DEG)).tolist(), key=abs):
         looking = replace(held, states=np.append(held.states, held.states[-1:] + [0.0, 0.0, change], axis=0))
-        is_clear = _clarity(lung, system, looking.tips[-1], ways) >= LEAST_CLARITY
-        if is_clear and not isinstance(prover.prove(looking), str):
-            return looking
-    return held
+        seen = looking.tips[-1]
+        if _clarity(lung, system, seen, ways) >= LEAST_CLARITY and not isinstance(prover.prove(looking), str):
+            return seen, float(looking.states[-1, 2])
+    return held.tips[-1], float(held.states[-1, 2])
 
 
 def _first(true: Bool) -> int:

@@ -21,6 +21,8 @@ from stages.scope import ScopeMotion, find_motions, prover_of
 
 PIXELS, STEP_MM, FARTHEST_MM = 81, 0.25, 120.0
 TANGENT = np.tan(np.radians(48.0))
+MOST_BESIDE = 0.06
+"""A mark lies at most this share of the picture beside the region: less than the radius of a drawn ring."""
 MIDDLE_DEG = 7.0
 """The hour of a region that is nearer to the middle of the picture says nothing."""
 NOT_APART, MOST_NOT_APART = "not apart", 0.1
@@ -112,14 +114,14 @@ def wrong_place(seen: Seen, opening: Opening, region: np.ndarray) -> str:
     hour = round(np.degrees(np.arctan2(right, up)) / 30.0) % 12 or 12
     aside_deg = np.degrees(np.arctan(np.hypot(up, right)))
     said = f"{opening.words}: seen at {hour} o'clock, {aside_deg:.0f} degrees from the middle"
-    at = seen.pixel(np.array(opening.place_lps))
-    if at is None or not opening.in_view or ndimage.distance_transform_edt(~region)[at] > 0.06 * PIXELS:
-        return f"{said}; place beside it"
-    if aside_deg < MIDDLE_DEG or (opening.hour == 0 and aside_deg < 2.0 * MIDDLE_DEG):
-        return ""
     off = 6 if opening.hour == 0 else abs((opening.hour - hour + 6) % 12 - 6)
     side = {"on the right": right, "on the left": -right, "at the top": up, "at the bottom": -up}
-    return "" if off <= 1 and side.get(opening.side, 1.0) > -0.02 else f"{said}; off by {off} hours"
+    near_middle = aside_deg < MIDDLE_DEG or (opening.hour == 0 and aside_deg < 2.0 * MIDDLE_DEG)
+    if not near_middle and (off > 1 or side.get(opening.side, 1.0) < -0.02):
+        return f"{said}; off by {off} hours"
+    at = seen.pixel(np.array(opening.place_lps))
+    beside = at is None or ndimage.distance_transform_edt(~region)[at] > MOST_BESIDE * PIXELS
+    return f"{said}; not marked there" if beside or not opening.in_view else ""
 
 
 def routes(lung: Lung, system: System, count: int) -> Iterator[tuple[ScopeMotion, np.ndarray]]:

@@ -14,6 +14,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LOBES
 from anatomy.lung import Lung
+from anatomy.poses import poses_on_arc
 from lungaccess.plans.picture import (
     STRAIGHT_AHEAD,
     Picture,
@@ -27,11 +28,11 @@ from stages.scope import ScopeMotion, prover_of
 
 SEEN_FROM_MM, VIEWS = 25.0, 8
 """A bifurcation is looked at from at most so far before it, in so many states at most."""
-LOOKED_PIXELS, SHOWN_PIXELS = 32, 80
+LOOKED_PIXELS, SHOWN_PIXELS = 24, 80
 """Pictures among which one is chosen have as many pixels along an edge, and the chosen one."""
 LEAST_CLARITY = 0.0005
 """Openings are in view if each fills 0.2 % of the picture where they are 15 degrees apart, or the like."""
-LOOK_DEG = 15.0
+LOOK_RAD = math.radians(15.0)
 """Bends of the tip that are tried in order to see all openings are so far apart."""
 TOGETHER_MM = 10.0
 """Branches of the same parent that part within so many mm are openings of one bifurcation."""
@@ -170,7 +171,7 @@ def route_bifurcations(
         tip, bend_rad = tips[state], float(motion.states[state, 2])
         if max(clear) < LEAST_CLARITY:
             held = replace(motion, states=motion.states[: state + 1])
-            tip, bend_rad = _look(held, lung, system, ways)
+            tip, bend_rad = _look(held, tip, lung, system, ways)
         found.append(
             Bifurcation(
                 number=number + 1,
@@ -208,15 +209,22 @@ def _clarity(lung: Lung, system: System, lps_from_tip: Float, ways: list[int]) -
     return min(hole.share for hole in holes) * min(angles, default=1.0)
 
 
-def _look(held: ScopeMotion, lung: Lung, system: System, ways: list[int]) -> tuple[Float, float]:
-    """Return tip and bend in rad after the least proved change that shows all ways, or those held."""
-    prover = prover_of(lung, system.scope)
-    for change in sorted(np.radians(np.arange(-180.0, 181.0, LOOK_DEG)).tolist(), key=abs):
-        looking = replace(held, states=np.append(held.states, held.states[-1:] + [0.0, 0.0, change], axis=0))
-        seen = looking.tips[-1]
-        if _clarity(lung, system, seen, ways) >= LEAST_CLARITY and not isinstance(prover.prove(looking), str):
-            return seen, float(looking.states[-1, 2])
-    return held.tips[-1], float(held.states[-1, 2])
+def _look(
+    held: ScopeMotion, lps_from_tip: Float, lung: Lung, system: System, ways: list[int]
+) -> tuple[Float, float]:
+    """Return tip and bend in rad of the clearest picture by a proved change of bend, or those held."""
+    length, held_rad = held.bending_length_mm, float(held.states[-1, 2])
+    base = poses_on_arc(lps_from_tip, 0.0, held_rad / length, [-length])[0]
+    looks = [(_clarity(lung, system, lps_from_tip, ways), held_rad, lps_from_tip)]
+    for bend_rad in np.arange(*system.scope.bends_rad, LOOK_RAD).tolist():
+        tip = poses_on_arc(base, 0.0, bend_rad / length, [length])[0]
+        looks.append((_clarity(lung, system, tip, ways), bend_rad, tip))
+    for _clear, bend_rad, tip in sorted(looks, key=lambda each: -each[0]):
+        states = np.append(held.states, [[*held.states[-1, :2], bend_rad]], axis=0)
+        proved = prover_of(lung, system.scope).prove(replace(held, states=states))
+        if not isinstance(proved, str):
+            return tip, bend_rad
+    return lps_from_tip, held_rad
 
 
 def _first(true: Bool) -> int:

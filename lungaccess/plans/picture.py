@@ -137,7 +137,7 @@ class Picture:
         own = np.flatnonzero(region == np.bincount(region, dark * (region > 0)).argmax())
         dark, across = dark[own], self._across[own]
         shown = own[np.linalg.norm(across - dark @ across / dark.sum(), axis=1).argmin()]
-        whole = 1.0 - (across**2).sum(axis=1) / math.tan(HALF_ANGLE_RAD) ** 2
+        whole = (1.0 - (across**2).sum(axis=1) / math.tan(HALF_ANGLE_RAD) ** 2) ** 2
         away = float(np.linalg.norm(tree.points_lps[fork] - self._eye)) + BEGIN_MM
         return Hole(
             place_lps=self._eye + min(away, self._away_mm[shown]) * self._rays[shown],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
 from anatomy.structures import LUMEN
+from lungaccess.plans import bifurcations
 from lungaccess.plans.bifurcations import Bifurcation, Opening, route_bifurcations
 from lungaccess.plans.insertion import SHOWN_STEP_MM, SHOWN_TURN_RAD
 from lungaccess.problem.system import System
@@ -22,7 +24,7 @@ from stages.scope import ScopeMotion, find_motions, prover_of
 PIXELS, STEP_MM, FARTHEST_MM = 81, 0.25, 120.0
 TANGENT = np.tan(np.radians(48.0))
 MOST_BESIDE = 0.06
-"""A mark lies at most this share of the picture beside the region: less than the radius of a drawn ring."""
+"""A mark lies at most this share of the picture beside the region, two radii of a drawn ring."""
 MIDDLE_DEG = 7.0
 """The hour of a region that is nearer to the middle of the picture says nothing."""
 NOT_APART, MOST_NOT_APART = "not apart", 0.1
@@ -85,14 +87,16 @@ class Seen:
         return regions == regions[own]
 
 
+def looking(motion: ScopeMotion, one: Bifurcation) -> ScopeMotion:
+    """Return a motion up to the picture of a bifurcation, with the bend for a look if there is one."""
+    states = motion.states[[*range(one.state + 1), one.state]]
+    states[-1, 2] = np.radians(one.bend_deg)
+    return replace(motion, states=states)
+
+
 def told_wrongly(lung: Lung, system: System, motion: ScopeMotion, one: Bifurcation) -> Iterator[str]:
     """Yield what is told of the openings of a bifurcation other than where the picture shows them."""
-    looking = motion.states[[*range(one.state + 1), one.state]]
-    looking[-1, 2] = np.radians(one.bend_deg)
-    tip = ScopeMotion(
-        lps_from_entry=motion.lps_from_entry, states=looking, bending_length_mm=motion.bending_length_mm
-    ).lps_from_tip
-    seen, tree = Seen(lung, system, tip), lung.tree
+    seen, tree = Seen(lung, system, looking(motion, one).lps_from_tip), lung.tree
     parent = int(tree.branch_parent[one.openings[0].branch])
     children = {each.branch for each in one.openings if each.branch != parent}
     fork = int(tree.parent_point[tree.branch_start[one.openings[0].branch]])
@@ -173,3 +177,18 @@ def test_openings_are_where_the_picture_shows_them_in_any_phantom(seed: int) -> 
 @pytest.mark.parametrize("patient", ["Patient1", "Patient2"])
 def test_openings_are_where_the_picture_shows_them_in_patients(data_dir: Path, patient: str) -> None:
     assert all_wrong(la.load_patient(data_dir / "med-rad" / patient), 8) == []
+
+
+def test_where_no_state_shows_all_openings_the_tip_is_bent_for_a_look(
+    small_lung: Lung, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So much clearness is asked for that the motion itself has it nowhere."""
+    monkeypatch.setattr(bifurcations, "LEAST_CLARITY", 0.02)
+    system = la.load_system("ultrathin")
+    motion, way = next(routes(small_lung, system, 1))
+    found = route_bifurcations(motion, way, small_lung, system)
+    looked = [one for one in found if one.bend_deg != one.held_bend_deg]
+    assert looked
+    for one in looked:
+        assert f"bend the tip to {abs(one.bend_deg):.0f}° " in one.text
+        assert isinstance(prover_of(small_lung, system.scope).prove(looking(motion, one)), float)

@@ -18,9 +18,9 @@ def follow_rays(labels, geometry, bits, starts, rays, most_mm, away_mm, ends):
     for n in range(rays.shape[0]):
         for axis in range(3):
             place, speed = geometry[axis, 3], 0.0
-            for k in range(3):
-                place += geometry[axis, k] * starts[n, k]
-                speed += geometry[axis, k] * rays[n, k]
+            for m in range(3):
+                place += geometry[axis, m] * starts[n, m]
+                speed += geometry[axis, m] * rays[n, m]
             here[axis] = math.floor(place)
             step[axis] = 1 if speed > 0.0 else -1
             each[axis] = abs(1.0 / speed) if speed != 0.0 else math.inf
@@ -28,19 +28,12 @@ def follow_rays(labels, geometry, bits, starts, rays, most_mm, away_mm, ends):
             along[axis] = border * each[axis] if speed != 0.0 else math.inf
         length, last = 0.0, 0
         while length < most_mm:
-            i, j, k = here
-            if (
-                i < 0
-                or j < 0
-                or k < 0
-                or i >= labels.shape[0]
-                or j >= labels.shape[1]
-                or k >= labels.shape[2]
-            ):
+            i, j, k = here[0], here[1], here[2]
+            if not (0 <= i < labels.shape[0] and 0 <= j < labels.shape[1] and 0 <= k < labels.shape[2]):
                 break
             if not labels[i, j, k] & bits:
                 break
-            last = labels[i, j, k]
+            last = int(labels[i, j, k])
             axis = int(np.argmin(along))
             length = along[axis]
             along[axis] += each[axis]

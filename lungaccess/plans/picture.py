@@ -68,14 +68,9 @@ def clock_words(hour: int) -> str:
 class Hole:
     """The dark region of a picture through which the airway goes on.
 
-    Parameters
-    ----------
-    place_lps : (3,) float64
-        A place behind its rim that is seen in its middle, LPS mm; on the centreline where it is not seen.
-    share : float
-        How much of the picture it darkens, less at the border, 0 to 1; 0 if it is not seen.
-    rim_mm : float
-        Distance of its nearest part from the camera.
+    `place_lps` (3,) is behind its rim and seen in its middle, LPS mm, or on the centreline if it is not seen;
+    `share` is how much of the picture it darkens, less at the border, 0 if it is not seen; `rim_mm` is the
+    distance of its nearest part from the camera.
     """
 
     place_lps: Float
@@ -84,15 +79,9 @@ class Hole:
 
 
 class Picture:
-    """What a camera in the airway sees: the wall of the lumen, as dark as it is far.
+    """What a camera at a frame of `lps_from_camera` sees: the wall of the lumen, as dark as it is far.
 
-    Parameters
-    ----------
-    lung : Lung
-    lps_from_eye : (4, 4) float64
-        See `lps_from_camera`.
-    pixels : int
-        Along an edge of the square around the picture.
+    It has so many `pixels` along an edge of the square around it.
     """
 
     def __init__(self, lung: Lung, lps_from_eye: Float, pixels: int) -> None:
@@ -107,7 +96,7 @@ class Picture:
     def _beyond(self, point: int) -> Bool:
         """Tell which rays end in the airway from a point of the tree on."""
         tree, own = self._tree, int(self._tree.branch_of_point[point])
-        found = np.append(branches_beyond(tree, point), False)[self._branch]
+        found: Bool = np.append(branches_beyond(tree, point), False)[self._branch]
         here = np.flatnonzero(self._branch == own)
         points = tree.branch_points(own)
         ends = self._eye + self._away_mm[here, None] * self._rays[here]
@@ -149,7 +138,7 @@ class Picture:
 def branches_beyond(tree: AirwayTree, point: int) -> Bool:
     """Return which branches `(B,)` go on from a point of the tree, that of the point among them."""
     own = int(tree.branch_of_point[point])
-    beyond = np.arange(tree.n_branches) == own
+    beyond: Bool = np.arange(tree.n_branches) == own
     for branch in range(own + 1, tree.n_branches):
         parent = tree.branch_parent[branch]
         beyond[branch] = beyond[parent] and (

@@ -124,8 +124,12 @@ def wrong_place(seen: Seen, opening: Opening, region: np.ndarray) -> str:
     if not near_middle and (off > 1 or side.get(opening.side, 1.0) < -0.02):
         return f"{said}; off by {off} hours"
     at = seen.pixel(np.array(opening.place_lps))
-    beside = at is None or ndimage.distance_transform_edt(~region)[at] > MOST_BESIDE * PIXELS
-    return f"{said}; not marked there" if beside or not opening.in_view else ""
+    if at is None or not opening.in_view:
+        return f"{said}; not marked"
+    beside = ndimage.distance_transform_edt(~region)[at] > MOST_BESIDE * PIXELS
+    dark = seen.depth_mm**2 / (seen.depth_mm**2 + 520.0)
+    is_light = dark[at] < 0.5 * dark[region].max()
+    return f"{said}; marked beside it, on the wall" if beside and is_light else ""
 
 
 def routes(lung: Lung, system: System, count: int) -> Iterator[tuple[ScopeMotion, np.ndarray]]:

@@ -162,16 +162,16 @@ def route_bifurcations(
     passed = depth[_places(tree, int(branches[-1]), tips[:, :3, 3])]
     found = []
     for number, (parent, child) in enumerate(zip(branches[:-1].tolist(), branches[1:].tolist(), strict=True)):
-        ways, fork = _ways(tree, parent, child), _fork(tree, child)
+        points, fork = _first_points(tree, parent, child), _fork(tree, child)
         entered = max(_first(passed >= depth[fork]), state)
         from_state = max(_first(passed >= depth[fork] - SEEN_FROM_MM), state)
         views = np.unique(np.linspace(from_state, entered, VIEWS).round().astype(int)).tolist()
-        clear = [_clarity(lung, system, tips[n], ways) for n in views]
+        clear = [_clarity(lung, system, tips[n], points) for n in views]
         state = views[int(np.argmax(clear))]
         tip, bend_rad = tips[state], float(motion.states[state, 2])
         if max(clear) < LEAST_CLARITY:
             held = replace(motion, states=motion.states[: state + 1])
-            tip, bend_rad = _look(held, tip, lung, system, ways)
+            tip, bend_rad = _look(held, tip, lung, system, points)
         found.append(
             Bifurcation(
                 number=number + 1,
@@ -182,13 +182,13 @@ def route_bifurcations(
                 inserted_mm=float(motion.states[state, 0]),
                 held_bend_deg=math.degrees(motion.states[state, 2]),
                 bend_deg=math.degrees(bend_rad),
-                openings=_openings(lung, lps_from_camera(system, tip), ways),
+                openings=_openings(lung, lps_from_camera(system, tip), points),
             )
         )
     return tuple(found)
 
 
-def _ways(tree: AirwayTree, parent: int, child: int) -> list[int]:
+def _first_points(tree: AirwayTree, parent: int, child: int) -> list[int]:
     """Return the first point of each way on at a bifurcation, that to a child first, the parent's last."""
     depth, fork, last = tree.distance_from_root_mm, _fork(tree, child), int(tree.branch_start[parent + 1]) - 1
     others = [
@@ -200,25 +200,25 @@ def _ways(tree: AirwayTree, parent: int, child: int) -> list[int]:
     return [*(int(tree.branch_start[each]) for each in (child, *others)), *([fork + 1] if goes_on else [])]
 
 
-def _clarity(lung: Lung, system: System, lps_from_tip: Float, ways: list[int]) -> float:
+def _clarity(lung: Lung, system: System, lps_from_tip: Float, points: list[int]) -> float:
     """Return how well a picture tells openings apart: share of the smallest times least angle between any."""
     eye = lps_from_camera(system, lps_from_tip)
-    holes = Picture(lung, eye, LOOKED_PIXELS).holes(ways)
-    rays = [hole.place_lps - eye[:3, 3] for hole in holes]
-    angles = [math.acos(min(a @ b / (norm(a) * norm(b)), 1.0)) for a, b in combinations(rays, 2)]
+    holes = Picture(lung, eye, LOOKED_PIXELS).holes(points)
+    rays = [(hole.place_lps - eye[:3, 3]) / norm(hole.place_lps - eye[:3, 3]) for hole in holes]
+    angles = [math.acos(min(float(a @ b), 1.0)) for a, b in combinations(rays, 2)]
     return min(hole.share for hole in holes) * min(angles, default=1.0)
 
 
 def _look(
-    held: ScopeMotion, lps_from_tip: Float, lung: Lung, system: System, ways: list[int]
+    held: ScopeMotion, lps_from_tip: Float, lung: Lung, system: System, points: list[int]
 ) -> tuple[Float, float]:
     """Return tip and bend in rad of the clearest picture by a proved change of bend, or those held."""
     length, held_rad = held.bending_length_mm, float(held.states[-1, 2])
     base = poses_on_arc(lps_from_tip, 0.0, held_rad / length, [-length])[0]
-    looks = [(_clarity(lung, system, lps_from_tip, ways), held_rad, lps_from_tip)]
+    looks = [(_clarity(lung, system, lps_from_tip, points), held_rad, lps_from_tip)]
     for bend_rad in np.arange(*system.scope.bends_rad, LOOK_RAD).tolist():
         tip = poses_on_arc(base, 0.0, bend_rad / length, [length])[0]
-        looks.append((_clarity(lung, system, tip, ways), bend_rad, tip))
+        looks.append((_clarity(lung, system, tip, points), bend_rad, tip))
     for _clear, bend_rad, tip in sorted(looks, key=lambda each: -each[0]):
         states = np.append(held.states, [[*held.states[-1, :2], bend_rad]], axis=0)
         proved = prover_of(lung, system.scope).prove(replace(held, states=states))
@@ -288,12 +288,12 @@ def _places(tree: AirwayTree, last: int, tips_lps: Float) -> Int:
     return np.asarray(route[np.maximum.accumulate(np.argmin(away, axis=1))])
 
 
-def _openings(lung: Lung, lps_from_eye: Float, ways: list[int]) -> tuple[Opening, ...]:
-    holes = Picture(lung, lps_from_eye, SHOWN_PIXELS).holes(ways)
+def _openings(lung: Lung, lps_from_eye: Float, points: list[int]) -> tuple[Opening, ...]:
+    holes = Picture(lung, lps_from_eye, SHOWN_PIXELS).holes(points)
     hours = [clock_hour(lps_from_eye, hole.place_lps) for hole in holes]
     sides = [_side_of_picture(hour) for hour in hours]
     made = []
-    for n, (point, hole, side) in enumerate(zip(ways, holes, sides, strict=True)):
+    for n, (point, hole, side) in enumerate(zip(points, holes, sides, strict=True)):
         branch, (x, y, z) = int(lung.tree.branch_of_point[point]), hole.place_lps.tolist()
         same = sorted((holes[k].rim_mm, k) for k, other in enumerate(sides) if other == side)
         made.append(

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 import lungaccess as la
 from anatomy.airway_tree import AirwayTree
-from anatomy.fields import distance_field
+from anatomy.fields import corner_geometry, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
 from anatomy.motion.prepare import prepare_motion
@@ -134,6 +134,7 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         folder=None,
         labels=read_only(np.asfortranarray(labels)),
         grid=grid,
+        geometry=corner_geometry(grid),
         cost=None,
         has_fissures=fissures,
         fields=fields,

@@ -10,16 +10,18 @@ import numpy as np
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
-from anatomy.base.typed import Array, Mask, UInt16
+from anatomy.base.typed import Array, Float, Int32, Mask, UInt16
 from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.lung import Lung
+from anatomy.mask_findings import mask_findings
 from anatomy.morphology import bounds, window
 from anatomy.motion.motion import Motion
 from anatomy.motion.source import MotionSource
 from anatomy.patient import PatientImages
-from anatomy.sides import septum
+from anatomy.plausibility import warnings_of_findings, with_accepted
+from anatomy.sides import border_of, coarse_sides, points_of_sides
 
 Progress = Callable[[str], None]
 Keep = Callable[[str, Array], Array]
@@ -96,7 +98,10 @@ def build_lung(
     tree = tree_from_mask(images.lumen)
     tell("labels")
     box = WorkingBox(images.lung.array | images.lumen.array, images.grid)
-    labels = keep("labels", _labels(images, box, tree, warnings))
+    labels, lungs_lps = _labels(images, box, tree, warnings)
+    labels = keep("labels", labels)
+    tell("plausibility of the masks")
+    findings = with_accepted(mask_findings(images, tree, lungs_lps), images.accepted)
     motion = None
     if images.motion is not None:
         tell("motion of breathing")
@@ -121,7 +126,8 @@ def build_lung(
         target_names=images.target_names,
         breath_hold=images.breath_hold,
         sources=images.sources,
-        warnings=tuple(warnings),
+        warnings=(*warnings, *warnings_of_findings(findings)),
+        findings=findings,
     )
 
 
@@ -146,8 +152,10 @@ def _require_tissue(images: PatientImages) -> None:
             )
 
 
-def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: list[str]) -> UInt16:
-    """Set the bits of every structure and the branch of airway voxels."""
+def _labels(
+    images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: list[str]
+) -> tuple[UInt16, tuple[Float, Float]]:
+    """Set the bits of every structure and the branch of airway voxels; also return points of both lungs."""
     lumen = box.cut(images.lumen.array)
     airway = lumen if images.wall is None else lumen | box.cut(images.wall.array)
     if images.wall is None:
@@ -164,21 +172,23 @@ def _labels(images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: 
     labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
     labels[~inside] = structures.OUTSIDE
     structures.close_border(labels)
-    labels[_septum(lung, airway, box.grid, warnings)] |= structures.OUTSIDE
+    sides = coarse_sides(lung & ~airway, box.grid)
+    labels[_septum(sides, lung & ~airway, warnings)] |= structures.OUTSIDE
     labels[vessels] |= structures.VESSEL
     if images.fissures is not None:
         fissures = box.cut(images.fissures.array) & ~airway
         labels[fissures] |= structures.FISSURE
     _label_airway(labels, airway, lumen, tree, box.grid)
-    return labels
+    empty = np.zeros((0, 3))
+    return labels, (empty, empty) if sides is None else points_of_sides(*sides, box.grid)
 
 
-def _septum(lung: Mask, airway: Mask, grid: Grid, warnings: list[str]) -> Mask:
+def _septum(sides: tuple[Int32, tuple[int, ...]] | None, tissue: Mask, warnings: list[str]) -> Mask:
     """Return the border between the lungs, empty with a warning if they cannot be told apart."""
-    border = septum(lung, airway, grid)
-    if border is None:
+    if sides is None:
         warnings.append("The mask could not be split into two lungs: taken as one lung.")
-        return np.zeros(lung.shape, dtype=bool)
+        return np.zeros(tissue.shape, dtype=bool)
+    border = border_of(*sides, tissue)
     count = int(border.sum())
     if count:
         warnings.append(

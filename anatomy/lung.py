@@ -13,6 +13,7 @@ from anatomy.lobes import LOBES
 from anatomy.morphology import voxels_in
 from anatomy.motion.motion import Motion
 from anatomy.organ import Organ
+from anatomy.plausibility import FITS
 from anatomy.structures import AIRWAY, OUTSIDE
 from anatomy.tree.naming import SEGMENT_LOBES
 
@@ -62,6 +63,20 @@ class Lung(Organ):
         ]
         facts = table(rows, f"Lung of {self.name}") + bullets("Warnings", self.warnings)
         return side_by_side(facts, self.tree.drawing())
+
+    @property
+    def mask_words(self) -> str:
+        """What a proof rests on: the airway of the masks, what was left out, and what is in doubt."""
+        report = self.tree.report
+        left_out = (
+            f", without {report.components_dropped} pieces ({report.voxels_dropped} voxels) that hang on "
+            "nothing"
+            if report.components_dropped
+            else ""
+        )
+        doubts = dict.fromkeys(each.name for each in self.findings if each.verdict != FITS)
+        look = f"; their checks of {', '.join(doubts)} are not as usual" if doubts else ""
+        return f"the masks of {self.name}, with an airway of {self.tree.n_branches} branches{left_out}{look}"
 
     @cached_property
     def _apex_and_base(self) -> tuple[tuple[float, float], ...]:

@@ -5,7 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from anatomy.base.typed import Array, Int, Mask
+from anatomy.base.typed import Array, Float, Int, Mask
+from anatomy.grid import Grid
 
 Window = tuple[slice, slice, slice]
 """A box of voxels, as an index of arrays."""
@@ -82,3 +83,15 @@ def window(low: Int, high: Int) -> Window:
     """Return the voxels `low <= ijk < high` as an index."""
     i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     return i, j, k
+
+
+def lattice_of(grid: Grid, cube_mm: float) -> Window:
+    """Return the index of about one voxel in each cube of `cube_mm`."""
+    i, j, k = (slice(None, None, max(1, round(cube_mm / float(side)))) for side in grid.spacing_mm)
+    return i, j, k
+
+
+def sampled(mask: Mask, grid: Grid, cube_mm: float) -> Float:
+    """Return about one point of a mask in each cube of `cube_mm`, LPS mm `(N, 3)`."""
+    lattice = lattice_of(grid, cube_mm)
+    return np.asarray(grid.lps(np.argwhere(mask[lattice]) * np.array([axis.step for axis in lattice])))

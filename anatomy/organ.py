@@ -18,6 +18,7 @@ from anatomy.base.typed import Float, Labels
 from anatomy.fields import DistanceField, corner_geometry
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels import field as kernel
+from anatomy.plausibility import Finding
 
 if TYPE_CHECKING:
     from anatomy.meshes import SurfaceMesh
@@ -54,6 +55,8 @@ class Organ:
         SHA-256 of every input file.
     warnings : tuple of str
         What was assumed or repaired on the way in.
+    findings : tuple of Finding
+        What the checks of the masks found, see `anatomy.plausibility`; none for masks that were not checked.
     folder : Path or None
         Where it is stored; None for one in memory alone, as a changed copy of a stored one is.
 
@@ -79,6 +82,7 @@ class Organ:
     breath_hold: str | None
     sources: Mapping[str, str]
     warnings: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
     folder: Path | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:

@@ -49,6 +49,8 @@ class PatientImages:
         File name to the SHA-256 of its bytes.
     warnings : tuple of str
         What was unusual about the input but did not prevent reading it.
+    accepted : tuple of str
+        Checks of `anatomy.plausibility.CHECKS` whose failure a person has accepted.
 
     Raises
     ------
@@ -78,6 +80,7 @@ class PatientImages:
     motion: MotionSource | None = None
     sources: Mapping[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    accepted: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for role in MASKS:

@@ -36,12 +36,27 @@ def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
     (ni, nj, nk) bool or None
         None if two lungs could not be told apart.
     """
+    found = coarse_sides(lung & ~airway, grid)
+    return None if found is None else border_of(*found, lung & ~airway)
+
+
+def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | None:
+    """Return the lung, 1 or 2, or 0 for none, of every coarse voxel of `tissue`, and its size in voxels.
+
+    None if two lungs could not be told apart.
+    """
     # The lungs are told apart on voxels of about this side: fast, and finer than any gap that matters.
     step = tuple(max(1, round(2.4 / float(s))) for s in grid.spacing_mm)
-    tissue = lung & ~airway
     core = ~_pooled(~tissue, step)
     sides = grow_sides(core, _pooled(tissue, step), grid.lps_from_ijk[:3, :3] * step)
-    return None if sides is None else _border(sides, step, tissue)
+    return None if sides is None else (sides, step)
+
+
+def points_of_sides(sides: Int32, step: tuple[int, ...], grid: Grid) -> tuple[Float, Float]:
+    """Return the middles of coarse voxels of the left and the right lung, LPS mm, each `(N, 3)`."""
+    size = np.array(step)
+    one, other = (grid.lps(np.argwhere(sides == side) * size + (size - 1) / 2) for side in (1, 2))
+    return (one, other) if one[:, 0].mean() > other[:, 0].mean() else (other, one)
 
 
 def _pooled(mask: Mask, step: tuple[int, ...]) -> Mask:
@@ -98,8 +113,11 @@ def _two_largest(mask: Mask, axes: Float, least: float) -> Int32 | None:
     return markers
 
 
-def _border(sides: Int32, step: tuple[int, ...], tissue: Mask) -> Mask:
-    """Mark the voxels of `tissue` that have a face neighbour in it on the other side."""
+def border_of(sides: Int32, step: tuple[int, ...], tissue: Mask) -> Mask:
+    """Return the voxels of `tissue` that have a face neighbour in it on the other side, bool `(ni, nj, nk)`.
+
+    `sides` and `step` are those of `coarse_sides`.
+    """
     border = np.zeros(tissue.shape, dtype=bool, order="F")
     meeting = np.argwhere(_differs_from_neighbour(sides))
     if not len(meeting):

@@ -4,7 +4,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,10 @@ from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.patient import PatientImages
+from anatomy.plausibility import Finding, require_plausible, with_accepted
 
 META = LUNG_FILE
-LAYOUT = 2
+LAYOUT = 3
 """Raise it when the files of a stored lung change, and the lung itself does not."""
 
 
@@ -35,8 +36,11 @@ def open_lung(
     *,
     cache: Path | None = None,
     progress: Callable[[str], None] | None = None,
+    accept: Collection[str] | None = None,
 ) -> Lung:
     """Return the lung made from inputs with these hashes, from the cache or newly built.
+
+    What its masks fail of `anatomy.plausibility.CHECKS` is among its warnings.
 
     Parameters
     ----------
@@ -48,12 +52,32 @@ def open_lung(
         Folder of the cache; `anatomy.base.cache.default_cache()` if None.
     progress : callable, optional
         Told each step as it begins.
+    accept : collection of str, optional
+        Names of the checks whose failure is accepted; others are refused.  None refuses nothing.
 
     Raises
     ------
+    AnatomyError
+        If a check of the masks fails that is not accepted.
     FileError
         If the cache cannot be written.
     """
+    lung = _stored_or_built(sources, read, cache, progress)
+    findings = with_accepted(lung.findings, accept or ())
+    if accept is not None:
+        require_plausible(findings, accept)
+    said = {old.warning: new.warning for old, new in zip(lung.findings, findings, strict=True)}
+    object.__setattr__(lung, "findings", findings)
+    object.__setattr__(lung, "warnings", tuple(said.get(each, each) for each in lung.warnings))
+    return lung
+
+
+def _stored_or_built(
+    sources: dict[str, str],
+    read: Callable[[], PatientImages],
+    cache: Path | None,
+    progress: Callable[[str], None] | None,
+) -> Lung:
     key = lung_key(sources)
     folder = (cache or default_cache()) / folder_name(key)
     stored = _load(folder, warn=True)

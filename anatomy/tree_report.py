@@ -24,6 +24,17 @@ class GapBridged(Repair):
     voxels_joined: int
 
 
+@frozen_record
+class PieceLeftOut(Repair):
+    """A piece of the mask that hangs on nothing; its position is the middle of the gap to the rest.
+
+    The length is that of the gap, `middle_lps` the middle of the piece, and `voxels` how many it has.
+    """
+
+    middle_lps: Float
+    voxels: int
+
+
 class SpurPruned(Repair):
     """A twig that was taken off because it barely leaves the branch it grows from; its position is its tip.
 
@@ -44,8 +55,8 @@ class TreeReport:
 
     Parameters
     ----------
-    gaps_bridged, spurs_pruned, loops_opened : tuple of records
-        Each with `position_lps` and `length_mm`.
+    gaps_bridged, spurs_pruned, loops_opened, pieces_left_out : tuple of records
+        Each with `position_lps` and `length_mm`; pieces of a few voxels are counted alone.
     components_dropped : int
         Separate pieces of the mask that were left out.
     voxels_dropped : int
@@ -59,6 +70,7 @@ class TreeReport:
     gaps_bridged: tuple[GapBridged, ...] = ()
     spurs_pruned: tuple[SpurPruned, ...] = ()
     loops_opened: tuple[LoopOpened, ...] = ()
+    pieces_left_out: tuple[PieceLeftOut, ...] = ()
     components_dropped: int = 0
     voxels_dropped: int = 0
     cavity_voxels: int = 0

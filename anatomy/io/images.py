@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,14 +12,15 @@ import numpy as np
 
 from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.files import DAMAGE, atomic_write, reading, reason, require_file
-from anatomy.base.typed import Array
+from anatomy.base.typed import Array, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io.frames import Frame
 from anatomy.io.image_header import ImageHeader
+from anatomy.io.mask_values import mask_of
 from anatomy.io.metaimage import open_metaimage
 from anatomy.io.nifti import begins_as_nifti, open_nifti
 from anatomy.io.nrrd import open_nrrd
-from anatomy.io.voxels import read_array, read_nonzero, require_whole
+from anatomy.io.voxels import read_array, read_two_valued, require_whole
 
 if TYPE_CHECKING:
     import SimpleITK
@@ -84,19 +86,64 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
         return Volume(grid=header.grid, array=read_array(header, stream, path))
 
 
-def read_mask(path: str | Path, *, frame: Frame | None = None) -> Volume:
-    """Read an image as a bool mask, true where a voxel is not zero.
+def read_mask(
+    path: str | Path,
+    *,
+    frame: Frame | None = None,
+    role: str = "",
+    labels: Sequence[int] = (),
+    say: Callable[[str], object] = warnings.warn,
+) -> Volume:
+    """Read an image as a bool mask: of one label, of two values, of fractions, or of labels that are named.
+
+    Parameters
+    ----------
+    path, frame
+        As in `read_volume`.
+    role, labels
+        What the mask shows, and the labels that count, as in `anatomy.io.mask_values.mask_of`.
+    say : callable
+        Receives what a user should know of how the values were understood, such as that of fractions those
+        of at least a half count, and how the volume changes.
 
     Raises
     ------
     AnatomyError
-        If a voxel is not a number.
+        If a voxel is not a number, several labels occur and none is named, or the values are those of no
+        mask.
     FileError, FrameError
         As `read_volume`.
     """
+    grid, masks, said = read_parts(path, [(role, labels)], frame=frame)
+    for each in said:
+        say(each)
+    return Volume(grid=grid, array=masks[0])
+
+
+def read_parts(
+    path: str | Path, parts: Sequence[tuple[str, Sequence[int]]], *, frame: Frame | None = None
+) -> tuple[Grid, list[Mask], tuple[str, ...]]:
+    """Read an image once, and return its grid, the masks of some roles and labels, and what to say of them.
+
+    Errors and meaning are those of `read_mask`.
+    """
     path = require_file(path)
-    with reading(path):
-        return read_nonzero(*open_image(path, frame), path)
+    if not any(labels for _, labels in parts):
+        with reading(path):
+            plain = read_two_valued(*open_image(path, frame), path)
+        if plain is not None:
+            return plain.grid, [plain.array] * len(parts), ()
+    volume = read_volume(path, frame=frame)
+    voxel_mm3 = volume.grid.voxel_volume_mm3
+    found = [
+        mask_of(volume.array, path.name, voxel_mm3=voxel_mm3, role=role, labels=labels)
+        for role, labels in parts
+    ]
+    return (
+        volume.grid,
+        [mask for mask, _ in found],
+        tuple(dict.fromkeys(s for _, said in found for s in said)),
+    )
 
 
 def read_labels(path: str | Path) -> Mapping[int, str]:

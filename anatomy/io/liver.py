@@ -7,7 +7,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.io.assembly import volumes_of
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.med_rad import numbered_nodules, text_poses
-from anatomy.io.near_names import by_name, looks_like, plain
+from anatomy.io.near_names import by_name, looks_like, plain, require_single
 from anatomy.liver import LiverImages
 
 LUMENS: Mapping[str, str] = {
@@ -48,7 +48,9 @@ def load_liver(folder: Path) -> LiverImages:
             remedy="Rename the file; without one of these a needle would not be kept out of it",
         )
     sources = [MaskSource(role=role, path=images[plain(name)]) for role, name in files.items()]
-    masks = read_masks([*sources, *numbered_nodules(images)], extent=("liver",))
+    sources += numbered_nodules(images)
+    doubles = require_single(folder, [source.path for source in sources])
+    masks = read_masks(sources, extent=("liver",))
     volumes, empty = volumes_of(masks)
     texts = text_poses(folder, masks.grid)
     return LiverImages(
@@ -63,7 +65,7 @@ def load_liver(folder: Path) -> LiverImages:
         targets_lps=texts.targets_lps,
         target_names=texts.target_names,
         sources={**masks.sources, **texts.sources},
-        warnings=(*_thick(float(masks.grid.spacing_mm.max())), *masks.statements, *empty),
+        warnings=(*_thick(float(masks.grid.spacing_mm.max())), *doubles, *masks.statements, *empty),
     )
 
 

@@ -14,15 +14,13 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask, UInt8, UInt16
 from anatomy.grid import Grid
 from anatomy.io.frames import Frame
-from anatomy.io.images import read_grid, read_mask, read_volume
+from anatomy.io.images import read_grid, read_parts, read_volume
+from anatomy.io.mask_values import PARTS, is_whole
 from anatomy.io.placement import Placed, box_in, covers_same_voxels, place, union_grid
-from anatomy.io.voxels import require_numbers
 
 _READERS = 2  # decompression releases the interpreter; more threads only raise the peak of memory
 SOLID = ("wall", "vessels", "fissures", "hepatic-vein", "portal-vein", "hepatic-artery")
 """Obstacles: none of their voxels may be lost where they are put on another grid."""
-MOST_NODULE_LABELS = 100
-"""A file with more values is no map of labels, which counts nodules, but a mask with soft edges."""
 EXTENT = ("lumen", "lung", "lobes")
 """Roles whose files decide how far the common grid reaches."""
 
@@ -31,8 +29,9 @@ EXTENT = ("lumen", "lung", "lobes")
 class MaskSource:
     """A file that makes up (a part of) the mask `role`, one of `anatomy.patient.MASKS` or "lobes".
 
-    Of the file count the voxels of the labels, or, if there are none, all but zero.  `lobe` is the number of
-    the lobe for the role "lobes", `nodule` that of the nodule for the role "nodules", 0 if it has none.
+    Of the file count the voxels of the labels, or, if there are none, what is its mask by
+    `anatomy.io.mask_values.mask_of`.  `lobe` is the number of the lobe for the role "lobes", `nodule` that of
+    the nodule for the role "nodules", 0 if it has none.
     """
 
     role: str
@@ -85,9 +84,9 @@ def read_masks(
     hashes: dict[str, str] = {}
     with ThreadPoolExecutor(_READERS) as pool:
         read = pool.map(lambda path: _read_file(path, sources, frame), paths)
-        for path, (file_grid, parts, digest) in zip(paths, read, strict=True):
+        for path, (file_grid, parts, digest, said) in zip(paths, read, strict=True):
             hashes[Path(os.path.relpath(os.path.abspath(path), folder)).as_posix()] = digest
-            gathered.add(path.name, file_grid, parts)
+            gathered.add(path.name, file_grid, parts, said)
     return MaskSet(
         grid=grid,
         masks=gathered.masks,
@@ -113,7 +112,8 @@ class _Gathered:
         self.nodules: set[int] = set()
         self.nodule_labels: UInt16 | None = None
 
-    def add(self, name: str, grid: Grid, parts: list[tuple[MaskSource, Mask]]) -> None:
+    def add(self, name: str, grid: Grid, parts: list[tuple[MaskSource, Mask]], said: tuple[str, ...]) -> None:
+        self._statements += said
         for source, mask in parts:
             on_grid = mask if self._grid.is_close(grid) else self._placed(name, source.role, grid, mask)
             if source.role == "nodules":
@@ -169,40 +169,26 @@ def _share(mask: Array, lung: Mask | None) -> float | None:
 
 def _read_file(
     path: Path, sources: Sequence[MaskSource], frame: Frame | None
-) -> tuple[Grid, list[tuple[MaskSource, Mask]], str]:
+) -> tuple[Grid, list[tuple[MaskSource, Mask]], str, tuple[str, ...]]:
     sources = [source for source in sources if source.path == path]
-    if not any(source.labels or source.role == "nodules" for source in sources):
-        volume = read_mask(path, frame=frame)
-        parts = [(source, volume.array) for source in sources]
-    else:
-        volume = read_volume(path, frame=frame)
-        require_numbers(volume.array, path)
-        expanded = [each for source in sources for each in _by_label(source, volume.array)]
-        parts = [(source, select(volume.array, source.labels)) for source in expanded]
-    return volume.grid, parts, sha256(path)
+    grid, masks, said = read_parts(path, [(source.role, source.labels) for source in sources], frame=frame)
+    parts = list(zip(sources, masks, strict=True))
+    if any(source.role == "nodules" for source in sources):
+        values = read_volume(path, frame=frame).array
+        parts = [each for source, mask in parts for each in _by_label(source, mask, values)]
+    return grid, parts, sha256(path), said
 
 
-def _by_label(source: MaskSource, values: Array) -> list[MaskSource]:
-    """Return a source for each nodule that the labels of a file tell apart; the source itself if none are."""
+def _by_label(source: MaskSource, mask: Mask, values: Array) -> list[tuple[MaskSource, Mask]]:
+    """Return a part for each nodule that the labels of a file tell apart; the mask itself if none are."""
     if source.role != "nodules":
-        return [source]
-    held = np.unique(values[values != 0])
-    labels = held if not source.labels else np.intersect1d(held, source.labels)
+        return [(source, mask)]
     if len(source.labels) == 1:
-        return [replace(source, nodule=source.labels[0])]
-    if not 1 < len(labels) <= MOST_NODULE_LABELS or (labels != np.floor(labels)).any() or labels[0] < 0:
-        return [source]
-    return [replace(source, labels=(int(label),), nodule=int(label)) for label in labels]
-
-
-def select(values: Array, labels: tuple[int, ...]) -> Mask:
-    """Return where `values` is one of `labels`, or not zero if there are none."""
-    if not labels:
-        return np.asarray(values != 0)
-    mask = values == labels[0]
-    for label in labels[1:]:
-        mask |= values == label
-    return np.asarray(mask)
+        return [(replace(source, nodule=source.labels[0]), mask)]
+    held = np.unique(values[mask])
+    if len(held) < 2 or not is_whole(held) or len(held) > PARTS["nodules"]:
+        return [(source, mask)]
+    return [(replace(source, labels=(n,), nodule=n), mask & (values == n)) for n in held.astype(int).tolist()]
 
 
 def _unite(masks: dict[str, Mask], role: str, mask: Mask) -> None:

@@ -1,7 +1,8 @@
 """Lungs of the UNC Med-RAD collection, and the starts and targets of its folders, which are RAS text."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from anatomy.grid import Grid
 from anatomy.io.assembly import LUNG_ROLES, assemble, describe_yourself
 from anatomy.io.frames import Frame, read_points, read_pose
 from anatomy.io.masks import MaskSource, read_masks
-from anatomy.io.near_names import by_name, looks_like, plain
+from anatomy.io.near_names import by_name, looks_like, plain, require_single
 from anatomy.lobes import lobe_named
 from anatomy.patient import PatientImages
 
@@ -76,6 +77,7 @@ def load_med_rad(folder: Path) -> PatientImages:
     """
     sources = lung_sources(folder)
     require_roles(folder, sources)
+    doubles = require_single(folder, [source.path for source in sources], _doubled_lobes(sources))
     masks = read_masks(sources)
     texts = text_poses(folder, masks.grid)
     return assemble(
@@ -88,7 +90,24 @@ def load_med_rad(folder: Path) -> PatientImages:
         targets_lps=texts.targets_lps,
         target_names=texts.target_names,
         sources=texts.sources,
+        warnings=(*doubles, *_not_read(folder, sources)),
     )
+
+
+def _doubled_lobes(sources: Sequence[MaskSource]) -> Iterator[tuple[Path, Path]]:
+    """Yield the pairs of files that are named after one lobe."""
+    of_lobes = [source for source in sources if source.role == "lobes"]
+    return ((a.path, b.path) for a, b in combinations(of_lobes, 2) if a.lobe == b.lobe)
+
+
+def _not_read(folder: Path, sources: Sequence[MaskSource]) -> Iterator[str]:
+    """Say which images are not read, as another one comes first by the names of `LUNG_FILES`."""
+    images = by_name(folder)
+    read = {source.role: source.path for source in sources}
+    for role, names in LUNG_FILES.items():
+        for path in (images[plain(name)] for name in names if plain(name) in images):
+            if role in read and path != read[role]:
+                yield f"{path.name} is not read: {read[role].name}, whose name comes first, shows the {role}."
 
 
 def lung_sources(folder: Path) -> list[MaskSource]:

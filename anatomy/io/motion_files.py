@@ -120,7 +120,7 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
     common: dict[str, Any] = {"masks_phase": phase, "amplitude": keys.amplitude}
     common["hysteresis"] = keys.hysteresis
     if keys.other_lungs:
-        common["other_lungs"] = read_mask(folder / keys.other_lungs)
+        common["other_lungs"] = read_mask(folder / keys.other_lungs, role="lung")
     if keys.population:
         words = f"population: other people's motion by height, {keys.population_motion_mm:g} mm"
         return MotionSource(description=words, population_motion_mm=keys.population_motion_mm, **common)

@@ -5,7 +5,10 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
-from anatomy.io.images import image_stem, images_in
+import numpy as np
+
+from anatomy.base.errors import AnatomyError
+from anatomy.io.images import image_stem, images_in, read_volume
 
 _SHORT = 4
 """A name of so few letters is part of many words."""
@@ -24,6 +27,49 @@ def by_name(folder: Path) -> dict[str, Path]:
     for path in images_in(folder):
         found.setdefault(plain(image_stem(path)), path)
     return found
+
+
+def require_single(
+    folder: Path, chosen: Iterable[Path], others: Iterable[tuple[Path, Path]] = ()
+) -> list[str]:
+    """Refuse images that stand twice for one mask, and say which one is read of two that hold the same.
+
+    Parameters
+    ----------
+    folder : Path
+    chosen : iterable of Path
+        The images that are read: another one of the folder with the same name in other letters or with
+        another ending is their double.
+    others : iterable of (Path, Path)
+        Further pairs: an image that is read, and one that stands for the same mask.
+
+    Raises
+    ------
+    AnatomyError
+        If the two of a pair differ.
+    """
+    paths = list(dict.fromkeys(chosen))
+    doubles = [
+        (path, other)
+        for path in paths
+        for other in images_in(folder)
+        if other != path and plain(image_stem(other)) == plain(image_stem(path))
+    ]
+    said: dict[frozenset[Path], str] = {}
+    for path, other in (*doubles, *others):
+        one, two = read_volume(path), read_volume(other)
+        if not one.grid.is_close(two.grid) or not np.array_equal(one.array, two.array):
+            raise AnatomyError(
+                f"{folder} holds {path.name} and {other.name}, which stand for one mask and differ",
+                expected="one image for each mask",
+                remedy="Remove or rename the one that is not meant, or write a patient.toml that names the "
+                "other one",
+            )
+        said.setdefault(
+            frozenset((path, other)),
+            f"{path.name} is read; {other.name} stands for the same mask and holds the same.",
+        )
+    return list(said.values())
 
 
 def looks_like(names: Iterable[str], images: Mapping[str, Path]) -> Path | None:

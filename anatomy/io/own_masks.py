@@ -15,6 +15,7 @@ from anatomy.io.assembly import assemble, require_cost
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume
 from anatomy.io.label_names import stored_names
+from anatomy.io.mask_values import parse_labels
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.motion_files import MotionFile, read_motion
 from anatomy.lobes import LOBES, lobe_named
@@ -78,7 +79,7 @@ class PatientFile:
 def load_own_masks(description: Path) -> PatientImages:
     """Read the masks that a `patient.toml` names; paths are relative to its folder.
 
-    `file#label` takes one label of a label map, by its value or its stored name.
+    `file#label` takes one label of a label map, by its value or its stored name, and `file#1,2` several.
 
     Raises
     ------
@@ -113,6 +114,7 @@ def load_own_masks(description: Path) -> PatientImages:
         breath_hold=keys.breath_hold or None,
         motion=motion,
         sources=hashes,
+        accepted=keys.accepted,
         warnings=(
             *_thick_slices(keys.thick_slices_mm),
             *_accepted(keys.accepted),
@@ -206,15 +208,16 @@ def _source(role: str, entry: str, folder: Path) -> MaskSource:
         path = _named_file(folder, entry)
         return _or_lobe(MaskSource(role=role, path=path), image_stem(path))
     path = _named_file(folder, name)
-    if label.isdigit():
-        return MaskSource(role=role, path=path, labels=(int(label),))
+    labels = parse_labels(label)
+    if labels is not None:
+        return MaskSource(role=role, path=path, labels=labels)
     names = stored_names(path)
     values = tuple(value for value, stored in names.items() if stored == label)
     if not values:
         raise AnatomyError(
             f"{path} has no label named {label!r}",
             expected=f"one of {sorted(names.values())}" if names else "a file that names its labels",
-            remedy=f"Write the label's value instead, as in {name}#1",
+            remedy=f"Write the label's value instead, as in {name}#1 or {name}#1,2",
         )
     return _or_lobe(MaskSource(role=role, path=path, labels=values), label)
 

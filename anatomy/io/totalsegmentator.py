@@ -9,6 +9,7 @@ from anatomy.io.images import image_stem, images_in
 from anatomy.io.label_names import label_values, published_names, stored_names
 from anatomy.io.lungs import fill_lung
 from anatomy.io.masks import MaskSource, read_masks
+from anatomy.io.near_names import plain, require_single
 from anatomy.lobes import lobe_named
 from anatomy.patient import PatientImages
 
@@ -83,10 +84,13 @@ def mask_sources(folder: Path, label_map: Path | None = None) -> tuple[list[Mask
     """
     sources: list[MaskSource] = []
     statements: list[str] = []
+    read: dict[str, Path] = {}
     for path in images_in(folder):
         of_file, said = file_sources(path, is_label_map=path == label_map)
-        sources += of_file
-        statements += said
+        if of_file and read.setdefault(plain(image_stem(path)), path) == path:
+            sources += of_file
+            statements += said
+    statements += require_single(folder, read.values())
     return sources, statements
 
 

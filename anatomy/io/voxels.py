@@ -36,25 +36,23 @@ def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Arra
     return native[::-1] if header.is_reversed else native
 
 
-def read_nonzero(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume:
-    """Read the voxels as a bool mask, true where a voxel is not zero.
+def read_two_valued(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume | None:
+    """Read voxels of 0 and of one whole number above it as a bool mask; None if there are other values.
 
-    Raises
-    ------
-    AnatomyError
-        If a voxel is not a number.
-    FileError
-        As `read_array`.
+    Errors as `read_array`.
     """
     mask = np.zeros(header.grid.shape, dtype=np.bool_, order="F")
     flat = mask.reshape(-1, order="F")
+    mark = 0.0
     for at, chunk in _chunks(header, stream, path):
-        require_numbers(chunk, path)
-        np.not_equal(chunk, 0, out=flat[at : at + chunk.size])
+        mark = mark or float(chunk.max())
+        part = np.equal(chunk, mark or 1, out=flat[at : at + chunk.size])
+        if np.count_nonzero(part) != np.count_nonzero(chunk) or mark < 0 or not mark.is_integer():
+            return None
     return Volume(grid=header.grid, array=mask[::-1] if header.is_reversed else mask)
 
 
-def require_numbers(values: Array, path: Path) -> None:
+def require_numbers(values: Array, path: str | Path) -> None:
     """Raise `AnatomyError` if a value is not-a-number."""
     if values.dtype.kind == "f" and bool(np.isnan(values).any()):
         raise AnatomyError(

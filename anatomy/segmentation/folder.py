@@ -90,12 +90,22 @@ class SegmentationFolder:
         return self.path / f"{name}{_MADE_SUFFIX}"
 
     def correction(self, name: str) -> Path | None:
-        """Return the file that a person put in place of an image, or None."""
-        for suffix in SUFFIXES:
-            path = self.path / CORRECTIONS / f"{name}{suffix}"
-            if path.is_file():
-                return path
-        return None
+        """Return the file that a person put in place of an image, or None.
+
+        Raises
+        ------
+        AnatomyError
+            If there are two of them.
+        """
+        paths = [self.path / CORRECTIONS / f"{name}{suffix}" for suffix in SUFFIXES]
+        found = [path for path in paths if path.is_file()]
+        if len(found) > 1:
+            raise AnatomyError(
+                f"{self.path / CORRECTIONS} holds {' and '.join(path.name for path in found)}",
+                expected=f"one correction of the {name.replace('_', ' ')}",
+                remedy="Remove the one that is not meant",
+            )
+        return found[0] if found else None
 
     def _places(self) -> list[Path]:
         """Return all files that may be written here or be corrections: they are moved, or overwritten."""

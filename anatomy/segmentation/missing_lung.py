@@ -7,7 +7,7 @@ import numpy as np
 
 from anatomy.base.typed import Float, Int, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import bounds, window
+from anatomy.morphology import bounds, sampled, window
 from anatomy.segmentation.closing import distance_mm
 
 SAMPLE_MM = 4.0
@@ -109,12 +109,6 @@ def _zones(chest: Mask, first: Float, carina_lps: Float) -> Iterator[tuple[str, 
             if whole:
                 lost_ml = (whole - lung) * SAMPLE_MM**3 / 1000.0
                 yield f"{part} of the {name} lung", float(lung / whole), float(lost_ml)
-
-
-def sampled(mask: Mask, grid: Grid, cube_mm: float) -> Float:
-    """Return about one point of a mask in each cube of `cube_mm`, LPS mm `(N, 3)`."""
-    step = np.maximum(1, np.rint(cube_mm / grid.spacing_mm)).astype(np.int64)
-    return np.asarray(grid.lps(np.argwhere(mask[tuple(slice(None, None, int(s)) for s in step)]) * step))
 
 
 def untilted(points: Float, carina_lps: Float) -> Float:

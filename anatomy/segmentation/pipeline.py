@@ -13,6 +13,7 @@ from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION
+from anatomy.plausibility import require_known_checks
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.folder import (
@@ -23,7 +24,6 @@ from anatomy.segmentation.folder import (
     grid_digest,
     key_of,
 )
-from anatomy.segmentation.gate import require_known_checks
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
 from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.parts import Parts

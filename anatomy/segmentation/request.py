@@ -1,7 +1,7 @@
 """What a segmentation starts from: a CT, and whatever other programs or people have made already."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,10 @@ from anatomy.base.typed import Array, Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.images import images_in, read_volume
+from anatomy.io.mask_values import is_whole, mask_of, parse_labels, require_label_values, select
 from anatomy.io.masks import SOLID, MaskSource, read_masks
 from anatomy.io.placement import place
 from anatomy.io.totalsegmentator import file_sources, mask_sources
-from anatomy.io.voxels import require_numbers
 from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.labels import lobe_numbers, sides_of_lobes
@@ -33,6 +33,8 @@ ROLES = {
 """The images of the folder that may come from elsewhere, and the role of each among masks."""
 LABELLED = ("lungs", "lobes", "fissures")
 """Images whose values mean something."""
+SEEN = 2
+"""The greatest value of an image of fissures that tells what was inferred from what was seen."""
 GREATEST_LOSS = 0.02
 """Share of a mask that may lie outside the CT: more is another patient, or another frame."""
 
@@ -48,10 +50,11 @@ class GivenImages:
 
 @frozen_record
 class _Read:
-    """An image on its own voxels, and what it was made from."""
+    """An image on its own voxels, what it was made from, and how its values were understood."""
 
     volume: Volume
     source: str
+    said: tuple[str, ...] = ()
 
 
 def read_given(files: Mapping[str, Path], folder: Path | None, grid: Grid) -> GivenImages:
@@ -79,9 +82,11 @@ def read_given(files: Mapping[str, Path], folder: Path | None, grid: Grid) -> Gi
     found = {} if folder is None else _all_of_folder(folder)
     for image, path in files.items():
         found[image] = _read(image, path)
-    placed, warnings = {}, []
+    placed: dict[str, Volume] = {}
+    warnings: list[str] = []
     for image, read in found.items():
         name = read.source.split(" (")[0]
+        warnings += read.said
         volume, coarse_mm = _onto_ct(read.volume, grid, name, solid=ROLES[image] in SOLID)
         if not volume.array.any():
             raise AnatomyError(
@@ -105,40 +110,40 @@ def _read(image: str, path: Path) -> _Read:
         return _one_of_folder(image, path)
     base, mark, stated = path.name.rpartition("#")
     if mark and not path.exists():
-        return _of_labels(image, path.with_name(base), stated)
+        labels = parse_labels(stated)
+        if labels is None:
+            raise FileError(
+                f"{path.name} names no labels",
+                expected="values after #, with commas between them",
+                remedy=f"Write for instance {base}#1,2",
+            )
+        return _of_file(image, path.with_name(base), labels, f"{base} (labels {stated})")
     sources, _ = file_sources(path)
     if sources:
         return _of_sources(image, sources, path.name)
+    return _of_file(image, path, (), path.name)
+
+
+def _of_file(image: str, path: Path, labels: tuple[int, ...], source: str) -> _Read:
+    """Read a file as a mask, or, where its labels are parts of what it shows, with its labels."""
     volume = read_volume(path)
-    require_numbers(volume.array, path)
-    if image == "lobes":
-        return _as_lobes(volume, path.name)
-    values = sorted({float(value) for value in np.unique(volume.array)} - {0.0})
-    if len(values) > 1 and image not in LABELLED:
-        raise AnatomyError(
-            f"{path.name} holds the values {', '.join(f'{v:g}' for v in values[:9])}, and names none of them",
-            expected=f"one value for the {_plain(image)}, or names of labels in the header or in a JSON file",
-            remedy=f"Say which count, as in {path.name}#{values[0]:g} or {path.name}#1,2",
+    array: Array = volume.array
+    said: tuple[str, ...] = ()
+    has_labels = image == "lobes" or (image in LABELLED and is_whole(array))
+    if has_labels:
+        require_label_values(array, path.name)
+        array = np.where(select(array, labels), array, array.dtype.type(0)) if labels else array
+    if not has_labels or (image == "fissures" and array.max() > SEEN):
+        array, said = mask_of(
+            volume.array,
+            path.name,
+            voxel_mm3=volume.grid.voxel_volume_mm3,
+            role=_plain(image) if image not in LABELLED else ROLES[image],
+            labels=labels,
         )
-    return _Read(volume=volume, source=path.name)
-
-
-def _of_labels(image: str, path: Path, stated: str) -> _Read:
-    try:
-        labels = [int(label) for label in stated.split(",")]
-    except ValueError:
-        raise FileError(
-            f"{path.name}#{stated} names no labels",
-            expected="values after #, with commas between them",
-            remedy=f"Write for instance {path.name}#1,2",
-        ) from None
-    volume = read_volume(path)
-    mask = np.isin(volume.array, labels)
-    source = f"{path.name} (labels {stated})"
-    if image in LABELLED:
-        kept = Volume(grid=volume.grid, array=volume.array * mask)
-        return _as_lobes(kept, source) if image == "lobes" else _Read(volume=kept, source=source)
-    return _Read(volume=Volume(grid=volume.grid, array=mask), source=source)
+    found = Volume(grid=volume.grid, array=array)
+    read = _as_lobes(found, source) if image == "lobes" else _Read(volume=found, source=source)
+    return replace(read, said=said)
 
 
 def _as_lobes(volume: Volume, source: str) -> _Read:
@@ -152,7 +157,7 @@ def _one_of_folder(image: str, folder: Path) -> _Read:
         path = {"airway": case.airway, "lungs": case.lungs}.get(image)
         if path is not None:
             read = _read(image, path)
-            return _Read(volume=read.volume, source=f"{read.source} ({case.data_set})")
+            return replace(read, source=f"{read.source} ({case.data_set})")
     return _of_sources(image, mask_sources(folder)[0], f"{folder.name}")
 
 
@@ -197,7 +202,8 @@ def _of_sources(image: str, sources: Sequence[MaskSource], name: str) -> _Read:
     if image == "lungs" and role not in read.masks:
         array = sides_of_lobes(array)
     files = ", ".join(dict.fromkeys(_shown(source) for source in fitting))
-    return _Read(volume=Volume(grid=read.grid, array=array), source=f"{name} (TotalSegmentator: {files})")
+    source = f"{name} (TotalSegmentator: {files})"
+    return _Read(volume=Volume(grid=read.grid, array=array), source=source, said=read.statements)
 
 
 def _shown(source: MaskSource) -> str:
@@ -309,7 +315,7 @@ class SegmentationRequest:
     large_radius_mm : float
         Vessels of this radius or more are obstacles, thinner ones costs.
     accept : tuple of str
-        Checks of `anatomy.segmentation.gate.CHECKS` whose failure a person accepts; it is recorded.
+        Checks of `anatomy.plausibility.CHECKS` whose failure a person accepts; it is recorded.
     seed_lps : (3,) float64, optional
         A point in the trachea, LPS mm.
     given : Given

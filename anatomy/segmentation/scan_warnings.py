@@ -14,8 +14,8 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
+from anatomy.plausibility import LIMITS, Finding
 from anatomy.segmentation.closing import distance_mm
-from anatomy.segmentation.gate import Implausible
 from anatomy.segmentation.input import slice_mm
 from anatomy.segmentation.parts import Parts
 
@@ -211,8 +211,7 @@ def quality_of(parts: Parts) -> Quality:
 
 def _volume_warnings(volumes: dict[str, float]) -> list[str]:
     both = volumes["right lung"] + volumes["left lung"]
-    # From a child to a large adult after breathing in.
-    least, most = (1.5, 9.0)
+    least, most = LIMITS["lungs_l"].usual
     if least <= both <= most:
         return []
     return [f"The lungs have {both:.2f} l in all; {least:g} to {most:g} l are usual in adults."]
@@ -269,7 +268,7 @@ can be moved in their plane."""
 
 def misplaced(
     ct: Volume, images: Mapping[str, Array], lungs: Mask, lumen: Mask
-) -> tuple[list[Implausible], list[str]]:
+) -> tuple[list[Finding], list[str]]:
     """Check masks from elsewhere by the CT.
 
     Parameters
@@ -283,7 +282,7 @@ def misplaced(
 
     Returns
     -------
-    list of Implausible
+    list of Finding
         The check `masks`, for each image that fails it.
     list of str
         Warnings.
@@ -341,8 +340,8 @@ def _at_lumen(wall: Mask, lumen: Mask, ct: Volume) -> float:
     return float(near[wall[box]].mean()) if wall.any() else 1.0
 
 
-def _failure(name: str, why: str) -> Implausible:
-    return Implausible(
+def _failure(name: str, why: str) -> Finding:
+    return Finding(
         name="masks",
         found=f"The mask of the {name.replace('_', ' ')} is not of this CT: {why}",
         remedy="Check that mask and CT show the same patient, scan and side, and that the mask holds nothing "

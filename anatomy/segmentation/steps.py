@@ -12,8 +12,10 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.files import sha256
 from anatomy.base.typed import Array, Float32, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.io.images import read_volume
+from anatomy.io.images import read_mask, read_volume
+from anatomy.io.mask_values import require_label_values
 from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
+from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
 from anatomy.segmentation.airway import wall_around
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.central_airway import without_larynx
@@ -25,7 +27,7 @@ from anatomy.segmentation.folder import (
     grid_digest,
     key_of,
 )
-from anatomy.segmentation.gate import plausibility, require_plausible
+from anatomy.segmentation.gate import plausibility
 from anatomy.segmentation.input import without_offset
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
@@ -74,7 +76,11 @@ class Steps:
         for name in IMAGES:
             path = folder.correction(name)
             if path is not None:
-                self._sources[name] = read_volume(path)
+                if name in _NOT_MASKS:
+                    self._sources[name] = read_volume(path)
+                    require_label_values(self._sources[name].array, path.name)
+                else:
+                    self._sources[name] = read_mask(path, say=self.warnings.append)
                 self.corrected.append(name)
                 self.from_elsewhere.pop(name, None)
 
@@ -96,6 +102,11 @@ class Steps:
         tree = self._tree_of(airway["airway"])
         self._require_plausible(lungs, airway, tree)
         nodule = self._nodule()
+        if nodule.any():
+            volume_ml = float(np.count_nonzero(nodule)) * self.grid.voxel_volume_mm3 / 1000.0
+            found = findings_of({"nodules_ml": volume_ml})
+            self.warnings += warnings_of_findings(each for each in found if each.verdict == DOUBTFUL)
+            self.accepted += require_plausible(found, self._request.accept)
         vessels = self._vessels(lungs, airway, nodule)
         lobes = self._lobes(lungs, airway, vessels, tree)
         cost = self._cost(lungs, airway, nodule, vessels)
@@ -236,13 +247,15 @@ class Steps:
             if corrected is not None:
                 return {"nodule": corrected}, {}
             nodule = np.zeros(grid.shape, dtype=np.bool_, order="F")
+            warnings: list[str] = []
             if given.nodule_contours is not None:
                 nodule |= self._box.sampled(
                     nodule_from_contours(given.nodule_contours, self._request.ct.grid)
                 )
             if given.nodule_mask is not None:
-                nodule |= self._box.placed(read_volume(given.nodule_mask), given.nodule_mask.name) != 0
-            return {"nodule": nodule}, {}
+                mask = read_mask(given.nodule_mask, role="nodules", say=warnings.append)
+                nodule |= self._box.placed(mask, given.nodule_mask.name)
+            return {"nodule": nodule}, {"warnings": warnings}
 
         return self._bring_up_to_date("nodule", ("nodule",), key, compute)[0]["nodule"]
 

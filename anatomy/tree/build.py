@@ -71,6 +71,7 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
             LoopOpened(position_lps=grid.lps((ijk[a] + ijk[b]) / 2), length_mm=length)
             for a, b, length in rings
         ),
+        pieces_left_out=prepared.left_out,
         components_dropped=prepared.components_dropped,
         voxels_dropped=prepared.voxels_dropped,
         cavity_voxels=prepared.cavity_voxels,

@@ -8,9 +8,12 @@ from anatomy.base.typed import Bool, Float, Float32, Int, Int32
 from anatomy.grid import Grid, Volume
 from anatomy.tree.bridge import Piece, join_pieces
 from anatomy.tree.noise import MOST_PIECES, require_at_most
-from anatomy.tree_report import GapBridged
+from anatomy.tree_report import GapBridged, PieceLeftOut
 
 CONNECT_26 = np.ones((3, 3, 3), dtype=bool)
+MOST_NAMED = 20
+"""Of the pieces that are left out the largest are described, so many at most: the others are a few voxels
+each."""
 
 
 @frozen_record
@@ -40,6 +43,7 @@ class PreparedLumen:
     depth_mm: Float32
     solid_depth_mm: Float32
     gaps: tuple[GapBridged, ...]
+    left_out: tuple[PieceLeftOut, ...]
     components_dropped: int
     voxels_dropped: int
     cavity_voxels: int
@@ -62,6 +66,7 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     lumen = np.asarray(labels == main)
     bridges = np.zeros_like(lumen)
     gaps: list[GapBridged] = []
+    left_out: tuple[PieceLeftOut, ...] = ()
     if count > 1:
         pieces = _pieces(labels, sizes, main, grid.spacing_mm)
         require_at_most(len(pieces), MOST_PIECES, "separate pieces")
@@ -75,6 +80,8 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
                     voxels_joined=len(join.voxels),
                 )
             )
+        apart = [piece for piece in pieces if not lumen[tuple(piece.voxels[0])]]
+        left_out = _left_out(lumen, apart[:MOST_NAMED], grid)
     bridges &= ~box
     solid = fill_cavities(lumen | bridges)
     cavity_voxels = int(solid.sum()) - int((lumen | bridges).sum())
@@ -87,10 +94,37 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
         depth_mm=depth,
         solid_depth_mm=depth_of_centres(solid, grid.spacing_mm) if cavity_voxels else depth,
         gaps=tuple(gaps),
+        left_out=left_out,
         components_dropped=count - 1 - len(gaps),
         voxels_dropped=int(sizes[1:].sum() - lumen.sum()),
         cavity_voxels=cavity_voxels,
     )
+
+
+def _left_out(lumen: Bool, pieces: list[Piece], grid: Grid) -> tuple[PieceLeftOut, ...]:
+    """Return what is known of pieces that were not joined to the lumen."""
+    from scipy.spatial import KDTree
+
+    if not pieces:
+        return ()
+    kept = np.argwhere(lumen)
+    nearest = KDTree(kept * grid.spacing_mm)
+    found = []
+    for piece in pieces:
+        distance, index = nearest.query(piece.voxels * grid.spacing_mm)
+        at = int(np.argmin(distance))
+        ends = np.stack([piece.voxels[at], kept[index[at]]])
+        found.append(
+            PieceLeftOut(
+                position_lps=grid.lps(ends.mean(axis=0)),
+                length_mm=float(
+                    np.linalg.norm(np.maximum(np.abs(ends[0] - ends[1]) - 1, 0) * grid.spacing_mm)
+                ),
+                middle_lps=grid.lps(piece.voxels.mean(axis=0)),
+                voxels=len(piece.voxels),
+            )
+        )
+    return tuple(found)
 
 
 def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
 
+from anatomy.plausibility import ACCEPTED, DOUBTFUL, FITS, REFUSED
 from lungaccess.cli import terminal
 
+VERDICTS = (REFUSED, ACCEPTED, DOUBTFUL, FITS)
+"""In this order checks are shown: what has to be looked at comes first."""
 MOTION_WORDS = {
     "landmark_pairs": "pairs of landmarks",
     "residual_mm": "left at the source's points, mean, mm",
@@ -34,7 +38,7 @@ MOTION_WORDS = {
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.organ import Organ
-    from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
+    from anatomy.tree_report import Repair
 
 
 def organ_record(lung: Organ) -> dict[str, Any]:
@@ -78,7 +82,23 @@ def organ_record(lung: Organ) -> dict[str, Any]:
         ],
         "sources": dict(lung.sources),
         "warnings": list(lung.warnings),
+        "checks": checks_record(lung),
     }
+
+
+def checks_record(lung: Organ) -> list[dict[str, str]]:
+    """Return what the checks of the masks found, as plain values."""
+    return [asdict(each) for each in lung.findings]
+
+
+def checks_table(lung: Organ) -> Table:
+    """Return what the checks of the masks found that is not usual, and how many found nothing."""
+    ordered = sorted(lung.findings, key=lambda each: VERDICTS.index(each.verdict))
+    rows = [(each.verdict, each.name, each.found) for each in ordered if each.verdict != FITS]
+    if lung.findings:
+        usual = len(lung.findings) - len(rows)
+        rows.append((FITS, "", f"{usual} of {len(lung.findings)} figures are usual; --json lists them"))
+    return terminal.table("Plausibility of the masks", ("verdict", "check", "found"), rows)
 
 
 def _breathing(lung: Organ) -> dict[str, Any]:
@@ -156,6 +176,7 @@ def anatomy_tables(lung: Organ) -> list[Table]:
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
         _nodule_table(lung),
         *(_tree_tables(lung) if isinstance(lung, Lung) else ()),
+        checks_table(lung),
         *(_motion_tables(lung) if isinstance(lung, Lung) else ()),
         terminal.table("Starts and targets", ("name", "LPS, mm"), _place_rows(lung)),
         terminal.table(
@@ -269,13 +290,14 @@ def _repair_rows(lung: Lung) -> list[terminal.Row]:
     ]
 
 
-def _repairs(lung: Lung) -> list[tuple[str, GapBridged | LoopOpened | SpurPruned]]:
+def _repairs(lung: Lung) -> list[tuple[str, Repair]]:
     """Return every change the airway tree needed, with its kind."""
     report = lung.tree.report
     return [
         *(("gap bridged", each) for each in report.gaps_bridged),
         *(("loop opened", each) for each in report.loops_opened),
         *(("spur pruned", each) for each in report.spurs_pruned),
+        *(("piece left out beyond a gap", each) for each in report.pieces_left_out),
     ]
 
 

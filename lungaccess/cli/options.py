@@ -89,14 +89,22 @@ class PatientOptions(OutputOptions):
     cache: Annotated[
         Path | None, Parameter(help="Folder where the prepared anatomy is kept for the next command.")
     ] = None
+    accept: Annotated[
+        tuple[str, ...],
+        Parameter(
+            consume_multiple=True,
+            help="Checks of the masks that fail and are overruled, by the names in the message that refuses "
+            "them, such as gap or vessels.",
+        ),
+    ] = ()
 
     def load(self, patient: Path, *, thick_slices: bool = False) -> Lung:
         """Return a patient's lung; see `load_lung`."""
-        return load_lung(patient, self.cache, thick_slices)
+        return load_lung(patient, self.cache, thick_slices, self.accept)
 
-    def load_organ(self, patient: Path, *, thick_slices: bool = False) -> Organ:
+    def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> Organ:
         """Return a patient's lung, or a liver of Med-RAD; see `load_organ`."""
-        return load_organ(patient, self.cache, thick_slices)
+        return load_organ(patient, self.cache, thick_slices, self.accept if refuse else None)
 
     def open_atlas(self, lung: Lung, system: System) -> Atlas:
         """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
@@ -471,22 +479,28 @@ def require_map(lung: Lung, objective: str) -> None:
         )
 
 
-def load_organ(patient: Path, cache: Path | None, thick_slices: bool) -> Organ:
+def load_organ(
+    patient: Path, cache: Path | None, thick_slices: bool, accept: tuple[str, ...] | None
+) -> Organ:
     """Return a patient's lung or liver, and show what is being done meanwhile; see `load_lung`."""
     from anatomy.io.liver import is_liver
     from lungaccess.problem.patients import load_organ as load
 
     if not is_liver(patient):
-        return load_lung(patient, cache, thick_slices)
+        return load_lung(patient, cache, thick_slices, accept)
     with progress(f"reading {patient}"):
-        return load(patient)
+        return load(patient, accept=accept)
 
 
-def load_lung(patient: Path, cache: Path | None, thick_slices: bool) -> Lung:
-    """Return a patient's lung, and show what is being done meanwhile.
+def load_lung(
+    patient: Path, cache: Path | None, thick_slices: bool, accept: tuple[str, ...] | None = ()
+) -> Lung:
+    """Return a patient's lung, and show what is being done meanwhile; None as `accept` refuses no masks.
 
     Raises
     ------
+    AnatomyError
+        If the masks fail a check that `accept` does not name.
     SettingsError
         If the masks were made from thick slices, unless `thick_slices` accepts them.
     """
@@ -496,7 +510,7 @@ def load_lung(patient: Path, cache: Path | None, thick_slices: bool) -> Lung:
         _refuse_thick_slices(patient)
     with progress(f"reading {patient}") as shown:
         return load_patient(
-            patient, cache=cache, progress=lambda step: shown.step(step, STEP_SHARES.get(step))
+            patient, cache=cache, progress=lambda step: shown.step(step, STEP_SHARES.get(step)), accept=accept
         )
 
 

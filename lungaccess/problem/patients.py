@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from anatomy.lung import Lung
 from anatomy.organ import Organ
+from anatomy.plausibility import require_known_checks
 
 
 def load_patient(
@@ -15,6 +16,7 @@ def load_patient(
     *,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
+    accept: Collection[str] | None = (),
 ) -> Lung:
     """Return the `Lung` of a patient folder; the second time it comes from the cache.
 
@@ -26,22 +28,28 @@ def load_patient(
         Folder for prepared anatomies; `anatomy.base.cache.default_cache()` if None.
     progress : callable, optional
         Receives each step as it begins.
+    accept : collection of str, optional
+        Names of checks of `anatomy.plausibility.CHECKS` whose failure is accepted; None refuses nothing.
 
     Raises
     ------
     LungaccessError
-        If the folder cannot be understood or an image in it is wrong; see `anatomy.io.load_patient`.
+        If the folder cannot be understood or an image in it is wrong, see `anatomy.io.load_patient`; or if
+        the
+        masks cannot be those of a patient.
     """
     from anatomy.io.inputs import input_hashes
     from anatomy.io.patients import load_patient as read_images
     from anatomy.store import open_lung
 
+    require_known_checks(accept or ())
     folder = Path(path)
     return open_lung(
         input_hashes(folder),
         lambda: read_images(folder),
         cache=None if cache is None else Path(cache),
         progress=progress,
+        accept=accept,
     )
 
 
@@ -50,6 +58,7 @@ def load_organ(
     *,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
+    accept: Collection[str] | None = (),
 ) -> Organ:
     """Return the liver of a Med-RAD folder, else what `load_patient` returns; parameters and errors as there.
 
@@ -58,6 +67,7 @@ def load_organ(
     from anatomy.io.liver import is_liver, load_liver
     from anatomy.liver import build_liver
 
+    require_known_checks(accept or ())
     if is_liver(Path(path)):
         return build_liver(load_liver(Path(path)))
-    return load_patient(path, cache=cache, progress=progress)
+    return load_patient(path, cache=cache, progress=progress, accept=accept)

@@ -13,10 +13,11 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Mask
 from anatomy.grid import Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
+from anatomy.plausibility import require_plausible
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.gate import plausibility, require_plausible
+from anatomy.segmentation.gate import plausibility
 from anatomy.segmentation.input import require_chest_ct, without_offset
 from anatomy.segmentation.lungs import Lungs, segment_lungs
 from anatomy.segmentation.scan_warnings import airway_warnings, scan_warnings, tree_or_error

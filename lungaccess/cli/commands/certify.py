@@ -81,6 +81,8 @@ def certify(
         ("deployments ruled out", f"{_percent(verdict.share_ruled_out)} of the deployment space"),
         ("ranges of deployments looked at", f"{verdict.boxes:,}"),
     ]
+    if verdict.rests_on:
+        rows.append(("rests on", verdict.rests_on))
     if verdict.open_places:
         branches = len({place.branch for place in verdict.open_places})
         rows.append(("open", f"{len(verdict.open_places)} places in {branches} branches"))
@@ -97,6 +99,7 @@ def _as_json(verdict: ReachVerdict) -> dict[str, object]:
         "boxes": verdict.boxes,
         "share_ruled_out": verdict.share_ruled_out,
         "finished": verdict.finished,
+        "rests_on": verdict.rests_on,
         "open_place_lps_mm": None if verdict.open_lps is None else verdict.open_lps.tolist(),
         "open_places": [
             {

@@ -33,7 +33,7 @@ def info(
     """Show what was understood of a patient: volumes, airway tree, sources and warnings."""
     if out is not None:
         claim_folder(out, ("tree.png", "motion.png", "organ.png"), force=force)
-    lung = output.load_organ(patient, thick_slices=True)
+    lung = output.load_organ(patient, thick_slices=True, refuse=False)
     if output.json:
         terminal.show_json(anatomy_tables.organ_record(lung))
     else:

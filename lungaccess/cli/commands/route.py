@@ -77,7 +77,9 @@ def route(
     claim_folder(out, ("route.json", "route.png"), force=force)
     with progress("route") as shown:
         shown.step("reading the tubes")
-        opened = open_source(source, lumen=lumen, frame=frame, pixel_mm=pixel, cache=output.cache)
+        opened = open_source(
+            source, lumen=lumen, frame=frame, pixel_mm=pixel, cache=output.cache, accept=output.accept
+        )
         shown.step("planning")
         end = opened.place(goal, limits.needed_mm)
         first = widest_end(opened.centreline) if start is None else opened.place(start, limits.needed_mm)

@@ -58,7 +58,7 @@ def view(
     own = () if system in shipped_names() else ((Path(system).resolve(), first),)
     source = PatientSource(
         folder=patient.resolve(), system=first.name, own=own, cache=output.cache,
-        ct=find_ct(patient) if ct is None else ct,
+        ct=find_ct(patient) if ct is None else ct, accept=output.accept,
     )  # fmt: skip
 
     def started(address: Address) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -230,4 +231,6 @@ def plan_record(
         "iterations": plan.iterations,
         "timing": dict(plan.timing),
         "scope_motion": motion_record(plan, lung),
+        "warnings": list(lung.warnings),
+        "checks": [asdict(each) for each in lung.findings],
     }

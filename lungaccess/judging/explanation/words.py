@@ -111,7 +111,9 @@ def _proof(e: Explanation) -> Iterator[Row]:
     if e.verdict is None:
         return
     if e.verdict.proved:
-        answer = "yes: no deployment has the target in its needle's workspace"
+        answer = (
+            f"yes: no deployment has the target in its needle's workspace. This rests on {e.verdict.rests_on}"
+        )
     elif e.verdict.boxes:
         answer = "not proved: it may be reachable or not"
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,6 +61,7 @@ def open_source(
     frame: Frame | None = None,
     pixel_mm: float | None = None,
     cache: str | os.PathLike[str] | None = None,
+    accept: Collection[str] = (),
 ) -> RouteSource:
     """Return the centreline of a patient folder, a centreline file, a mask of vessels or a drawing.
 
@@ -74,6 +75,8 @@ def open_source(
         Size of a pixel of a drawing; needed for one.
     cache : path, optional
         Where prepared patients are kept.
+    accept : collection of str
+        Checks of a patient's masks whose failure is accepted.
 
     Raises
     ------
@@ -92,7 +95,7 @@ def open_source(
     if path.is_dir():
         from lungaccess.problem.patients import load_patient
 
-        lung = load_patient(path, cache=cache)
+        lung = load_patient(path, cache=cache, accept=accept)
         return RouteSource(
             name=lung.name,
             kind="patient",
@@ -117,8 +120,10 @@ def open_source(
         return RouteSource(name=path.stem, kind="drawing", centreline=drawing)
     from anatomy.io import read_mask
 
-    mask = read_mask(path, frame=frame)
-    return RouteSource(name=path.stem, kind="mask", centreline=from_mask(mask, rounded=True))
+    said: list[str] = []
+    mask = read_mask(path, frame=frame, say=said.append)
+    centreline = from_mask(mask, rounded=True)
+    return RouteSource(name=path.stem, kind="mask", centreline=centreline, warnings=tuple(said))
 
 
 def _in_liver(folder: Path, lumen: str | None) -> RouteSource:

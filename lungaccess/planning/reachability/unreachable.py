@@ -67,6 +67,8 @@ class ReachVerdict:
         Whether every box is ruled out or has a part that is too small to halve; else the budget was used up.
     open_places : tuple of OpenPlace
         Where the deployments start that could not be ruled out, the largest share first.
+    rests_on : str
+        On which masks a proof rests, and what of them is in doubt.
     """
 
     proved: bool
@@ -74,6 +76,7 @@ class ReachVerdict:
     share_ruled_out: float = 0.0
     finished: bool = False
     open_places: tuple[OpenPlace, ...] = ()
+    rests_on: str = ""
 
     @property
     def open_lps(self) -> Float | None:
@@ -216,6 +219,7 @@ class UnreachableProof:
             share_ruled_out=1.0 - float((1.0 - found.share) @ shares),
             finished=bool((found.outcome != TOO_MANY).all()),
             open_places=() if proved else open_places(self._lung, space, found),
+            rests_on=self._lung.mask_words,
         )
 
     def _rounds(self, environment: ProofEnvironment, target: Float, found: Found) -> Iterator[Int]:

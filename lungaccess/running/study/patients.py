@@ -74,7 +74,7 @@ def open_patient(patient: Patient, cache: Path | None = None) -> Lung:
     """
     from anatomy.store import open_lung
 
-    return open_lung(dict(patient.sources), lambda: _read(patient), cache=cache)
+    return open_lung(dict(patient.sources), lambda: _read(patient), cache=cache, accept=())
 
 
 def _read(patient: Patient) -> PatientImages:

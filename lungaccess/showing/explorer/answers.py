@@ -59,7 +59,9 @@ class Answers:
     def lung(self) -> Lung:
         """The patient, read when it is first needed."""
         if self._lung is None:
-            self._lung = load_patient(self._source.folder, cache=self._source.cache)
+            self._lung = load_patient(
+                self._source.folder, cache=self._source.cache, accept=self._source.accept
+            )
         return self._lung
 
     def _system(self, what_if: WhatIf) -> System:

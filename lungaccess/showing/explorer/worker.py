@@ -37,6 +37,8 @@ class PatientSource:
         Folder of prepared anatomy and atlases; the default one if None.
     ct : path or None
         CT for the slices.
+    accept : tuple of str
+        Checks of the masks whose failure is accepted.
     """
 
     folder: Path
@@ -44,6 +46,7 @@ class PatientSource:
     own: tuple[tuple[Path, System], ...] = ()
     cache: Path | None = None
     ct: Path | None = None
+    accept: tuple[str, ...] = ()
 
 
 @frozen_value

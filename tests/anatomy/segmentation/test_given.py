@@ -14,9 +14,9 @@ from anatomy.grid import Grid, Volume
 from anatomy.io import write_volume
 from anatomy.io.own_masks import load_own_masks
 from anatomy.phantom import Phantom
+from anatomy.plausibility import CHECKS
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.folder import description_text
-from anatomy.segmentation.gate import CHECKS
 from anatomy.segmentation.labels import NUMBERINGS, lobe_numbers, sides_of
 from anatomy.segmentation.request import Given, GivenImages, read_given
 from anatomy.segmentation.scan_warnings import FITS, misplaced, moved_by
@@ -150,7 +150,7 @@ def test_cases_of_aeropath_and_atm(tmp_path: Path, ct: Volume, truth: dict[str, 
 def test_labels_without_names_must_be_chosen(tmp_path: Path, ct: Volume, truth: dict[str, Array]) -> None:
     both = truth["airway"] + 2 * truth["vessels"].astype(np.uint8) * ~truth["airway"]
     path = _write(tmp_path / "both.nii.gz", ct, both)
-    with pytest.raises(AnatomyError, match=r"holds the values 1, 2, and names none.*both.nii.gz#1"):
+    with pytest.raises(AnatomyError, match=r"holds the labels 1, 2, and it is not said which.*both.nii.gz#1"):
         read_given({"airway": path}, None, ct.grid)
     assert (_read("airway", Path(f"{path}#1"), ct.grid) == (both == 1)).all()
     assert (_read("vessels", Path(f"{path}#1,2"), ct.grid) == (both > 0)).all()

@@ -8,8 +8,8 @@ import pytest
 from anatomy.base.errors import AnatomyError
 from anatomy.grid import Volume
 from anatomy.phantom import Phantom
+from anatomy.plausibility import CHECKS, Finding, require_known_checks, require_plausible
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.gate import CHECKS, Implausible, require_known_checks, require_plausible
 from anatomy.segmentation.input import without_offset
 from experiments.support.segmentation.hard_cases import CASES
 from experiments.support.segmentation.hard_images import HardImage, phantom_image, turned
@@ -89,8 +89,8 @@ def _handed(order: tuple[int, ...], flips: tuple[int, ...]) -> float:
 
 def test_a_failed_check_is_refused_until_it_is_accepted_by_name() -> None:
     failed = (
-        Implausible(name="sides", found="It is mirrored", remedy="Look at it"),
-        Implausible(name="one-lung", found="One lung", remedy="Look again"),
+        Finding(name="sides", found="It is mirrored", remedy="Look at it"),
+        Finding(name="one-lung", found="One lung", remedy="Look again"),
     )
     with pytest.raises(AnatomyError, match=r"mirrored; One lung.*--accept sides --accept one-lung"):
         require_plausible(failed, ())

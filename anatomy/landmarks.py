@@ -1,0 +1,170 @@
+"""What airway and lungs say about the directions of an image: upwards, forwards, and to the left."""
+
+import numpy as np
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Float
+from anatomy.plausibility import DOUBTFUL, Finding
+
+SAMPLE_MM = 3.0
+"""Lungs are looked at in steps of this: their shape is known to a step."""
+LEAST_TRACHEA_MM = 15.0
+"""From a shorter trachea no direction can be told."""
+HEART_MM = (70.0, 120.0)
+"""The heart is looked for so far in front of the carina, and so far below it."""
+
+
+@frozen_value
+class Landmarks:
+    """Signs of each direction: 1 as in a patient whose header is right, -1 against it, 0 undecided."""
+
+    up: tuple[int, ...]
+    front: tuple[int, ...]
+    left: tuple[int, ...]
+
+
+def landmarks(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) -> Landmarks:
+    """Return what airway and lungs say about the directions.
+
+    Each direction is told by signs that do not depend on each other.  Only a header that is wrong, or organs
+    that are mirrored, turn all signs of a direction around.
+
+    Parameters
+    ----------
+    left, right : (N, 3) float64, LPS mm
+        About one point in every cube of `SAMPLE_MM` of each lung.
+    lowest_mm : float
+        The height z of the lowest voxels of the image, LPS mm: a lung that reaches them may be cut off.
+    """
+    lungs = [left, right]
+    top, carina = tree.points_lps[0], tree.carina_lps
+    along = top - carina
+    length = float(np.linalg.norm(along))
+    up, front = [], []
+    if length >= LEAST_TRACHEA_MM:
+        # The trachea runs upwards within 60 degrees even in a bent patient.
+        up.append(1 if along[2] >= 0.5 * length else -1)
+        # The trachea runs backwards on its way down, by 8 to 40 degrees; less than 3 degrees say nothing.
+        front.append(_sign(-along[1] / length, 0.05))
+    whole = (points for points in lungs if len(points) and points[:, 2].min() > lowest_mm + 0.5 * SAMPLE_MM)
+    bases = [_base(points) for points in whole]
+    if bases:
+        # The base lies 9 to 30 mm behind the rest; less says nothing.
+        front.append(_sign(float(np.mean(bases)), 3.0))
+    return Landmarks(up=tuple(up), front=tuple(front), left=_left(tree, lungs, carina))
+
+
+def _left(tree: AirwayTree, lungs: list[Float], carina: Float) -> tuple[int, ...]:
+    if not all(len(points) for points in lungs):
+        return ()
+    signs = []
+    lengths = _main_bronchi(tree, lungs)
+    if lengths is not None:
+        # The left main bronchus is about twice as long as the right one, 5 against 2.5 cm.
+        signs.append(_sign(float(np.log(lengths[0] / lengths[1])), float(np.log(1.2))))
+    heart = _heart_mm(lungs, carina)
+    if heart is not None:
+        # Two thirds of the heart lie on the left: 10 to 30 mm on the average; less says nothing.
+        signs.append(_sign(heart, 4.0))
+    return tuple(signs)
+
+
+def _sign(value: float, least: float) -> int:
+    return 0 if abs(value) < least else int(np.sign(value))
+
+
+def _base(points: Float) -> float:
+    """Return how far the base of a lung lies behind the rest, mm."""
+    # This share of each lung is its base, which lies behind, where the diaphragm slopes down.
+    low = points[:, 2] <= np.quantile(points[:, 2], 0.15)
+    return float(points[low, 1].mean() - points[~low, 1].mean())
+
+
+def _main_bronchi(tree: AirwayTree, lungs: list[Float]) -> tuple[float, float] | None:
+    """Return the lengths of the left and right main bronchus, mm; None unless the trachea leads to both."""
+    middle = 0.5 * (lungs[0][:, 0].mean() + lungs[1][:, 0].mean())
+    left_at_plus_x = lungs[0][:, 0].mean() > lungs[1][:, 0].mean()
+    top = np.arange(tree.n_branches)
+    for branch in range(1, tree.n_branches):  # the child of the trachea that each branch hangs on
+        parent = int(tree.branch_parent[branch])
+        top[branch] = branch if parent == 0 else top[parent]
+    ends = tree.points_lps[tree.branch_start[1:] - 1]
+    is_left = (ends[:, 0] > middle) == left_at_plus_x
+    found = []
+    for side in (is_left, ~is_left):
+        counts = np.bincount(top[1:][side[1:]], minlength=tree.n_branches)
+        if not counts.any():
+            return None
+        found.append(int(np.argmax(counts)))
+    if found[0] == found[1]:
+        return None
+    left, right = (float(tree.branch_length_mm[b]) for b in found)
+    return (left, right) if min(left, right) > 0.0 else None
+
+
+def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
+    """Return how far left of the carina the middle between the lungs lies in front of it and below, mm."""
+    low = max(float(carina[2]) - HEART_MM[1], *(float(np.quantile(p[:, 2], 0.03)) for p in lungs))
+    bins = []
+    for points in lungs:
+        at = points[
+            (points[:, 1] <= carina[1])
+            & (points[:, 1] >= carina[1] - HEART_MM[0])
+            # Above this lie vessels that are as wide on both sides.
+            & (points[:, 2] <= carina[2] - 30.0)
+            & (points[:, 2] >= low)
+        ]
+        lines = np.floor((at[:, 1:] - carina[1:]) / (2.0 * SAMPLE_MM)).astype(np.int64)
+        bins.append((at[:, 0], lines))
+    left_is_right = lungs[0][:, 0].mean() < lungs[1][:, 0].mean()
+    inner = []
+    for n, (x, lines) in enumerate(bins):
+        towards_plus = (n == 0) == left_is_right
+        nearest: dict[tuple[int, int], float] = {}
+        for value, line in zip(x.tolist(), map(tuple, lines.tolist()), strict=True):
+            known = nearest.get(line, value)
+            nearest[line] = max(known, value) if towards_plus else min(known, value)
+        inner.append(nearest)
+    shared = inner[0].keys() & inner[1].keys()
+    # From fewer lines across the chest no place of the heart is told.
+    if len(shared) < 20:
+        return None
+    middle = np.mean([0.5 * (inner[0][line] + inner[1][line]) for line in sorted(shared)])
+    return float(middle - carina[0])
+
+
+def directions(signs: Landmarks) -> list[Finding]:
+    """Return the directions that fail, as all signs are against them, and those in doubt, as one is."""
+    found = []
+    for name, what, votes in (
+        ("axes", "upside down or lying across: the trachea does not run upwards", signs.up),
+        (
+            "axes",
+            "front to back: trachea and bases of the lungs lie as if front and back were exchanged",
+            signs.front,
+        ),
+        ("sides", "mirrored: main bronchi and heart lie as if left and right were exchanged", signs.left),
+    ):
+        decided = [vote for vote in votes if vote]
+        if not decided or max(decided) > 0 > min(decided):
+            if name == "sides" or decided:
+                found.append(_doubt(name))
+        elif max(decided) < 0 and (name == "sides" or len(decided) > 1 or what.startswith("upside")):
+            remedy = "Check the header of the image: its directions may be wrong"
+            if name == "sides":
+                remedy += "; or the organs of this patient are mirrored"
+            found.append(Finding(name=name, found=f"The image is {what}", remedy=remedy))
+        elif max(decided) < 0:
+            found.append(_doubt(name))
+    return found
+
+
+def _doubt(name: str) -> Finding:
+    what = "left and right" if name == "sides" else "front and back"
+    return Finding(
+        name=name,
+        verdict=DOUBTFUL,
+        found=f"The anatomy does not tell {what} for sure: look at a picture of the masks whether they are "
+        "where they belong. If the header is wrong, every plan is for the wrong place.",
+    )

@@ -1,0 +1,189 @@
+"""What the masks of a patient look like, each by itself and beside the others."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from anatomy.airway_tree import AirwayTree
+from anatomy.base.typed import Array, Float, Mask
+from anatomy.display import point
+from anatomy.grid import Grid
+from anatomy.landmarks import SAMPLE_MM, directions, landmarks
+from anatomy.lobes import LOBES, RIGHT_LOWER
+from anatomy.morphology import bounds, components, grown_by_one, lattice_of, sampled, window
+from anatomy.patient import PatientImages
+from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
+from anatomy.tree_report import PieceLeftOut
+
+WALL_MM = 4.0
+"""Walls are up to 3 mm thick, and their inner voxels share a face with the lumen."""
+PARTS = 3
+"""Each lung is looked at in so many parts from apex to base, of the same volume."""
+LEAST_PIECE = 0.05
+"""A piece with less than this share of the lungs is no lung."""
+LEAST_CUT, GREATEST_CUT = 0.01, 0.1
+"""A piece of the airway with this share of the lumen is named, and one with the other share is refused: in
+phantoms a segment and all behind it has 2 to 5 %, what hangs on a main bronchus 20 % and more."""
+MOST_VOXELS = 5_000_000
+"""Nodules of more voxels are not taken apart: they are refused for their volume."""
+
+
+def mask_findings(
+    images: PatientImages, tree: AirwayTree, lungs_lps: tuple[Float, Float]
+) -> tuple[Finding, ...]:
+    """Check the masks of a patient by all figures of `anatomy.plausibility.LIMITS`, and by their directions.
+
+    Parameters
+    ----------
+    images : PatientImages
+    tree : AirwayTree
+        Of their lumen.
+    lungs_lps : two (N, 3) float64 arrays
+        Points spread evenly over the left and the right lung, LPS mm; empty if they cannot be told apart.
+
+    Returns
+    -------
+    tuple of Finding
+        Every check, what is usual included; those that `images.accepted` names are accepted.
+    """
+    found = findings_of(dict(_figures(images, tree)))
+    found += _cut_off(images, tree)
+    corners = images.grid.lps(np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * (
+        np.array(images.grid.shape) - 1
+    ))  # fmt: skip
+    found += directions(landmarks(tree, *lungs_lps, lowest_mm=float(corners[:, 2].min())))
+    found += [Finding(name="airway", found=said, verdict=DOUBTFUL) for said in tree.report.warnings]
+    return tuple(found)
+
+
+def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, float]]:
+    """Yield the figures that can be told, by the names of `anatomy.plausibility.LIMITS`."""
+    ml = images.grid.voxel_volume_mm3 / 1000.0
+    lung, lumen, vessels = images.lung.array, images.lumen.array, images.vessels.array
+    yield from _of_lungs(lung, vessels, images.grid, tree)
+    yield "lungs_l", _count(lung) * ml / 1000.0
+    yield "lumen_ml", _count(lumen) * ml
+    yield "lumen_holes", tree.report.cavity_voxels / _count(lumen)
+    yield from _of_airway(lung, images.grid, tree)
+    inside = vessels & lung
+    yield "vessels_of_lungs", _count(inside) / _count(lung)
+    yield "vessels_in_lungs", _count(inside) / _count(vessels)
+    yield "vessels_in_lumen", _shared(vessels, lumen)
+    if images.wall is not None:
+        yield "wall_in_lumen", _shared(images.wall.array, lumen)
+        yield "wall_at_lumen", _at_lumen(images.wall.array, lumen, images.grid)
+    if images.fissures is not None:
+        fissures = images.fissures.array
+        within = _count(fissures & lung)
+        yield "fissures_of_lungs", within / _count(lung)
+        yield "fissures_in_lungs", within / _count(fissures)
+        yield "fissures_in_others", _count(fissures & (vessels | lumen)) / _count(fissures)
+    if images.nodules is not None:
+        nodules = images.nodules.array
+        yield "nodules_ml", _count(nodules) * ml
+        yield "nodules_in_others", _count(nodules & (vessels | lumen)) / _count(nodules)
+        if _count(nodules) <= MOST_VOXELS:
+            yield "nodules_at_lungs", _touching(nodules, lung)
+    if images.lobes is not None:
+        yield from _of_lobes(images.lobes.array, lung, images.grid, tree)
+
+
+def _count(mask: Mask) -> float:
+    """Return how many voxels a mask has, at least one."""
+    return float(max(int(np.count_nonzero(mask)), 1))
+
+
+def _shared(one: Mask, other: Mask) -> float:
+    return float(np.count_nonzero(one & other)) / min(_count(one), _count(other))
+
+
+def _of_lungs(lung: Mask, vessels: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:
+    """Yield what about one voxel in every cube of `SAMPLE_MM` tells of the lungs."""
+    from scipy import ndimage
+
+    lattice = lattice_of(grid, SAMPLE_MM)
+    coarse = np.pad(lung[lattice], 1)
+    pieces, count = ndimage.label(coarse, np.ones((3, 3, 3)))
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
+    total = float(max(sizes.sum(), 1))
+    yield "lung_pieces", float(sizes[sizes < LEAST_PIECE * total].sum()) / total
+    outside, _ = ndimage.label(~coarse)
+    yield "lung_holes", float(np.count_nonzero((outside != outside[0, 0, 0]) & ~coarse)) / total
+    points = sampled(lung, grid, SAMPLE_MM)
+    has_vessel = vessels[lattice][lung[lattice]]
+    left = points[:, 0] > tree.carina_lps[0]
+    yield "smaller_lung", float(min(left.mean(), 1.0 - left.mean())) if len(points) else 0.0
+    mean = float(has_vessel.mean()) if has_vessel.any() else 1.0
+    shares = []
+    for side in (left, ~left):
+        order = np.flatnonzero(side)[np.argsort(points[side, 2], kind="stable")]
+        shares += [
+            float(has_vessel[part].mean()) / mean for part in np.array_split(order, PARTS) if len(part)
+        ]
+    yield "least_vessels", min(shares, default=0.0)
+
+
+def _of_airway(lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:
+    ends = np.setdiff1d(np.arange(tree.n_branches), tree.branch_parent)
+    last = tree.branch_start[ends + 1] - 1
+    tips = tree.points_lps[last]
+    yield "trachea_mm", float(np.median(tree.radius_mm[tree.branch_points(0)]))
+    yield "thinnest_mm", float(np.median(tree.radius_mm[last]))
+    yield "ends_in_lungs", float(np.mean(grid.values_at(lung, tips, False)))
+    left = int(np.count_nonzero(tips[:, 0] > tree.carina_lps[0]))
+    yield "least_ends", float(min(left, len(tips) - left))
+
+
+def _at_lumen(wall: Mask, lumen: Mask, grid: Grid) -> float:
+    """Return the share of a wall within `WALL_MM` of the lumen."""
+    import edt
+
+    box = window(*bounds(wall | lumen))
+    sides = tuple(map(float, grid.spacing_mm))
+    near = edt.edt(np.asfortranarray(~lumen[box]), anisotropy=sides, order="F") <= WALL_MM
+    return float(np.count_nonzero(near & wall[box])) / _count(wall)
+
+
+def _touching(nodules: Mask, lung: Mask) -> float:
+    """Return the share of nodules, by voxels, that lie in the lungs or touch them."""
+    voxels, part = components(nodules)
+    box = window(*bounds(nodules, 1))
+    near = grown_by_one(np.asfortranarray(lung[box]))
+    at = near[tuple((voxels - [axis.start for axis in box]).T)]
+    touches = np.bincount(part, weights=at) > 0
+    return float(touches[part].mean()) if len(part) else 1.0
+
+
+def _of_lobes(lobes: Array, lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:
+    lattice = lattice_of(grid, SAMPLE_MM)
+    numbers, inside = lobes[lattice], lung[lattice]
+    yield "lobes_of_lungs", _count((numbers > 0) & inside) / _count(inside)
+    points, number = sampled(lobes > 0, grid, SAMPLE_MM), numbers[numbers > 0]
+    on_left = points[:, 0] > tree.carina_lps[0]
+    yield "lobes_on_side", float(np.mean(on_left == (number > RIGHT_LOWER))) if len(number) else 1.0
+
+
+def _cut_off(images: PatientImages, tree: AirwayTree) -> Iterator[Finding]:
+    """Yield the pieces of the airway that hang on nothing, with the gap and what lies behind it."""
+    whole = _count(images.lumen.array)
+    for piece in tree.report.pieces_left_out:
+        share = piece.voxels / whole
+        if share < LEAST_CUT:
+            continue
+        yield Finding(
+            name="gap",
+            found=f"A gap of {piece.length_mm:.1f} mm at LPS ({point(piece.position_lps)}) mm cuts off "
+            f"{share:.0%} of the airway, which leads into the {_behind(images, tree, piece)}: none of it is "
+            "used, and no path that leads through it is known",
+            remedy="Close the gap in the mask of the airway, if it is one",
+            verdict=REFUSED if share >= GREATEST_CUT else DOUBTFUL,
+        )
+
+
+def _behind(images: PatientImages, tree: AirwayTree, piece: PieceLeftOut) -> str:
+    """Return the lobe, or else the lung, in which the middle of a piece lies."""
+    if images.lobes is not None:
+        lobe = int(images.grid.values_at(images.lobes.array, piece.middle_lps, 0))
+        if lobe:
+            return LOBES[lobe]
+    return "left lung" if piece.middle_lps[0] > tree.carina_lps[0] else "right lung"

@@ -1,0 +1,284 @@
+"""What masks of a patient must look like, whatever program made them: a table of limits."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+from anatomy.base.errors import AnatomyError, SettingsError
+from anatomy.base.records import frozen_value
+
+FITS, DOUBTFUL, REFUSED, ACCEPTED = "fits", "doubtful", "refused", "accepted"
+"""What a check finds: usual; unusual, which is a warning; impossible; and that, accepted by its name."""
+
+CHECKS: Mapping[str, str] = MappingProxyType(
+    {
+        "axes": "the trachea runs upwards, and the spine is behind: the header is right",
+        "sides": "left and right are not exchanged",
+        "airway": "trachea and bronchi form a tree as wide as airways are",
+        "gap": "no large part of the airway is cut off from the trachea",
+        "bronchi": "a bronchus leads into each lung",
+        "one-lung": "there are two lungs",
+        "volume": "the lungs are as large as lungs can be",
+        "lung": "the lungs are whole, filled, and nothing else is in their mask",
+        "vessels": "vessels lie in the lungs, in all their parts, and are as many as there can be",
+        "overlap": "no mask is the copy of another one",
+        "wall": "the wall lies around the lumen",
+        "fissures": "fissures are thin sheets in the lungs",
+        "lobes": "the lobes lie where they belong, and make up the lungs",
+        "nodules": "nodules lie in or at the lungs, and are as large as nodules can be",
+        "grid": "the masks lie within the images",
+        "density": "the lungs are as dense as lungs can be",
+        "masks": "masks from elsewhere lie on what they show in the CT",
+    }
+)
+"""The checks, by the name that `--accept` takes."""
+
+
+@frozen_value
+class Finding:
+    """What a check of `CHECKS` found: a sentence, between which limits, what to do, and the verdict."""
+
+    name: str
+    found: str
+    remedy: str = ""
+    verdict: str = REFUSED
+
+    @property
+    def warning(self) -> str:
+        """The sentence that commands, pages and records show as a warning; empty if all is usual."""
+        if self.verdict == FITS:
+            return ""
+        if self.verdict == DOUBTFUL:
+            return self.found
+        how = "was accepted" if self.verdict == ACCEPTED else "is not accepted yet"
+        return f"{self.found}. The check {self.name} fails, which {how}."
+
+
+@frozen_value
+class Limit:
+    """Between which values a figure of the masks is usual, and between which it is possible.
+
+    Parameters
+    ----------
+    check : str
+        A key of `CHECKS`.
+    words, form : str
+        The sentence with a place for the figure, and how the figure is written.
+    usual, possible : (least, greatest)
+        Beyond the one is a warning, beyond the other a refusal.
+    reason : str
+        Where the limits are from.
+    """
+
+    check: str
+    words: str
+    form: str
+    usual: tuple[float, float]
+    possible: tuple[float, float]
+    reason: str
+    remedy: str = "Look at the masks, and correct what is wrong"
+
+    def finding(self, value: float) -> Finding:
+        """Return what a figure means."""
+        inside = [low <= value <= high for low, high in (self.usual, self.possible)]
+        verdict = FITS if inside[0] else DOUBTFUL if inside[1] else REFUSED
+        what = "possible" if verdict == REFUSED else "usual"
+        limits = _range(self.form, self.possible if verdict == REFUSED else self.usual)
+        return Finding(
+            name=self.check,
+            found=f"{self.words.format(self.form.format(value))}; {limits} is {what} ({self.reason})",
+            remedy=self.remedy,
+            verdict=verdict,
+        )
+
+
+def _range(form: str, limits: tuple[float, float]) -> str:
+    low, high = (form.format(limit) for limit in limits)
+    if limits[1] == MOST:
+        return f"{low} or more"
+    return f"up to {high}" if limits[0] == 0 else f"{low} to {high}"
+
+
+MOST = float("inf")
+_FILE = "Check that the file shows what its name or role says, and belongs to these images"
+LIMITS: Mapping[str, Limit] = MappingProxyType(
+    {
+        "lungs_l": Limit(
+            check="volume", words="The lungs have {}", form="{:.2f} l", usual=(1.5, 9.0),
+            possible=(0.3, 11.0),
+            reason="from a child of one year after breathing out to a very tall man after breathing in",
+            remedy="Check the voxel size in the header, and look at the masks",
+        ),
+        "smaller_lung": Limit(
+            check="one-lung", words="{} of the lungs lie on the side of the carina that has less of them",
+            form="{:.0%}", usual=(0.25, 0.5), possible=(0.05, 0.5),
+            reason="the left lung has 45 %; a lung that has collapsed has 10 %",
+            remedy="Look whether the other lung is solid, taken out, or missing in the mask",
+        ),
+        "lung_pieces": Limit(
+            check="lung", words="{} of the lungs are pieces apart from both", form="{:.1%}",
+            usual=(0, 0.02), possible=(0, 0.2), reason="two lungs are two pieces, in phantoms and patients",
+            remedy="Remove what is no lung: stomach, bowel, table",
+        ),
+        "lung_holes": Limit(
+            check="lung", words="Holes in the lungs take {} of them", form="{:.1%}", usual=(0, 0.05),
+            possible=(0, 0.5), reason="a filled mask has none; a mass or unfilled vessels take 5 %",
+            remedy="Fill the mask: what is a hole is an obstacle",
+        ),
+        "lumen_ml": Limit(
+            check="airway", words="The airway lumen has {}", form="{:.1f} ml", usual=(8, 200),
+            possible=(2, 500),
+            reason="20 to 120 ml are seen in CT; a child of one year has 5 ml", remedy=_FILE,
+        ),
+        "lumen_holes": Limit(
+            check="airway", words="Holes in the lumen take {} of it", form="{:.1%}", usual=(0, 0.02),
+            possible=(0, 0.2), reason="a lumen has none, a wall has its lumen", remedy=_FILE,
+        ),
+        "trachea_mm": Limit(
+            check="airway", words="The trachea has the radius {}", form="{:.1f} mm", usual=(4, 14),
+            possible=(1.5, 22), reason="adults have 5 to 14 mm, infants 2 mm", remedy=_FILE,
+        ),
+        "thinnest_mm": Limit(
+            check="airway", words="Half of the ends of the airway have a radius of {} or more",
+            form="{:.1f} mm",
+            usual=(0, 2.2), possible=(0, 6),
+            reason="CT shows bronchi down to 1 mm; wider ends are those of a "
+            "tree that is cut, or of a mask that was widened", remedy=_FILE,
+        ),
+        "ends_in_lungs": Limit(
+            check="bronchi", words="{} of the ends of the airway lie in the lungs", form="{:.0%}",
+            usual=(0.85, 1), possible=(0.4, 1), reason="98 % and more do in phantoms and patients",
+            remedy="Look whether a part of the lungs is missing, or a mask lies beside the others",
+        ),
+        "least_ends": Limit(
+            check="bronchi", words="The airway has {} ends in the lung that has fewer", form="{:.0f}",
+            usual=(4, MOST), possible=(1, MOST),
+            reason="a lung has three lobes or two, with some segments each; "
+            "reach in that lung is understated", remedy="Look where the mask of the airway stops",
+        ),
+        "vessels_of_lungs": Limit(
+            check="vessels", words="Vessels take {} of the lungs", form="{:.2%}", usual=(0.004, 0.15),
+            possible=(0.0005, 0.4), reason="large vessels take 1 %, all that CT shows 3 to 8 %", remedy=_FILE,
+        ),
+        "vessels_in_lungs": Limit(
+            check="vessels", words="{} of the vessels lie in the lungs", form="{:.0%}", usual=(0.5, 1),
+            possible=(0.2, 1),
+            reason="all do, or two thirds where the mask has the vessels of the mediastinum too",
+            remedy="Check the header of the mask of the vessels: it may have lost its place",
+        ),
+        "least_vessels": Limit(
+            check="vessels", words="The part of the lungs with the fewest vessels has {} of their mean share",
+            form="{:.0%}", usual=(0.1, 1), possible=(0.01, 1),
+            reason="of three parts of each lung, from apex to "
+            "base, none is without", remedy="Look whether vessels are missing there: none is avoided",
+        ),
+        "vessels_in_lumen": Limit(
+            check="overlap", words="{} of vessels or lumen, the smaller one, lie in the other one",
+            form="{:.1%}",
+            usual=(0, 0.02), possible=(0, 0.3),
+            reason="a voxel is one or the other; masks of two programs may share 5 %", remedy=_FILE,
+        ),
+        "wall_in_lumen": Limit(
+            check="overlap", words="{} of wall or lumen, the smaller one, lie in the other one",
+            form="{:.1%}",
+            usual=(0, 0.05), possible=(0, 0.8), reason="a voxel is one or the other, or the wall is filled",
+            remedy=_FILE,
+        ),
+        "wall_at_lumen": Limit(
+            check="wall", words="{} of the wall lie at the lumen", form="{:.0%}", usual=(0.8, 1),
+            possible=(0.4, 1),
+            reason="walls are up to 3 mm thick", remedy=_FILE,
+        ),
+        "fissures_of_lungs": Limit(
+            check="fissures", words="Fissures take {} of the lungs", form="{:.1%}", usual=(0, 0.05),
+            possible=(0, 0.2), reason="a sheet of two voxels takes 1 to 2 %", remedy=_FILE,
+        ),
+        "fissures_in_lungs": Limit(
+            check="fissures", words="{} of the fissures lie in the lungs", form="{:.0%}", usual=(0.9, 1),
+            possible=(0.5, 1), reason="99 % do in phantoms and patients", remedy=_FILE,
+        ),
+        "fissures_in_others": Limit(
+            check="overlap", words="{} of the fissures lie in vessels or airway", form="{:.0%}",
+            usual=(0, 0.2),
+            possible=(0, 0.7), reason="they are crossed by few vessels", remedy=_FILE,
+        ),
+        "lobes_of_lungs": Limit(
+            check="lobes", words="The lobes take {} of the lungs", form="{:.0%}", usual=(0.85, 1),
+            possible=(0.3, 1), reason="all but airways and vessels is of a lobe", remedy=_FILE,
+        ),
+        "lobes_on_side": Limit(
+            check="lobes", words="{} of the lobes lie on their side of the carina", form="{:.0%}",
+            usual=(0.9, 1),
+            possible=(0.6, 1), reason="a lung reaches little beyond the middle",
+            remedy="Check the labels of the lobes, and whether their mask is mirrored",
+        ),
+        "nodules_ml": Limit(
+            check="nodules", words="Nodules have {}", form="{:.3f} ml", usual=(0.004, 120), possible=(0, 500),
+            reason="a nodule of 2 mm has 0.004 ml, a mass of 6 cm 113 ml", remedy=_FILE,
+        ),
+        "nodules_at_lungs": Limit(
+            check="nodules", words="{} of the nodules lie in or at the lungs", form="{:.0%}",
+            usual=(0.999, 1),
+            possible=(0.5, 1), reason="a nodule that a mask of the lungs leaves out still touches it",
+            remedy="Check the header of the mask of the nodules, and that it shows nothing else",
+        ),
+        "nodules_in_others": Limit(
+            check="overlap", words="{} of the nodules lie in vessels or airway", form="{:.0%}",
+            usual=(0, 0.5),
+            possible=(0, 0.9), reason="a target that is all obstacle cannot be reached", remedy=_FILE,
+        ),
+    }
+)  # fmt: skip
+"""The figures of masks of a patient.  Limits are from phantoms and published volumes."""
+
+
+def findings_of(figures: Mapping[str, float]) -> list[Finding]:
+    """Return what figures mean, by the names of `LIMITS`."""
+    return [limit.finding(figures[name]) for name, limit in LIMITS.items() if name in figures]
+
+
+def with_accepted(findings: Iterable[Finding], names: Collection[str]) -> tuple[Finding, ...]:
+    """Return findings in which those that fail are accepted by their names."""
+    return tuple(
+        replace(each, verdict=ACCEPTED) if each.verdict == REFUSED and each.name in names else each
+        for each in findings
+    )
+
+
+def require_plausible(findings: Collection[Finding], accepted: Collection[str]) -> tuple[str, ...]:
+    """Return the names of the checks that failed and are accepted.
+
+    Raises
+    ------
+    AnatomyError
+        If a check failed that is not.
+    """
+    failed = [each for each in findings if each.verdict in (REFUSED, ACCEPTED)]
+    refused = [each for each in with_accepted(failed, accepted) if each.verdict == REFUSED]
+    if refused:
+        names = " ".join(f"--accept {name}" for name in dict.fromkeys(check.name for check in refused))
+        raise AnatomyError(
+            "; ".join(check.found for check in refused),
+            expected="; ".join(dict.fromkeys(CHECKS[check.name] for check in refused)),
+            remedy="; ".join(dict.fromkeys(check.remedy for check in refused))
+            + f"; if the masks are right all the same, add {names}",
+        )
+    return tuple(dict.fromkeys(check.name for check in failed))
+
+
+def require_known_checks(names: Collection[str]) -> None:
+    """Refuse names that are not in `CHECKS`."""
+    unknown = [name for name in names if name not in CHECKS]
+    if unknown:
+        raise SettingsError(
+            f"--accept names {', '.join(unknown)}, which is no check",
+            expected=f"one of {', '.join(CHECKS)}",
+            remedy="Take the name from the message that refuses the masks",
+        )
+
+
+def warnings_of_findings(findings: Iterable[Finding]) -> Iterator[str]:
+    """Yield the sentence of every finding that is not usual."""
+    yield from filter(None, (each.warning for each in findings))

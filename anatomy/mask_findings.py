@@ -83,7 +83,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         yield "nodules_ml", _count(nodules) * ml
         yield "nodules_in_others", _count(nodules & (vessels | lumen)) / _count(nodules)
         if _count(nodules) <= MOST_VOXELS:
-            yield "nodules_at_lungs", _touching(nodules, lung)
+            yield from _of_nodules(nodules, lung)
     if images.lobes is not None:
         yield from _of_lobes(images.lobes.array, lung, images.grid, tree)
 
@@ -144,14 +144,16 @@ def _at_lumen(wall: Mask, lumen: Mask, grid: Grid) -> float:
     return float(np.count_nonzero(near & wall[box])) / _count(wall)
 
 
-def _touching(nodules: Mask, lung: Mask) -> float:
-    """Return the share of nodules, by voxels, that lie in the lungs or touch them."""
+def _of_nodules(nodules: Mask, lung: Mask) -> Iterator[tuple[str, float]]:
+    """Yield how much of the nodules lies in or at the lungs, and how compact the largest one is."""
     voxels, part = components(nodules)
     box = window(*bounds(nodules, 1))
     near = grown_by_one(np.asfortranarray(lung[box]))
     at = near[tuple((voxels - [axis.start for axis in box]).T)]
     touches = np.bincount(part, weights=at) > 0
-    return float(touches[part].mean()) if len(part) else 1.0
+    yield "nodules_at_lungs", float(touches[part].mean())
+    largest = voxels[part == np.argmax(np.bincount(part))]
+    yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
 
 
 def _of_lobes(lobes: Array, lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:

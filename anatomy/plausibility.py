@@ -192,7 +192,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             reason="walls are up to 3 mm thick", remedy=_FILE,
         ),
         "fissures_of_lungs": Limit(
-            check="fissures", words="Fissures take {} of the lungs", form="{:.1%}", usual=(0, 0.05),
+            check="fissures", words="Fissures take {} of the lungs", form="{:.1%}", usual=(0.002, 0.05),
             possible=(0, 0.2), reason="a sheet of two voxels takes 1 to 2 %", remedy=_FILE,
         ),
         "fissures_in_lungs": Limit(
@@ -223,6 +223,11 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             usual=(0.999, 1),
             possible=(0.5, 1), reason="a nodule that a mask of the lungs leaves out still touches it",
             remedy="Check the header of the mask of the nodules, and that it shows nothing else",
+        ),
+        "nodule_filled": Limit(
+            check="nodules", words="The largest nodule fills {} of the box around it", form="{:.0%}",
+            usual=(0.15, 1), possible=(0.02, 1), reason="a ball fills 52 %; sheets and trees fill little",
+            remedy=_FILE,
         ),
         "nodules_in_others": Limit(
             check="overlap", words="{} of the nodules lie in vessels or airway", form="{:.0%}",

@@ -71,6 +71,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     yield "vessels_in_lumen", _shared(vessels, lumen)
     if images.wall is not None:
         yield "wall_in_lumen", _shared(images.wall.array, lumen)
+        yield "wall_in_vessels", _shared(images.wall.array, vessels)
         yield "wall_at_lumen", _at_lumen(images.wall.array, lumen, images.grid)
     if images.fissures is not None:
         fissures = images.fissures.array

@@ -186,6 +186,11 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             usual=(0, 0.05), possible=(0, 0.8), reason="a voxel is one or the other, or the wall is filled",
             remedy=_FILE,
         ),
+        "wall_in_vessels": Limit(
+            check="overlap", words="{} of wall or vessels, the smaller one, lie in the other one",
+            form="{:.0%}", usual=(0, 0.4), possible=(0, 0.9),
+            reason="vessels touch walls, and where they do a voxel may be both", remedy=_FILE,
+        ),
         "wall_at_lumen": Limit(
             check="wall", words="{} of the wall lie at the lumen", form="{:.0%}", usual=(0.8, 1),
             possible=(0.4, 1),

@@ -110,7 +110,9 @@ def _with(masks: Masks, role: str, array: Array, name: str, *, same: bool = Fals
 def drawn(masks: Mapping[str, Volume], rng: np.random.Generator) -> Mutation:
     """Draw a mutation of a role."""
     kind = KINDS[int(rng.integers(len(KINDS)))]
-    return kind(dict(masks), str(rng.choice(ROLES)), rng)
+    role = str(rng.choice(ROLES))
+    # A nodule that is wider is a nodule: nothing in the masks contradicts it.
+    return kind(dict(masks), "lumen" if kind is widened and role == "nodules" else role, rng)
 
 
 def write(folder: Path, masks: Mapping[str, Volume]) -> Path:

@@ -23,7 +23,7 @@ from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.patient import PatientImages
-from anatomy.plausibility import Finding, require_plausible, with_accepted
+from anatomy.plausibility import require_plausible, with_accepted
 
 META = LUNG_FILE
 LAYOUT = 3

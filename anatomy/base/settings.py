@@ -161,9 +161,12 @@ def parse(cls: type[T], mapping: Mapping[str, object], where: str, remedy: str =
 def to_mapping(values: object) -> dict[str, Any]:
     """Return settings as plain JSON types, from which `parse` restores them without loss.
 
-    Fields with LEFT_OUT_IF_EMPTY in their metadata are left out where they are empty.
+    Fields with LEFT_OUT_IF_EMPTY in their metadata are left out where they are empty, and those that no
+    constructor takes always.
     """
-    held = {field: getattr(values, field.name) for field in dataclasses.fields(cast(Any, values))}
+    held = {
+        field: getattr(values, field.name) for field in dataclasses.fields(cast(Any, values)) if field.init
+    }
     return {
         field.name: _plain(value)
         for field, value in held.items()
@@ -251,7 +254,7 @@ def _shown(value: object) -> str:
 
 def _known_keys(cls: type, loc: Sequence[int | str]) -> str:
     owner, unknown = _class_at(cls, loc[:-1]), str(loc[-1])
-    names = list(_fields(owner))
+    names = [name for name, field in _fields(owner).items() if field.init is not False]
     close = difflib.get_close_matches(unknown, names, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     return f"one of {', '.join(names)}{hint}"

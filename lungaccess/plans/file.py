@@ -111,7 +111,7 @@ def _in_schema(content: dict[str, Any]) -> dict[str, Any]:
     outer, inner = float(tube["outer_insertion_mm"]), float(tube["inner_insertion_mm"])
     straight = max(inner - tubes.inner.curved_length_mm, 0.0)
     ends = [min(straight, outer), outer, max(straight, outer), inner]
-    curvatures = [0.0, tubes.overlap_curvature_per_mm, 0.0, tubes.inner.precurvature_per_mm]
+    curvatures = [0.0, tubes.overlap_curvature_per_mm, 0.0, tubes.free_curvature_per_mm]
     radii = [tubes.outermost.radius_mm] * 2 + [tubes.inner.radius_mm] * 2
     lengths = np.diff(ends, prepend=0.0).tolist()
     shape = {

@@ -5,13 +5,15 @@ from __future__ import annotations
 import functools
 import os
 import tomllib
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 
 from anatomy.base.checksums import canonical_sha256
 from anatomy.base.errors import SettingsError
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, parse, settings, switch, text, to_mapping
 from anatomy.margins import Margins
 from lungaccess.problem.preset_files import PresetFiles
@@ -47,6 +49,9 @@ class System:
         Runs inside the inner tube.  Without one the tip of the inner tube goes to the target itself.
     margins : Margins, optional
         Kept around every device.
+    needle_preloaded : bool, optional
+        Whether the needle's tip stays at that of the inner tube while the tubes are deployed.  Then it bends
+        with them, and `tubes` know its shaft; else its stiffness is neglected.
     fissures_allowed : bool, optional
         Whether tubes and needle may cross a fissure, which pierces the pleura twice.
 
@@ -63,6 +68,13 @@ class System:
     tubes: ConcentricTubes
     needle: Needle | None = None
     margins: Margins = Margins()
+    needle_preloaded: Annotated[
+        bool,
+        switch(
+            "whether the needle lies in the tubes up to their tip while they are deployed, and bends with "
+            "them; if not, its stiffness is neglected"
+        ),
+    ] = field(default=False, metadata={LEFT_OUT_IF_EMPTY: True})
     fissures_allowed: Annotated[bool, switch("whether a fissure may be crossed")] = False
 
     def __post_init__(self) -> None:
@@ -76,6 +88,9 @@ class System:
             self._check_aim()
         else:
             self._check_needle(self.needle)
+        if self.needle_preloaded:
+            self._check_shaft()
+        object.__setattr__(self, "tubes", self.tubes.with_needle(self._shaft_in_tubes))
 
     def _check_aim(self) -> None:
         """Without a needle the tip of the tubes must come to points in space, not on a line only."""
@@ -107,6 +122,28 @@ class System:
                 f"{bent:.4g} / mm, so that its strain exceeds needle.max_strain = "
                 f"{needle.max_strain:g}. Slots (needle.slotted_segments) or a smaller "
                 "tubes.max_channel_curvature_per_mm allow more",
+            )
+
+    @property
+    def _shaft_in_tubes(self) -> Tube | None:
+        """The shaft that bends with the tubes while they are deployed."""
+        return self.needle_tube if self.needle_preloaded else None
+
+    def _check_shaft(self) -> None:
+        """What slides through bent tubes while the needle is inserted must be alike, or their shape changes."""
+        shaft = self.needle_tube
+        if shaft is None:
+            return
+        slides_mm = self.tubes.curved_out_mm + self.require_needle("Its shaft").max_length_mm
+        parts = shaft.parts
+        stiffness = parts.stiffness_n_mm2[parts.begin_mm < slides_mm]
+        if self.tubes.curved_out_mm > 0.0 and np.ptp(stiffness) > 0.0:
+            raise impossible(
+                "needle.slotted_segments",
+                len(shaft.slotted_segments),
+                f"none, or one from the tip on of at least {slides_mm:g} mm, where needle_preloaded is true: so "
+                "much of the shaft comes to lie in bent tubes, and where its stiffness changes the tubes would "
+                "move while it is inserted",
             )
 
     @property

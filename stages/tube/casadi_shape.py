@@ -4,9 +4,11 @@ Nothing of the kernels takes part: neither their integration nor their judgement
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
@@ -59,7 +61,9 @@ class DerivedShape:
         return np.stack([np.interp(s, self.arc_lengths_mm, axis) for axis in self.points_mm.T], axis=1)
 
 
-def derive_shape(tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm: ArrayLike) -> DerivedShape:
+def derive_shape(
+    tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm: ArrayLike, *, needle: Tube | None = None
+) -> DerivedShape:
     """Follow the tubes to a deployment by the sequence `together`, with the CasADi model.
 
     Parameters
@@ -68,6 +72,8 @@ def derive_shape(tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm:
         The innermost first.
     rotations_rad, insertions_mm : (n,) float64
         As in `stages.tube.shapes.TubeShapes`.
+    needle : Tube, optional
+        Straight; its tip stays where that of the innermost tube is, so it is one more tube, the innermost.
 
     Raises
     ------
@@ -79,6 +85,14 @@ def derive_shape(tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm:
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     sequence = together(tubes, turned, insertions_mm)
     angles, betas, moves = joint_steps(sequence, tubes, step_mm=STEP_MM, step_rad=np.pi)
+    if needle is not None:
+        # Its rear end goes with that of the innermost tube, and it has no torsion: its angle stays 0.
+        behind = betas[:, :1] + (tubes[0].length_mm - needle.length_mm)
+        betas, angles = np.hstack([behind, betas]), np.hstack([np.zeros_like(behind), angles])
+        tubes, turned = (
+            (replace(needle, length_mm=needle.length_mm + BEYOND_MM), *tubes),
+            np.append(0.0, turned),
+        )
     model = CasadiTubes(tubes)
     tips, least, before = turned, 1.0, betas[moves == 0][-1]
     way = []
@@ -86,12 +100,16 @@ def derive_shape(tubes: Sequence[Tube], rotations_rad: ArrayLike, insertions_mm:
         tips, determinant = _stepped(model, base, before, beta, tips)
         least, before = min(least, determinant), beta
         way.append(model.body(tips, beta))
-    body = way[-1]
+    body, tip = way[-1], np.array(model.given_tip_angles(tips, betas[-1]).base_from_tip)
+    relative = body[:, 4:]
+    if needle is not None:
+        relative = relative[:, 1:] - relative[:, :1]
+        tip[:3, :3] = tip[:3, :3] @ Rotation.from_rotvec([0.0, 0.0, tips[1] - tips[0]]).as_matrix()
     return DerivedShape(
         arc_lengths_mm=read_only(body[:, 0].copy()),
         points_mm=read_only(body[:, 1:4].copy()),
-        relative_rad=read_only(body[:, 4:].copy()),
-        base_from_tip=model.given_tip_angles(tips, betas[-1]).base_from_tip,
+        relative_rad=read_only(relative.copy()),
+        base_from_tip=read_only(tip),
         least_determinant=least,
         way=tuple(read_only(each[:, :4].copy()) for each in way),
     )

@@ -30,7 +30,7 @@ def shapes_of(tubes: ConcentricTubes) -> TubeShapes:
     Of planar tubes they are those that sweep nothing: few others keep the limit, and the tree of shapes would
     be twice as large for them.
     """
-    return _opened(tubes.nested, _limits(tubes), _grid(tubes.nested))
+    return _opened(tubes.nested, _limits(tubes), _grid(tubes.nested), tubes.needle_shaft)
 
 
 def shapes_at_hand(tubes: ConcentricTubes) -> bool:
@@ -38,7 +38,8 @@ def shapes_at_hand(tubes: ConcentricTubes) -> bool:
     nested = tubes.nested
     if sum(bool(tube.bends) for tube in nested) <= 1:
         return True
-    return record_path("shapes", shapes_format(), _design(nested, _limits(tubes), _grid(nested))).is_file()
+    design = _design(nested, _limits(tubes), _grid(nested), tubes.needle_shaft)
+    return record_path("shapes", shapes_format(), design).is_file()
 
 
 def _limits(tubes: ConcentricTubes) -> ShapeLimits:
@@ -50,12 +51,15 @@ def _limits(tubes: ConcentricTubes) -> ShapeLimits:
     )
 
 
-def _design(tubes: Sequence[Tube], limits: ShapeLimits, grid: ShapeGrid) -> dict[str, Any]:
+def _design(
+    tubes: Sequence[Tube], limits: ShapeLimits, grid: ShapeGrid, needle: Tube | None
+) -> dict[str, Any]:
     """Return what the shapes of a design depend on."""
     return {
         "tubes": [to_mapping(tube) for tube in tubes],
         "limits": to_mapping(limits),
         "grid": to_mapping(grid),
+        "needle": None if needle is None else to_mapping(needle),
     }
 
 
@@ -90,8 +94,8 @@ def _grid(tubes: tuple[Tube, ...]) -> ShapeGrid:
 
 
 @lru_cache(maxsize=KEPT)
-def _opened(tubes: tuple[Tube, ...], limits: ShapeLimits, grid: ShapeGrid) -> TubeShapes:
-    return open_shapes(tubes, limits, grid)
+def _opened(tubes: tuple[Tube, ...], limits: ShapeLimits, grid: ShapeGrid, needle: Tube | None) -> TubeShapes:
+    return open_shapes(tubes, limits, grid, needle=needle)
 
 
 @lru_cache(maxsize=2 * KEPT)
@@ -119,6 +123,7 @@ def open_shapes(
     limits: ShapeLimits | None = None,
     grid: ShapeGrid | None = None,
     *,
+    needle: Tube | None = None,
     cache: str | os.PathLike[str] | None = None,
 ) -> TubeShapes:
     """Return the shapes of a design from the cache, or make and keep them.
@@ -127,5 +132,6 @@ def open_shapes(
     `anatomy.kept_records.kept_record`.
     """
     limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
-    design, made = _design(tubes, limits, grid), partial(tube_shapes, tubes, limits, grid)
+    design = _design(tubes, limits, grid, needle)
+    made = partial(tube_shapes, tubes, limits, grid, needle=needle)
     return kept_record("shapes", shapes_format(), design, TubeShapes, make=made, cache=cache)

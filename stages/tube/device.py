@@ -1,7 +1,9 @@
 """What the planner has to know of concentric tubes."""
 
+from __future__ import annotations
+
 import math
-from dataclasses import field
+from dataclasses import field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Annotated
@@ -170,7 +172,8 @@ class ConcentricTubes:
     Without an outer tube the inner one is alone, for instance as a straight stylet through the wall.  Where
     only the inner tube is bent, by one arc, the tubes bend in one plane and their shape has a closed form;
     any other design is turned tube by tube, and its shapes follow from the mechanics.
-    The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
+    A straight needle whose tip stays at that of the inner tube while they are deployed bends with them
+    (`with_needle`).  The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
     perpendicular; the extension counts along the tubes.  In the worst case the working channel bends the tube
     that it holds against its precurvature.  Where no largest curvature of the channel is stated, it is what
     `max_strain` allows.
@@ -206,6 +209,7 @@ class ConcentricTubes:
         float | None,
         quantity("largest curvature of the channel that the tubes pass", at_least=0.0, at_most=0.5),
     ] = None
+    needle_shaft: Tube | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._check_nesting()
@@ -330,12 +334,37 @@ class ConcentricTubes:
         """Length of inner tube that can be ahead of the outer one, mm, their rear ends being in order."""
         return self.inner.length_mm - (0.0 if self.outer is None else self.outer.length_mm)
 
+    def with_needle(self, shaft: Tube | None) -> ConcentricTubes:
+        """Return the same tubes with a straight needle whose tip stays at that of the inner tube.
+
+        It belongs to the system and not to the tubes, so no file states it among them.
+        """
+        made = replace(self)
+        object.__setattr__(made, "needle_shaft", shaft)
+        return made
+
+    @property
+    def curved_out_mm(self) -> float:
+        """Length from the inner tube's tip within which tubes are bent ahead of the scope at most, mm."""
+        if any(tube.bends for tube in self.nested[1:]):
+            return self.max_extension_mm
+        return min(self.inner.bent_length_mm, self.max_extension_mm)
+
     @property
     def overlap_curvature_per_mm(self) -> float:
-        """Curvature of the inner tube's bent part inside the straight outer tube of planar tubes, 1/mm.
+        """Curvature of the inner tube's bent part inside the straight outer tube of planar tubes, 1/mm."""
+        return self._shared_curvature(*self.nested[1:])
 
-        The two share the precurvature in proportion to their bending stiffness [Rucker2010].
+    @property
+    def free_curvature_per_mm(self) -> float:
+        """Curvature of the inner tube's bent part ahead of all other tubes where they are planar, 1/mm."""
+        return self._shared_curvature()
+
+    def _shared_curvature(self, *around: Tube) -> float:
+        """Return the curvature of the inner tube's bent part with a needle in it and others around it, 1/mm.
+
+        They share the precurvature in proportion to their bending stiffness [Rucker2010].
         """
-        stiffness = sum(tube.bending_stiffness_n_mm2 for tube in reversed(self.nested[1:]))
-        inner = self.inner.bending_stiffness_n_mm2
-        return self.inner.precurvature_per_mm * (inner / (inner + stiffness))
+        straight = around if self.needle_shaft is None else (self.needle_shaft, *around)
+        inner, *others = (float(tube.parts.stiffness_n_mm2[0]) for tube in (self.inner, *straight))
+        return self.inner.precurvature_per_mm * (inner / (inner + sum(others)))

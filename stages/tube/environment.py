@@ -49,7 +49,7 @@ def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
     inner, outer = tubes.inner, tubes.outermost
     if tubes.planar:
         constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
-        constants[kernels.INNER_CURVATURE] = inner.precurvature_per_mm
+        constants[kernels.INNER_CURVATURE] = tubes.free_curvature_per_mm
         constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
     constants[kernels.OUTER_RADIUS] = outer.radius_mm
     constants[kernels.INNER_RADIUS] = inner.radius_mm

@@ -104,7 +104,11 @@ def needle_arrivals(
             f"The needle is {needle.length_mm:g} mm long and goes {needle_out_mm:g} mm beyond the tubes",
             expected=f"0 mm or more, and a needle of at least {longest:g} mm",
         )
-    tips = mechanics.batch(base, beta).tip_angles_rad if tip_angles_rad is None else tip_angles_rad
+    tips = (
+        mechanics.batch(base, beta, needle_mm=0.0).tip_angles_rad
+        if tip_angles_rad is None
+        else tip_angles_rad
+    )
     tips = np.array(tips, dtype=np.float64)
     mechanics.check_shifts(beta)
     results = np.zeros((len(beta), kernel.ARRIVAL_COLUMNS))

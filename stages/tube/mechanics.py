@@ -50,8 +50,8 @@ class TubeMechanics(NestedTubes):
     tubes : sequence of Tube
         One or more, the innermost first.
     needle : Tube, optional
-        A straight needle or wire in the innermost tube, of which only the bending stiffness matters.  It may
-        end anywhere; what is of it beyond the tubes is no part of their shape.
+        A straight needle or wire in the innermost tube, of which only the bending stiffness matters.  It ends
+        where that tube does, or anywhere else; what is of it beyond the tubes is no part of their shape.
     step_rad : float
         Steps span at most this angle of the fastest torsional oscillation: a half of it makes errors 16
         times smaller.
@@ -67,7 +67,7 @@ class TubeMechanics(NestedTubes):
     """
 
     def given_tip_angles(
-        self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: float = 0.0
+        self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: float | None = None
     ) -> Equilibrium:
         """Return the equilibrium with given rotations of the tubes' own ends: it always exists.
 
@@ -77,8 +77,9 @@ class TubeMechanics(NestedTubes):
             Rotation of each tube's material at its end against the Bishop frame, not wrapped.
         beta_mm : (n,) float64
             Where the rear ends are: 0 at the front plate, negative behind it.
-        needle_mm : float
-            Where the needle's tip is: at 0 or behind it changes nothing.
+        needle_mm : float, optional
+            Where the needle's tip is: at 0 or behind it changes nothing.  By default it is where the innermost
+            tube's is.
 
         Raises
         ------
@@ -87,14 +88,14 @@ class TubeMechanics(NestedTubes):
             next tube, or a tube ends behind the front plate or ahead of one that it encloses.
         """
         tips, beta = self._joints(tip_angles_rad, "tip angles"), self._shifts(beta_mm)
-        return Equilibrium(self, tips, beta, self._needle(needle_mm, 1)[0])
+        return Equilibrium(self, tips, beta, self._needle(needle_mm, beta[None])[0])
 
     def given_base_angles(
         self,
         base_angles_rad: ArrayLike,
         beta_mm: ArrayLike,
         *,
-        needle_mm: float = 0.0,
+        needle_mm: float | None = None,
         guess_rad: ArrayLike | None = None,
     ) -> Equilibrium:
         """Return an equilibrium with given rotations of the rear ends.
@@ -108,7 +109,7 @@ class TubeMechanics(NestedTubes):
         base_angles_rad : (n,) float64
             Not wrapped: a full turn between tubes is another state.
         beta_mm : (n,) float64
-        needle_mm : float
+        needle_mm : float, optional
             See `given_tip_angles`.
         guess_rad : (n,) float64, optional
             Tip angles to start from, such as those of a configuration nearby; by default the base angles.
@@ -123,7 +124,7 @@ class TubeMechanics(NestedTubes):
         base, beta = self._joints(base_angles_rad, "base angles"), self._shifts(beta_mm)
         tip = base.copy() if guess_rad is None else self._joints(guess_rad, "guess")
         results = np.zeros((1, equilibrium.RESULT_COLUMNS))
-        tips, needle = tip[None].copy(), self._needle(needle_mm, 1)
+        tips, needle = tip[None].copy(), self._needle(needle_mm, beta[None])
         rear = self.rear_ends(beta[None], needle)
         equilibrium.settle_many(self.design, base[None], rear, self.step_rad, True, tips, results)
         if not results[0, equilibrium.CONVERGED]:
@@ -135,13 +136,16 @@ class TubeMechanics(NestedTubes):
             )
         return Equilibrium(self, tips[0], beta, needle[0])
 
-    def batch(self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: ArrayLike = 0.0) -> Batch:
+    def batch(
+        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: ArrayLike | None = None
+    ) -> Batch:
         """Return the equilibria of many configurations; see `given_base_angles`.
 
         Parameters
         ----------
         base_angles_rad, beta_mm : (M, n) float64
-        needle_mm : float or (M,) float64
+        needle_mm : float or (M,) float64, optional
+            See `given_tip_angles`.
 
         Raises
         ------
@@ -159,7 +163,7 @@ class TubeMechanics(NestedTubes):
                 )
         self.check_shifts(beta)
         results = np.zeros((len(base), equilibrium.RESULT_COLUMNS))
-        rear = self.rear_ends(beta, self._needle(needle_mm, len(base)))
+        rear = self.rear_ends(beta, self._needle(needle_mm, beta))
         equilibrium.settle_many(self.design, base, rear, self.step_rad, True, tips, results)
         return Batch(
             tip_angles_rad=read_only(tips),
@@ -178,9 +182,11 @@ class TubeMechanics(NestedTubes):
             )
         return found
 
-    def _needle(self, needle_mm: ArrayLike, count: int) -> Float:
-        """Return where the needle's tip is in each of so many configurations."""
-        found = np.array(np.broadcast_to(np.asarray(needle_mm, dtype=np.float64), (count,)))
+    def _needle(self, needle_mm: ArrayLike | None, beta: Float) -> Float:
+        """Return where the needle's tip is in configurations of rear ends `(M, n)`."""
+        if needle_mm is None:
+            return np.asarray(beta[:, 0] + self.lengths_mm[0])
+        found = np.array(np.broadcast_to(np.asarray(needle_mm, dtype=np.float64), (len(beta),)))
         farthest = 0.0 if self.needle is None else self.needle.length_mm
         if not np.isfinite(found).all() or (found > farthest).any():
             raise SettingsError(

@@ -54,11 +54,20 @@ class Neighbourhood:
     ) -> None:
         self._mechanics, self._tips, self._turned = mechanics, tip_angles_rad, rotations_rad
         self._radii = np.array([tube.radius_mm for tube in mechanics.tubes])
-        self._beta = insertions_mm - mechanics.lengths_mm
+        self._beta = self._rear_ends(insertions_mm)
 
     @classmethod
-    def of(cls, tubes: Sequence[Tube], insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> Neighbourhood:
+    def of(
+        cls,
+        tubes: Sequence[Tube],
+        insertions_mm: ArrayLike,
+        rotations_rad: ArrayLike,
+        *,
+        needle: Tube | None = None,
+    ) -> Neighbourhood:
         """Return that of a deployment which is reached by the sequence `together`.
+
+        A needle's tip stays where that of the innermost tube is.
 
         Raises
         ------
@@ -67,7 +76,8 @@ class Neighbourhood:
         SettingsError
             If the insertions are impossible.
         """
-        mechanics, turned = TubeMechanics(tubes), np.array(rotations_rad, dtype=np.float64)
+        mechanics = TubeMechanics(tubes, needle=needle)
+        turned = np.array(rotations_rad, dtype=np.float64)
         inserted = np.array(insertions_mm, dtype=np.float64)
         deployed = deploy(mechanics, together(tubes, turned + BEND_RAD, inserted), step_rad=math.pi)
         return cls(mechanics, inserted, turned, np.array(deployed.final.tip_angles_rad))
@@ -95,8 +105,8 @@ class Neighbourhood:
                 raise SettingsError(
                     f"The {name} are {values.tolist()}", expected=f"{mechanics.count} finite numbers"
                 )
-        end = out - mechanics.lengths_mm
-        mechanics.check_shifts(end[None])
+        mechanics.check_shifts((out - mechanics.lengths_mm)[None])
+        end = self._rear_ends(out)
         result, tips = np.zeros(kernel.SHAPE_COLUMNS), self._tips.copy()
         room = ROOM
         while True:
@@ -119,3 +129,8 @@ class Neighbourhood:
             least_determinant=float(result[kernel.LEAST]),
             arc_error_mm=float(result[kernel.ERROR]),
         )
+
+    def _rear_ends(self, insertions_mm: Float) -> Float:
+        """Return the rear ends `(b,)` of tubes and needle, mm."""
+        beta = (insertions_mm - self._mechanics.lengths_mm)[None]
+        return np.array(self._mechanics.rear_ends(beta, insertions_mm[:1])[0])

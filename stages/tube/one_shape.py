@@ -31,7 +31,7 @@ WAY_STEP_MM = 2.0
 @lru_cache(maxsize=KEPT)
 def design_arrays(tubes: ConcentricTubes) -> DesignArrays:
     """Return a design and its limits for the kernels."""
-    mechanics = TubeMechanics(tubes.nested)
+    mechanics = TubeMechanics(tubes.nested, needle=tubes.needle_shaft)
     limits = np.zeros(kernel.N_LIMITS)
     limits[kernel.STEP], limits[kernel.STOP] = mechanics.step_rad, WAY_STEP_MM
     limits[kernel.BEND], limits[kernel.MAX_EXTENSION] = BEND_RAD, tubes.max_extension_mm
@@ -63,8 +63,8 @@ def without_limits(design: DesignArrays) -> DesignArrays:
 
 def shape_arrays(design: DesignArrays) -> ShapeArrays:
     """Return arrays with room for any shape of a design."""
-    n = len(design.lengths)
-    room = columns.MOST_ARCS * (1 + n + 2 * len(design.bends))
+    n = len(design.radii)
+    room = columns.MOST_ARCS * (1 + len(design.lengths) + 2 * len(design.bends))
     return ShapeArrays(
         joints=np.zeros(2 * n),
         tips=np.zeros(n),
@@ -129,7 +129,7 @@ def shape_or_reason(design: DesignArrays, insertions_mm: Float, rotations_rad: F
     inserted, limits, result = insertions_mm, design.limits, shape.result
     if inserted[0] > min(limits[kernel.MAX_EXTENSION], design.lengths[0]):
         return TOO_LONG
-    if (-np.diff(inserted) > -np.diff(design.lengths) + SAME_MM).any():
+    if (-np.diff(inserted) > -np.diff(design.lengths[: len(inserted)]) + SAME_MM).any():
         return PROTRUDES
     if inserted[0] == 0.0:
         return STAYS

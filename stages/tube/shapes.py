@@ -169,7 +169,11 @@ class TubeShapes:
 
 
 def tube_shapes(
-    tubes: Sequence[Tube], limits: ShapeLimits | None = None, grid: ShapeGrid | None = None
+    tubes: Sequence[Tube],
+    limits: ShapeLimits | None = None,
+    grid: ShapeGrid | None = None,
+    *,
+    needle: Tube | None = None,
 ) -> TubeShapes:
     """Return all deployments of a design that follow a stable branch of equilibria and keep its limits.
 
@@ -180,6 +184,8 @@ def tube_shapes(
     limits : ShapeLimits, optional
     grid : ShapeGrid, optional
         `ShapeGrid.default` if None.
+    needle : Tube, optional
+        A straight needle whose tip stays where that of the innermost tube is.
 
     Raises
     ------
@@ -194,7 +200,7 @@ def tube_shapes(
             remedy="Leave out tubes, or ask `deploy` for single deployments",
         )
     limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
-    mechanics = TubeMechanics(tubes)
+    mechanics = TubeMechanics(tubes, needle=needle)
     stops = _stops(mechanics, limits, grid)
     states, parents = _states(mechanics, stops)
     rotations = _rotations(mechanics.tubes, grid)

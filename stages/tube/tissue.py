@@ -127,7 +127,7 @@ def held_shape(
             f"Tissue of {tissue_n_mm2:g} N/mm^2 and elements of {element_mm:g} mm",
             expected="a finite stiffness of 0 or more, and elements longer than 0",
         )
-    before = mechanics.given_base_angles(base_angles_rad, beta_mm)
+    before = mechanics.given_base_angles(base_angles_rad, beta_mm, needle_mm=0.0)
     mechanics.given_tip_angles(before.tip_angles_rad, before.beta_mm, needle_mm=needle_mm)
     rear = mechanics.rear_ends(before.beta_mm[None].repeat(2, axis=0), np.array([needle_mm, 0.0]))
     nodes = _nodes(mechanics, rear[0], tissue_from_mm, element_mm)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from anatomy.base.typed import Float
+from anatomy.shafts import SlottedSegment
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.scope_motion import motion_of
 from lungaccess.plans.plan import Plan
@@ -50,7 +51,7 @@ def _strains(tube: Tube, behind_mm: Float, bent: Float, inserted_mm: float) -> I
         passed = bent[behind_mm >= at - inserted_mm - STEP_MM]
         most = float(passed.max(initial=0.0))
         for end in (max(at - STEP_MM, 0.0), at):
-            rest, factor = _bend_at_rest(tube, end), _slots(tube, end)[1]
+            rest, factor = _bend_at_rest(tube, end), slots_at(tube.slotted_segments, end)[1]
             yield 0.5 * tube.outer_diameter_mm * factor * (most + rest)
 
 
@@ -71,9 +72,9 @@ def bent_at_rest(tube: Tube) -> list[tuple[float, float, float]]:
     return [*parts, (begin, np.inf, 0.0)]
 
 
-def _slots(tube: Tube, from_tip_mm: float) -> tuple[float, float]:
-    """Return how stiff and how strained a tube is at a place, as shares of a plain tube's."""
-    for segment in tube.slotted_segments:
+def slots_at(segments: Sequence[SlottedSegment], from_tip_mm: float) -> tuple[float, float]:
+    """Return how stiff and how strained a shaft is at a place, as shares of a plain one's."""
+    for segment in segments:
         if segment.from_tip_mm <= from_tip_mm <= segment.from_tip_mm + segment.length_mm:
             return segment.stiffness_factor, segment.strain_factor
     return 1.0, 1.0
@@ -90,16 +91,23 @@ def _largest_factor(system: System) -> float:
 
 
 def _check_handle(plan: Plan, inserted_mm: tuple[float, ...], found: Findings) -> None:
-    """Section and tubes share the bending moment that the handle sets: it must be set to bend both."""
+    """Section, tubes and needle share the bending moment that the handle sets: it must bend them all."""
     device, tubes = plan.system.scope, plan.system.tubes
     stiffness = device.bending_stiffness_n_mm2
     for tube, inserted in zip(reversed(tubes.nested), inserted_mm, strict=True):
         plain = 1e3 * tube.youngs_modulus_gpa * np.pi / 64.0
         plain *= tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4
         inside = np.append(np.arange(inserted, inserted + device.bending_length_mm, STEP_MM), inserted)
-        stiffness += plain * max(_slots(tube, float(at))[0] for at in inside)
+        stiffness += plain * max(slots_at(tube.slotted_segments, float(at))[0] for at in inside)
+    shaft = plan.system.needle
+    if shaft is not None and plan.system.needle_preloaded:
+        passes = inserted_mm[-1] + shaft.max_length_mm + device.bending_length_mm
+        plain = 1e3 * shaft.youngs_modulus_gpa * np.pi / 64.0
+        plain *= shaft.diameter_mm**4 - shaft.inner_diameter_mm**4
+        places = np.arange(0.0, passes, STEP_MM)
+        stiffness += plain * max(slots_at(shaft.slotted_segments, float(at))[0] for at in places)
     bend = float(plan.scope.states[-1, 2])
     limit = np.deg2rad(device.bend_up_deg if bend >= 0.0 else device.bend_down_deg)
-    detail = "bend that the handle sets so that section and tubes bend as planned"
+    detail = "bend that the handle sets so that section, tubes and needle bend as planned"
     wanted = abs(bend) * stiffness / device.bending_stiffness_n_mm2
     found.at_most("scope.handle", wanted, float(limit), "rad", detail, 1e-6)

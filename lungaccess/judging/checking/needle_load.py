@@ -1,4 +1,4 @@
-"""Own look at what the needle's stiffness does to the tubes that aim it, which plans do not count."""
+"""Own look at what the needle's stiffness does to the tubes that aim it."""
 
 from __future__ import annotations
 
@@ -9,28 +9,58 @@ import numpy as np
 from anatomy.base.errors import LungaccessError
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.poses import angle_between
+from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
+from stages.tube.device import Tube
+from stages.tube.sequences import BEND_RAD
 
 FINDING = "tube.needle_load"
-"""The finding has this name: it states the needle's load on the tubes, which no plan counts."""
+"""The finding has this name: it states what the needle does to the tip of the tubes."""
 STILL_MM = 1e-3
 """A tip that moves less is where the plan states it."""
 
 
 def check_needle_load(plan: Plan, found: Findings) -> None:
-    """Record how far the tubes' tip moves and turns when the needle arrives, if no tissue holds the tubes."""
-    shaft, tubes = plan.system.needle_tube, plan.system.tubes
-    if plan.needle is None or shaft is None:
-        return
-    from stages.tube.casadi_shape import derive_arrival
+    """Record where the tubes' tip is under the needle's load, if no tissue holds the tubes.
 
+    A needle whose tip stays at that of the tubes while they are deployed bends with them, and the stated shape
+    is theirs together; then it must not move them any more while it is inserted.  What of any other needle
+    no plan counts is not checked, and said.
+    """
+    shaft, needle = plan.system.needle_tube, plan.needle
+    if needle is None or shaft is None:
+        return
     try:
-        before, arrived = derive_arrival(
-            tubes.nested, shaft, plan.tube.rotations_rad(tubes)[::-1], plan.tube.insertions_mm(tubes)[::-1]
-        )
+        if plan.system.needle_preloaded:
+            _check_inserted(plan, needle, shaft, found)
+        else:
+            _say_neglected(plan, shaft, found)
     except LungaccessError as error:
         found.unchecked(FINDING, f"no shape was found with the needle in the tubes: {error}")
-        return
+
+
+def _check_inserted(plan: Plan, needle: NeedlePath, shaft: Tube, found: Findings) -> None:
+    """The tip is where it is stated when the needle is inserted, too."""
+    from stages.tube.casadi_statics import derive_loaded
+
+    tube, tubes = plan.tube, plan.system.tubes.nested
+    turned = np.array(tube.rotations_rad(plan.system.tubes))[::-1] + BEND_RAD
+    out = np.array(tube.insertions_mm(plan.system.tubes))[::-1]
+    beta = out - [each.length_mm for each in tubes]
+    loaded = derive_loaded(tubes, shaft, turned, beta, float(out[0] + needle.length_mm))
+    stated = np.linalg.solve(plan.scope.lps_from_scope_tip, tube.lps_from_tip)
+    off_mm = float(np.linalg.norm(loaded.base_from_tip[:3, 3] - stated[:3, 3]))
+    detail = "from the stated tip of the tubes to that under the load of the inserted needle"
+    found.at_most(FINDING, off_mm, 0.0, "mm", detail, STILL_MM)
+
+
+def _say_neglected(plan: Plan, shaft: Tube, found: Findings) -> None:
+    from stages.tube.casadi_shape import derive_arrival
+
+    tubes = plan.system.tubes
+    before, arrived = derive_arrival(
+        tubes.nested, shaft, plan.tube.rotations_rad(tubes)[::-1], plan.tube.insertions_mm(tubes)[::-1]
+    )
     shift_mm = float(np.linalg.norm(arrived[:3, 3] - before[:3, 3]))
     turn_rad = float(angle_between(arrived[:3, 2], before[:3, 2]))
     detail = (

@@ -9,6 +9,7 @@ import numpy as np
 
 from anatomy.base.errors import LungaccessError
 from anatomy.base.typed import Float
+from lungaccess.judging.checking.channel import slots_at
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.poses import ANGLE_TOLERANCE_RAD, angle_between
 from lungaccess.judging.checking.shapes import Curve, distance_to_polyline, radius_at
@@ -49,7 +50,10 @@ def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
     ):
         return None
     try:
-        derived = derive_shape(tubes.nested, tube.rotations_rad(tubes)[::-1], tube.insertions_mm(tubes)[::-1])
+        derived = derive_shape(
+            tubes.nested, tube.rotations_rad(tubes)[::-1], tube.insertions_mm(tubes)[::-1],
+            needle=plan.system.needle_tube if plan.system.needle_preloaded else None,
+        )  # fmt: skip
     except LungaccessError as error:
         found.true("tube.stable", False, str(error))
         return None
@@ -106,6 +110,7 @@ def _replay(plan: Plan, derived: DerivedShape, found: Findings) -> float:
 def _check_strain(plan: Plan, derived: DerivedShape, found: Findings) -> None:
     """Where several tubes lie in each other, each is bent away from its rest by the others."""
     tubes, inserted = plan.system.tubes.nested, plan.tube.insertions_mm(plan.system.tubes)[::-1]
+    needle = plan.system.needle_tube if plan.system.needle_preloaded else None
     straight = np.column_stack([np.zeros(len(derived.arc_lengths_mm)), derived.relative_rad])
     worst = max(curvature * _strained_mm(tube) for tube in tubes for _, _, curvature, _ in _pieces(tube))
     for (begin, end), angles in zip(
@@ -114,13 +119,15 @@ def _check_strain(plan: Plan, derived: DerivedShape, found: Findings) -> None:
         middle, here = 0.5 * (begin + end), []
         for tube, out_mm, angle in zip(tubes, inserted, angles.tolist(), strict=True):
             if middle < out_mm and end > begin:
-                here.append((tube, _rest(tube, out_mm - middle, angle)))
+                here.append((tube, _rest(tube, out_mm - middle, angle), _stiffness(tube, out_mm - middle)))
         if not here:
             continue
-        stiffness = [_stiffness(tube) for tube, _ in here]
-        shared = sum(e * rest for e, (_, rest) in zip(stiffness, here, strict=True)) / sum(stiffness)
+        total = sum(stiffness for *_, stiffness in here)
+        if needle is not None:
+            total += _stiffness(needle, inserted[0] - middle)
+        shared = sum(stiffness * rest for _, rest, stiffness in here) / total
         worst = max(
-            worst, *(_strained_mm(tube) * float(np.linalg.norm(shared - rest)) for tube, rest in here)
+            worst, *(_strained_mm(tube) * float(np.linalg.norm(shared - rest)) for tube, rest, _ in here)
         )
     detail = "largest strain of the tube material"
     found.at_most("tube.strain", worst, plan.system.tubes.max_strain, "", detail)
@@ -146,9 +153,10 @@ def _rest(tube: Tube, from_tip_mm: float, angle_rad: float) -> Float:
     return np.zeros(2)
 
 
-def _stiffness(tube: Tube) -> float:
-    """Return the bending stiffness of a tube up to a factor that all tubes share."""
-    return tube.youngs_modulus_gpa * (tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4)
+def _stiffness(tube: Tube, from_tip_mm: float) -> float:
+    """Return the bending stiffness of a tube at a place, up to a factor that all tubes share."""
+    factor = slots_at(tube.slotted_segments, from_tip_mm)[0]
+    return factor * tube.youngs_modulus_gpa * (tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4)
 
 
 def _strained_mm(tube: Tube) -> float:

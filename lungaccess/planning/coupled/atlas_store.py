@@ -110,6 +110,7 @@ def _depends_on(
         "lung": lung.key,
         "scope": to_mapping(system.scope),
         "tubes": to_mapping(system.tubes),
+        "needle": None if system.tubes.needle_shaft is None else to_mapping(system.tubes.needle_shaft),
         "margins": to_mapping(system.margins),
         "shapes": shapes_digest(system.tubes),
         "with_fissures": fissures_are_obstacles(lung, system),

@@ -246,7 +246,7 @@ def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Ite
         if bound.settled or search.incumbent.step is None:
             continue
         for tip, rotation, outer, inner in bound.lowest:
-            made = deployed(design, [inner, outer][: len(design.lengths)], np.zeros(len(design.lengths)))
+            made = deployed(design, [inner, outer][: len(design.radii)], np.zeros(len(design.radii)))
             if made is None:
                 continue
             scope_tip = search.atlas.motions.tip(tip)

@@ -29,15 +29,16 @@ def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] |
     SettingsError, FileError
         As `stages.tube.open_shapes`.
     """
-    limits = ShapeLimits()
+    limits, needle = ShapeLimits(), None
     if isinstance(device, System):
         stated = device.tubes
+        needle = stated.needle_shaft
         limits = ShapeLimits(
             max_extension_mm=stated.max_extension_mm,
             max_lateral_sweep_mm=stated.max_lateral_sweep_mm,
             max_strain=stated.max_strain,
         )
-    return open_shapes(tubes_of(device), limits, cache=cache)
+    return open_shapes(tubes_of(device), limits, needle=needle, cache=cache)
 
 
 def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:

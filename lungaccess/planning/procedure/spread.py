@@ -136,7 +136,7 @@ def sizes(system: System, left: Residuals, errors: ErrorModel, aside_mm: float) 
 
 def bend_per_mm(system: System) -> float:
     """Return the curvature with which the inner tube bends on as it goes farther; 0 where it is not one."""
-    return float(system.tubes.inner.precurvature_per_mm) if system.tubes.planar else 0.0
+    return system.tubes.free_curvature_per_mm if system.tubes.planar else 0.0
 
 
 def _below(standard: Float) -> Float:

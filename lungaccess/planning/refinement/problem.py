@@ -122,7 +122,7 @@ class Problem:
             arcs=arcs,
             with_map=weights.mapped > 0.0,
             weighs_tubes=weights.tubes > 0.0,
-            tubes=len(design.lengths),
+            tubes=len(design.radii),
             turned=int(design.turned.sum()),
         )
         self.axis = LocalAxis(evaluator.tip_rows, candidate.tip)

@@ -61,7 +61,7 @@ class ShapeModel:
     ) -> None:
         self._design, self._shape, self._most_mm = design, shape, most_mm
         self.centre = joints_of(design, shape)
-        self._steps = np.where(np.arange(len(self.centre)) < len(design.lengths), INSERTED_MM, TURNED_RAD)
+        self._steps = np.where(np.arange(len(self.centre)) < len(design.radii), INSERTED_MM, TURNED_RAD)
         self.lower, self.upper = self.centre - self._steps, self.centre + self._steps
         count = len(self.centre)
         self.matrix = np.zeros((N_FEATURES, 1 + count + count * (count + 1) // 2))
@@ -91,7 +91,7 @@ class ShapeModel:
             self.matrix[:, 1:] = fitted.T / scale
 
     def _shape_at(self, design: DesignArrays, joints: Float) -> TubeShape | None:
-        n = len(design.lengths)
+        n = len(design.radii)
         inserted, turned = np.clip(joints[:n], 0.0, self._most_mm), np.array(self._shape.rotations_rad)
         inserted = np.minimum.accumulate(np.maximum(inserted, SHORTEST_MM * (np.arange(n) == n - 1))[::-1])
         turned[design.turned] = joints[n:]

@@ -212,7 +212,7 @@ def _tube_tips(plan: Plan, inserted_mm: Float) -> Float:
     turned = np.array(tube.rotations_rad(tubes))[::-1] - tube.rotation_rad
     around = None
     for n, row in enumerate(inserted_mm):
-        around = around or Neighbourhood.of(tubes.nested, row[::-1], turned)
+        around = around or Neighbourhood.of(tubes.nested, row[::-1], turned, needle=tubes.needle_shaft)
         found = around.at(row[::-1], turned)
         if found is None:
             raise SettingsError("The tubes of the plan snap on the way", remedy="Run `lungaccess check`")

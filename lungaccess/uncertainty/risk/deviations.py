@@ -219,7 +219,7 @@ def _tube_values(tubes: ConcentricTubes, tube: TubeDeployment | Deployed) -> Flo
             tubes.max_inner_protrusion_mm,
             tubes.inner.curved_length_mm,
             tubes.overlap_curvature_per_mm,
-            tubes.inner.precurvature_per_mm,
+            tubes.free_curvature_per_mm,
             tubes.outermost.radius_mm + tube.lateral_sweep_mm,
             tubes.inner.radius_mm + tube.lateral_sweep_mm,
             outer_longest,

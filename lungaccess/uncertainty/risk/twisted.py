@@ -33,7 +33,9 @@ def twisted_shapes(plan: Plan, insertion_mm: Float, relative_rad: Float) -> tupl
     n = len(inserted)
     out = _within_limits(inserted + insertion_mm, lengths, tubes.max_extension_mm)
     joints, which = np.unique(np.hstack([out, relative_rad]), axis=0, return_inverse=True)
-    around = Neighbourhood.of(tubes.nested, inserted[::-1], turned[::-1] - tube.rotation_rad)
+    around = Neighbourhood.of(
+        tubes.nested, inserted[::-1], turned[::-1] - tube.rotation_rad, needle=tubes.needle_shaft
+    )
     shapes = []
     for each in joints:
         lengths_mm, angles = each[:n], turned - tube.rotation_rad + each[n:]

@@ -54,7 +54,7 @@ def _change(design, near, shape, want_aside, want_ahead, change):
 
     Where the tip goes with each joint is seen from the frames of the mechanics, which change smoothly.
     """
-    n = design.lengths.shape[0]
+    n = design.radii.shape[0]
     here = near.result[TIP + 9 :]
     aside = math.hypot(here[0], here[1])
     if aside == 0.0:
@@ -117,7 +117,7 @@ def aim_shape(design, near, shape, base, target):
     allowed : bool
         Whether the way to the shape keeps all limits of the design.
     """
-    n = design.lengths.shape[0]
+    n = design.radii.shape[0]
     want_aside, want_ahead, towards = _seen_from(base, target)
     change = np.zeros(2 * n)
     aside, ahead, direction = _tip(near)

@@ -29,6 +29,7 @@ from stages.tube.kernels.shapes import (
     lay_out,
     lay_untwisted,
     reach,
+    rear_ends,
     twists,
 )
 from stages.tube.kernels.sweep import sweep_of
@@ -44,7 +45,7 @@ class DesignArrays(NamedTuple):
     Parameters
     ----------
     stiffness, lengths, bends
-        See `assembly`.
+        See `assembly`; a body after the tubes is a straight needle, whose tip is that of the innermost tube.
     radii, strained : (n,) float64
         See `shapes.follow_all`.
     turned : (n,) bool
@@ -106,7 +107,7 @@ class ManyShapes(NamedTuple):
 @inner_kernel
 def in_order(design, joints):
     """Tell whether tubes and their rear ends are in order and none is too far out."""
-    n, lengths = design.lengths.shape[0], design.lengths
+    n, lengths = design.radii.shape[0], design.lengths
     for i in range(n):
         if joints[i] < 0.0 or joints[i] > min(lengths[i], design.limits[MAX_EXTENSION]):
             return False
@@ -124,7 +125,7 @@ def near_shape(design, near, shape):
 
     Returns whether there is such a shape; neither its sweep nor its strain is judged.
     """
-    n = design.lengths.shape[0]
+    n = design.radii.shape[0]
     if not in_order(design, shape.joints):
         return False
     if not twists(design.bends):
@@ -133,8 +134,8 @@ def near_shape(design, near, shape):
     shape.tips[:] = near.tips
     shape.number[0] = arcs_near(
         (design.stiffness, design.lengths, design.bends), design.radii, near.joints[n:] + design.limits[BEND],
-        near.joints[:n] - design.lengths, shape.joints[n:] - near.joints[n:],
-        shape.joints[:n] - design.lengths, design.limits[STEP], shape.tips, shape.result, shape.arcs,
+        rear_ends(design.lengths, near.joints[:n]), shape.joints[n:] - near.joints[n:],
+        rear_ends(design.lengths, shape.joints[:n]), design.limits[STEP], shape.tips, shape.result, shape.arcs,
     )  # fmt: skip
     return shape.number[0] > 0
 
@@ -142,12 +143,12 @@ def near_shape(design, near, shape):
 @inner_kernel
 def _fill_untwisted(design, shape):
     """Fill a shape of tubes that do not twist each other at its joints, but for its sweep."""
-    n, result = design.lengths.shape[0], shape.result
+    n, result = design.radii.shape[0], shape.result
     arrays = design.stiffness, design.lengths, design.bends
     shape.tips[:] = shape.joints[n:] + design.limits[BEND]
     result[LEAST], result[STRAIN] = 1.0, _strain_at_rest(design)
     shape.number[0] = lay_untwisted(
-        arrays, design.radii, design.strained, shape.tips, shape.joints[:n] - design.lengths,
+        arrays, design.radii, design.strained, shape.tips, rear_ends(design.lengths, shape.joints[:n]),
         design.limits[STEP], result, shape.arcs,
     )  # fmt: skip
 
@@ -157,7 +158,8 @@ def _strain_at_rest(design):
     """Return the largest strain of the tubes held straight in the scope."""
     worst = 0.0
     for b in range(design.bends.shape[0]):
-        worst = max(worst, design.strained[int(design.bends[b, 0])] * design.bends[b, 3])
+        if design.bends[b, 3] > 0.0:
+            worst = max(worst, design.strained[int(design.bends[b, 0])] * design.bends[b, 3])
     return worst
 
 
@@ -171,7 +173,7 @@ def whole_way(design, shape):
     joints, result, lengths = shape.joints, shape.result, design.lengths
     if not in_order(design, joints):
         return False
-    n = lengths.shape[0]
+    n = design.radii.shape[0]
     arrays = design.stiffness, lengths, design.bends
     if design.planar.shape[0] > 0:
         _fill_untwisted(design, shape)
@@ -184,14 +186,14 @@ def whole_way(design, shape):
     states = np.arange(steps_out + 1).reshape(-1, 1)
     bodies = np.zeros((steps_out + 1, steps_out + 1, 3))
     found, angles, rates = np.zeros((len(stops), 12)), np.zeros((len(stops), n)), np.zeros((len(stops), n))
-    places = np.zeros((2 * MOST_ARCS * (1 + n + 2 * design.bends.shape[0]), 4))
+    places = np.zeros((2 * MOST_ARCS * (1 + lengths.shape[0] + 2 * design.bends.shape[0]), 4))
     scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
     shape.tips[:] = base
     result[:] = 0.0
     result[LEAST], result[EXTENSION], result[STRAIN] = 1.0, joints[0], _strain_at_rest(design)
-    begin = -lengths
+    begin = rear_ends(lengths, still)
     for k in range(1, steps_out + 1):
-        end = np.minimum(stops[k], joints[:n]) - lengths
+        end = rear_ends(lengths, np.minimum(stops[k], joints[:n]))
         least, cutting, nodes, steps = reach(arrays, base, still, begin, end, design.limits[STEP], shape.tips)
         result[LEAST] = min(result[LEAST], least)
         if least <= 0.0:

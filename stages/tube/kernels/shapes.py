@@ -62,6 +62,15 @@ def _largest(one, other):
 
 
 @inner_kernel
+def rear_ends(lengths, insertions):
+    """Return where the rear ends of all bodies are: straight ones in the tubes end where the innermost does."""
+    found = insertions[0] - lengths
+    for i in range(insertions.shape[0]):
+        found[i] = insertions[i] - lengths[i]
+    return found
+
+
+@inner_kernel
 def reach(design, base, turn, begin, end, step, tip_angles):
     """Follow a branch of stable equilibria to rear ends at `end`, turned on by `turn`, in steps as needed.
 
@@ -227,8 +236,7 @@ def lay_untwisted(design, radii, strained, base, beta, step, result, arcs):
 
     Raises the strain of `result` to that of the shape where it is less, and fills its error, length and tip.
     """
-    _stiffness, lengths, _bends = design
-    n = lengths.shape[0]
+    lengths, n = design[1], radii.shape[0]
     pieces, moments, directions = cutting_scratch(design, n)
     count, _steps = cut(design, beta, step, pieces, moments, directions)
     pose, across = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
@@ -322,13 +330,14 @@ def follow_all(
     bodies = np.zeros((n_states, n_stops, 3))
     still = np.zeros(n)
     found, angles, rates = np.zeros((n_stops, 12)), np.zeros((n_stops, n)), np.zeros((n_stops, n))
-    places = np.zeros((2 * MOST_ARCS * (1 + n + 2 * design[2].shape[0]), 4))
+    places = np.zeros((2 * MOST_ARCS * (1 + design[1].shape[0] + 2 * design[2].shape[0]), 4))
     scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
     tips[0] = base_angles
     results[0] = 0.0
     results[0, LEAST] = 1.0
     for b in range(design[2].shape[0]):
-        results[0, STRAIN] = max(results[0, STRAIN], strained[int(design[2][b, 0])] * design[2][b, 3])
+        if design[2][b, 3] > 0.0:
+            results[0, STRAIN] = max(results[0, STRAIN], strained[int(design[2][b, 0])] * design[2][b, 3])
     for m in (0, 4, 8):
         results[0, TIP + m] = 1.0
     sagitta = 0.0
@@ -340,7 +349,8 @@ def follow_all(
         results[state, EXTENSION] = stops[states[state, 0]]
         if results[parent, LEAST] <= 0.0:
             continue
-        begin, end = stops[states[parent]] - design[1], stops[states[state]] - design[1]
+        begin = rear_ends(design[1], stops[states[parent]])
+        end = rear_ends(design[1], stops[states[state]])
         tips[state] = tips[parent]
         least, cutting, nodes, steps = reach(design, base_angles, still, begin, end, step, tips[state])
         results[state, LEAST] = min(results[parent, LEAST], least)
@@ -377,11 +387,13 @@ def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, ar
     ----------
     design, radii, step
         See `follow_all`.
-    base, beta, tip_angles : (n,) float64
-        Rotation and place of the rear ends, and angles at the own ends, of the deployment nearby; the last
-        are changed to those of the new one.
-    turn, end : (n,) float64
-        By how much the rear ends turn on, and where they are then.
+    base, tip_angles : (n,) float64
+        Rotation of the rear ends and angles at the own ends of the deployment nearby; the last are changed to
+        those of the new one.
+    beta, end : (b,) float64
+        Where the rear ends are, and where they are then.
+    turn : (n,) float64
+        By how much the rear ends turn on.
     result : (SHAPE_COLUMNS,) float64
         Is filled: the least determinant from there on, the error of the arcs, the length and the tip.
     arcs : (rows, ARC_COLUMNS) float64
@@ -400,7 +412,7 @@ def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, ar
     poses = np.zeros((steps[0].shape[0] + 1, 12))
     lay(cutting, nodes, steps, poses)
     result[TIP:] = poses[-1]
-    places = np.zeros((2 * MOST_ARCS * (1 + n + 2 * design[2].shape[0]), 4))
+    places = np.zeros((2 * MOST_ARCS * (1 + design[1].shape[0] + 2 * design[2].shape[0]), 4))
     scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
     number, error = lay_out(design, radii, end, cutting, nodes, steps, poses, arcs, 0, places, scratch)
     result[ERROR] = error

@@ -101,7 +101,7 @@ def _needle_clear(needle, pose, vias, count, target, branch):
 @merged_kernel
 def _shape_nearby(design, near, shape, x):
     """Fill `shape` with that of a choice; return whether there is one, and whether it is the one nearby."""
-    n = design.lengths.shape[0]
+    n = design.radii.shape[0]
     same = True
     for i in range(n):
         shape.joints[i] = x[INSERTED + n - 1 - i]

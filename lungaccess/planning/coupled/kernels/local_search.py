@@ -65,7 +65,7 @@ def _add_via(vias, count, start, target, spread, state):
 @inner_kernel
 def _vary_tubes(design, x, spread, state):
     """Change rotation and insertions, and how the tubes are turned beside it where that changes the shape."""
-    n = design.lengths.shape[0]
+    n = design.radii.shape[0]
     if uniform(state) < EACH_SHARE:
         x[ROTATION] += ROTATION_SPREAD_RAD * spread * _normal(state)
     for m in range(INSERTED, INSERTED + n):
@@ -167,7 +167,7 @@ def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, s
 def _draw(design, near, shapes, row, rotation, spreads, x, state):
     """Draw a choice near a deployment with a rotation, and near its shape."""
     x[ROTATION] = rotation + spreads[0] * (2.0 * uniform(state) - 1.0)
-    n = design.lengths.shape[0]
+    n = design.radii.shape[0]
     take_member(near, shapes, row)
     for m in range(2 * n):
         x[INSERTED + m] = near.joints[n - 1 - m if m < n else 3 * n - 1 - m]

@@ -153,7 +153,8 @@ def _shapes_lps(plan: Plan, inner_mm: Float) -> list[Float]:
     inserted = np.array(tube.insertions_mm(tubes))[::-1]
     turned = np.array(tube.rotations_rad(tubes))[::-1] - tube.rotation_rad
     shapes = [np.repeat(pose[None, :3, 3], TUBE_POINTS, axis=0)]
-    around = Neighbourhood.of(tubes.nested, np.minimum(inserted, inner_mm[1]), turned)
+    first = np.minimum(inserted, inner_mm[1])
+    around = Neighbourhood.of(tubes.nested, first, turned, needle=tubes.needle_shaft)
     for out_mm in inner_mm[1:].tolist():
         found = around.at(np.minimum(inserted, out_mm), turned)
         if found is None:

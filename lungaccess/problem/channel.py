@@ -20,7 +20,7 @@ def bend_factor(system: System, *insertions_mm: float) -> float:
 
 
 def bends_with_tubes_rad(system: System) -> tuple[float, float]:
-    """Return the bends farthest down (0 or negative) and up that the section keeps with tubes and needle in it, rad.
+    """Return the bends farthest down (0 or negative) and up that the section keeps, filled, in rad.
 
     They hold for every insertion: for each tube the stiffest part counts that may come to lie in the section.
     The handle bends an empty section up to `bend_down_deg` and `bend_up_deg`.

@@ -130,7 +130,7 @@ class System:
         return self.needle_tube if self.needle_preloaded else None
 
     def _check_shaft(self) -> None:
-        """What slides through bent tubes while the needle is inserted must be alike, or their shape changes."""
+        """What slides through bent tubes while the needle is inserted must be alike, or they move."""
         shaft = self.needle_tube
         if shaft is None:
             return
@@ -141,9 +141,9 @@ class System:
             raise impossible(
                 "needle.slotted_segments",
                 len(shaft.slotted_segments),
-                f"none, or one from the tip on of at least {slides_mm:g} mm, where needle_preloaded is true: so "
-                "much of the shaft comes to lie in bent tubes, and where its stiffness changes the tubes would "
-                "move while it is inserted",
+                f"none, or one from the tip on of at least {slides_mm:g} mm, where needle_preloaded is true: "
+                "so much of the shaft comes to lie in bent tubes, and where its stiffness changes the tubes "
+                "would move while it is inserted",
             )
 
     @property

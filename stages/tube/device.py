@@ -173,7 +173,8 @@ class ConcentricTubes:
     only the inner tube is bent, by one arc, the tubes bend in one plane and their shape has a closed form;
     any other design is turned tube by tube, and its shapes follow from the mechanics.
     A straight needle whose tip stays at that of the inner tube while they are deployed bends with them
-    (`with_needle`).  The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
+    (`with_needle`).
+    The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
     perpendicular; the extension counts along the tubes.  In the worst case the working channel bends the tube
     that it holds against its precurvature.  Where no largest curvature of the channel is stated, it is what
     `max_strain` allows.

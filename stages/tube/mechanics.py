@@ -78,8 +78,8 @@ class TubeMechanics(NestedTubes):
         beta_mm : (n,) float64
             Where the rear ends are: 0 at the front plate, negative behind it.
         needle_mm : float, optional
-            Where the needle's tip is: at 0 or behind it changes nothing.  By default it is where the innermost
-            tube's is.
+            Where the needle's tip is: at 0 or behind it changes nothing.  By default it is where that of the
+            innermost tube is.
 
         Raises
         ------

@@ -135,7 +135,8 @@ def near_shape(design, near, shape):
     shape.number[0] = arcs_near(
         (design.stiffness, design.lengths, design.bends), design.radii, near.joints[n:] + design.limits[BEND],
         rear_ends(design.lengths, near.joints[:n]), shape.joints[n:] - near.joints[n:],
-        rear_ends(design.lengths, shape.joints[:n]), design.limits[STEP], shape.tips, shape.result, shape.arcs,
+        rear_ends(design.lengths, shape.joints[:n]), design.limits[STEP], shape.tips, shape.result,
+        shape.arcs,
     )  # fmt: skip
     return shape.number[0] > 0
 

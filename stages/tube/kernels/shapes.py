@@ -63,7 +63,7 @@ def _largest(one, other):
 
 @inner_kernel
 def rear_ends(lengths, insertions):
-    """Return where the rear ends of all bodies are: straight ones in the tubes end where the innermost does."""
+    """Return where the rear ends of all bodies are; straight ones in the tubes end with the innermost."""
     found = insertions[0] - lengths
     for i in range(insertions.shape[0]):
         found[i] = insertions[i] - lengths[i]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from experiments.support.mutants import channel, motion, place, record, scope, tissue, twisted
+from experiments.support.mutants import channel, load, motion, place, record, scope, tissue, twisted
 from experiments.support.mutants.draws import Rng
 from experiments.support.mutants.mutant import Case, Mutant, Mutation
 
 MUTATIONS: dict[str, Mutation] = {
     mutation.__name__: mutation
-    for family in (record, scope, channel, motion, twisted, place, tissue)
+    for family in (record, scope, channel, load, motion, twisted, place, tissue)
     for mutation in family.MUTATIONS
 }
 

@@ -40,7 +40,7 @@ def shape_of_another_equilibrium(case: Case, rng: Rng) -> Mutant | None:
     tube, tubes = case.plan.tube, case.plan.system.tubes
     inserted = np.array(tube.insertions_mm(tubes))[::-1]
     turned = np.array(tube.rotations_rad(tubes))[::-1] - tube.rotation_rad
-    other = Neighbourhood.of(tubes.nested, inserted, turned).at(
+    other = Neighbourhood.of(tubes.nested, inserted, turned, needle=tubes.needle_shaft).at(
         inserted, turned + np.append(0.0, np.full(len(turned) - 1, signed(rng, 0.05, 1.0)))
     )
     if other is None:
@@ -82,7 +82,9 @@ def _moves(plan: Plan, mutant: Plan) -> bool:
             np.array(values)[::-1]
             for values in (each.tube.insertions_mm(tubes), each.tube.rotations_rad(tubes))
         )
-        found = Neighbourhood.of(tubes.nested, inserted, turned).at(inserted, turned)
+        found = Neighbourhood.of(tubes.nested, inserted, turned, needle=tubes.needle_shaft).at(
+            inserted, turned
+        )
         if found is None:
             return True
         tips.append(found.scope_from_tip[:3, 3])

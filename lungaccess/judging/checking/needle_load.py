@@ -23,9 +23,9 @@ STILL_MM = 1e-3
 def check_needle_load(plan: Plan, found: Findings) -> None:
     """Record where the tubes' tip is under the needle's load, if no tissue holds the tubes.
 
-    A needle whose tip stays at that of the tubes while they are deployed bends with them, and the stated
-    shape is theirs together; then it must not move them any more while it is inserted.  What of any other needle
-    no plan counts is not checked, and said.
+    A needle whose tip stays at that of the tubes while they are deployed bends with them: the stated shape is
+    theirs together, and it must not move them any more while it is inserted.  What any other needle does is
+    counted by no plan, is not checked here, and is said.
     """
     shaft, needle = plan.system.needle_tube, plan.needle
     if needle is None or shaft is None:

@@ -201,3 +201,29 @@ def test_documentation_names_every_key() -> None:
         return set(mapping).union(*nested)
 
     assert not {key for key in keys(to_mapping(load_system("lung-default"))) if f"`{key}`" not in page}
+
+
+def test_a_needle_that_lies_in_the_tubes_while_they_are_deployed_belongs_to_them() -> None:
+    """The tubes know its shaft, files state it once, and systems of the time before have none."""
+    segment = {"length_mm": 250.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
+    changes = {"name": "own", "needle_preloaded": True, "needle.slotted_segments": (segment,)}
+    plain = override(load_system("tight-inner"), {"name": "own", "needle_preloaded": False})
+    system = override(plain, changes)
+    assert system.tubes.needle_shaft == system.needle_tube
+    assert plain.tubes.needle_shaft is None
+    assert system.tubes != plain.tubes
+    assert to_mapping(system)["tubes"] == to_mapping(plain)["tubes"]
+    assert "needle_preloaded" not in to_mapping(plain)
+    assert parse(System, to_mapping(system), "again") == system
+    assert replace(system, needle_preloaded=False).tubes.needle_shaft is None
+    with pytest.raises(SettingsError, match="needle_shaft is not a setting"):
+        override(plain, {"tubes.needle_shaft": None})
+
+
+def test_what_slides_through_bent_tubes_must_be_alike() -> None:
+    system = override(load_system("tight-inner"), {"name": "own", "needle_preloaded": True})
+    curved_mm, most_mm = system.tubes.inner.curved_length_mm, system.needle.max_length_mm
+    segment = {"length_mm": curved_mm + most_mm, "stiffness_factor": 0.1, "strain_factor": 0.75}
+    override(system, {"needle.slotted_segments": (segment,)})
+    with pytest.raises(SettingsError, match=f"at least {curved_mm + most_mm:g} mm"):
+        override(system, {"needle.slotted_segments": ({**segment, "length_mm": 150.0},)})

@@ -30,6 +30,6 @@ def pieces(tubes: ConcentricTubes, outer: float, inner: float) -> list[tuple[flo
         (0.0, min(straight, outer), 0.0, radii[0]),
         (min(straight, outer), outer, tubes.overlap_curvature_per_mm, radii[0]),
         (outer, max(straight, outer), 0.0, radii[1]),
-        (max(straight, outer), inner, tubes.inner.precurvature_per_mm, radii[1]),
+        (max(straight, outer), inner, tubes.free_curvature_per_mm, radii[1]),
     )
     return [piece for piece in every if piece[1] > piece[0]]

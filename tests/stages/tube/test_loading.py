@@ -11,9 +11,24 @@ from scipy.spatial.transform import Rotation
 
 from anatomy.base.errors import SettingsError
 from anatomy.shafts import SlottedSegment
-from stages.tube import bending_section, needle_arrivals
+from stages.tube import (
+    BEND_RAD,
+    Neighbourhood,
+    ShapeGrid,
+    ShapeLimits,
+    TubeMechanics,
+    bending_section,
+    deploy,
+    deployed,
+    design_arrays,
+    needle_arrivals,
+    together,
+    tube_shapes,
+)
+from stages.tube.casadi_shape import derive_shape
 from stages.tube.device import Tube
-from stages.tube.mechanics import TubeMechanics
+from stages.tube.kernels.shapes import TIP
+
 from tests.stages.tube.pairs import WIDE
 
 INNER, OUTER = WIDE.inner, WIDE.outer
@@ -178,3 +193,49 @@ def test_needles_that_are_not_there_or_too_short_are_refused() -> None:
         needle_arrivals(mechanics, [[0.0, 0.0]], beta, 800.0)
     with pytest.raises(SettingsError, match="at most 830"):
         mechanics.given_base_angles([0.0, 0.0], beta[0], needle_mm=831.0)
+
+
+SHAFT = replace(NEEDLE, slotted_segments=(replace(SLOTS, length_mm=250.0),))
+
+
+@pytest.mark.parametrize(("outer_mm", "inner_mm"), [(0.0, 30.0), (10.0, 38.0), (25.0, 25.0)])
+def test_planar_tubes_are_deployed_with_their_needle_as_stiffness_shares_the_bend(
+    outer_mm: float, inner_mm: float
+) -> None:
+    stiff, outer = (float(tube.parts.stiffness_n_mm2[0]) for tube in (INNER, OUTER))
+    soft = 0.04 * NEEDLE.bending_stiffness_n_mm2
+    tubes, moment = WIDE.with_needle(SHAFT), INNER.precurvature_per_mm * stiff
+    assert tubes.overlap_curvature_per_mm == pytest.approx(moment / (stiff + outer + soft), rel=1e-12)
+    assert tubes.free_curvature_per_mm == pytest.approx(moment / (stiff + soft), rel=1e-12)
+    made = deployed(design_arrays(tubes), [inner_mm, outer_mm], [0.0, 0.0])
+    assert made is not None
+    expected = [
+        (length, kappa)
+        for length, kappa in (
+            (outer_mm, moment / (stiff + outer + soft)), (inner_mm - outer_mm, moment / (stiff + soft)),
+        )
+        if length > 0.0
+    ]  # fmt: skip
+    assert made.arcs[: made.number[0], [0, 2]] == pytest.approx(np.array(expected), rel=1e-12)
+    derived = derive_shape(tubes.nested, [0.0, 0.0], [inner_mm, outer_mm], needle=SHAFT)
+    assert derived.base_from_tip[:3, 3] == pytest.approx(made.result[TIP + 9 :], abs=2e-6)
+
+
+def test_twisted_tubes_are_followed_with_their_needle_by_every_road() -> None:
+    turned, inserted = np.array([0.0, 1.1]), np.array([40.0, 24.0])
+    limits = ShapeLimits(max_lateral_sweep_mm=20.0, max_extension_mm=40.0)
+    shapes = tube_shapes(TWISTED, limits, ShapeGrid(stop_mm=8.0, rotations=6), needle=THIN)
+    alone = tube_shapes(TWISTED, limits, ShapeGrid(stop_mm=8.0, rotations=6))
+    rows = np.flatnonzero((shapes.insertions_mm == [40.0, 24.0]).all(axis=1))
+    assert len(rows)
+    for m in rows.tolist():
+        derived = derive_shape(TWISTED, shapes.rotations_rad[m], shapes.insertions_mm[m], needle=THIN)
+        assert derived.base_from_tip[:3, 3] == pytest.approx(shapes.scope_from_tip[m, :3, 3], abs=1e-5)
+        assert derived.relative_rad.shape[1] == 1
+    assert np.abs(shapes.scope_from_tip[:, :3, 3] - alone.scope_from_tip[:, :3, 3]).max() > 0.1
+    around = Neighbourhood.of(TWISTED, inserted, turned, needle=THIN).at(inserted, turned)
+    way = deploy(TubeMechanics(TWISTED, needle=THIN), together(TWISTED, turned + BEND_RAD, inserted)).final
+    assert around is not None
+    assert around.scope_from_tip[:3, 3] == pytest.approx(way.base_from_tip[:3, 3], abs=1e-9)
+    derived = derive_shape(TWISTED, turned, inserted, needle=THIN)
+    assert derived.base_from_tip[:3, 3] == pytest.approx(way.base_from_tip[:3, 3], abs=1e-5)

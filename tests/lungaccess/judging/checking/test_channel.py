@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.support.mutants import channel
+from anatomy.base.settings import override
+from experiments.support.mutants import channel, load
 from experiments.support.mutants.mutant import Case
 from lungaccess.judging.checking import check
 from lungaccess.judging.checking.findings import Findings
@@ -90,3 +91,42 @@ def test_a_device_that_does_not_pass_the_scope_is_refused(mutation: Any, case: C
     for mutant in mutants:
         refused = {each.name for each in check(mutant.plan, case.lung).refusals}
         assert refused & REFUSED_BY[mutation.__name__]
+
+
+@pytest.fixture(scope="module")
+def loaded(plan: Plan, lung: Any, system: Any, tools: Any) -> Case:
+    """The toy plan of tubes that are deployed with a flexible needle in them."""
+    segment = {"length_mm": 380.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
+    changes = {"name": "own", "needle_preloaded": True, "needle.slotted_segments": (segment,)}
+    inserted = plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
+    made = tools.toy_plan(lung, override(system, changes), *inserted, straightened_rad=0.02)
+    return Case(lung=lung, plan=made, report=check(made, lung), other=plan)
+
+
+def test_the_shape_with_the_needle_in_the_tubes_is_derived_anew(loaded: Case, case: Case) -> None:
+    """The needle lessens the bend, weighs on the handle, and moves nothing any more as it goes on."""
+    findings = {each.name: each for each in loaded.report.findings}
+    for name in ("tube.arcs", "tube.tip.derived", "tube.stable", "tube.strain", "tube.needle_load"):
+        assert findings[name].ok, name
+    assert findings["tube.needle_load"].value < 1e-4
+    assert "tube.needle_load" not in {each.name for each in loaded.report.unchecked}
+    inserted = loaded.plan.tube.outer_insertion_mm, loaded.plan.tube.inner_insertion_mm
+    factor = bend_factor(loaded.plan.system, *inserted)
+    shaft = loaded.plan.system.needle_tube
+    assert shaft is not None
+    share = shaft.parts.stiffness_n_mm2[0] / loaded.plan.system.scope.bending_stiffness_n_mm2
+    assert factor == pytest.approx(bend_factor(case.plan.system, *inserted) + share)
+    bend = abs(float(loaded.plan.scope.states[-1, 2]))
+    assert findings["scope.handle"].value == pytest.approx(factor * bend)
+
+
+@pytest.mark.parametrize("mutation", load.MUTATIONS, ids=lambda each: each.__name__)
+def test_a_shape_that_does_not_bear_its_needle_is_refused(mutation: Any, loaded: Case, case: Case) -> None:
+    for each in (loaded, case):
+        mutant = mutation(each, np.random.default_rng(1))
+        if mutant is None:
+            assert each is case and mutation is not load.needle_left_out_of_shape
+            continue
+        refused = {finding.name for finding in check(mutant.plan, each.lung).refusals}
+        assert refused & {"tube.arcs", "tube.tip.derived", "tube.needle_load"}
+        assert "tube.needle_load" in refused

@@ -92,6 +92,6 @@ def needle_load(system: System) -> NeedleLoad | None:
 
 def system_warnings(system: System) -> tuple[str, ...]:
     """Return what no plan with a system counts, in sentences with numbers."""
-    load = needle_load(system)
+    load = None if system.needle_preloaded else needle_load(system)
     # A needle that moves the tubes' tip by less is not worth a warning: a tenth of a mm is far below errors.
     return () if load is None or load.shift_mm < 0.1 else (load.words,)

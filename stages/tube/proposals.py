@@ -69,7 +69,11 @@ class SequenceComparison:
 
 
 def least_sweep_sequence(
-    tubes: SequenceOf[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike
+    tubes: SequenceOf[Tube],
+    base_angles_rad: ArrayLike,
+    insertions_mm: ArrayLike,
+    *,
+    needle: Tube | None = None,
 ) -> SequenceComparison:
     """Compare the sequences that lead to one deployment, by their sweep.
 
@@ -82,6 +86,8 @@ def least_sweep_sequence(
         Innermost first.
     base_angles_rad : float or (n,) float64
     insertions_mm : (n,) float64
+    needle : Tube, optional
+        A straight needle whose tip stays where that of the innermost tube is.
 
     Raises
     ------
@@ -90,7 +96,7 @@ def least_sweep_sequence(
     """
     together(tubes, base_angles_rad, insertions_mm)
     angles = np.broadcast_to(np.asarray(base_angles_rad, dtype=np.float64), (len(tubes),))
-    mechanics = TubeMechanics(tubes)
+    mechanics = TubeMechanics(tubes, needle=needle)
     deployed, refused = [], {}
     for name, make in _makers(tubes, angles, insertions_mm).items():
         try:
@@ -226,7 +232,9 @@ def propose_designs(
         for curve_mm, curvature_per_mm in curves
     ]
     found = [
-        evaluate_design(replace(tubes, outer=outer, inner=inner), outer_mm, inner_mm)
+        evaluate_design(
+            replace(tubes, outer=outer, inner=inner).with_needle(tubes.needle_shaft), outer_mm, inner_mm
+        )
         for outer, inner in product(outers, inners)
     ]
     kept = _worth_a_look([each for each in found if each.lateral_sweep_mm <= max_sweep_mm])

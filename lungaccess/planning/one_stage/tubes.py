@@ -171,7 +171,8 @@ def deploy_tubes(
         )
     angles = np.array([rotation_rad, rotation_rad + relative_rad]) + BEND_RAD
     sequence = kuntz2015(tubes, angles, outer_mm, inner_mm)
-    mechanics = TubeMechanics(tubes)
+    shaft = device.tubes.needle_shaft if isinstance(device, System) else None
+    mechanics = TubeMechanics(tubes, needle=shaft)
     deployed, snap = None, None
     try:
         deployed = deploy(mechanics, sequence)
@@ -196,7 +197,8 @@ def compare_sequences(answer: TubeAnswer) -> SequenceComparison:
     """Compare the sequences that lead to the same deployment."""
     final = answer.final
     angles = np.array([answer.rotation_rad, answer.rotation_rad + answer.relative_rad]) + BEND_RAD
-    return least_sweep_sequence(final.mechanics.tubes, angles, (answer.inner_mm, answer.outer_mm))
+    inserted, mechanics = (answer.inner_mm, answer.outer_mm), final.mechanics
+    return least_sweep_sequence(mechanics.tubes, angles, inserted, needle=mechanics.needle)
 
 
 def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProposal, ...]]:

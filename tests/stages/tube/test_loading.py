@@ -28,7 +28,6 @@ from stages.tube import (
 from stages.tube.casadi_shape import derive_shape
 from stages.tube.device import Tube
 from stages.tube.kernels.shapes import TIP
-
 from tests.stages.tube.pairs import WIDE
 
 INNER, OUTER = WIDE.inner, WIDE.outer

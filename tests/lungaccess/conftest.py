@@ -28,7 +28,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 from stages.needle import arc_transform
 from tests.lungaccess.pursuit import pursued
-from tests.lungaccess.tube_shapes import stated_shape
+from tests.lungaccess.tube_shapes import shared_curvatures, stated_shape
 
 LEFT_LUNG_LPS = np.array([60.0, 0.0, 0.0])
 RIGHT_LUNG_LPS = np.array([-60.0, 0.0, 0.0])
@@ -209,12 +209,8 @@ def make_plan() -> Plan:
     motion = pursued(route, 118.0, system.scope.bending_length_mm)
     tip = motion.lps_from_tip
     exit_point = tip[:3, 3] + 8 * tip[:3, 2]
-    # The tubes are moved together: the overlap is bent by the share of the inner tube's stiffness.
-    inner, outer = system.tubes.inner, system.tubes.outer
-    share = inner.bending_stiffness_n_mm2 / (inner.bending_stiffness_n_mm2 + outer.bending_stiffness_n_mm2)
-    bend = 2.3
-    curvature = inner.precurvature_per_mm
-    start = _advance(tip, [(12.0, bend, share * curvature), (12.0, 0.0, curvature), (0.0, -bend, 0.0)])
+    bend, (curvature, overlap) = 2.3, shared_curvatures(system)
+    start = _advance(tip, [(12.0, bend, overlap), (12.0, 0.0, curvature), (0.0, -bend, 0.0)])
     arcs = tuple(
         NeedleArc(length_mm=10.0, roll_rad=roll, curvature_per_mm=k)
         for roll, k in ((0.4, 0.008), (1.0, 0.0), (-0.5, 0.006))

@@ -11,6 +11,7 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.plans.plan import Plan
+from tests.lungaccess.tube_shapes import shared_curvatures
 from tests.stages.scenes import brute_clearance
 
 STEP_MM = 0.02
@@ -65,16 +66,12 @@ def needle_walk(plan: Plan) -> Walk:
 
 
 def tube_walk(plan: Plan) -> Walk:
-    """The straight outer tube bends the inner one back by the share of its stiffness."""
+    """The straight outer tube and the needle bend the inner one back by the share of their stiffness."""
     tubes, outer, inner = plan.system.tubes, plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
-    stiff = [
-        t.youngs_modulus_gpa * (t.outer_diameter_mm**4 - t.inner_diameter_mm**4)
-        for t in (tubes.inner, tubes.outer)
-    ]
-    kappa = tubes.inner.precurvature_per_mm
+    kappa, overlap = shared_curvatures(plan.system)
     straight = max(inner - tubes.inner.curved_length_mm, 0.0)
     edges = [0.0, min(straight, outer), outer, max(straight, outer), inner]
-    curvature = [0.0, kappa * stiff[0] / sum(stiff), 0.0, kappa]
+    curvature = [0.0, overlap, 0.0, kappa]
     pieces = [(b - a, 0.0, k) for a, b, k in zip(edges[:-1], edges[1:], curvature, strict=True) if b > a]
     return follow(rolled(plan.scope.lps_from_scope_tip, plan.tube.rotation_rad), pieces)
 

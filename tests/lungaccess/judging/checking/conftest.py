@@ -21,7 +21,7 @@ from lungaccess.problem.system import System, load_system, system_fingerprint
 from stages.scope import ScopeMotion
 from tests.lungaccess.pursuit import pursued
 from tests.lungaccess.rigid import arc, turned
-from tests.lungaccess.tube_shapes import stated_shape
+from tests.lungaccess.tube_shapes import shared_curvatures, stated_shape
 from tests.stages.scenes import box_distance, forked_tree
 
 SPACING_MM = (1.0, 0.9, 1.1)
@@ -250,12 +250,7 @@ def toy_tube(
 ) -> tuple[TubeDeployment, np.ndarray, int]:
     """The tubes from the scope tip, their points 0.005 mm apart, and which of them is the exit."""
     tubes = system.tubes
-    stiff = [
-        t.youngs_modulus_gpa * (t.outer_diameter_mm**4 - t.inner_diameter_mm**4)
-        for t in (tubes.inner, tubes.outer)
-    ]
-    kappa = tubes.inner.precurvature_per_mm
-    overlap = kappa * stiff[0] / sum(stiff)
+    kappa, overlap = shared_curvatures(system)
     curved = max(inner_mm - tubes.inner.curved_length_mm, 0.0)
     across = tip[:3, :3].T @ TOWARDS
     rotation = float(np.arctan2(across[1], across[0]))

@@ -151,7 +151,9 @@ def test_fingerprint_depends_on_every_number_and_nothing_else() -> None:
 
 
 def test_a_needle_without_further_keys_is_a_solid_wire_of_nitinol() -> None:
-    system = load_system("tight-inner")
+    stated = to_mapping(load_system("tight-inner"))
+    needle = {key: stated["needle"][key] for key in ("diameter_mm", "max_curvature_per_mm", "max_length_mm")}
+    system = parse(System, {**stated, "name": "bare", "needle_preloaded": False, "needle": needle}, "bare")
     assert system.needle_tube.bending_stiffness_n_mm2 == pytest.approx(60e3 * math.pi / 64.0 * 0.8**4)
     assert system.needle_tube.length_mm == system.tubes.inner.length_mm + system.needle.max_length_mm
     assert not system.needle_tube.bends
@@ -170,7 +172,8 @@ def test_a_needle_states_its_shaft_as_tubes_do_and_may_be_neglected() -> None:
 
 
 def test_a_system_warns_of_a_needle_that_bends_its_tubes_away() -> None:
-    system = load_system("tight-inner")
+    solid = {"needle.slotted_segments": (), "needle.inner_diameter_mm": 0.0}
+    system = override(load_system("tight-inner"), {"name": "other", "needle_preloaded": False, **solid})
     load = needle_load(system)
     inner, kappa = 0.04 * system.tubes.inner.bending_stiffness_n_mm2, system.tubes.inner.precurvature_per_mm
     ratio = system.needle_tube.bending_stiffness_n_mm2 / inner
@@ -181,9 +184,10 @@ def test_a_system_warns_of_a_needle_that_bends_its_tubes_away() -> None:
     tips = [40.0 / turn * np.array([1.0 - math.cos(turn), math.sin(turn)]) for turn in (40.0 * kappa, left)]
     assert load.shift_mm == pytest.approx(np.linalg.norm(tips[1] - tips[0]), abs=1e-5)
     assert system_warnings(system) == (load.words,)
-    for name in ("stylet-needle", "tubes-only"):
+    for name in (*preset_names(), *tube_preset_names()):
         assert not system_warnings(load_system(name))
-    assert not system_warnings(override(system, {"name": "other", "needle.youngs_modulus_gpa": 0.0}))
+    assert not system_warnings(replace(system, needle_preloaded=True))
+    assert not system_warnings(override(system, {"needle.youngs_modulus_gpa": 0.0}))
 
 
 def test_example_of_the_documentation_works(tmp_path: Path) -> None:
@@ -207,7 +211,9 @@ def test_a_needle_that_lies_in_the_tubes_while_they_are_deployed_belongs_to_them
     """The tubes know its shaft, files state it once, and systems of the time before have none."""
     segment = {"length_mm": 250.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
     changes = {"name": "own", "needle_preloaded": True, "needle.slotted_segments": (segment,)}
-    plain = override(load_system("tight-inner"), {"name": "own", "needle_preloaded": False})
+    plain = override(
+        load_system("tight-inner"), {"name": "own", "needle_preloaded": False, "needle.slotted_segments": ()}
+    )
     system = override(plain, changes)
     assert system.tubes.needle_shaft == system.needle_tube
     assert plain.tubes.needle_shaft is None
@@ -221,7 +227,8 @@ def test_a_needle_that_lies_in_the_tubes_while_they_are_deployed_belongs_to_them
 
 
 def test_what_slides_through_bent_tubes_must_be_alike() -> None:
-    system = override(load_system("tight-inner"), {"name": "own", "needle_preloaded": True})
+    system = override(load_system("tight-inner"), {"name": "own"})
+    assert system.needle_preloaded
     curved_mm, most_mm = system.tubes.inner.curved_length_mm, system.needle.max_length_mm
     segment = {"length_mm": curved_mm + most_mm, "stiffness_factor": 0.1, "strain_factor": 0.75}
     override(system, {"needle.slotted_segments": (segment,)})

@@ -28,9 +28,11 @@ REFUSED_BY = {
 
 @pytest.fixture(scope="module")
 def case(plan: Plan, lung: Any, system: Any, tools: Any) -> Case:
-    """The toy plan with a tip that stays bent, so that the tubes have something to straighten."""
+    """A toy plan that neglects its needle, with a tip that stays bent, which the tubes straighten."""
     inserted = plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
-    bent = tools.toy_plan(lung, system, *inserted, straightened_rad=0.02)
+    solid = {"needle_preloaded": False, "needle.slotted_segments": (), "needle.inner_diameter_mm": 0.0}
+    alone = override(system, {"name": "own", **solid})
+    bent = tools.toy_plan(lung, alone, *inserted, straightened_rad=0.02)
     report = check(bent, lung)
     assert not {each.name for each in report.refusals} & set.union(*REFUSED_BY.values())
     return Case(lung=lung, plan=bent, report=report, other=plan)
@@ -97,7 +99,10 @@ def test_a_device_that_does_not_pass_the_scope_is_refused(mutation: Any, case: C
 def loaded(plan: Plan, lung: Any, system: Any, tools: Any) -> Case:
     """The toy plan of tubes that are deployed with a flexible needle in them."""
     segment = {"length_mm": 380.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
-    changes = {"name": "own", "needle_preloaded": True, "needle.slotted_segments": (segment,)}
+    changes = {
+        "name": "own", "needle_preloaded": True, "needle.inner_diameter_mm": 0.0,
+        "needle.slotted_segments": (segment,),
+    }  # fmt: skip
     inserted = plan.tube.outer_insertion_mm, plan.tube.inner_insertion_mm
     made = tools.toy_plan(lung, override(system, changes), *inserted, straightened_rad=0.02)
     return Case(lung=lung, plan=made, report=check(made, lung), other=plan)

@@ -81,17 +81,26 @@ def find_counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]
 
 
 def needle_changes(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
-    """Yield the changes of the needle alone: a tighter curvature, then a thinner needle."""
+    """Yield the changes of the needle alone: a tighter curvature, then a thinner needle.
+
+    A thinner needle that lies in the tubes while they are deployed bends them less, so that the atlas does
+    not hold: of it nothing is said.
+    """
     needle = task.system.require_needle("A change of the needle")
 
     def tighter(radius_mm: float) -> System:
         return _changed(task.system, needle=replace(needle, max_curvature_per_mm=1.0 / radius_mm))
 
     def thinner(diameter_mm: float) -> System:
-        return _changed(task.system, needle=replace(needle, diameter_mm=diameter_mm))
+        bore_mm = needle.inner_diameter_mm * diameter_mm / needle.diameter_mm
+        return _changed(
+            task.system, needle=replace(needle, diameter_mm=diameter_mm, inner_diameter_mm=bore_mm)
+        )
 
     name, present = "a needle with a radius of curvature", needle.min_radius_of_curvature_mm
     yield from _least_change(task, atlas, name, present, TIGHTEST_RADIUS_MM, RADIUS_STEP_MM, tighter)
+    if task.system.tubes.needle_shaft is not None:
+        return
     name, present = "a needle with a diameter", needle.diameter_mm
     yield from _least_change(task, atlas, name, present, THINNEST_NEEDLE_MM, DIAMETER_STEP_MM, thinner)
 

@@ -26,6 +26,7 @@ from lungaccess.plans.parts import (
 )
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
+from tests.lungaccess.tube_shapes import stated_shape
 
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)
 

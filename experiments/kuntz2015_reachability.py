@@ -5,8 +5,8 @@
 
 Targets are drawn per lung, 5 to 25 mm from the pleura and at least 3 mm clear of airway, vessels and
 pleura.  Their lung is a commercial model that cannot be had, so the numbers compare methods and devices, not
-lungs.  Each search ends with its first plan, which the check then judges.  The runs are a study
-(`lungaccess study`): `--runs DB` keeps them, each in a transaction of its own, and what it holds is not run
+lungs.  The needle's stiffness is neglected, as in the paper.  Each search ends with its first plan, which
+the check then judges.  The runs are a study (`lungaccess study`): `--runs DB` keeps them, each in a transaction of its own, and what it holds is not run
 again: the study may be killed at any moment and goes on when it is started again.  `--so-far` runs nothing
 and tells of the cases whose runs are all there.
 
@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from anatomy.base.files import write_text
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
+from experiments.support.kuntz2015 import as_in_paper
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.running.study.driver import run_study
 from lungaccess.running.study.results import ResultsFile
@@ -64,13 +66,15 @@ QUICK = Size(per_lung=5, ours_s=5.0, papers_s=5.0, systems=(("ultrathin", True),
 NOT_REPRODUCED = ["The lung of the paper and its nodules; it is a commercial model that cannot be had."]
 
 
-def study(patients: list[str], size: Size, planner: str) -> dict[str, Any]:
-    """Return the study of one planner as its TOML would say it."""
+def study(patients: list[str], size: Size, planner: str, folder: Path) -> dict[str, Any]:
+    """Return the study of one planner as its TOML would say it; files of the devices are in the folder."""
+    for system, _allowed in size.systems:
+        write_text(folder / f"{system}.toml", as_in_paper(system))
     cases = [
         {
             "name": f"{patient}, {system}, fissures {'crossed' if allowed else 'forbidden'}",
             "anatomy": patient if patient == PHANTOM else str(require_data(f"med-rad/{patient}").resolve()),
-            "system": system, "fissures_allowed": allowed,
+            "system": str((folder / f"{system}.toml").resolve()), "fissures_allowed": allowed,
             "peripheral": {"per_lung": size.per_lung, "seed": 0},
         }
         for patient in patients for system, allowed in size.systems
@@ -161,6 +165,7 @@ def main() -> None:
         conditions={
             "targets": f"{size.per_lung} on each side, 5 to 25 mm from the pleura",
             "time": "wall, without the atlas; as many searches at once as there are workers",
+            "needle": "its stiffness is neglected, as in the paper",
             "searches": f"{OURS} up to {size.ours_s:g} s, {PAPERS} on our kernels up to {size.papers_s:g} s",
         },
         not_reproduced=[
@@ -171,7 +176,7 @@ def main() -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     wanted: dict[tuple[str, str], int] = {}
     for planner in (OURS, PAPERS):
-        asked = study_of(study(patients, size, planner))
+        asked = study_of(study(patients, size, planner, file.parent))
         if not options.so_far:
             run_study(asked, file, workers=options.workers)
         for run in runs_of(asked):

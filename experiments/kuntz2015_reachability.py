@@ -5,10 +5,10 @@
 
 Targets are drawn per lung, 5 to 25 mm from the pleura and at least 3 mm clear of airway, vessels and
 pleura.  Their lung is a commercial model that cannot be had, so the numbers compare methods and devices, not
-lungs.  The needle's stiffness is neglected, as in the paper.  Each search ends with its first plan, which
-the check then judges.  The runs are a study (`lungaccess study`): `--runs DB` keeps them, each in a transaction of its own, and what it holds is not run
-again: the study may be killed at any moment and goes on when it is started again.  `--so-far` runs nothing
-and tells of the cases whose runs are all there.
+lungs.  The needle's stiffness is neglected, as in the paper.  Each search ends with its first plan, which the
+check then judges.  The runs are a study (`lungaccess study`): `--runs DB` keeps them, each in a transaction
+of its own, and what it holds is not run again: the study may be killed at any moment and goes on when it is
+started again.  `--so-far` runs nothing and tells of the cases whose runs are all there.
 
 The full setting has 800 runs.  They take at most 2.8 hours with one worker, or half of that with two; most
 end with their first plan, or at once where no deployment can reach the target.

@@ -1,4 +1,4 @@
-"""What the needle does to the tubes that aim it: presets, and devices that keep their authority.
+"""What a needle does to tubes that are deployed without it: presets with a solid wire, and other needles.
 
     python -m experiments.needle_load
 
@@ -40,8 +40,10 @@ PLAIN = {
     "tubes.outer.slotted_segments": (),
     "tubes.max_channel_curvature_per_mm": None,
 }
+SOLID = {"needle_preloaded": False, "needle.inner_diameter_mm": 0.0, "needle.slotted_segments": ()}
+"""A needle that is a solid wire and comes when the tubes stand."""
 CHANGES: Mapping[str, Mapping[str, Any]] = {
-    "as it is: solid wire of 0.8 mm": {},
+    "solid wire of 0.8 mm": {},
     "needle with a bore of 0.6 mm": {"needle.inner_diameter_mm": 0.6},
     "the same, its last 60 mm slotted": {
         "needle.inner_diameter_mm": 0.6,
@@ -65,7 +67,7 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
         "needle.slotted_segments": (SLOTS,),
     },
 }
-"""What differs from the base, by key.  Sizes are assumptions; the slots are those of the presets' tubes."""
+"""What differs from the base with a solid wire, by key.  Sizes are assumptions; the slots are those of the presets' tubes."""
 SAMPLE = 12
 """Deployments looked at in tissue, evenly among all."""
 EXIT_MM = 5.0
@@ -94,8 +96,8 @@ class Row:
 
 
 def with_changes(system: System, changes: Mapping[str, Any]) -> System:
-    """Return a device of its own name that differs by some keys."""
-    return override(system, {"name": "changed", **changes}) if changes else system
+    """Return a device of its own name that has a solid wire and differs by some keys."""
+    return override(system, {"name": "changed", **SOLID, **changes})
 
 
 def shapes_without_needle(system: System) -> TubeShapes:
@@ -174,7 +176,7 @@ def lines(devices: Mapping[str, System]) -> Iterator[str]:
 def main() -> None:
     """Print both tables."""
     for table in (
-        {f"`{name}`": la.load_system(name) for name in PRESETS},
+        {f"`{name}`": with_changes(la.load_system(name), {}) for name in PRESETS},
         {name: with_changes(la.load_system(BASE), changes) for name, changes in CHANGES.items()},
     ):
         for line in lines(table):

@@ -67,7 +67,7 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
         "needle.slotted_segments": (SLOTS,),
     },
 }
-"""What differs from the base with a solid wire, by key.  Sizes are assumptions; the slots are those of the presets' tubes."""
+"""What differs from the base with a solid wire; sizes are assumptions, slots those of the presets' tubes."""
 SAMPLE = 12
 """Deployments looked at in tissue, evenly among all."""
 EXIT_MM = 5.0

@@ -5,7 +5,8 @@
     lungaccess benchmark synthetic-v1 score answers.json SYNTHETIC --only-answered
 
 It reads the files of a case alone: masks, scope tips, device, targets.  From every published tip it lets the
-inner tube out alone, an arc of known curvature, and tries one arc of the needle from its end to the target.
+inner tube out alone, an arc of known curvature that a needle in it lessens, and tries one arc of the needle
+from its end to the target.
 The arc with the largest clearance is handed in.  Clearances are looked up in distance maps of the masks.
 """
 
@@ -54,6 +55,21 @@ def distance_maps(case):
     return lookup(airway), lookup(others)
 
 
+def bending_stiffness(shaft, diameter):
+    """Return how stiff a shaft is at its tip, up to a factor that all shafts share."""
+    slots = shaft["slotted_segments"][:1]
+    plain = shaft["youngs_modulus_gpa"] * (diameter**4 - shaft["inner_diameter_mm"] ** 4)
+    return plain * (slots[0]["stiffness_factor"] if slots else 1.0)
+
+
+def curvature_ahead(device):
+    """Return the curvature of the inner tube ahead of the outer one: a needle in it shares it by stiffness."""
+    tube, needle = device["tubes"]["inner"], device["needle"]
+    own = bending_stiffness(tube, tube["outer_diameter_mm"])
+    within = bending_stiffness(needle, needle["diameter_mm"]) if device.get("needle_preloaded") else 0.0
+    return tube["precurvature_per_mm"] * own / (own + within)
+
+
 def arc_poses(poses, roll, curvature, length):
     """Return where arcs end that begin at poses (N, 4, 4): turn about +z, then bend towards +x."""
     roll, curvature, length = np.broadcast_arrays(roll, curvature, length)
@@ -88,8 +104,8 @@ class Planner:
         grid = np.meshgrid(np.arange(len(tips)), ROTATIONS, INSERTIONS_MM, indexing="ij")
         self.tip, self.rotation, self.insertion = (each.ravel() for each in grid)
         poses = np.array([tip["lps_from_tip"] for tip in tips])
-        curvature = self.tube["precurvature_per_mm"]
-        self.starts = arc_poses(poses[self.tip], self.rotation, curvature, self.insertion)
+        self.curvature = curvature_ahead(device)
+        self.starts = arc_poses(poses[self.tip], self.rotation, self.curvature, self.insertion)
         self.tip_poses = poses
         # The end of the tube must be in tissue: clear of the airway and of everything else.
         ends = self.starts[:, :3, 3]
@@ -122,9 +138,7 @@ class Planner:
         if spare <= 0.0 or (len(beyond) and (self.airway_mm(beyond) - self.needle_mm).min() <= 0.0):
             return 0.0
         tip = self.tip_poses[self.tip[n]]
-        tube, _along = points_on_arc(
-            tip, self.rotation[n], self.tube["precurvature_per_mm"], self.insertion[n]
-        )
+        tube, _along = points_on_arc(tip, self.rotation[n], self.curvature, self.insertion[n])
         outside = tube[self.airway_mm(tube) > -0.5]
         # Once the devices are out of the airway they only go away from it: no second lumen, no other branch.
         away = np.minimum(self.airway_mm(np.concatenate([outside, points])), self.tube_mm)

@@ -18,6 +18,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, system_fingerprint
 from stages.needle.path import ArcPath
 from tests.lungaccess.judging.checking.verdict import refusals
+from tests.lungaccess.tube_shapes import shared_curvatures
 
 
 @pytest.mark.parametrize(
@@ -196,16 +197,12 @@ def test_sweep_understated(plan: Plan, lung: Any, tools: Any, system: Any) -> No
 def _sweep_by_hand(system: Any, outer: float, inner: float) -> float:
     """Largest distance to the final shape while both tubes, then the inner one, advance."""
     tubes = system.tubes
-    stiff = [
-        t.youngs_modulus_gpa * (t.outer_diameter_mm**4 - t.inner_diameter_mm**4)
-        for t in (tubes.inner, tubes.outer)
-    ]
-    share = stiff[0] / sum(stiff)
+    ahead, within = shared_curvatures(system)
 
     def shape(e2: float, e1: float) -> np.ndarray:
         s = np.arange(0.0, e1 + 1e-9, 0.02)
         curved = s >= e1 - tubes.inner.curved_length_mm
-        k = tubes.inner.precurvature_per_mm * np.where(s < e2, share, 1.0) * curved
+        k = np.where(s < e2, within, ahead) * curved
         heading = np.cumsum(k) * 0.02
         return np.cumsum(np.stack([np.sin(heading), np.cos(heading)], axis=1), axis=0) * 0.02
 

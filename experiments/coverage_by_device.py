@@ -27,6 +27,7 @@ PLAIN = {
 """Tubes without slots; the channel is as bent as their strain allows."""
 DEVICES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "tight-inner": ("tight-inner", {}),
+    "tight-inner, needle's stiffness neglected": ("tight-inner", {"needle_preloaded": False}),
     "ultrathin": ("ultrathin", {}),
     "stylet-needle": ("stylet-needle", {}),
     "lung-default": ("lung-default", {}),

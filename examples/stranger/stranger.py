@@ -63,7 +63,7 @@ def bending_stiffness(shaft, diameter):
 
 
 def curvature_ahead(device):
-    """Return the curvature of the inner tube ahead of the outer one: a needle in it shares it by stiffness."""
+    """Return the curvature of the inner tube ahead of the outer one, shared with a needle by stiffness."""
     tube, needle = device["tubes"]["inner"], device["needle"]
     own = bending_stiffness(tube, tube["outer_diameter_mm"])
     within = bending_stiffness(needle, needle["diameter_mm"]) if device.get("needle_preloaded") else 0.0

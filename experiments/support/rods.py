@@ -175,7 +175,7 @@ def apart(numbers: Iterable[int]) -> list[Apart]:
         at_plate = found.angles([0.0])[0].tolist()
         systems.append(([*tubes, needle], [*ends, needle_mm], [*at_plate, 0.0]))
         wanted.append(found.base_from_tip)
-        unloaded.append(mechanics.given_base_angles(angles, beta).base_from_tip)
+        unloaded.append(mechanics.given_base_angles(angles, beta, needle_mm=0.0).base_from_tip)
     all_apart = []
     for rods, tip, before in zip(at_rest(systems, SPACING, DURATION), wanted, unloaded, strict=True):
         point, ahead = tip_of(rods[0])

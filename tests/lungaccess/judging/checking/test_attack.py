@@ -35,13 +35,15 @@ WITHOUT_EXPLANATION = (
 
 
 def systems() -> list[la.System]:
-    """A preset, one with two curved tubes, and a device that may cross fissures and bends tightly."""
+    """A preset, two curved tubes, and a device that crosses fissures, bends tightly and bears its needle."""
     preset = la.load_system("ultrathin")
     own = {
         "name": "own",
         "fissures_allowed": True,
         "needle.max_curvature_per_mm": 0.02,
         "needle.exit_exemption_mm": 3.0,
+        "needle_preloaded": True,
+        "needle.slotted_segments": ({"length_mm": 380.0, "stiffness_factor": 0.04, "strain_factor": 0.75},),
         "tubes.max_lateral_sweep_mm": 2.0,
         "tubes.inner.curved_length_mm": 20.0,
         "margins.registration_margin_mm": 0.2,

@@ -147,7 +147,7 @@ def _only(found: list[Kind], reference: Reference, what: str, names: Iterable[st
     known = ", ".join(sorted({name for name in names if name})) or "none"
     raise FileError(
         f"{reference.file} has {len(found) or 'no'} {what}{'s' if len(found) > 1 else ''} {reference.name!r}",
-        expected=f"exactly one; it has {known}",
+        expected=f"exactly one, in the folder of the scene or below; it has {known}",
         remedy="Give it a name of its own in 3D Slicer, save the scene, and name it after the #",
     )
 
@@ -167,15 +167,9 @@ def read_markups(path: str | Path) -> tuple[Markup, ...]:
     kind = path.suffix.lower()
     if kind == ".mrml":
 
-        def beside(name: str) -> str:
+        def beside(name: str) -> str | None:
             file = path.parent / name
-            if not file.resolve().is_relative_to(path.parent.resolve()):
-                raise FileError(
-                    f"{path} names {name}, which lies elsewhere",
-                    expected="files in the folder of the scene, or below",
-                    remedy=_REMEDY,
-                )
-            return read_text(file)
+            return read_text(file) if file.resolve().is_relative_to(path.parent.resolve()) else None
 
         return _of_scene(read_text(path), beside, path)
     if kind == ".mrb":
@@ -199,7 +193,7 @@ def _of_bundle(path: Path) -> tuple[Markup, ...]:
             member = f"{folder}/{name}" if folder else name
             content = b""
             if member in members and members[member].compress_type in _METHODS:
-                with bundle.open(member) as stream:
+                with zipfile.Path(bundle, member).open("rb") as stream:
                     content = stream.read(_LARGEST_BYTES)
             if not 0 < len(content) < _LARGEST_BYTES:
                 raise FileError(
@@ -212,8 +206,11 @@ def _of_bundle(path: Path) -> tuple[Markup, ...]:
         return _of_scene(text(scenes[0].rpartition("/")[2]), text, path)
 
 
-def _of_scene(text: str, read: Callable[[str], str], path: Path) -> tuple[Markup, ...]:
-    """Return the markups of a scene; `read` returns the text of a file beside it, each of them once."""
+def _of_scene(text: str, read: Callable[[str], str | None], path: Path) -> tuple[Markup, ...]:
+    """Return the markups of a scene; `read` returns the text of a file beside it, each of them once.
+
+    What is not beside it is left out: a scene from elsewhere must not decide which files are read here.
+    """
     lists: dict[str, list[Markup]] = {}
     with reading(path):
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -232,7 +229,8 @@ def _of_scene(text: str, read: Callable[[str], str], path: Path) -> tuple[Markup
         transform = references.get("transform")
         _require_still(node, by_id.get(transform or ""), transform, path)
         if file not in lists:
-            lists[file] = _of_file(read(file), path.parent / file)
+            content = read(file)
+            lists[file] = [] if content is None else _of_file(content, path.parent / file)
         markups += [
             Markup(name=node.get("name") or each.name, kind=each.kind, points=each.points)
             for each in lists[file]

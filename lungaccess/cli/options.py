@@ -65,6 +65,7 @@ STEP_SHARES = {
     "reading images": 0.02,
     "airway tree": 0.12,
     "labels": 0.24,
+    "plausibility of the masks": 0.35,
     "clearance to airway": 0.45,
     "clearance to vessel": 0.57,
     "clearance to pleura": 0.69,
@@ -83,12 +84,26 @@ class OutputOptions:
 
 @Parameter(name="*")
 @frozen_value
-class PatientOptions(OutputOptions):
+class CacheOptions(OutputOptions):
     """How a command answers, and where it keeps what it prepares."""
 
     cache: Annotated[
         Path | None, Parameter(help="Folder where the prepared anatomy is kept for the next command.")
     ] = None
+
+    def open_atlas(self, lung: Lung, system: System) -> Atlas:
+        """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
+        from lungaccess.planning.coupled import open_atlas
+
+        with progress("enumerating what scope and tubes can do") as shown:
+            return open_atlas(lung, system, cache=self.cache, progress=shown.share)
+
+
+@Parameter(name="*")
+@frozen_value
+class PatientOptions(CacheOptions):
+    """How a command that reads a patient answers, and what of the masks is overruled."""
+
     accept: Annotated[
         tuple[str, ...],
         Parameter(
@@ -105,13 +120,6 @@ class PatientOptions(OutputOptions):
     def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> Organ:
         """Return a patient's lung, or a liver of Med-RAD; see `load_organ`."""
         return load_organ(patient, self.cache, thick_slices, self.accept if refuse else None)
-
-    def open_atlas(self, lung: Lung, system: System) -> Atlas:
-        """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
-        from lungaccess.planning.coupled import open_atlas
-
-        with progress("enumerating what scope and tubes can do") as shown:
-            return open_atlas(lung, system, cache=self.cache, progress=shown.share)
 
 
 @Parameter(name="*")

@@ -13,7 +13,7 @@ from anatomy.base.files import write_text
 from anatomy.base.records import frozen_value
 from lungaccess.cli import plan_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import Asked, PatientOptions
+from lungaccess.cli.options import Asked, CacheOptions
 from lungaccess.cli.progress import SearchDisplay, progress
 from lungaccess.plans.no_plan import NoPlan
 
@@ -98,7 +98,7 @@ class PlanJob:
     asked: Asked
     target: StatedTarget
     out: Path
-    output: PatientOptions
+    output: CacheOptions
     pictures: bool = True
 
     @property

@@ -14,6 +14,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from stages.tube.casadi_model import CasadiTubes
+from stages.tube.casadi_statics import derive_loaded
 from stages.tube.device import Tube
 from stages.tube.errors import ConvergenceError
 from stages.tube.sequences import BEND_RAD, joint_steps, together
@@ -136,6 +137,19 @@ def derive_arrival(
     before = CasadiTubes(tubes).solve(turned, beta)
     arrived = CasadiTubes((needle, *tubes)).solve(np.append(0.0, turned), np.append(rear, beta))
     return before.base_from_tip, arrived.base_from_tip
+
+
+def derive_inserted(
+    tubes: Sequence[Tube], needle: Tube, rotations_rad: ArrayLike, insertions_mm: ArrayLike, needle_mm: float
+) -> Float:
+    """Return the frame `(4, 4)` of the tubes' tip with a needle whose tip is `needle_mm` beyond it.
+
+    Errors are those of `derive_arrival`.
+    """
+    turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
+    out = np.asarray(insertions_mm, dtype=np.float64)
+    beta = out - [tube.length_mm for tube in tubes]
+    return derive_loaded(tubes, needle, turned, beta, float(out[0] + needle_mm)).base_from_tip
 
 
 def _stepped(model: CasadiTubes, base: Float, begin: Float, end: Float, tips: Float) -> tuple[Float, float]:

@@ -61,7 +61,7 @@ def _image(name: str, compressed: bool) -> Callable[[Path], None]:
 
 def _image_target(name: str, header: Callable[[bytes], int] | None, compressed: bool = False) -> Target:
     def read(folder: Path) -> Volume:
-        read_mask(folder / name)
+        read_mask(folder / name, role="lung")
         return read_volume(folder / name)
 
     return Target(file=name, make=_image(name, compressed), read=read, header_bytes=header)

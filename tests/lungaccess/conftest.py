@@ -146,6 +146,8 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         motion=None,
         lobes=None,
         nodule_labels=None,
+        findings=(),
+        mask_words="the masks of Toy",
         lobe_at=lambda point_lps: "left lower lobe" if point_lps[0] > 0.0 else "",
         segment_at=lambda _point_lps: "",
         region_at=lambda point_lps: "left lower lobe" if point_lps[0] > 0.0 else "",

@@ -13,7 +13,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, CountOrNone, Processes, SamplesOrNone, Seconds
-from lungaccess.cli.options import OutputOptions, PatientOptions
+from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def run(
     answers: Path | None = None,
     scheduler: str | None = None,
     workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
-    output: PatientOptions = PatientOptions(),
+    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Run methods of lungaccess on the cases, as a study; stop it at any time and start it again.
 
@@ -177,7 +177,7 @@ def score(
     certify: CountOrNone = 0,
     only_answered: Annotated[bool, Parameter(negative="")] = False,
     out: Path | None = None,
-    output: PatientOptions = PatientOptions(),
+    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Score a submission by the independent check alone; exit code 1 if an answer is refused.
 

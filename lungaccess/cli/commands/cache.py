@@ -13,7 +13,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative
-from lungaccess.cli.options import PatientOptions
+from lungaccess.cli.options import CacheOptions
 
 if TYPE_CHECKING:
     from anatomy.base.cache_entries import CacheEntry
@@ -26,7 +26,7 @@ cache = App(
 
 
 @cache.default
-def show(*, output: PatientOptions = PatientOptions()) -> ExitCode:
+def show(*, output: CacheOptions = CacheOptions()) -> ExitCode:
     """List prepared anatomies, their pictures, atlases and shapes of tubes, the least recently used first."""
     folder = output.cache or default_cache()
     entries, limit = _entries(folder), cache_limit_bytes()
@@ -54,7 +54,7 @@ def prune(
     max_size: Annotated[
         str | None, Parameter(help="What may stay, such as 2GB; LUNGACCESS_CACHE_LIMIT if not given.")
     ] = None,
-    output: PatientOptions = PatientOptions(),
+    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Remove old formats, leftovers of killed commands, and what is too old or too much."""
     from anatomy.base.cache_entries import overdue
@@ -65,7 +65,7 @@ def prune(
 
 
 @cache.command(help_epilogue=epilogue("cache clear"))
-def clear(*, output: PatientOptions = PatientOptions()) -> ExitCode:
+def clear(*, output: CacheOptions = CacheOptions()) -> ExitCode:
     """Remove all that is kept; what another command is writing just then stays."""
     entries = _entries(output.cache or default_cache())
     return _remove([each for each in entries if each.kind != "unfinished" or each.abandoned], output)
@@ -82,7 +82,7 @@ def _entries(folder: Path) -> tuple[CacheEntry, ...]:
     )
 
 
-def _remove(entries: Iterable[CacheEntry], output: PatientOptions) -> ExitCode:
+def _remove(entries: Iterable[CacheEntry], output: CacheOptions) -> ExitCode:
     """Remove entries and say so."""
     from anatomy.base.cache_entries import remove_entry
 

@@ -14,7 +14,7 @@ from anatomy.base.errors import AnatomyError
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Seconds, Seed
-from lungaccess.cli.options import PatientOptions, SearchOptions, SystemOptions
+from lungaccess.cli.options import CacheOptions, SearchOptions, SystemOptions
 from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, RESULTS, PlanJob, plan_and_report
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
@@ -33,7 +33,7 @@ def demo(
     # The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps.
     seed: Annotated[Seed, Parameter(help="Seed of the patient and of the search.")] = 1,
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it."""
     from lungaccess.cli.anatomy_tables import anatomy_tables

@@ -12,7 +12,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.commands.template import template_text
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Processes
-from lungaccess.cli.options import PatientOptions
+from lungaccess.cli.options import CacheOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def design(
     out: Path = Path("lungaccess-design"),
     scheduler: str | None = None,
     workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
-    output: PatientOptions = PatientOptions(),
+    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Search the numbers of a device that reach most targets of a cohort, or most often succeed there.
 

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions
+from lungaccess.cli.options import DEFAULT_SYSTEM, CacheOptions
 
 if TYPE_CHECKING:
     from stages.tube import TubeShapes
@@ -26,7 +26,7 @@ def shapes(
         ),
     ] = DEFAULT_SYSTEM,
     out: Annotated[Path | None, Parameter(help="CSV file for a table of all shapes.")] = None,
-    output: PatientOptions = PatientOptions(),
+    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Follow a design of one to three tubes through all insertions and relative rotations.
 

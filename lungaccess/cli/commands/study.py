@@ -13,7 +13,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Processes
-from lungaccess.cli.options import OutputOptions, PatientOptions
+from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def run(
     out: Path = Path("results.db"),
     scheduler: str | None = None,
     workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
-    output: PatientOptions = PatientOptions(),
+    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Make the runs of a study that the results do not have yet; exit code 1 if one could not be made.
 

@@ -12,7 +12,6 @@ from lungaccess.judging.checking.poses import angle_between
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.tube.device import Tube
-from stages.tube.sequences import BEND_RAD
 
 FINDING = "tube.needle_load"
 """The finding has this name: it states what the needle does to the tip of the tubes."""
@@ -41,15 +40,18 @@ def check_needle_load(plan: Plan, found: Findings) -> None:
 
 def _check_inserted(plan: Plan, needle: NeedlePath, shaft: Tube, found: Findings) -> None:
     """The tip is where it is stated when the needle is inserted, too."""
-    from stages.tube.casadi_statics import derive_loaded
+    from stages.tube.casadi_shape import derive_inserted
 
-    tube, tubes = plan.tube, plan.system.tubes.nested
-    turned = np.array(tube.rotations_rad(plan.system.tubes))[::-1] + BEND_RAD
-    out = np.array(tube.insertions_mm(plan.system.tubes))[::-1]
-    beta = out - [each.length_mm for each in tubes]
-    loaded = derive_loaded(tubes, shaft, turned, beta, float(out[0] + needle.length_mm))
+    tube, tubes = plan.tube, plan.system.tubes
+    loaded = derive_inserted(
+        tubes.nested,
+        shaft,
+        tube.rotations_rad(tubes)[::-1],
+        tube.insertions_mm(tubes)[::-1],
+        needle.length_mm,
+    )
     stated = np.linalg.solve(plan.scope.lps_from_scope_tip, tube.lps_from_tip)
-    off_mm = float(np.linalg.norm(loaded.base_from_tip[:3, 3] - stated[:3, 3]))
+    off_mm = float(np.linalg.norm(loaded[:3, 3] - stated[:3, 3]))
     detail = "from the stated tip of the tubes to that under the load of the inserted needle"
     found.at_most(FINDING, off_mm, 0.0, "mm", detail, STILL_MM)
 

@@ -30,7 +30,7 @@ WEAKENED = [
     ("scope motions", "stages/scope/kernels/body.py", "0.25 * change", "0.05 * change"),
     ("start region", "stages/needle/kernels/start_region.py", "+ (chord", "+ 0.5 * (chord"),
     ("no path", f"{INFEASIBLE}/bounds.py", "return change + (depth", "return 0.5 * change + 0.5 * (depth"),
-    ("no path", f"{INFEASIBLE}/cubes.py", "if above + half >=", "if above + -half >="),
+    ("no path", f"{INFEASIBLE}/blocked.py", "if above + half >=", "if above + -half >="),
     (
         "cost bound",
         "lungaccess/planning/coupled/kernels/cost_bound.py",

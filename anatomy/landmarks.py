@@ -1,4 +1,4 @@
-"""What airway and lungs say about the directions of an image: upwards, forwards, and to the left."""
+"""Directions of an image, upwards, forwards and to the left, as airway and lungs tell them."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What the masks of a patient look like, each by itself and beside the others."""
+"""Figures of the masks of a patient, each by itself and beside the others."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""What masks of a patient must look like, whatever program made them: a table of limits."""
+"""A table of limits that masks of a patient must keep, whatever program made them."""
 
 from __future__ import annotations
 

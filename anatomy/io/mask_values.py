@@ -1,4 +1,4 @@
-"""What the values of an image say of a mask: one label, labels that are named, or fractions; else refused."""
+"""Masks from the values of an image, which are one label, named labels, or fractions; else refused."""
 
 from collections.abc import Mapping, Sequence
 

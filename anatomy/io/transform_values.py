@@ -9,7 +9,7 @@ import sys
 import numpy as np
 
 MOST_MEMORY_BYTES = 8 << 30
-"""More than any transform of a chest needs; a damaged one may ask for all that there is."""
+"""Reading a transform may take this memory: no chest needs as much, and a damaged file may ask for all."""
 
 
 def _write_values(path: str, grid: str, out: str) -> None:

@@ -1,4 +1,4 @@
-"""What is seen along rays within a structure: how far it goes on, and its last voxel."""
+"""Rays within a structure: they say how far it goes on, and which is its last voxel."""
 
 import math
 

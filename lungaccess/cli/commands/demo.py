@@ -100,7 +100,7 @@ def what_to_look_at(out: Path) -> Panel:
     """Return a guide to the pictures of a plan."""
     lines = (
         f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its "
-        "wall at the diamond, the black needle passes the vessels and ends in the green nodule. R and L are "
+        "wall at the diamond, the magenta needle passes the vessels and ends in the green nodule. R and L are "
         "the patient's right and left. In the two cuts, no full red or grey reaches the dashed lines; in the "
         "graph, no curve enters the red area outside the blue one.",
         f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",

@@ -101,8 +101,8 @@ def what_to_look_at(out: Path) -> Panel:
     lines = (
         f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its "
         "wall at the diamond, the magenta needle passes the vessels and ends in the green nodule. R and L "
-        "are the patient's right and left. In the two cuts, no full red or grey reaches the dashed lines; in the "
-        "graph, no curve enters the red area outside the blue one.",
+        "are the patient's right and left. In the two cuts, no full red or grey reaches the dashed lines; "
+        "in the graph, no curve enters the red area outside the blue one.",
         f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
         f"{out / 'report.html'}: all of it in 3-D, playing along a slider; open it in a browser.",
     )

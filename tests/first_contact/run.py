@@ -34,6 +34,7 @@ from anatomy.base.cache import user_cache
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 PACKAGES = ("anatomy", "stages", "lungaccess")
+COMMANDS = "docs/reference/command_line.md"
 HANGS_AFTER_S = 600.0
 MOST_COMPILED = 5
 """A search that ends by the clock may come to a kernel to which no recorded one came."""
@@ -90,12 +91,12 @@ def main() -> int:
 
 
 def unnamed_commands(tasks: list[dict[str, Any]]) -> list[str]:
-    """Return the commands of the tasks that README.md does not name."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"lungaccess ([a-z]+)", readme))
+    """Return the commands of the tasks that the page of the command line does not name."""
+    page = (ROOT / COMMANDS).read_text(encoding="utf-8")
+    named = set(re.findall(r"lungaccess ([a-z]+)", page))
     runs = [shlex.split(step["run"]) for task in tasks for step in task["step"] if "run" in step]
     used = {words[1] for words in runs if len(words) > 1 and not words[1].startswith("-")}
-    unnamed = [f"README.md does not name lungaccess {command}" for command in sorted(used - named)]
+    unnamed = [f"{COMMANDS} does not name lungaccess {command}" for command in sorted(used - named)]
     print("\n".join(unnamed), end="\n" if unnamed else "", flush=True)
     return unnamed
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.typed import Array, Float, Mask
+from anatomy.base.words import percent
 from anatomy.display import point
 from anatomy.grid import Grid
 from anatomy.landmarks import SAMPLE_MM, directions, landmarks
@@ -176,7 +177,7 @@ def _cut_off(images: PatientImages, tree: AirwayTree) -> Iterator[Finding]:
         yield Finding(
             name="gap",
             found=f"A gap of {piece.length_mm:.1f} mm at LPS ({point(piece.position_lps)}) mm cuts off "
-            f"{share:.0%} of the airway, which leads into the {_behind(images, tree, piece)}: none of it is "
+            f"{percent(share)} of the airway, which leads into the {_behind(images, tree, piece)}: none of it is "
             "used, and no path that leads through it is known",
             remedy="Close the gap in the mask of the airway, if it is one",
             verdict=REFUSED if share >= GREATEST_CUT else DOUBTFUL,

@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.base.records import frozen_value
+from anatomy.base.words import percent
 
 FITS, DOUBTFUL, REFUSED, ACCEPTED = "fits", "doubtful", "refused", "accepted"
 """What a check finds: usual; unusual, which is a warning; impossible; and that, accepted by its name."""
@@ -65,7 +66,7 @@ class Limit:
     check : str
         A key of `CHECKS`.
     words, form : str
-        The sentence with a place for the figure, and how the figure is written.
+        The sentence with a place for the figure, and how the figure is written: without a form it is a share.
     usual, possible : (least, greatest)
         Beyond the one is a warning, beyond the other a refusal.
     reason : str
@@ -74,11 +75,11 @@ class Limit:
 
     check: str
     words: str
-    form: str
     usual: tuple[float, float]
     possible: tuple[float, float]
     reason: str
     remedy: str = "Look at the masks, and correct what is wrong"
+    form: str = ""
 
     def finding(self, value: float) -> Finding:
         """Return what a figure means."""
@@ -88,14 +89,18 @@ class Limit:
         limits = _range(self.form, self.possible if verdict == REFUSED else self.usual)
         return Finding(
             name=self.check,
-            found=f"{self.words.format(self.form.format(value))}; {limits} is {what} ({self.reason})",
+            found=f"{self.words.format(_written(self.form, value))}; {limits} is {what} ({self.reason})",
             remedy=self.remedy,
             verdict=verdict,
         )
 
 
+def _written(form: str, value: float) -> str:
+    return form.format(value) if form else percent(value)
+
+
 def _range(form: str, limits: tuple[float, float]) -> str:
-    low, high = (form.format(limit) for limit in limits)
+    low, high = (_written(form, limit) for limit in limits)
     if limits[1] == MOST:
         return f"{low} or more"
     return f"up to {high}" if limits[0] == 0 else f"{low} to {high}"
@@ -113,17 +118,17 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         ),
         "smaller_lung": Limit(
             check="one-lung", words="{} of the lungs lie on the side of the carina that has less of them",
-            form="{:.0%}", usual=(0.25, 0.5), possible=(0.05, 0.5),
+            usual=(0.25, 0.5), possible=(0.05, 0.5),
             reason="the left lung has 45 %; a lung that has collapsed has 10 %",
             remedy="Look whether the other lung is solid, taken out, or missing in the mask",
         ),
         "lung_pieces": Limit(
-            check="lung", words="{} of the lungs are pieces apart from both", form="{:.1%}",
+            check="lung", words="{} of the lungs are pieces apart from both",
             usual=(0, 0.02), possible=(0, 0.2), reason="two lungs are two pieces, in phantoms and patients",
             remedy="Remove what is no lung: stomach, bowel, table",
         ),
         "lung_holes": Limit(
-            check="lung", words="Holes in the lungs take {} of them", form="{:.1%}", usual=(0, 0.05),
+            check="lung", words="Holes in the lungs take {} of them", usual=(0, 0.05),
             possible=(0, 0.5), reason="a filled mask has none; a mass or unfilled vessels take 5 %",
             remedy="Fill the mask: what is a hole is an obstacle",
         ),
@@ -133,7 +138,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             reason="20 to 120 ml are seen in CT; a child of one year has 5 ml", remedy=_FILE,
         ),
         "lumen_holes": Limit(
-            check="airway", words="Holes in the lumen take {} of it", form="{:.1%}", usual=(0, 0.02),
+            check="airway", words="Holes in the lumen take {} of it", usual=(0, 0.02),
             possible=(0, 0.2), reason="a lumen has none, a wall has its lumen", remedy=_FILE,
         ),
         "trachea_mm": Limit(
@@ -148,7 +153,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             "tree that is cut, or of a mask that was widened", remedy=_FILE,
         ),
         "ends_in_lungs": Limit(
-            check="bronchi", words="{} of the ends of the airway lie in the lungs", form="{:.0%}",
+            check="bronchi", words="{} of the ends of the airway lie in the lungs",
             usual=(0.85, 1), possible=(0.4, 1), reason="98 % and more do in phantoms and patients",
             remedy="Look whether a part of the lungs is missing, or a mask lies beside the others",
         ),
@@ -159,62 +164,62 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             "reach in that lung is understated", remedy="Look where the mask of the airway stops",
         ),
         "vessels_of_lungs": Limit(
-            check="vessels", words="Vessels take {} of the lungs", form="{:.2%}", usual=(0.004, 0.15),
+            check="vessels", words="Vessels take {} of the lungs", usual=(0.004, 0.15),
             possible=(0.0005, 0.4), reason="large vessels take 1 %, all that CT shows 3 to 8 %", remedy=_FILE,
         ),
         "vessels_in_lungs": Limit(
-            check="vessels", words="{} of the vessels lie in the lungs", form="{:.0%}", usual=(0.5, 1),
+            check="vessels", words="{} of the vessels lie in the lungs", usual=(0.5, 1),
             possible=(0.2, 1),
             reason="all do, or two thirds where the mask has the vessels of the mediastinum too",
             remedy="Check the header of the mask of the vessels: it may have lost its place",
         ),
         "least_vessels": Limit(
             check="vessels", words="The part of the lungs with the fewest vessels has {} of their mean share",
-            form="{:.0%}", usual=(0.1, 1), possible=(0.01, 1),
+            usual=(0.1, 1), possible=(0.01, 1),
             reason="of three parts of each lung, from apex to "
             "base, none is without", remedy="Look whether vessels are missing there: none is avoided",
         ),
         "vessels_in_lumen": Limit(
             check="overlap", words="{} of vessels or lumen, the smaller one, lie in the other one",
-            form="{:.1%}",
+
             usual=(0, 0.02), possible=(0, 0.3),
             reason="a voxel is one or the other; masks of two programs may share 5 %", remedy=_FILE,
         ),
         "wall_in_lumen": Limit(
             check="overlap", words="{} of wall or lumen, the smaller one, lie in the other one",
-            form="{:.1%}",
+
             usual=(0, 0.05), possible=(0, 0.8), reason="a voxel is one or the other, or the wall is filled",
             remedy=_FILE,
         ),
         "wall_in_vessels": Limit(
             check="overlap", words="{} of wall or vessels, the smaller one, lie in the other one",
-            form="{:.0%}", usual=(0, 0.4), possible=(0, 0.9),
+            usual=(0, 0.4), possible=(0, 0.9),
             reason="vessels touch walls, and where they do a voxel may be both", remedy=_FILE,
         ),
         "wall_at_lumen": Limit(
-            check="wall", words="{} of the wall lie at the lumen", form="{:.0%}", usual=(0.8, 1),
+            check="wall", words="{} of the wall lie at the lumen", usual=(0.8, 1),
             possible=(0.4, 1),
             reason="walls are up to 3 mm thick", remedy=_FILE,
         ),
         "fissures_of_lungs": Limit(
-            check="fissures", words="Fissures take {} of the lungs", form="{:.1%}", usual=(0.002, 0.05),
+            check="fissures", words="Fissures take {} of the lungs", usual=(0.002, 0.05),
             possible=(0, 0.2), reason="a sheet of two voxels takes 1 to 2 %", remedy=_FILE,
         ),
         "fissures_in_lungs": Limit(
-            check="fissures", words="{} of the fissures lie in the lungs", form="{:.0%}", usual=(0.9, 1),
+            check="fissures", words="{} of the fissures lie in the lungs", usual=(0.9, 1),
             possible=(0.5, 1), reason="99 % do in phantoms and patients", remedy=_FILE,
         ),
         "fissures_in_others": Limit(
-            check="overlap", words="{} of the fissures lie in vessels or airway", form="{:.0%}",
+            check="overlap", words="{} of the fissures lie in vessels or airway",
             usual=(0, 0.2),
             possible=(0, 0.7), reason="they are crossed by few vessels", remedy=_FILE,
         ),
         "lobes_of_lungs": Limit(
-            check="lobes", words="The lobes take {} of the lungs", form="{:.0%}", usual=(0.85, 1),
+            check="lobes", words="The lobes take {} of the lungs", usual=(0.85, 1),
             possible=(0.3, 1), reason="all but airways and vessels is of a lobe", remedy=_FILE,
         ),
         "lobes_on_side": Limit(
-            check="lobes", words="{} of the lobes lie on their side of the carina", form="{:.0%}",
+            check="lobes", words="{} of the lobes lie on their side of the carina",
             usual=(0.9, 1),
             possible=(0.6, 1), reason="a lung reaches little beyond the middle",
             remedy="Check the labels of the lobes, and whether their mask is mirrored",
@@ -224,18 +229,18 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             reason="a nodule of 2 mm has 0.004 ml, a mass of 6 cm 113 ml", remedy=_FILE,
         ),
         "nodules_at_lungs": Limit(
-            check="nodules", words="{} of the nodules lie in or at the lungs", form="{:.0%}",
+            check="nodules", words="{} of the nodules lie in or at the lungs",
             usual=(0.999, 1),
             possible=(0.5, 1), reason="a nodule that a mask of the lungs leaves out still touches it",
             remedy="Check the header of the mask of the nodules, and that it shows nothing else",
         ),
         "nodule_filled": Limit(
-            check="nodules", words="The largest nodule fills {} of the box around it", form="{:.0%}",
+            check="nodules", words="The largest nodule fills {} of the box around it",
             usual=(0.15, 1), possible=(0.02, 1), reason="a ball fills 52 %; sheets and trees fill little",
             remedy=_FILE,
         ),
         "nodules_in_others": Limit(
-            check="overlap", words="{} of the nodules lie in vessels or airway", form="{:.0%}",
+            check="overlap", words="{} of the nodules lie in vessels or airway",
             usual=(0, 0.5),
             possible=(0, 0.9), reason="a target that is all obstacle cannot be reached", remedy=_FILE,
         ),

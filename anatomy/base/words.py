@@ -1,5 +1,6 @@
 """Numbers in sentences, and which of several names was meant."""
 
+import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -13,6 +14,49 @@ def plural(count: int, noun: str) -> str:
     ('1 arc', '2,000 draws')
     """
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def of_hundred(share: float, *, up: bool = False) -> str:
+    """Return a share as a number of 100, rounded down, or up where the greater number is the worse.
+
+    Near 0 and 100 it has one decimal, and below 0.1 one digit, so that neither end is stated where it does
+    not hold.  Tables, sentences and pages all write shares by it, so that one share never reads as two.
+
+    Examples
+    --------
+    >>> of_hundred(0.0065), of_hundred(0.428), of_hundred(0.9996), of_hundred(0.428, up=True)
+    ('0.6', '42', '99.9', '43')
+    >>> of_hundred(0.000123), of_hundred(0.0)
+    ('0.01', '0')
+    """
+    decimals = 0 if 0.1 <= share <= 0.9 else 1
+    if 0.0 < share < 0.001:
+        decimals = -math.floor(math.log10(share)) - 2
+    exact = round(100.0 * 10**decimals * share, 6)
+    return f"{(math.ceil(exact) if up else math.floor(exact)) / 10**decimals:.12g}"
+
+
+def percent(share: float, *, up: bool = False) -> str:
+    """Return a share in percent, as `of_hundred` writes it.
+
+    Examples
+    --------
+    >>> percent(0.428), percent(0.428, up=True)
+    ('42 %', '43 %')
+    """
+    return f"{of_hundred(share, up=up)} %"
+
+
+def range_of_hundred(interval: Iterable[float]) -> str:
+    """Return an interval of a share as two numbers of 100, rounded outwards.
+
+    Examples
+    --------
+    >>> range_of_hundred((0.267, 0.331))
+    '26 to 34'
+    """
+    low, high = interval
+    return f"{of_hundred(low)} to {of_hundred(high, up=True)}"
 
 
 def did_you_mean(given: str, names: Iterable[str]) -> str:

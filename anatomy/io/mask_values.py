@@ -6,6 +6,7 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Array, Mask
+from anatomy.base.words import percent
 from anatomy.io.voxels import require_numbers
 
 PARTS: Mapping[str, int] = {"lung": 5, "lobes": 5, "fissures": 5, "nodules": 100}
@@ -138,7 +139,7 @@ def _of_fractions(values: Array, name: str, top: float, voxel_mm3: float) -> tup
     between = sum(int(np.count_nonzero((plane > low) & (plane < high))) for plane in values.T)
     if between > MOST_BETWEEN * values.size:
         raise AnatomyError(
-            f"{name} holds values between {low:g} and {high:g} in {between / values.size:.0%} of its "
+            f"{name} holds values between {low:g} and {high:g} in {percent(between / values.size)} of its "
             "voxels: it is a map or an image, and no mask",
             expected="a mask, whose values lie between only at its surface",
             remedy="Give the mask itself, or threshold this image where you know what its values mean",

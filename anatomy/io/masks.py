@@ -12,6 +12,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.files import sha256
 from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask, UInt8, UInt16
+from anatomy.base.words import percent
 from anatomy.grid import Grid
 from anatomy.io.frames import Frame
 from anatomy.io.images import read_grid, read_parts, read_volume
@@ -255,7 +256,7 @@ def placement(name: str, role: str, mask: Mask, grid: Grid, target: Grid, found:
         sentences.append(f"It reaches {faces} of its 6 faces, so that it may go on beyond them.")
     if found.n_lost:
         sentences.append(
-            f"{found.n_lost} of its {found.n_voxels} voxels ({found.n_lost / found.n_voxels:.1%}) "
+            f"{found.n_lost} of its {found.n_voxels} voxels ({percent(found.n_lost / found.n_voxels)}) "
             "lie outside the images and are left out."
         )
     return " ".join(sentences)
@@ -281,8 +282,8 @@ def moved(
     ]
     if share_by_header is not None or share_by_index is not None:
         sentences.append(
-            f"By its header {share_by_header or 0.0:.0%} of it lie in the lungs, voxel by voxel "
-            f"{share_by_index or 0.0:.0%}."
+            f"By its header {percent(share_by_header or 0.0)} of it lie in the lungs, voxel by voxel "
+            f"{percent(share_by_index or 0.0)}."
         )
     if found.n_lost:
         sentences.append(f"{found.n_lost} of its {found.n_voxels} voxels lie outside the images.")

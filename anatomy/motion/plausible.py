@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Labels, Mask
+from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.motion.motion import LEFT, RIGHT, Motion
 from anatomy.structures import OUTSIDE
@@ -53,7 +54,7 @@ def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
     # A field that is split where the lungs touch is mended in 1 % of a lung.
     if motion.figures.get("mended_share", 0.0) > 0.05:
         warnings.append(
-            f"The motion slides or folds in {100.0 * motion.figures['mended_share']:.0f} % of a lung; there "
+            f"The motion slides or folds in {percent(motion.figures['mended_share'])} of a lung; there "
             "it is continued from elsewhere, which leaves what the residual says."
         )
     if motion.warning_only:
@@ -91,7 +92,7 @@ def _require_invertible(motion: Motion) -> float:
         at = motion.grid.lps(np.array(worst[1:]) + 0.5)
         folded = float((least <= 0.0).mean())
         raise AnatomyError(
-            f"The motion is not proved to be invertible in {100.0 * folded:.2g} % of its cells: at "
+            f"The motion is not proved to be invertible in {percent(folded)} of its cells: at "
             f"lps:{at[0]:.0f},{at[1]:.0f},{at[2]:.0f} lengths may shrink by a factor of {value:.2f}",
             expected="a motion that squeezes tissue nowhere to nothing, a factor above 0",
             remedy="Smooth the field, or register again with more regularisation",

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from anatomy.base.errors import AnatomyError, FrameError
 from anatomy.base.typed import Float, Labels, Mask
+from anatomy.base.words import percent
 from anatomy.grid import Grid
 from anatomy.motion.landmarks import Fitted, fit_landmarks
 from anatomy.motion.motion import LEFT, RIGHT, Motion, cell_bounds
@@ -171,7 +172,7 @@ def _require_covered(source: MotionSource, places: Float) -> None:
     covered = 0.0 if source.grid is None else float(source.grid.contains(places).mean())
     if not covered >= LEAST_COVERED:
         raise FrameError(
-            f"The {source.description} covers {100.0 * covered:.0f} % of the lungs",
+            f"The {source.description} covers {percent(covered)} of the lungs",
             expected="a field over both lungs, LPS mm of the masks",
             remedy="Export the field on the whole image; check that it and the masks come from the same one",
         )

@@ -12,6 +12,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float32, Int, Int32, Mask, UInt8
+from anatomy.base.words import percent
 from anatomy.grid import Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER, fissures_between
 from anatomy.morphology import bounds, window
@@ -108,8 +109,8 @@ def segment_lobes(
             found[np.isin(found, OF_LUNG[side])] = 0
             seen = {name: value for name, value in seen.items() if not name.startswith(side)}
             warnings.append(
-                f"The lobes of the {side} lung are not known: its oblique fissure is seen on {share:.0%} of "
-                "what would be its course."
+                f"The lobes of the {side} lung are not known: its oblique fissure is seen on "
+                f"{percent(share)} of what would be its course."
             )
     lobes = cubic.back(found)
     lobes *= np.where(lobes >= LEFT_UPPER, lungs.left, lungs.right)
@@ -122,7 +123,8 @@ def _with_fissures(
     for name, share in seen.items():
         if share < LEAST_SEEN:
             warnings.append(
-                f"The {name} is seen on {share:.0%} of the border between its lobes; the rest is inferred."
+                f"The {name} is seen on {percent(share)} of the border between its lobes; "
+                "the rest is inferred."
             )
     near = cubic.back(_grown(sheets.seen, SEEN_WITHIN_VOXELS))
     fissures = np.where(near, np.uint8(SEEN), np.uint8(BORDER)) * fissures_between(lobes)

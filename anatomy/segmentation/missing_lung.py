@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from anatomy.base.typed import Float, Int, Mask
+from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, sampled, window
 from anatomy.segmentation.closing import distance_mm
@@ -44,7 +45,7 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
     points = sampled(left | right, grid, SAMPLE_MM)
     chest, first = _on_cubes(untilted(points, carina_lps))
     zones = tuple(
-        f"About {lost_ml / 1000.0:.2f} l of lung are missing in the {name}: only {100 * share:.0f} % of "
+        f"About {lost_ml / 1000.0:.2f} l of lung are missing in the {name}: only {percent(share)} of "
         "what lies there in a healthy chest is lung. It may be solid, full of fluid or collapsed. Its "
         f"airways and vessels are not seen, it counts as outside the lung, and reach in the {name} is "
         "understated."

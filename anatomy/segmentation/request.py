@@ -10,6 +10,7 @@ from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.base.files import sha256
 from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float
+from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.images import images_in, read_volume
@@ -226,7 +227,7 @@ def _onto_ct(volume: Volume, grid: Grid, name: str, *, solid: bool) -> tuple[Vol
     lost = placed.n_lost / max(placed.n_voxels, 1)
     # An axis may turn by so many radians: over 300 mm a mask is then 3 mm off.
     if not (turned <= 0.01 and lost <= GREATEST_LOSS):
-        why = f"{lost:.0%} of it lie outside the CT" if lost > GREATEST_LOSS else "its axes are turned"
+        why = f"{percent(lost)} of it lie outside the CT" if lost > GREATEST_LOSS else "its axes are turned"
         raise GridMismatchError(
             f"{name} lies in another frame than the CT: {why}. It has {volume.grid.describe()}",
             expected=f"a mask of this CT, which has {grid.describe()}",

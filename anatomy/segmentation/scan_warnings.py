@@ -12,6 +12,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask
+from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
 from anatomy.plausibility import LIMITS, Finding
@@ -305,13 +306,13 @@ def misplaced(
             share = _share(mask & lungs, mask)
             # Share of lobes and fissures that lies in the lungs: half the lungs lie in the mirrored ones.
             if share < 0.7:
-                failed.append(_failure(name, f"only {share:.0%} of it lie in the lungs"))
+                failed.append(_failure(name, f"only {percent(share)} of it lie in the lungs"))
         if name == "lobes":
             share = _share(mask & lungs, lungs)
             if share < LEAST_COVERED:
-                failed.append(_failure(name, f"it covers only {share:.0%} of the lungs"))
+                failed.append(_failure(name, f"it covers only {percent(share)} of the lungs"))
         if name == "airway_wall" and (share := _at_lumen(mask, lumen, ct)) < LEAST_AT_LUMEN:
-            failed.append(_failure(name, f"only {share:.0%} of it lie at the lumen"))
+            failed.append(_failure(name, f"only {percent(share)} of it lie at the lumen"))
     return failed, warnings
 
 

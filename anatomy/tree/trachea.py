@@ -10,6 +10,7 @@ import numpy as np
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from anatomy.base.words import percent
 from anatomy.tree.skeleton import SkeletonTree
 
 MIN_RADIUS_MM = 2.0
@@ -73,7 +74,7 @@ def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
             _refuse(f"{size}: too narrow for an adult's and too short for a child's trachea")
         share = _lesser_lung_share(tree, trunk)
         if share < MIN_CHILD_LUNG_SHARE:
-            _refuse(f"{size}, but all but {share:.0%} of the tree are on one side of its division")
+            _refuse(f"{size}, but all but {percent(share)} of the tree are on one side of its division")
     widest = _widest_elsewhere(tree, trunk)
     if widest > 1.25 * radius:
         _refuse(f"{size}, but other parts are wider ({widest:.1f} mm)")

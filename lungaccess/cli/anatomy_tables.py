@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table
 
+from anatomy.base.words import percent
 from anatomy.plausibility import ACCEPTED, DOUBTFUL, FITS, REFUSED
 from lungaccess.cli import terminal
 
@@ -217,7 +218,7 @@ def _bronchus_rows(lung: Lung) -> list[terminal.Row]:
             f"{tree.generation[branch]}",
             f"{2.0 * tree.branch_mean_radius_mm[branch]:.1f}",
             f"{tree.branch_length_mm[branch]:.1f}",
-            f"{100.0 * named.confidence[branch]:.0f} %",
+            percent(named.confidence[branch]),
         )
         for branch in np.flatnonzero(named.starts).tolist()
     ]

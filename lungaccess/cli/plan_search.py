@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import partial
@@ -48,7 +47,7 @@ class Display(AbstractContextManager[Any], Protocol):
     def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
         """Show the state of the search."""
 
-    def better(self, elapsed_s: float, value: float | None) -> None:
+    def better(self, elapsed_s: float, value: str) -> None:
         """Show that a better plan was found, and what it states of the goal."""
 
     def interrupted(self) -> None:
@@ -56,7 +55,7 @@ class Display(AbstractContextManager[Any], Protocol):
 
 
 class CostHistory:
-    """Collects how the best cost falls while a search runs; its clock is that of the planner."""
+    """Collects how plans become better while a search runs; its clock is that of the planner."""
 
     def __init__(self, display: Display, goal: Goal) -> None:
         from lungaccess.showing.report import CostPoint
@@ -75,14 +74,13 @@ class CostHistory:
 
     def on_plan(self, found: Plan) -> None:
         """Take over a better plan, or the first clear one, of which the goal may not be known yet."""
-        loss = self._goal.loss(found)
-        self._best, self._iteration = (loss if math.isfinite(loss) else None), found.iterations
+        self._best, self._iteration = self._goal.value(found), found.iterations
         elapsed_s = float(found.timing["planning_s"])
         self._append(elapsed_s)
-        self._display.better(elapsed_s, self._goal.value(found))
+        self._display.better(elapsed_s, "" if self._best is None else self._goal.said(self._best))
 
     def _append(self, elapsed_s: float) -> None:
-        self.points.append(self._point(elapsed_s=elapsed_s, iteration=self._iteration, best_cost=self._best))
+        self.points.append(self._point(elapsed_s=elapsed_s, iteration=self._iteration, best=self._best))
 
 
 @frozen_value
@@ -253,4 +251,4 @@ def write_history(
         with progress("drawing the plan"):
             overview_png(found, lung, job.out / "overview.png", appraisal)
             tree_png(lung, job.out / "tree.png")
-            cost_over_time_png(history, job.out / "cost_over_time.png", goal.loss_words)
+            cost_over_time_png(history, job.out / "cost_over_time.png", goal)

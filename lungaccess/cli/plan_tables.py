@@ -12,6 +12,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
 from lungaccess.judging.appraisal.grade import Grade
 from stages.needle import Objective
@@ -123,8 +124,6 @@ def show_headline(headline: Headline) -> None:
 
 def show_advice(advice: Sequence[Advice], appraisal: Appraisal) -> None:
     """Print what lifts the chance of success most, as it was tried, each with its command."""
-    from lungaccess.judging.appraisal.headline import of_hundred
-
     success = appraisal.headline.success
     if not advice or success is None:
         return

@@ -144,9 +144,9 @@ class SearchDisplay(_Shown):
         words = "improving the plan" if self._found else "no plan yet"
         self._progress.update(self._task, description=description, completed=done, best=words)
 
-    def better(self, elapsed_s: float, value: float | None) -> None:
-        """Leave a line about a better plan above the bar."""
-        said = "a first clear plan" if value is None else f"{self._what} {value:.5g}"
+    def better(self, elapsed_s: float, value: str) -> None:
+        """Leave a line about a better plan above the bar; without a value it is the first clear one."""
+        said = f"{self._what} {value}" if value else "a first clear plan"
         self._progress.console.print(f"  {elapsed_s:8.2f} s   {said}", highlight=False)
 
     def interrupted(self) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 
 from anatomy.base.kernel_clock import working_s
 from anatomy.base.records import frozen_value
+from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import Appraisal
-from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.judging.checking import Checker
 from lungaccess.planning import run
 from lungaccess.planning.coupled import Atlas

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from anatomy.base.kernel_clock import working_cpu_s, working_s
 from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.words import percent
 from lungaccess.planning.constraints import holds
 from lungaccess.plans.insertion import with_simplest_motion
 from lungaccess.plans.no_plan import NoPlan
@@ -83,7 +84,7 @@ def atlas_event(share: float) -> ProgressEvent:
         elapsed_s=0.0,
         best_cost=None,
         phase="atlas",
-        message=f"deployment atlas, {share:.0%} of the scope tips",
+        message=f"deployment atlas, {percent(share)} of the scope tips",
     )
 
 

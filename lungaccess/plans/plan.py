@@ -13,7 +13,7 @@ import numpy as np
 from anatomy.base.errors import PlanFileError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.base.typed import Float
-from anatomy.base.words import plural
+from anatomy.base.words import percent, plural
 from anatomy.poses import poses_on_pieces
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.chance import Chance
@@ -258,7 +258,7 @@ class Plan(Record):
         if self.gap is None:
             return ""
         return (
-            f"The cost is proved to be at most {100.0 * self.gap:.1f} % above the least from any scope "
+            f"The cost is proved to be at most {percent(self.gap, up=True)} above the least from any scope "
             f"tip of the atlas, which is {self.cost_bound:.4g} or more."
         )
 

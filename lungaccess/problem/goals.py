@@ -14,6 +14,7 @@ from typing import Any
 from anatomy.base.errors import SettingsError
 from anatomy.base.plugins import registered
 from anatomy.base.records import frozen_record
+from anatomy.base.words import of_hundred
 
 PlanFunction = Callable[[Any, Any], float]
 """A number of a `lungaccess.plans.plan.Plan` in a `anatomy.lung.Lung`."""
@@ -101,20 +102,17 @@ class Goal:
             return -value if self.larger_is_better else value
         return 1.0 - value if self.larger_is_better else value
 
-    @property
-    def loss_words(self) -> str:
-        """What figures call the loss."""
-        if self.larger_is_better:
-            return LOSSES.get(self.name, f"minus {self.words_with_unit}")
-        return self.words_with_unit
+    def said(self, value: float) -> str:
+        """Return a value as people read it: shares of a hundred, other numbers with their unit."""
+        if self.name in (SUCCESS.name, WINDOW.name):
+            return f"{of_hundred(value)} of 100"
+        return f"{value:.4g} {self.unit}".rstrip()
 
 
 SUCCESS = Goal(name="success", words="chance of success", larger_is_better=True)
 """The chance that the procedure ends well under the stated errors: the goal of whoever states none."""
 WINDOW = Goal(name="window", words="share of the breath in which the plan is proved", larger_is_better=True)
 """The widest window of the breath."""
-LOSSES = {SUCCESS.name: "chance of failure", WINDOW.name: "share of the breath outside the window"}
-"""What is left to improve of shares, in words."""
 PLUGINS = "lungaccess.goals"
 """The group of entry points by which packages add goals."""
 REGISTERED: dict[str, Goal] = {}

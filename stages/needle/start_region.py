@@ -7,6 +7,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int, UInt8
+from anatomy.base.words import percent
 from anatomy.grid import read_only
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_region as proof_kernel
@@ -193,7 +194,7 @@ class StartRegion:
                 f"{_down(math.degrees(proved.tilt_rad))}° from the plan, proved"
             )
         return (
-            f"{first}; {100.0 * tried.share():.0f} % of the poses up to {tried.offset_mm:g} mm and "
+            f"{first}; {percent(tried.share())} of the poses up to {tried.offset_mm:g} mm and "
             f"{math.degrees(tried.tilt_rad):g}° still have a clear path {self.aim}"
         )
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative
@@ -154,13 +155,12 @@ def _records(
 
 
 def _row(number: int, each: Alternative, appraisal: Appraisal, has_map: bool) -> tuple[str, ...]:
-    from lungaccess.judging.appraisal.headline import of_hundred
 
     success = appraisal.headline.success
     return (
         f"{number:02d}",
         "refused" if success is None else of_hundred(success.value),
-        *([] if each.plan.window is None else [f"{100.0 * each.plan.window.share:.0f}"]),
+        *([] if each.plan.window is None else [of_hundred(each.plan.window.share)]),
         str(each.plan.tube.exit.branch),
         str(each.plan.scope.generation),
         f"{each.criteria['clearance_mm']:.2f}",

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
+from anatomy.base.words import of_hundred, percent, range_of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Hertz, NotNegative, Positive, Samples, Seed
@@ -98,11 +99,8 @@ def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
     hits = [", ".join(f"{name} {n}" for name, n in each["hits"].items()) or "none" for each in columns]
     reached = [each["reached"] for each in columns]
     rows = [
-        ("reached, %", *(f"{100.0 * each['probability']:.1f}" for each in reached)),
-        (
-            "95 % interval",
-            *("{:.1f} to {:.1f}".format(*(100.0 * end for end in each["interval_95"])) for each in reached),
-        ),
+        ("reached, %", *(of_hundred(each["probability"]) for each in reached)),
+        ("95 % interval", *(range_of_hundred(each["interval_95"]) for each in reached)),
         ("hit", *hits),
         ("no path left", *(f"{each['outcomes']['no path left']}" for each in columns)),
         ("tip error, median, mm", *(f"{each['tip_error_median_mm']:.2f}" for each in columns)),
@@ -117,7 +115,7 @@ def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
     made.caption = (
         f"Tracker: {tracker.position_mm:g} mm and {tracker.direction_deg:g}°, "
         f"every {tracker.measure_every_mm:g} mm, {tracker.latency_mm:g} mm late, "
-        f"{100.0 * tracker.lost_share:g} % lost. Errors of needle and target: {found.errors.label}."
+        f"{percent(tracker.lost_share)} lost. Errors of needle and target: {found.errors.label}."
     )
     return made
 
@@ -126,4 +124,4 @@ def _known(found: InsertionStudy) -> str:
     """Return by how much the believed factor of the curvature differs from the true one, in words."""
     bent = [run for run in found.closed_loop.insertions if run.factor > 0.0]
     off = [abs(run.believed_factor / run.factor - 1.0) for run in bent]
-    return f"{100.0 * median(off):.1f}" if off else "none bends"
+    return of_hundred(median(off)) if off else "none bends"

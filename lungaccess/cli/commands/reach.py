@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder, write_json
+from anatomy.base.words import of_hundred, percent
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, Spacing
@@ -146,7 +147,7 @@ def _region_table(reach: ReachMap) -> Table:
         (
             row.name,
             f"{row.volume_ml:.0f}",
-            *(f"{row.state_ml(state):.0f} ({100.0 * row.share(state):.1f} %)" for state in STATES),
+            *(f"{row.state_ml(state):.0f} ({percent(row.share(state))})" for state in STATES),
             f"{row.median_cost:.2f}",
             f"{row.median_clearance_mm:.2f}",
         )
@@ -164,7 +165,7 @@ def _comparison_table(maps: tuple[ReachMap, ...]) -> Table:
             each.system.name,
             f"{each.system.scope.outer_diameter_mm:g}",
             *each.system.needle_sizes,
-            *(f"{100.0 * row.reached:.1f}" for row in each.by_region()),
+            *(of_hundred(row.reached) for row in each.by_region()),
             f"{gained:.0f}",
             f"{lost:.0f}",
         )

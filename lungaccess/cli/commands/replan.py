@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.base.errors import SettingsError
+from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Positive, Seed
@@ -232,9 +233,9 @@ def decision_tables(decision: Decision) -> list[Table]:
     """Return what a policy says is to be done next."""
     from lungaccess.cli.plan_tables import arcs_table
 
-    rows = [("estimated chance of success so", f"{100.0 * decision.chance:.0f} of 100")]
+    rows = [("estimated chance of success so", f"{of_hundred(decision.chance)} of 100")]
     if decision.again:
-        rows.append(("if the scope is placed again", f"{100.0 * decision.again:.0f} of 100"))
+        rows.append(("if the scope is placed again", f"{of_hundred(decision.again)} of 100"))
     if not decision.goes_on:
         return [terminal.table(str(decision.action), ("", ""), rows)]
     rows += [] if decision.tube is None else tube_rows(decision.tube)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from anatomy.base.words import of_hundred, percent, range_of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Probability, Processes, Samples, Seed
@@ -166,10 +167,12 @@ def _outcome_table(report: RiskReport) -> Table:
     for name, share in report.touches.items():
         words = name if name.startswith("stays") else f"touches {name}"
         words = words if name in report.forbidden else f"{words} (allowed)"
-        rows.append(_rare_row(words, report.rare[name]) if name in report.rare else share_row(words, share))
-    rows += [
-        (f"{100.0 * share:.0f} % end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()
-    ]
+        rows.append(
+            _rare_row(words, report.rare[name])
+            if name in report.rare
+            else share_row(words, share, fails=True)
+        )
+    rows += [(f"{percent(share)} end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()]
     title = (
         f"{report.samples} deviated plans, errors of '{report.model.label}'; radius: {report.radius_origin}"
     )
@@ -178,11 +181,10 @@ def _outcome_table(report: RiskReport) -> Table:
 
 def _rare_row(name: str, rare: RareShare) -> terminal.Row:
     """Return name, per cent and interval of a probability estimated with weights, and how exact it is."""
-    low, high = rare.interval
     return (
         f"{name} (weighted)",
-        f"{100.0 * rare.value:.2g}",
-        f"{100.0 * low:.2g} to {100.0 * high:.2g}, as {rare.effective_samples:.0f} events",
+        of_hundred(rare.value, up=True),
+        f"{range_of_hundred(rare.interval)}, as {rare.effective_samples:.0f} events",
     )
 
 
@@ -190,8 +192,8 @@ def _sensitivity_table(report: RiskReport) -> Table:
     rows = [
         (
             each.kind.replace("_", " "),
-            f"{100.0 * each.alone.value:.1f}",
-            f"{100.0 * each.changes.value:.1f}",
+            of_hundred(each.alone.value),
+            of_hundred(each.changes.value),
             f"{each.first_order:.2f}",
             f"{each.total:.2f}",
         )
@@ -207,7 +209,7 @@ def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:
             each.kind.replace("_", " "),
             each.unit,
             f"{each.stated:g}",
-            f"{100.0 * each.alone.value:.1f}",
+            of_hundred(each.alone.value),
             _largest(each),
             "{:.2f}, {:.2f}".format(*each.margin),
         )
@@ -228,10 +230,9 @@ def _largest(tolerance: Tolerance) -> str:
     return f"{more}{size:.2f}"
 
 
-def share_row(name: str, share: Share) -> terminal.Row:
-    """Return name, per cent and interval of a share."""
-    low, high = share.interval
-    return name, f"{100.0 * share.value:.2f}", f"{100.0 * low:.2f} to {100.0 * high:.2f}"
+def share_row(name: str, share: Share, *, fails: bool = False) -> terminal.Row:
+    """Return name, per cent and interval of a share, which is rounded up where it fails."""
+    return name, of_hundred(share.value, up=fails), range_of_hundred(share.interval)
 
 
 def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
@@ -273,9 +274,9 @@ def procedure_record(report: ProcedureReport) -> dict[str, object]:
 def procedure_tables(report: ProcedureReport) -> list[Table]:
     """Return how procedures ended, and what each stage corrected."""
     rows = [share_row("success", report.succeeds)]
-    rows += [share_row(name, share) for name, share in report.failures]
+    rows += [share_row(name, share, fails=True) for name, share in report.failures]
     rows += [
-        (f"{100.0 * share:.0f} % of the inserted end within", f"{miss:.2f}", "mm")
+        (f"{percent(share)} of the inserted end within", f"{miss:.2f}", "mm")
         for share, miss in report.miss_mm.items()
     ]
     title = (
@@ -288,7 +289,7 @@ def procedure_tables(report: ProcedureReport) -> list[Table]:
             (
                 each.stage,
                 f"{each.replans / report.samples:.2f}",
-                f"{100.0 * each.without_path.value:.1f}",
+                of_hundred(each.without_path.value, up=True),
                 "" if math.isnan(each.corrected_mm) else f"{each.corrected_mm:.2f}",
             )
             for each in report.stages

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative, Positive, Samples, SamplesOrNone, Seed
@@ -94,7 +95,7 @@ def _tried_table(region: StartRegion) -> Table:
     steps = np.arange(1, len(shares) + 1) / len(shares)
     headings = ("up to", *(f"{angle:.0f}°" for angle in np.degrees(tried.tilt_rad) * steps))
     rows = [
-        (f"{far:.1f} mm", *("–" if np.isnan(share) else f"{100.0 * share:.0f}" for share in row))
+        (f"{far:.1f} mm", *("–" if np.isnan(share) else of_hundred(share) for share in row))
         for far, row in zip(tried.offset_mm * steps, shares.tolist(), strict=True)
     ]
     return terminal.table("Tried: % of the starts with a clear path, ring by ring", headings, rows)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from anatomy.base.errors import SettingsError
+from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
@@ -176,10 +177,10 @@ def _row(group: Group) -> tuple[str, ...]:
         group.planner,
         str(group.runs),
         str(group.failed),
-        f"{100.0 * group.solved_share:.1f}",
-        f"{100.0 * group.accepted_share:.1f}" if group.first_plan_s else "",
+        of_hundred(group.solved_share),
+        of_hundred(group.accepted_share) if group.first_plan_s else "",
         "" if group.first_plan_s is None else f"{group.first_plan_s[0]:.3f}",
         f"{group.run_s:.2f}",
         "" if group.cost is None else f"{group.cost:.4g}",
-        "" if group.success is None else f"{100.0 * group.success:.1f}",
+        "" if group.success is None else of_hundred(group.success),
     )

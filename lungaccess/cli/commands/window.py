@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from anatomy.base.files import require_suffix
+from anatomy.base.words import of_hundred, percent
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative
@@ -62,11 +63,8 @@ def window(
         terminal.show_json({**plain(found), "share": found.share, "words": found.words, **told})
         return ExitCode.of(len(found.phases) > 0)
     terminal.say(found.words)
-    rows = [
-        (f"{100.0 * a:.1f} to {100.0 * b:.1f} %", f"{100.0 * (b - a):.1f} %")
-        for a, b in found.phases.tolist()
-    ]
-    rows += [("not decided", f"{100.0 * found.undecided_share:.2f} %")]
+    rows = [(f"{of_hundred(a, up=True)} to {percent(b)}", percent(b - a)) for a, b in found.phases.tolist()]
+    rows += [("not decided", percent(found.undecided_share))]
     tables = [terminal.table(f"Window of breathing: {found.motion_source}", ("phases", "share"), rows)]
     if in_place is not None:
         tables.append(_in_place(in_place))

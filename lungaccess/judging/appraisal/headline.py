@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
 from anatomy.base.records import frozen_value
-from anatomy.base.words import plural
+from anatomy.base.words import of_hundred, plural, range_of_hundred
 from anatomy.lobes import FISSURES_UNKNOWN
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
 from lungaccess.judging.checking.needle_load import FINDING as NEEDLE_LOAD
@@ -187,7 +186,6 @@ class Headline:
         chance, success = self.chance, self.success
         if chance is None or success is None:
             return "Chance of success not computed."
-        low, high = success.interval
         failures = " and ".join(
             f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in self.failures
         )
@@ -196,7 +194,7 @@ class Headline:
         left = "" if open_loop is None else f" Without measuring: {of_hundred(open_loop.value)} of 100."
         return (
             f"Estimated to succeed in {of_hundred(success.value)} of 100 procedures (95 % interval "
-            f"{of_hundred(low)} to {of_hundred(high, up=True)}); {why}. "
+            f"{range_of_hundred(success.interval)}); {why}. "
             f"Procedure '{chance.procedure}', errors of '{chance.errors}'.{left}"
         )
 
@@ -205,9 +203,7 @@ class Headline:
         """The chance of success alone, for the cell of a table."""
         if self.success is None:
             return "not computed"
-        low, high = self.success.interval
-        interval = f"{of_hundred(low)} to {of_hundred(high, up=True)}"
-        return f"{of_hundred(self.success.value)} of 100 ({interval})"
+        return f"{of_hundred(self.success.value)} of 100 ({range_of_hundred(self.success.interval)})"
 
     @property
     def details(self) -> tuple[str, ...]:
@@ -268,18 +264,3 @@ def _errors(chance: Chance, estimate: Estimate | None) -> dict[str, object]:
     if estimate is None or isinstance(estimate, Chance):
         return {"name": chance.errors, "sizes": chance.sizes}
     return {**to_mapping(estimate.model), "name": chance.errors}
-
-
-def of_hundred(probability: float, *, up: bool = False) -> str:
-    """Return a probability as a number of 100, rounded down, or up where the greater number is the worse.
-
-    Near 0 and 100 it has one decimal, so that neither is stated where it does not hold.
-
-    Examples
-    --------
-    >>> of_hundred(0.0065), of_hundred(0.428), of_hundred(0.9996), of_hundred(0.428, up=True)
-    ('0.6', '42', '99.9', '43')
-    """
-    steps = 1.0 if 0.1 <= probability <= 0.9 else 10.0
-    exact = round(100.0 * steps * probability, 6)
-    return f"{(math.ceil(exact) if up else math.floor(exact)) / steps:g}"

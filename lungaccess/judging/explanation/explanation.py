@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import field
 
 from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.words import of_hundred
 from lungaccess.judging.answering import Attempt
 from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking
 from lungaccess.judging.explanation.neighbours import Neighbour, ReachedShare
@@ -136,7 +137,7 @@ class Explanation:
     def _how_often(self, plan: Plan | None) -> str:
         """Say how often a plan succeeds: that it exists says too little."""
         chance = self.chances.get(self.file_of(plan) or "")
-        return "" if chance is None else f" (succeeds in {100.0 * chance.value:.0f} of 100)"
+        return "" if chance is None else f" (succeeds in {of_hundred(chance.value)} of 100)"
 
     @property
     def _way_on(self) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from anatomy.base.words import percent, range_of_hundred
 from anatomy.poses import spread_directions
 from anatomy.structures import obstacle_bits
 from lungaccess.judging.explanation.blocking import region_of
@@ -56,10 +57,10 @@ class ReachedShare:
     @property
     def words(self) -> str:
         """The share and its interval, in words."""
-        low, high = self.share.interval
+        share = self.share
         return (
-            f"{100.0 * self.share.value:.0f} % of {self.share.samples} random points "
-            f"(95 % interval {100.0 * low:.0f} to {100.0 * high:.0f} %)"
+            f"{percent(share.value)} of {share.samples} random points "
+            f"(95 % interval {range_of_hundred(share.interval)} %)"
         )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from anatomy.base.records import frozen_value
+from anatomy.base.words import of_hundred, percent
 from lungaccess.judging.explanation.explanation import Explanation
 from lungaccess.planning.one_stage.obstruction import point_in_words
 
@@ -72,7 +73,7 @@ def _accepted(e: Explanation, name: str) -> str:
     chance = e.chances.get(name)
     how_often = "chance of success not estimated"
     if chance is not None:
-        how_often = f"succeeds in {100.0 * chance.value:.0f} of 100 procedures under the default errors"
+        how_often = f"succeeds in {of_hundred(chance.value)} of 100 procedures under the default errors"
     return f"a plan that the check accepts; {how_often}"
 
 
@@ -97,7 +98,7 @@ def _blocks(e: Explanation) -> Iterator[Row]:
         spot, near = each.place, f"{each.arcs_at_place} within 5 mm of {point_in_words(each.place.lps_mm)}"
         yield (
             f"{spot.kind} {spot.name}",
-            f"{each.arcs} of {each.of} ({100.0 * each.arcs / each.of:.0f} %)",
+            f"{each.arcs} of {each.of} ({percent(each.arcs / each.of)})",
             f"{near}, {spot.from_target_mm:.1f} mm from the target",
         )
 

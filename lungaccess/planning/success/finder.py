@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.base.records import frozen_record
+from anatomy.base.words import percent
 from lungaccess.planning import searches
 from lungaccess.planning.constraints import holds
 from lungaccess.planning.coupled.atlas import Atlas
@@ -261,7 +262,7 @@ class ContestFinder:
         leader = self._leader
         if leader is None or not leader.draws or isinstance(self._rating, FunctionRating):
             return ""
-        return f"succeeds in {leader.share:.0%} of the draws"
+        return f"succeeds in {percent(leader.share)} of the draws"
 
     def _turn(self, iteration: int) -> Turn:
         """Return a turn with the leader, if what it states is better than what was shown before."""

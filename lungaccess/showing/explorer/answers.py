@@ -192,9 +192,9 @@ class Answers:
 
         try:
             for found in run(request, atlas=atlas, counterfactuals=False, on_progress=on_progress):
-                last, loss = found, request.goal.loss(found)
-                if np.isfinite(loss):
-                    curve.append((time.monotonic() - began, float(found.iterations), loss))
+                last, value = found, request.goal.value(found)
+                if value is not None:
+                    curve.append((time.monotonic() - began, float(found.iterations), value))
                 if time.monotonic() - told >= TELL_EVERY_S:
                     told, shown = time.monotonic(), found
                     yield self._plan_part(asked, found, curve, system, place, final=False)
@@ -339,8 +339,8 @@ def _require_below(number: int, count: int, what: str) -> None:
 def _goal_words(goal: Goal, found: Plan) -> dict[str, str]:
     """Return what a plan was made good at, and how good it is, in words."""
     value = goal.value(found)
-    text = "not known yet" if value is None else f"{value:.4g}"
-    return {"words": goal.words_with_unit, "value": text, "loss_words": goal.loss_words}
+    text = "not known yet" if value is None else goal.said(value)
+    return {"words": goal.words_with_unit, "value": text, "loss_words": goal.words_with_unit}
 
 
 def _why(failure: LungaccessError) -> dict[str, Any]:

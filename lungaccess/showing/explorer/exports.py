@@ -26,14 +26,14 @@ from lungaccess.planning.reachability import KINDS, ReachStream
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target
-from lungaccess.problem.request import Request
+from lungaccess.problem.goals import SUCCESS
+from lungaccess.problem.request import Request, goal_of
 from lungaccess.showing import report
 from lungaccess.showing.explorer.questions import ExplainQuestion
 from lungaccess.showing.explorer.worker import Part, Turn
 from lungaccess.showing.report.html import PageOptions, plan_page
 from lungaccess.showing.report.html.volumes import read_ct
 from lungaccess.showing.slicer import export_slicer
-from stages.needle import Objective
 
 Reached = MutableMapping[tuple[Any, ...], Int]
 """The deployment that reached each voxel, by scope, tubes, margins and rule for fissures."""
@@ -41,7 +41,7 @@ Reached = MutableMapping[tuple[Any, ...], Int]
 ITERATIONS = 100
 
 Curve = Sequence[tuple[float, float, float]]
-"""Seconds, iterations and cost of better and better plans."""
+"""Seconds, iterations and value of the goal of better and better plans."""
 
 
 def export_file(
@@ -57,8 +57,8 @@ def export_file(
     made = Path(tempfile.mkdtemp(dir=folder))
     file = made / what
     points = [
-        report.CostPoint(elapsed_s=elapsed_s, iteration=int(iteration), best_cost=cost)
-        for elapsed_s, iteration, cost in curve
+        report.CostPoint(elapsed_s=elapsed_s, iteration=int(iteration), best=value)
+        for elapsed_s, iteration, value in curve
     ]
     if what == "plan.json":
         plan.save(file)
@@ -79,7 +79,7 @@ def export_file(
     elif what == "cost_over_time.csv":
         report.cost_over_time_csv(points, file)
     elif what == "cost_over_time.png":
-        report.cost_over_time_png(points, file, Objective.of(plan.objective).words)
+        report.cost_over_time_png(points, file, SUCCESS if plan.chance else goal_of(plan.objective))
     else:
         scene = made / "slicer"
         export_slicer(plan, lung, scene)

@@ -11,6 +11,7 @@ import numpy as np
 from anatomy.base.errors import LungaccessError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_pieces
 from lungaccess.planning.one_stage import RestOfPlan, ScopeReplanner, measured_pose, replan_from_tube
@@ -140,7 +141,7 @@ class TrackedReplanner:
         self._seen = {each: self._seen[each] for each in stages if each in self._seen} | {name: pose}
         scope, tubes, needle = ([self._seen[each]] if each in self._seen else [] for each in TRACKED)
         decision = policy.decide(Measurements.of(scope=scope, tubes=tubes, needle=needle))
-        words = f"{decision.action}: {100.0 * decision.chance:.0f} of 100"
+        words = f"{decision.action}: {of_hundred(decision.chance)} of 100"
         if not decision.goes_on:
             return None, None, words
         out = None

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 from anatomy.base.typed import Float
+from anatomy.base.words import percent
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import AXIAL, CORONAL, View
@@ -57,7 +58,7 @@ def open_places_png(
     )
     said = "proved unreachable" if verdict.proved else f"{len(verdict.open_places)} places are open"
     style.heading(
-        figure, f"{lung.name}: {said}, {100.0 * verdict.share_ruled_out:.3g} % of the deployments ruled out"
+        figure, f"{lung.name}: {said}, {percent(verdict.share_ruled_out)} of the deployments ruled out"
     )
     return style.save_png(figure, path)
 
@@ -111,7 +112,7 @@ def _legend(verdict: ReachVerdict) -> list[Line2D]:
             [],
             [],
             ls="none",
-            label=f"{n + 1}: branch {place.name}, {100.0 * place.share:.2g} % of the deployments open",
+            label=f"{n + 1}: branch {place.name}, {percent(place.share)} of the deployments open",
         )
         for n, place in enumerate(verdict.open_places[:NAMED])
     ]

@@ -13,6 +13,7 @@ from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
 from anatomy.base.typed import Float
+from anatomy.base.words import percent
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import STANDARD, View
@@ -153,7 +154,7 @@ def _text(figure: Figure, reach: ReachMap) -> None:
     total = reach.total
     figure.legend(
         handles=[
-            Patch(color=COLOURS[name], label=f"{name}: {100.0 * share:.1f} %")
+            Patch(color=COLOURS[name], label=f"{name}: {percent(share)}")
             for name, share in zip(KINDS, total.shares, strict=True)
         ]
         + [

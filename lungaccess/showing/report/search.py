@@ -11,14 +11,15 @@ from matplotlib.axes import Axes
 
 from anatomy.base.files import atomic_write
 from anatomy.base.records import frozen_value
+from lungaccess.problem.goals import Goal
 from lungaccess.showing.report import drawing, style
 
 
 @style.plain_look
-def cost_over_time_png(
-    history: Sequence[CostPoint], path: str | os.PathLike[str], objective: str = "cost"
-) -> Path:
-    """Draw the best cost against planning time; a search without a plan says so.
+def cost_over_time_png(history: Sequence[CostPoint], path: str | os.PathLike[str], goal: Goal) -> Path:
+    """Draw the best value of a goal against planning time; a search without a plan says so.
+
+    Costs fall, and chances of success rise.
 
     Raises
     ------
@@ -27,26 +28,31 @@ def cost_over_time_png(
     """
     figure = style.new_figure(8.0, 4.5)
     axes = figure.add_axes((0.105, 0.135, 0.86, 0.77))
-    found = [point for point in history if point.best_cost is not None]
+    found = [point for point in history if point.best is not None]
     if found:
-        _steps(axes, found, history[-1].elapsed_s, objective)
+        _steps(axes, found, history[-1].elapsed_s, goal)
     else:
         axes.text(0.5, 0.5, "no plan was found", ha="center", va="center", transform=axes.transAxes)
-    drawing.graph(axes, "planning time (s)", objective)
-    drawing.title(axes, "Best cost over planning time")
+    drawing.graph(axes, "planning time (s)", goal.words_with_unit)
+    drawing.title(axes, f"Best plan over planning time: {goal.words}")
     return style.save_png(figure, path)
 
 
-def _steps(axes: Axes, found: Sequence[CostPoint], end_s: float, objective: str) -> None:
+def _steps(axes: Axes, found: Sequence[CostPoint], end_s: float, goal: Goal) -> None:
     times = [point.elapsed_s for point in found] + [max(end_s, found[-1].elapsed_s)]
-    costs = [float(point.best_cost or 0.0) for point in found]
-    axes.step(times, [*costs, costs[-1]], where="post", color=style.SCOPE, lw=2)
-    better = [n for n in range(len(costs)) if n == 0 or costs[n] < costs[n - 1]]
-    axes.plot([times[n] for n in better], [costs[n] for n in better], "o", color=style.SCOPE, ms=5)
-    _note(axes, times[0], costs[0], f"first plan {times[0]:.2f} s, {costs[0]:.4g}", (12, 2), "left")
-    if costs[-1] < costs[0]:
-        _note(axes, times[-1], costs[-1], f"best {costs[-1]:.4g}", (-4, 8), "right")
-        axes.set_ylim(costs[-1] - 0.08 * (costs[0] - costs[-1]), costs[0] + 0.12 * (costs[0] - costs[-1]))
+    values = [float(point.best or 0.0) for point in found]
+    axes.step(times, [*values, values[-1]], where="post", color=style.SCOPE, lw=2)
+    better = [n for n in range(len(values)) if n == 0 or values[n] != values[n - 1]]
+    axes.plot([times[n] for n in better], [values[n] for n in better], "o", color=style.SCOPE, ms=5)
+    gained = abs(values[-1] - values[0])
+    # Words stand on the side of the curve that it leaves free.
+    side = -16 if goal.larger_is_better and gained else 2
+    _note(
+        axes, times[0], values[0], f"first plan {times[0]:.2f} s, {goal.said(values[0])}", (12, side), "left"
+    )
+    if gained:
+        _note(axes, times[-1], values[-1], f"best {goal.said(values[-1])}", (-4, 8), "right")
+        axes.set_ylim(min(values) - 0.14 * gained, max(values) + 0.14 * gained)
     if len(better) > 2 and times[-1] > 50 * max(times[0], 1e-3):
         axes.set_xscale("log")
 
@@ -66,17 +72,17 @@ class CostPoint:
     ----------
     elapsed_s : float
         Planning time since the search began.
-    best_cost : float or None
-        Cost of the best plan yet, in the unit of the objective; None before the first plan.
+    best : float or None
+        Value of the goal for the best plan yet, in its unit; None before the first plan.
     """
 
     elapsed_s: float
     iteration: int
-    best_cost: float | None
+    best: float | None
 
 
 def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str]) -> Path:
-    """Write one line a point: elapsed_s, iteration, best_cost (empty before the first plan).
+    """Write one line a point: elapsed_s, iteration, best (empty before the first plan).
 
     Raises
     ------
@@ -85,10 +91,10 @@ def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str
     """
     with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["elapsed_s", "iteration", "best_cost"])
+        writer.writerow(["elapsed_s", "iteration", "best"])
         for point in history:
-            cost = "" if point.best_cost is None else repr(float(point.best_cost))
-            writer.writerow([f"{point.elapsed_s:.6f}", point.iteration, cost])
+            best = "" if point.best is None else repr(float(point.best))
+            writer.writerow([f"{point.elapsed_s:.6f}", point.iteration, best])
     return Path(path)
 
 

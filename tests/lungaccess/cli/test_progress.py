@@ -90,7 +90,7 @@ def test_steps_are_shown_with_an_estimate(screen: StringIO) -> None:
 def test_a_search_shows_best_cost_and_estimate(screen: StringIO) -> None:
     with progress.SearchDisplay(10.0, None) as shown:
         shown.update("local search", 5.0, 3, None)
-        shown.better(5.0, 1.25)
+        shown.better(5.0, "1.25")
         shown.update("local search", 6.0, 3, 1.25)
         shown._progress.refresh()
         shown.interrupted()
@@ -105,5 +105,5 @@ def test_nothing_is_shown_where_nobody_looks(monkeypatch: pytest.MonkeyPatch) ->
     with progress.progress("working") as shown:
         shown.share(0.5)
     with progress.SearchDisplay(1.0, None) as search:
-        search.better(0.1, 1.0)
+        search.better(0.1, "1.0")
     assert stream.getvalue() == ""

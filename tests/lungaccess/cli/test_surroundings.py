@@ -13,6 +13,7 @@ import pytest
 
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.problem.goals import SUCCESS
 from lungaccess.showing.report import CostPoint, cost_over_time_png
 
 ROOT = Path(__file__).parents[3]
@@ -54,10 +55,10 @@ def test_any_encoding_of_the_output_will_do(encoding, tmp_path):
 
 
 def test_settings_of_matplotlib_change_no_picture(tmp_path):
-    history = [CostPoint(elapsed_s=float(n), iteration=n, best_cost=3.0 - n) for n in range(3)]
-    cost_over_time_png(history, tmp_path / "plain.png", "cost")
+    history = [CostPoint(elapsed_s=float(n), iteration=n, best=3.0 - n) for n in range(3)]
+    cost_over_time_png(history, tmp_path / "plain.png", SUCCESS)
     with matplotlib.rc_context({"text.usetex": True, "savefig.dpi": 10, "lines.linewidth": 9.0}):
-        cost_over_time_png(history, tmp_path / "other.png", "cost")
+        cost_over_time_png(history, tmp_path / "other.png", SUCCESS)
         assert matplotlib.rcParams["text.usetex"]
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "other.png").read_bytes()
 

@@ -125,7 +125,7 @@ class TestValues:
         stated = replace(toy_plan, goals={"deep": value})
         assert DEEP.value(stated) == value and DEEP.loss(stated) == -value
         assert replace(DEEP, larger_is_better=False).loss(stated) == value
-        assert DEEP.loss_words == "minus way in tissue (mm)"
+        assert DEEP.said(value) == f"{value:.4g} mm"
 
     @pytest.mark.parametrize("value", [math.nan, math.inf, "much", None])
     def test_what_is_no_finite_number_is_refused(self, value: Any, toy_plan: Plan, toy_lung: Lung) -> None:
@@ -142,7 +142,7 @@ class TestValues:
     def test_shares_lack_what_is_left(self) -> None:
         half: Any = SimpleNamespace(chance=SimpleNamespace(share=0.5), window=SimpleNamespace(share=0.25))
         assert (SUCCESS.loss(half), WINDOW.loss(half)) == (0.5, 0.75)
-        assert SUCCESS.loss_words == "chance of failure"
+        assert SUCCESS.said(0.488) == "48 of 100" and WINDOW.said(0.25) == "25 of 100"
 
 
 def test_the_public_name_is_the_same() -> None:

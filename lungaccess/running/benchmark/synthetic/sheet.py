@@ -11,6 +11,7 @@ from typing import Any
 from anatomy.base.errors import FileError
 from anatomy.base.files import atomic_write, read_json
 from anatomy.base.records import frozen_value
+from anatomy.base.words import of_hundred
 from lungaccess.running.benchmark.runs import decimals, require_table_file
 from lungaccess.running.benchmark.synthetic.manifest import manifest_sha256
 from lungaccess.running.benchmark.synthetic.phantoms import VERSION
@@ -70,13 +71,15 @@ class SheetLine:
 
     def cells(self) -> tuple[str, ...]:
         """Return the line as text; what is not known is empty."""
-        share = 100.0 * self.solved / self.queries if self.queries else 0.0
-        percent = [None if each is None else 100.0 * each for each in (self.success, self.breath_share)]
+        solved, *others = (
+            "" if each is None else of_hundred(each)
+            for each in (self.solved / max(self.queries, 1), self.success, self.breath_share)
+        )
         return (
-            self.planner, self.family, self.system, f"{self.queries}", f"{self.solved}", f"{share:.1f}",
+            self.planner, self.family, self.system, f"{self.queries}", f"{self.solved}", solved,
             f"{self.refused}", f"{self.certified}", f"{self.refuted}", decimals(self.first_cpu_s, 3),
             decimals(self.cpu_s, 3), decimals(self.cost, 2), decimals(self.shared_cost, 2),
-            decimals(percent[0], 1), decimals(percent[1], 1), f"{self.not_checked}",
+            *others, f"{self.not_checked}",
         )  # fmt: skip
 
 

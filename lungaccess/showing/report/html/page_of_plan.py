@@ -12,14 +12,15 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.base.words import plural
+from anatomy.base.words import of_hundred, plural, range_of_hundred
 from lungaccess.judging.advice import Advice
 from lungaccess.judging.appraisal import Appraiser
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
-from lungaccess.judging.appraisal.headline import Geometry, of_hundred
+from lungaccess.judging.appraisal.headline import Geometry
 from lungaccess.planning import with_front
 from lungaccess.plans.chance import Chance
 from lungaccess.problem.error_files import error_preset_names, load_errors
+from lungaccess.problem.goals import SUCCESS
 from lungaccess.problem.procedures import load_procedure, procedure_names
 from lungaccess.showing.report.html import breathing, tables, words
 from lungaccess.showing.report.html.deployment import device_points, packed_plan
@@ -220,7 +221,7 @@ def page_data(
 
 def made_small(plan: Plan) -> str:
     """Say what a search made small over its time."""
-    return "best cost" if plan.chance is None else "chance of failure"
+    return "best cost" if plan.chance is None else SUCCESS.words
 
 
 def image_source(lung: Lung, ct_name: str) -> str:
@@ -231,12 +232,12 @@ def image_source(lung: Lung, ct_name: str) -> str:
 
 
 def cost_history(path: Path | None) -> list[list[float]]:
-    """Return seconds and best cost from a CSV of `lungaccess plan`; empty if there is none."""
+    """Return seconds and the best value of the goal from a CSV of `lungaccess plan`; empty without one."""
     if path is None or not path.is_file():
         return []
     with path.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    return [[float(row["elapsed_s"]), float(row["best_cost"])] for row in rows if row.get("best_cost")]
+    return [[float(row["elapsed_s"]), float(row["best"])] for row in rows if row.get("best")]
 
 
 def summary(plan: Plan) -> str:
@@ -295,7 +296,7 @@ def _chance(said: Headline) -> str:
         '<span class="bar" aria-hidden="true">'
         f'<span style="margin-left:{min(100.0 * low, 99.0):.1f}%;width:{width:.1f}%"></span></span>'
     )
-    note = f"95 % interval {of_hundred(low)} to {of_hundred(high, up=True)}"
+    note = f"95 % interval {range_of_hundred(success.interval)}"
     value = f"{of_hundred(success.value)} of 100"
     return _tile("Chance of success", grade_of_chance(success), value, note, bar)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from anatomy.base.words import of_hundred
 from anatomy.grid import Volume
 from lungaccess.showing.report.html import words
 from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
@@ -118,7 +119,7 @@ def volumes_section(maps: Sequence[ReachMap]) -> str:
             (
                 words.text(row.name),
                 f"{row.volume_ml:.0f}",
-                *(f"{row.state_ml(state):.0f} ({100.0 * row.share(state):.1f})" for state in STATES),
+                *(f"{row.state_ml(state):.0f} ({of_hundred(row.share(state))})" for state in STATES),
                 f"{row.volume_ml * row.shares[1]:.0f}",
                 words.number(row.median_cost),
                 words.number(row.median_clearance_mm),
@@ -140,7 +141,7 @@ def systems_section(maps: Sequence[ReachMap]) -> str:
             *each.system.needle_sizes,
             "are obstacles" if each.with_fissures else "may be crossed or have no mask",
             each.entries,
-            f"{100.0 * each.total.reached:.1f}",
+            of_hundred(each.total.reached),
             f"{gained:.0f}",
             f"{lost:.0f}",
         ]

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from anatomy.base.words import percent, range_of_hundred
 from lungaccess.planning.procedure import ProcedureReport
 from lungaccess.plans.chance import Chance
 from lungaccess.showing.report.html import words
@@ -61,14 +62,14 @@ def _of_procedures(report: ProcedureReport) -> str:
         f"{report.placements:.2f} times. The range is the 95 % interval."
     )
     missed = [
-        (f"of the inserted ends, {100.0 * share:.0f} % miss by no more than", f"{miss:.2f} mm")
+        (f"of the inserted ends, {percent(share)} miss by no more than", f"{miss:.2f} mm")
         for share, miss in report.miss_mm.items()
     ]
     stages = [
         (
             words.text(each.stage),
             f"{each.replans / report.samples:.2f}",
-            _share(each.without_path),
+            _share(each.without_path, fails=True),
             "–" if math.isnan(each.corrected_mm) else f"{each.corrected_mm:.2f} mm",
         )
         for each in report.stages
@@ -76,7 +77,7 @@ def _of_procedures(report: ProcedureReport) -> str:
     headings = ("planned again from", "times", "without a path", "would have missed by (median)")
     return (
         f"<p class='note'>{words.text(note)}</p>"
-        + words.pairs(FAILS, [(name, _share(share)) for name, share in report.failures] + missed)
+        + words.pairs(FAILS, [(name, _share(share, fails=True)) for name, share in report.failures] + missed)
         + words.table("What measuring corrects", headings, stages)
     )
 
@@ -86,11 +87,11 @@ def _of_deviations(report: RiskReport) -> str:
     rows = [("reaches the goal and touches nothing forbidden", _share(report.succeeds))]
     rows.append((f"ends within {report.radius_mm:.1f} mm of the target", _share(report.reaches)))
     rows += [
-        (f"touches: {name}" if name != "stays in the airway" else name, _share(share))
+        (f"touches: {name}" if name != "stays in the airway" else name, _share(share, fails=True))
         for name, share in report.touches.items()
     ]
     rows += [
-        (f"miss that {100.0 * share:.0f} % do not exceed", f"{miss:.2f} mm")
+        (f"miss that {percent(share)} do not exceed", f"{miss:.2f} mm")
         for share, miss in report.miss_mm.items()
     ]
     alone = [(name.replace("_", " "), _share(share)) for name, share in report.alone.items()]
@@ -135,6 +136,5 @@ def sensitivity_bars(found: Sequence[Sensitivity]) -> str:
     )
 
 
-def _share(share: Share) -> str:
-    low, high = share.interval
-    return f"{100.0 * share.value:.1f} % ({100.0 * low:.1f} to {100.0 * high:.1f})"
+def _share(share: Share, *, fails: bool = False) -> str:
+    return f"{percent(share.value, up=fails)} ({range_of_hundred(share.interval)})"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from anatomy.base.words import plural
+from anatomy.base.words import percent, plural
 from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
 from lungaccess.showing.report.html import words
 from lungaccess.showing.report.key_numbers import figures_of_plan
@@ -143,7 +143,7 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
 
 
 def _window(plan: Plan) -> str:
-    return "not computed" if plan.window is None else f"{100.0 * plan.window.share:.0f} %"
+    return "not computed" if plan.window is None else percent(plan.window.share)
 
 
 def plan_name(number: int) -> str:

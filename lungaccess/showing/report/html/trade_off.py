@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from anatomy.base.words import of_hundred
 from lungaccess.showing.report.html import words
 from lungaccess.uncertainty.risk import Share
 
@@ -58,7 +59,7 @@ def _mark(number: int, each: Alternative, x: float, y: float) -> str:
     colour = COLOURS[sum(values["clearance_mm"] > bound for bound in CLEARANCES_MM)]
     front = ", on the front" if each.on_front else ""
     told = (
-        f"plan {number}: succeeds in {100.0 * chance.share:.0f} of 100, "
+        f"plan {number}: succeeds in {of_hundred(chance.share)} of 100, "
         f"{values['length_in_tissue_mm']:.0f} mm in tissue, clearance {values['clearance_mm']:.1f} mm{front}"
     )
     return (
@@ -74,7 +75,7 @@ def _axes(low: float, high: float) -> list[str]:
     floor, end = HEIGHT - BOTTOM, WIDTH - RIGHT
     parts = [
         f'<line x1="{LEFT}" x2="{end}" y1="{_y(share):.1f}" y2="{_y(share):.1f}" stroke="currentColor" '
-        f'opacity="0.2"/>{_text(LEFT - 7, _y(share) + 4, f"{100.0 * share:.0f}", "end")}'
+        f'opacity="0.2"/>{_text(LEFT - 7, _y(share) + 4, of_hundred(share), "end")}'
         for share in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
     ]
     for tick in range(int(low), int(high) + 1, 10 if high - low <= 100.0 else 20):

@@ -37,7 +37,7 @@ def make_reach(lung: Lung) -> ReachMap:
 def plan_file(plans: tuple[Plan, ...], lung: Lung, ct: Volume | None, folder: Path) -> Path:
     """Write the page of a plan with an alternative, with or without a CT."""
     table = folder / "cost_over_time.csv"
-    table.write_text("elapsed_s,iteration,best_cost\n0.1,0,\n0.5,3,9.5\n1.25,8,7.0\n")
+    table.write_text("elapsed_s,iteration,best\n0.1,0,\n0.5,3,9.5\n1.25,8,7.0\n")
     options = PageOptions(
         alternatives=plans[1:],
         ct=ct,

@@ -199,14 +199,12 @@ def test_the_key_numbers_of_an_appraised_plan_are_those_of_its_check(toy_plan: A
 
 def _history() -> list[report.CostPoint]:
     costs = [None, 0.1 + 0.2, 0.25]
-    return [
-        report.CostPoint(elapsed_s=0.5 * n, iteration=10 * n, best_cost=cost) for n, cost in enumerate(costs)
-    ]
+    return [report.CostPoint(elapsed_s=0.5 * n, iteration=10 * n, best=cost) for n, cost in enumerate(costs)]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_cost_over_time_is_drawn_for_any_history(count: int, tmp_path: Path) -> None:
-    path = report.cost_over_time_png(_history()[:count], tmp_path / "cost.png")
+    path = report.cost_over_time_png(_history()[:count], tmp_path / "cost.png", goal_of("length"))
     assert _size(path) > (800, 400)
 
 
@@ -214,7 +212,7 @@ def test_cost_over_time_is_written_without_loss(tmp_path: Path) -> None:
     path = report.cost_over_time_csv(_history(), tmp_path / "cost.csv")
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [row["best_cost"] for row in rows] == ["", repr(0.1 + 0.2), "0.25"]
+    assert [row["best"] for row in rows] == ["", repr(0.1 + 0.2), "0.25"]
     assert [int(row["iteration"]) for row in rows] == [0, 10, 20]
 
 

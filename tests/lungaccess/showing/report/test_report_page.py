@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 import lungaccess as la
+from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from anatomy.structures import VESSEL
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.judging.appraisal import SHOWN_LIMITS
-from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.plans.curves import arc_lengths
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report import pack
@@ -233,7 +233,7 @@ def test_the_camera_follows_the_states_with_the_top_of_its_picture_where_a_bend_
 
 def test_cost_over_time_is_read_as_it_was_written(tmp_path: Path) -> None:
     table = tmp_path / "cost.csv"
-    table.write_text("elapsed_s,iteration,best_cost\n0.0,0,\n0.5,3,9.5\n1.25,8,7.0\n")
+    table.write_text("elapsed_s,iteration,best\n0.0,0,\n0.5,3,9.5\n1.25,8,7.0\n")
     assert page_of_plan.cost_history(table) == [[0.5, 9.5], [1.25, 7.0]]
     assert page_of_plan.cost_history(tmp_path / "none.csv") == []
     assert page_of_plan.cost_history(None) == []

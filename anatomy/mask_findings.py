@@ -177,8 +177,8 @@ def _cut_off(images: PatientImages, tree: AirwayTree) -> Iterator[Finding]:
         yield Finding(
             name="gap",
             found=f"A gap of {piece.length_mm:.1f} mm at LPS ({point(piece.position_lps)}) mm cuts off "
-            f"{percent(share)} of the airway, which leads into the {_behind(images, tree, piece)}: none of it is "
-            "used, and no path that leads through it is known",
+            f"{percent(share)} of the airway, which leads into the {_behind(images, tree, piece)}: none of "
+            "it is used, and no path that leads through it is known",
             remedy="Close the gap in the mask of the airway, if it is one",
             verdict=REFUSED if share >= GREATEST_CUT else DOUBTFUL,
         )

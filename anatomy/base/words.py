@@ -59,6 +59,18 @@ def range_of_hundred(interval: Iterable[float]) -> str:
     return f"{of_hundred(low)} to {of_hundred(high, up=True)}"
 
 
+def point_in_words(lps_mm: Iterable[float]) -> str:
+    """Return a point in mm in both frames, since a reader may have either at hand.
+
+    Examples
+    --------
+    >>> point_in_words((1.0, 0.0, 3.0))
+    'LPS (1.0, 0.0, 3.0) = RAS (-1.0, 0.0, 3.0) mm'
+    """
+    x, y, z = (float(v) + 0.0 for v in lps_mm)
+    return f"LPS ({x:.1f}, {y:.1f}, {z:.1f}) = RAS ({-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}) mm"
+
+
 def did_you_mean(given: str, names: Iterable[str]) -> str:
     """Return a question that offers the name nearest to a wrong one; "" if none is near.
 

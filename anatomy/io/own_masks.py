@@ -99,12 +99,7 @@ def load_own_masks(description: Path) -> PatientImages:
         cost_path = _named_file(folder, keys.cost)
         cost = require_cost(read_volume(cost_path, frame=frame), masks.grid)
         hashes[keys.cost] = sha256(cost_path)
-    motion = None
-    if keys.motion is not None:
-        for name in filter(None, keys.motion.files):
-            hashes[name] = sha256(_named_file(folder, name))
-        motion = read_motion(keys.motion, folder, masks.grid)
-    return assemble(
+    images = assemble(
         masks,
         name=keys.name or folder.resolve().name,
         kind="masks",
@@ -112,7 +107,6 @@ def load_own_masks(description: Path) -> PatientImages:
         cost=cost,
         targets_lps=targets,
         breath_hold=keys.breath_hold or None,
-        motion=motion,
         sources=hashes,
         accepted=keys.accepted,
         warnings=(
@@ -122,6 +116,34 @@ def load_own_masks(description: Path) -> PatientImages:
             *keys.warnings,
         ),
     )
+    return images if keys.motion is None else with_motion(images, keys.motion, description)
+
+
+def motion_alone(description: Path) -> MotionFile | None:
+    """Return the motion that a `patient.toml` names; None if it names anything else, such as masks.
+
+    Raises
+    ------
+    SettingsError
+        If the file is no TOML, or a key of the motion is unknown.
+    """
+    content = _read_content(description)
+    return parse(MotionFile, content["motion"], description.name) if [*content] == ["motion"] else None
+
+
+def with_motion(images: PatientImages, keys: MotionFile, description: Path) -> PatientImages:
+    """Return images with a motion that a `patient.toml` in their folder names.
+
+    Raises
+    ------
+    AnatomyError, FileError, FrameError, SettingsError
+        As `load_own_masks`.
+    """
+    folder = description.parent
+    hashes = {description.name: sha256(description)}
+    hashes |= {name: sha256(_named_file(folder, name)) for name in keys.files if name}
+    motion = read_motion(keys, folder, images.grid)
+    return replace(images, motion=motion, sources={**images.sources, **hashes})
 
 
 def thick_slices_mm(path: str | Path) -> float:
@@ -164,14 +186,17 @@ def _from_elsewhere(sources: Mapping[str, str]) -> tuple[str, ...]:
     return (f"Masks of other programs or people took the place of steps of the segmentation: {words}.",)
 
 
-def _read_description(path: Path) -> PatientFile:
-    content = read_toml(
+def _read_content(path: Path) -> dict[str, Any]:
+    return read_toml(
         path,
         expected='lines such as lumen = "airway.nii.gz"',
         remedy="`lungaccess template patient` prints a complete file to start from",
     )
+
+
+def _read_description(path: Path) -> PatientFile:
     try:
-        return parse(PatientFile, content, path.name)
+        return parse(PatientFile, _read_content(path), path.name)
     except SettingsError as error:
         raise SettingsError(
             error.found,

@@ -10,7 +10,7 @@ from anatomy.io.ct_cases import cases_in, require_no_ct_case
 from anatomy.io.images import image_suffix, images_in
 from anatomy.io.liver import is_liver
 from anatomy.io.med_rad import is_med_rad, load_med_rad, lung_sources, require_no_brain, require_roles
-from anatomy.io.own_masks import DESCRIPTION, load_own_masks
+from anatomy.io.own_masks import DESCRIPTION, load_own_masks, motion_alone, with_motion
 from anatomy.io.totalsegmentator import has_lobes, is_totalsegmentator, load_totalsegmentator
 from anatomy.patient import PatientImages
 
@@ -24,7 +24,8 @@ def load_patient(path: str | Path) -> PatientImages:
     Parameters
     ----------
     path : str or Path
-        A folder with a `patient.toml`, a lung of Med-RAD, a folder with output of TotalSegmentator; or a
+        A folder with a `patient.toml`, a lung of Med-RAD, a folder with output of TotalSegmentator, beside
+        which a `patient.toml` may name the motion alone; or a
         `.toml` file, or a label map of TotalSegmentator with the lobes beside it.
 
     Returns
@@ -56,13 +57,15 @@ def load_patient(path: str | Path) -> PatientImages:
         raise FileError(
             f"There is no patient at {path}", expected="an existing folder or file", remedy="Check the path"
         )
-    if (path / DESCRIPTION).is_file():
-        return load_own_masks(path / DESCRIPTION)
-    if is_med_rad(path):
-        return load_med_rad(path)
-    if is_totalsegmentator(path):
-        return load_totalsegmentator(path)
-    _refuse(path)
+    description = path / DESCRIPTION
+    motion = motion_alone(description) if description.is_file() else None
+    if description.is_file() and motion is None:
+        return load_own_masks(description)
+    kinds = ((is_med_rad, load_med_rad), (is_totalsegmentator, load_totalsegmentator))
+    images = next((load(path) for is_kind, load in kinds if is_kind(path)), None)
+    if images is None:
+        _refuse(path)
+    return images if motion is None else with_motion(images, motion, description)
 
 
 def _load_file(path: Path) -> PatientImages:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -168,16 +169,19 @@ def structure_voxels(lung: Organ) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-def anatomy_tables(lung: Organ) -> list[Table]:
-    """Return what was understood of a patient: structures, airway tree by generation, sources."""
+def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
+    """Return what was understood of a patient: structures, airway tree by generation, sources.
+
+    With `details` every repair of the airway tree has a line; they are counted else.
+    """
     from anatomy.lung import Lung
 
     made = [
         terminal.table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
         _nodule_table(lung),
-        *(_tree_tables(lung) if isinstance(lung, Lung) else ()),
         checks_table(lung),
+        *(_tree_tables(lung, details) if isinstance(lung, Lung) else ()),
         *(_motion_tables(lung) if isinstance(lung, Lung) else ()),
         terminal.table("Starts and targets", ("name", "LPS, mm"), _place_rows(lung)),
         terminal.table(
@@ -224,7 +228,8 @@ def _bronchus_rows(lung: Lung) -> list[terminal.Row]:
     ]
 
 
-def _tree_tables(lung: Lung) -> list[Table]:
+def _tree_tables(lung: Lung, details: bool) -> list[Table]:
+    repairs = _repair_rows(lung) if details else []
     return [
         terminal.table(
             "Bronchi with a name",
@@ -236,9 +241,7 @@ def _tree_tables(lung: Lung) -> list[Table]:
             ("generation", "branches", "mean radius, mm", "least radius, mm", "mean length, mm"),
             _generation_rows(lung),
         ),
-        terminal.table(
-            "Repairs of the airway tree", ("repair", "at LPS, mm", "length, mm"), _repair_rows(lung)
-        ),
+        terminal.table("Repairs of the airway tree", ("repair", "at LPS, mm", "length, mm"), repairs),
     ]
 
 
@@ -280,6 +283,10 @@ def _patient_rows(lung: Organ) -> list[terminal.Row]:
     dropped = lung.tree.report.components_dropped
     if dropped:
         rows.append(("airway pieces left out", f"{dropped} ({lung.tree.report.voxels_dropped} voxels)"))
+    kinds = Counter(kind for kind, _repair in _repairs(lung))
+    if kinds:
+        counted = ", ".join(f"{count} x {kind}" for kind, count in kinds.items())
+        rows.append(("repairs of the airway tree", f"{counted}; --details lists them"))
     return rows
 
 

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter
 
 from anatomy.base.checksums import DamagedCacheWarning
 from anatomy.base.errors import AnatomyError, FileError, LungaccessError
@@ -95,15 +95,25 @@ def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
     return ExitCode.OK
 
 
-for _command in (
-    plan, needle, replan, stream, certify, check, info, presets, template, phantom, demo, advise,
-    alternatives, route, tour, tubes, shapes, steps, risk, window, start_region, reach, segment, report,
-    view, export, insert, design, doctor, selftest, completion,
-):  # fmt: skip
-    app.command(_command, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
-app.command(study)
-app.command(benchmark)
-app.command(cache)
+GROUPS: dict[str, tuple[Callable[..., ExitCode] | App, ...]] = {
+    "Plan": (demo, plan, alternatives, replan, certify, needle, route, tour, advise),
+    "Understand a plan": (report, view, steps, check, risk, window, start_region, insert, reach),
+    "Anatomy": (segment, info, phantom),
+    "Devices": (presets, tubes, shapes, design),
+    "Studies": (study, benchmark),
+    "Files and links": (export, stream, template),
+    "This installation": (doctor, selftest, cache, completion),
+}
+"""All commands by what they are for, in the order of `lungaccess --help`."""
+
+for _number, (_title, _commands) in enumerate(GROUPS.items()):
+    _group = Group(_title, sort_key=_number)
+    for _command in _commands:
+        if isinstance(_command, App):
+            _command.group = (_group,)
+            app.command(_command)
+        else:
+            app.command(_command, group=_group, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 
 
 # Cyclopts would end the process by itself.

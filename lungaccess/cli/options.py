@@ -349,10 +349,11 @@ class SearchOptions(BudgetOptions):
         Parameter(
             name=("--goal", "--objective"),
             help="What to make good. success: the chance that the procedure succeeds; window: the share of "
-            "the breath in which it is proved; or a cost to make small: integral of 1/clearance, of the "
-            "patient's cost map, its sum over the voxels crossed, or length, of the needle alone; tissue: of "
-            "width/clearance over tubes and needle; a weighted sum such as length=1,cost-map=0.5; default is "
-            "the first, and the second too where there is a map; or a goal that a package adds.",
+            "the breath in which it is proved; or a cost of the needle to make small. inverse-clearance: "
+            "nearness to obstacles, 1/clearance along it; cost-map, voxel-sum: the patient's cost map along "
+            "it; length; tissue: nearness of tubes and needle, times their width; a weighted sum such as "
+            "length=1,cost-map=0.5; default is the first, and the second too where there is a map; or a goal "
+            "that a package adds.",
         ),
     ] = SUCCESS.name
     phases: PhasesText = None

@@ -17,6 +17,8 @@ from lungaccess.cli.progress import SearchDisplay, progress
 from lungaccess.plans.no_plan import NoPlan
 
 if TYPE_CHECKING:
+    from rich.panel import Panel
+
     from anatomy.lung import Lung
     from lungaccess.judging.advice import Advice
     from lungaccess.judging.appraisal import Appraisal
@@ -91,6 +93,8 @@ class PlanJob:
     ----------
     asked : Asked
         Everything of the request but the patient and the target in it.
+    guide : Panel, optional
+        What a newcomer is told of the pictures, before the plan and its headline are shown.
     """
 
     asked: Asked
@@ -98,6 +102,7 @@ class PlanJob:
     out: Path
     output: CacheOptions
     pictures: bool = True
+    guide: Panel | None = None
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -184,6 +189,8 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     record = plan_record(found, lung, appraisal, job.out, job.files, [each.to_mapping() for each in advice])
     write_text(job.out / SUMMARY_FILE, terminal.json_text(record))
     if not job.output.json:
+        if job.guide is not None:
+            terminal.console.print(job.guide)
         show_plan(found, lung, appraisal, advice)
     write_history(found, history, lung, appraisal, job, goal)
     if job.output.json:
@@ -226,9 +233,9 @@ def system_of(plan: Plan, systems: Sequence[System]) -> System:
 
 
 def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal, advice: Sequence[Advice] = ()) -> None:
-    """Print headline of a plan, what would lift its chance, its limits, then the plan."""
-    plan_tables.show_headline(appraisal.headline)
-    plan_tables.show_advice(advice, appraisal)
+    """Print a plan, its limits, what would lift its chance, and last, where a terminal stops, the headline."""
+    terminal.show(plan_tables.plan_tables(plan, lung))
+    terminal.show_warnings(lung.warnings)
     plan_tables.show_findings(appraisal)
     if plan.window is not None:
         terminal.say(plan.window.words)
@@ -236,8 +243,8 @@ def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal, advice: Sequence[Adv
         terminal.say(plan.gap_in_words)
     if plan.system_choice:
         terminal.say(" ".join(plan.system_choice))
-    terminal.show(plan_tables.plan_tables(plan, lung))
-    terminal.show_warnings(lung.warnings)
+    plan_tables.show_advice(advice, appraisal)
+    plan_tables.show_headline(appraisal.headline)
 
 
 def write_history(

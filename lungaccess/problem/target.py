@@ -7,6 +7,7 @@ import numpy as np
 from anatomy.base.errors import TargetError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from anatomy.base.words import point_in_words
 from anatomy.grid import read_only
 from anatomy.io.frames import MOST_COORDINATE_MM
 from anatomy.lung import Lung
@@ -200,7 +201,7 @@ def require_free(lung: Organ, point: Float, origin: str = "") -> None:
     for bit, name in ((VESSEL, "a vessel"), (AIRWAY, "an airway")):
         if label & bit:
             raise TargetError(
-                f"The target at {_place(point)} lies inside {name}",
+                f"The target at {point_in_words(point)} lies inside {name}",
                 expected=f"a point in {_word_of(lung)} tissue",
                 remedy="Move the target, or remove the nodule from that mask",
             )
@@ -215,15 +216,15 @@ def _outside(lung: Organ, point: Float, origin: str) -> TargetError:
         corners = [lung.grid.lps(np.zeros(3)), lung.grid.lps(np.array(lung.grid.shape) - 1.0)]
         ranges = (f"{a:.0f} to {b:.0f}" for a, b in zip(np.min(corners, 0), np.max(corners, 0), strict=True))
         return TargetError(
-            f"The target at {_place(point)} lies outside the {where}",
+            f"The target at {point_in_words(point)} lies outside the {where}",
             expected=f"a point in {organ} tissue; the box of the {organ} is LPS {', '.join(ranges)} mm",
             remedy="Read the point off the images again",
         )
     frame, _, numbers = origin.removeprefix("point ").partition(":")
     other = {"ras": "lps", "lps": "ras"}.get(frame.strip().lower(), "")
-    typed = f"--target {other}:{numbers}" if other else f"the point {_place(flipped)}"
+    typed = f"--target {other}:{numbers}" if other else f"the point {point_in_words(flipped)}"
     return TargetError(
-        f"The target at {_place(point)} lies outside the {where}"
+        f"The target at {point_in_words(point)} lies outside the {where}"
         + (
             f"; in {other.upper()} the same numbers lie inside"
             if other
@@ -236,7 +237,3 @@ def _outside(lung: Organ, point: Float, origin: str) -> TargetError:
 
 def _word_of(organ: Organ) -> str:
     return "lung" if isinstance(organ, Lung) else "liver"
-
-
-def _place(point: Float) -> str:
-    return "LPS ({:.1f}, {:.1f}, {:.1f}) mm".format(*(point + 0.0))

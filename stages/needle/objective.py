@@ -68,16 +68,12 @@ class Term:
 
 
 TERMS = (
-    Term(key="inverse_clearance", weight="inverse_clearance", words="integral of 1/clearance"),
-    Term(key="cost_map", weight="cost_map", words="integral of the cost map", unit="mm", of_map=True),
-    Term(key="voxel_sum", weight="voxel_sum", words="sum of the cost map over voxels", of_map=True),
+    Term(key="inverse_clearance", weight="inverse_clearance", words="nearness to obstacles along the path"),
+    Term(key="cost_map", weight="cost_map", words="cost map along the path", unit="mm", of_map=True),
+    Term(key="voxel_sum", weight="voxel_sum", words="cost map of the voxels passed", of_map=True),
     Term(key="length_mm", weight="length", words="length of the path", unit="mm"),
     Term(
-        key="tissue",
-        weight="tissue",
-        words="integral of width/clearance over all in tissue",
-        unit="mm",
-        of_all=True,
+        key="tissue", weight="tissue", words="nearness to obstacles of all in tissue", unit="mm", of_all=True
     ),
 )
 """Every cost of a plan."""
@@ -188,7 +184,7 @@ class Objective:
         weighed = self.weighed
         if len(weighed) == 1 and weighed[0][1] == 1.0:
             return weighed[0][0].words_with_unit
-        return "weighted sum " + " + ".join(f"{weight:g} {term.option}" for term, weight in weighed)
+        return " + ".join(f"{weight:g} x {term.words}".removeprefix("1 x ") for term, weight in weighed)
 
     @property
     def weighs_map(self) -> bool:

@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 PICTURE = "trade_off.svg"
 COLUMNS = (
     *("plan", "succeeds", "window", "branch", "gen."),
-    *("clear", "pleura", "tissue", "1/clear", "map", "front"),
+    *("clear", "pleura", "tissue", "near", "map", "front"),
 )
 NOTE = (
     "succeeds: of 100; gen.: generation of the scope's tip; clear, pleura: least distance of tubes and "
     "needle from any obstacle and from the pleura, mm, as the plan states it; tissue: way in tissue, mm; "
-    "1/clear: integral of 1/clearance; front: no other plan is better in one of succeeds, clear and tissue "
-    "and as good in the others.  The plan that succeeds most often of several owes part of it to luck, which "
-    "its interval does not count"
+    "near, map: nearness to obstacles and cost map along the needle; front: no other plan is better in one "
+    "of succeeds, clear and tissue and as good in the others.  The plan that succeeds most often of several "
+    "owes part of it to luck, which its interval does not count"
 )
 WINDOW_NOTE = "window: share of the breath in which the plan is proved, %; the front counts it, too"
 

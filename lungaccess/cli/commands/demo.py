@@ -44,14 +44,14 @@ def demo(
     with progress("making a synthetic patient") as shown:
         lung = demo_lung(seed, output.cache, shown.step)
     target, systems = stated_target(None, 1), SystemOptions().candidates()
-    job = PlanJob(asked=search.asked(systems), target=target, out=out, output=output)
+    if not output.json:
+        terminal.show(anatomy_tables(lung)[1:3])
+    guide = what_to_look_at(out)
+    job = PlanJob(asked=search.asked(systems), target=target, out=out, output=output, guide=guide)
     code = _first_reachable_nodule(lung, job)
     if code == ExitCode.OK:
         with progress("making the page"):
             _write_page(lung, out)
-        if not output.json:
-            terminal.show(anatomy_tables(lung)[1:3])
-            terminal.console.print(what_to_look_at(out))
     return code
 
 

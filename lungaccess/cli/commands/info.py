@@ -27,6 +27,7 @@ def info(
             help="Folder for tree.png, a picture of the airway tree, and motion.png; for a liver organ.png."
         ),
     ] = None,
+    details: Annotated[bool, Parameter(help="List every repair of the airway tree.", negative="")] = False,
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
@@ -37,7 +38,7 @@ def info(
     if output.json:
         terminal.show_json(anatomy_tables.organ_record(lung))
     else:
-        terminal.show(anatomy_tables.anatomy_tables(lung))
+        terminal.show(anatomy_tables.anatomy_tables(lung, details=details))
         terminal.show_warnings(lung.warnings)
     if out is not None:
         from anatomy.lung import Lung

@@ -55,8 +55,8 @@ def needle(
     objective: Annotated[
         ObjectiveText,
         Parameter(
-            help="What to make small: length, integral of 1/clearance, integral of the cost map, its sum "
-            "over voxels, or a weighted sum such as length=1,cost-map=0.5."
+            help="What to make small: length, inverse-clearance (nearness to obstacles), cost-map, "
+            "voxel-sum, or a weighted sum such as length=1,cost-map=0.5."
         ),
     ] = "length",
     budget: BudgetOptions = BudgetOptions(),

@@ -12,7 +12,8 @@ from anatomy.structures import AIRWAY, BRANCH_SHIFT
 from lungaccess.judging.explanation import kernels
 from lungaccess.planning.coupled import DirectArcs
 from lungaccess.plans.evaluator import blocker_name
-from stages.needle import direct_path
+from lungaccess.problem.preset_order import presets_by_invasiveness
+from stages.needle import Needle, direct_path
 
 MOST_ARCS = 4000
 """Arcs that are looked along, evenly chosen: enough for shares of a few percent, in about half a second."""
@@ -184,7 +185,8 @@ def look_along(arcs: DirectArcs) -> tuple[tuple[Blocking, ...], BlockedArc | Non
 def arc_beyond_limits(arcs: DirectArcs) -> ArcBeyondLimits | None:
     """Return the direct arc that exceeds the needle's limits least; None if one keeps them, or there is none.
 
-    By how much a limit is exceeded is measured as a share of it, and these shares are added.
+    By how much a limit is exceeded is measured as a share of it, and these shares are added.  An arc that
+    exceeds what every needle of the presets can do, too, is no near miss and is left out.
     """
     entries, needle = arcs.atlas.deployments, arcs.evaluator.environment.needle
     if not entries.count:
@@ -195,11 +197,21 @@ def arc_beyond_limits(arcs: DirectArcs) -> ArcBeyondLimits | None:
     aside = np.sqrt(np.maximum(chord**2 - ahead**2, 0.0))
     curvature, turn = 2.0 * aside / chord**2, 2.0 * np.arctan2(aside, ahead)
     length = np.where(turn > 1e-6, turn / np.maximum(curvature, 1e-12), chord)
-    most_turn = math.radians(min(needle.max_angle_from_start_deg, needle.max_accumulated_turn_deg))
+    most_turn = _most_turn(needle)
     shares = (curvature / needle.max_curvature_per_mm, length / needle.max_length_mm, turn / most_turn)
     excess = np.sum([np.maximum(share - 1.0, 0.0) for share in shares], axis=0)
-    best = int(np.argmin(excess))
-    if excess[best] <= 0.0:
+    needles = [each.needle for each in presets_by_invasiveness() if each.needle is not None]
+    possible = np.any(
+        [
+            (curvature <= each.max_curvature_per_mm)
+            & (length <= each.max_length_mm)
+            & (turn <= _most_turn(each))
+            for each in [needle, *needles]
+        ],
+        axis=0,
+    )
+    best = int(np.argmin(np.where(possible, excess, np.inf)))
+    if excess.min() <= 0.0 or not possible[best]:
         return None
     return ArcBeyondLimits(
         points_lps=_points(arcs, best),
@@ -210,6 +222,11 @@ def arc_beyond_limits(arcs: DirectArcs) -> ArcBeyondLimits | None:
         most_length_mm=needle.max_length_mm,
         most_turn_deg=math.degrees(most_turn),
     )
+
+
+def _most_turn(needle: Needle) -> float:
+    """Return the angle in rad by which a needle may turn from its start, on one arc."""
+    return math.radians(min(needle.max_angle_from_start_deg, needle.max_accumulated_turn_deg))
 
 
 def region_of(lung: Lung, point: Float) -> str:

@@ -3,9 +3,8 @@
 from collections.abc import Iterator
 
 from anatomy.base.records import frozen_value
-from anatomy.base.words import of_hundred, percent
+from anatomy.base.words import of_hundred, percent, point_in_words
 from lungaccess.judging.explanation.explanation import Explanation
-from lungaccess.planning.one_stage.obstruction import point_in_words
 
 Row = tuple[str, ...]
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from anatomy.base.typed import Float
+from anatomy.base.words import point_in_words
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, OUTSIDE, VESSEL
+from lungaccess.problem.system import load_system, needle_preset_names, preset_names
 from stages.needle import Obstruction
 
 NAMES = ((VESSEL, "a vessel"), (FISSURE, "a fissure"), (OUTSIDE, "the outside of the organ"))
@@ -25,12 +26,6 @@ def structure_in_words(label: int) -> str:
     return next((name for bit, name in NAMES if label & bit), "nothing")
 
 
-def point_in_words(lps_mm: Float) -> str:
-    """Return a point in both frames, since a reader may have either at hand."""
-    x, y, z = (float(v) for v in lps_mm)
-    return f"LPS ({x:.1f}, {y:.1f}, {z:.1f}) = RAS ({-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}) mm"
-
-
 def reason_in_words(found: Obstruction) -> str:
     """Return in a few words what is blocked, by what, and by how much."""
     if found.place == "reach":
@@ -40,12 +35,20 @@ def reason_in_words(found: Obstruction) -> str:
             return "target out of reach, whatever the radius of curvature"
         # Rounded down, so that the radius named does reach it.
         radius_mm = math.floor(10.0 * found.radius_mm) / 10.0
-        return f"target out of reach of this radius: needs R <= {radius_mm:.1f} mm"
+        return f"target out of reach of this radius: needs R <= {radius_mm:.1f} mm{_needle_with(radius_mm)}"
     what = {"start": "start blocked", "target": "target blocked"}.get(found.place, "path blocked")
     return (
         f"{what} by {structure_in_words(found.label)}: "
         f"{found.distance_mm:.2f} mm away, needs {found.needed_mm:.2f} mm"
     )
+
+
+def _needle_with(radius_mm: float) -> str:
+    """Name the system with the gentlest needle that turns within a radius; "" if none that ships does."""
+    systems = [load_system(name) for name in (*preset_names(), *needle_preset_names())]
+    radii = {each.name: each.needle.min_radius_of_curvature_mm for each in systems if each.needle is not None}
+    name = max((each for each in radii if radii[each] <= radius_mm), key=lambda each: radii[each], default="")
+    return f", as --system {name} ({radii[name]:g} mm)" if name else ""
 
 
 def obstruction_rows(found: Obstruction, proved: bool, lobe: str = "") -> list[tuple[str, str]]:

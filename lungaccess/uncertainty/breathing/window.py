@@ -111,9 +111,10 @@ def require_motion(lung: Lung) -> Motion:
     if lung.motion is None:
         raise AnatomyError(
             f"Nothing is known of the breathing of {lung.name}",
-            expected="a [motion] in its patient.toml",
-            remedy='Write there [motion], file = "field.nrrd" (or landmarks.csv) and masks_phase = 0.0, or '
-            "population = true for a warning without data; docs/explanation/breathing.md says more",
+            expected="a [motion] in the patient.toml of its folder, which may hold nothing else",
+            remedy='Write into it motion = { file = "field.nrrd", masks_phase = 0.0 }, or landmarks.csv as '
+            "its file, or motion = { population = true } for a warning without data; "
+            "docs/explanation/breathing.md says more",
         )
     return lung.motion
 

@@ -77,7 +77,7 @@ def test_a_sum_is_written_with_its_weights() -> None:
     objective = Objective.of("length=1,cost-map=0.5")
     assert objective == Objective(length=1.0, cost_map=0.5)
     assert str(objective) == "cost_map=0.5,length_mm=1"
-    assert objective.words == "weighted sum 0.5 cost-map + 1 length"
+    assert objective.words == "0.5 x cost map along the path + length of the path"
     assert Objective.of(objective) is objective
 
 

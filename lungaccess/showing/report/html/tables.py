@@ -136,7 +136,7 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
     headings = (
         "plan", "succeeds", "fails most often because it", "tissue, mm", "clearance, mm", "on the front",
         "check", "nearest limit", "branch pierced", "generation of the scope's tip",
-        "integral of 1/clearance",
+        "nearness to obstacles",
     )  # fmt: skip
     more = ("share of the breath in the window",) if breathe else ()
     return words.table("Plans to this target", (*headings, *more), rows)

@@ -18,6 +18,7 @@ from anatomy.base.errors import FileError
 from anatomy.grid import Grid, Volume
 from anatomy.store import open_lung
 from lungaccess.judging.appraisal import Appraisal, limits_of
+from lungaccess.problem.request import goal_of
 from lungaccess.showing import report
 from lungaccess.showing.report import views
 from lungaccess.showing.report.key_numbers import key_numbers

@@ -27,7 +27,7 @@ COMMANDS = (
     "lungaccess segment BREATHING/ct.nii.gz --out patient",
 )
 STORED = {"breathing-motion": "info/motion.png", "breathing-clock": "clock.png"}
-WIDTH_PX, COLOURS, MOVING_COLOURS = 900, 128, 200
+WIDTH_PX, MOVING_COLOURS = 900, 200
 PHASES = np.linspace(0.0, 1.0, 9)
 FRAME_MS, END_MS = 140, 700
 CLOSER = 5
@@ -120,7 +120,7 @@ def draw_lobes(patient: Path, ct: Path, path: Path) -> None:
     padded = [np.pad(part, ((0, height - len(part)), (0, 4), (0, 0)), constant_values=255) for part in parts]
     image = Image.fromarray(np.hstack(padded))
     image = image.resize((WIDTH_PX, round(image.height * WIDTH_PX / image.width)), Image.Resampling.LANCZOS)
-    image.quantize(COLOURS).save(path, optimize=True)
+    image.save(path, optimize=True)
 
 
 def make() -> None:
@@ -132,7 +132,7 @@ def make() -> None:
         for stored, file in STORED.items():
             image = Image.open(folder / file).convert("RGB")
             image.thumbnail((WIDTH_PX, WIDTH_PX))
-            image.quantize(COLOURS).save(IMAGES / f"{stored}.png", optimize=True)
+            image.save(IMAGES / f"{stored}.png", optimize=True)
         ct = find_ct(folder / "BREATHING")
         if ct is not None:
             draw_lobes(folder / "patient", ct, IMAGES / "lobes.png")

@@ -25,7 +25,7 @@ from tests.lungaccess.showing.report.browser import Browser
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "tutorials" / "first_steps.md"
 IMAGES = ROOT / "docs" / "images"
-WIDTH_PX, COLOURS = 1100, 256
+WIDTH_PX = 1100
 """Wide enough to read on a page, small enough to be stored."""
 LEAST_HU, GREATEST_HU = -1350.0, 150.0
 """The usual window for lungs."""
@@ -83,11 +83,10 @@ def run_commands(text: str, folder: Path) -> str:
 
 
 def store(picture: Path, name: str) -> None:
-    """Write a picture small, with few colours."""
+    """Write a picture as small as it is shown, in all its colours."""
     image = Image.open(picture).convert("RGB")
     image.thumbnail((WIDTH_PX, 2 * WIDTH_PX))
-    few = image.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE)
-    few.save(IMAGES / f"first-steps-{name}.png", optimize=True)
+    image.save(IMAGES / f"first-steps-{name}.png", optimize=True)
 
 
 def draw_ct(file: Path, out: Path) -> None:

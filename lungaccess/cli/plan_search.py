@@ -233,7 +233,7 @@ def system_of(plan: Plan, systems: Sequence[System]) -> System:
 
 
 def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal, advice: Sequence[Advice] = ()) -> None:
-    """Print a plan, its limits, what would lift its chance, and last, where a terminal stops, the headline."""
+    """Print a plan, its limits and what would lift its chance; the headline comes last, where it is seen."""
     terminal.show(plan_tables.plan_tables(plan, lung))
     terminal.show_warnings(lung.warnings)
     plan_tables.show_findings(appraisal)

@@ -27,17 +27,24 @@ def export(
         Path | None,
         Parameter(help="Folder for the motion in time: joint values as CSV, and messages of ROS 2 as YAML."),
     ] = None,
+    models: Annotated[
+        Path | None,
+        Parameter(
+            help="Folder for surfaces of anatomy and devices, as STL and as one glTF, and for the camera "
+            "of a film."
+        ),
+    ] = None,
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Write a stored plan for 3D Slicer, for robots, or both; exit code 1 if the check refuses the plan.
+    """Write a stored plan for 3D Slicer, for robots, or as models; exit code 1 if the check refuses the plan.
 
-    A refused plan is named so for 3D Slicer, and is not written for robots.
+    A refused plan is named so for 3D Slicer, and is not written for robots or as models.
     """
-    if slicer is None and trajectory is None:
+    if slicer is None and trajectory is None and models is None:
         raise SettingsError(
-            "Neither --slicer nor --trajectory is given",
-            expected="a folder for 3D Slicer, one for the motion in time, or both",
+            "None of --slicer, --trajectory and --models is given",
+            expected="a folder for 3D Slicer, for the motion in time, or for models",
             remedy="Add --slicer DIR",
         )
     from lungaccess.cli.plan_tables import show_headline
@@ -45,10 +52,11 @@ def export(
     from lungaccess.judging.checking import check
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.live import plan_trajectory, write_trajectory
+    from lungaccess.showing.model_files import export_models
     from lungaccess.showing.slicer import export_slicer
     from lungaccess.uncertainty.risk import assess
 
-    for folder in (slicer, trajectory):
+    for folder in (slicer, trajectory, models):
         if folder is not None:
             claim_folder(folder, ("*",), force=force)
     stored = Plan.load(plan)
@@ -64,6 +72,9 @@ def export(
             report = check(stored, lung)
     if trajectory is not None and report.accepted:
         written[trajectory] = write_trajectory(plan_trajectory(stored), trajectory)
+    if models is not None and report.accepted:
+        with progress("writing models"):
+            written[models] = export_models(stored, lung, models)
     accepted = report.accepted
     if output.json:
         folders = [{"folder": str(folder), "files": list(files)} for folder, files in written.items()]

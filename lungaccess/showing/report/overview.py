@@ -32,6 +32,8 @@ HEADLINE_TOP_IN = 0.47
 # left, bottom, width, height of each panel, inches
 PROJECTIONS_IN = ((0.55, 6.0, 4.75, 4.7), (5.85, 6.0, 4.75, 4.7), (11.15, 6.0, 3.35, 4.7))
 EXIT_IN, NEEDLE_IN = (0.3, 0.75, 4.3, 4.3), (4.8, 0.75, 4.3, 4.3)
+TEXT_LETTERS = 46
+"""The width of the panel of the words: a label and its value on one line have no more letters."""
 CLEARANCE_IN, TEXT_IN = (9.75, 0.95, 4.75, 4.05), (14.85, 0.5, 2.95, 10.4)
 
 
@@ -193,6 +195,7 @@ def text_panel(axes: Axes, plan: Plan, lung: Lung, appraisal: Appraisal | None =
     """Write the key numbers of a plan, evenly over the height of a panel."""
     axes.set_axis_off()
     blocks = [(heading, rows) for heading, rows in key_numbers(plan, lung, appraisal) if rows]
+    blocks = [(heading, [line for row in rows for line in _fitting(*row)]) for heading, rows in blocks]
     lines = sum(len(rows) + 1.6 for _, rows in blocks)
     step = min(1.0 / lines, 0.034)
     y = 1.0
@@ -204,3 +207,11 @@ def text_panel(axes: Axes, plan: Plan, lung: Lung, appraisal: Appraisal | None =
             axes.text(1.0, y, value, fontsize=8.3, color=style.INK, va="top", ha="right")
             y -= step
         y -= 0.5 * step
+
+
+def _fitting(label: str, value: str) -> list[tuple[str, str]]:
+    """Return the lines of a label and its value, none of which is wider than the panel of the words."""
+    *first, last = textwrap.wrap(label, max(TEXT_LETTERS - len(value), TEXT_LETTERS // 2)) or [""]
+    if len(last) + len(value) > TEXT_LETTERS:
+        first, last = [*first, last], ""
+    return [*((line, "") for line in first), (last, value)]

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
-from anatomy.base.typed import Float
+from anatomy.base.typed import Float, UInt8
 from anatomy.base.words import percent
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
@@ -65,9 +65,8 @@ def reach_png(reach: ReachMap, lung: Lung, path: str | os.PathLike[str]) -> Path
             drawing.fit(axes, uv.min(axis=0) - 6.0, uv.max(axis=0) + 6.0)
             lps, extent = _plane(axes, view, centre)
             image = paint(reach, lps)
-            axes.imshow(
-                image, extent=extent, origin="lower", aspect="auto", interpolation="nearest", zorder=1
-            )
+            image[~layers.cut("lung", lps)] = 0.0
+            axes.imshow(image, extent=extent, origin="lower", aspect="auto", zorder=1)
             _anatomy(axes, layers, lps, extent)
             drawing.dress(axes, view, ticks=True)
             depth = float(centre @ view.towards_viewer)
@@ -107,26 +106,43 @@ def _plane(axes: Axes, view: View, centre: Float) -> tuple[Float, tuple[float, f
     return lps, (left, left + len(u) * PIXEL_MM, bottom, bottom + len(v) * PIXEL_MM)
 
 
-def _kind_colours(reach: ReachMap, lps: Float) -> Float:
+def _between(reach: ReachMap, values: Float, lps: Float) -> Float:
+    """Return values of voxels at points `(..., 3)`, linear between the centres and 0 beyond the grid."""
+    from scipy.ndimage import map_coordinates
+
+    places = np.moveaxis(reach.kinds.grid.ijk(lps), -1, 0)
+    return np.asarray(map_coordinates(values.astype(np.float64), places, order=1, mode="constant"))
+
+
+def _likeliest(reach: ReachMap, lps: Float) -> tuple[UInt8, Float]:
+    """Return the place in `KINDS` of the kind that weighs most at each point, and what all kinds weigh.
+
+    Borders so run between the centres of voxels and not along their sides, as a map of 10 mm has few of them.
+    """
     from lungaccess.planning.reachability import KINDS
 
-    kinds = reach.kinds.at(lps, 0)
-    image = np.zeros((*kinds.shape, 4))
-    for name, code in KINDS.items():
-        image[kinds == code] = (*to_rgb(COLOURS[name]), 0.85)
+    weights = np.array([_between(reach, reach.kinds.array == code, lps) for code in KINDS.values()])
+    return weights.argmax(axis=0).astype(np.uint8), weights.sum(axis=0)
+
+
+def _kind_colours(reach: ReachMap, lps: Float) -> Float:
+    places, weight = _likeliest(reach, lps)
+    image = np.array([(*to_rgb(colour), 0.85) for colour in COLOURS.values()])[places]
+    image[weight <= 0.0] = 0.0
     return image
 
 
 def _clearance_colours(reach: ReachMap, lps: Float) -> Float:
-    from lungaccess.planning.reachability import KINDS
-
-    kinds = reach.kinds.at(lps, 0)
-    reached = (kinds == KINDS["direct arc"]) | (kinds == KINDS["search"])
-    image = np.zeros((*kinds.shape, 4))
-    image[(kinds > 0) & ~reached] = (*to_rgb("#E6E6E6"), 1.0)
-    shades = matplotlib.colormaps["viridis"](Normalize(*CLEARANCE_MM)(reach.clearance_mm.at(lps, 0.0)))
-    image[reached] = shades[reached]
-    return image
+    places, weight = _likeliest(reach, lps)
+    found = reach.kinds.array > 0
+    found &= reach.clearance_mm.array > 0.0
+    clearance = _between(reach, np.where(found, reach.clearance_mm.array, 0.0), lps)
+    clearance /= np.maximum(_between(reach, found, lps), 1e-9)
+    image = matplotlib.colormaps["viridis"](Normalize(*CLEARANCE_MM)(clearance))
+    # The first two kinds of `COLOURS` are reached.
+    image[places > 1] = (*to_rgb("#E6E6E6"), 1.0)
+    image[weight <= 0.0] = 0.0
+    return np.asarray(image)
 
 
 def _anatomy(axes: Axes, layers: Layers, lps: Float, extent: tuple[float, float, float, float]) -> None:

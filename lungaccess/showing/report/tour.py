@@ -10,9 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from anatomy.base.typed import Float
+from anatomy.poses import pose
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import CORONAL, SAGITTAL, View
+from stages.needle import direct_path
 
 if TYPE_CHECKING:
     from anatomy.airway_tree import AirwayTree
@@ -31,7 +34,7 @@ def tour_png(answer: TourAnswer, lung: Lung, path: str | os.PathLike[str]) -> Pa
     """Draw the shortest tour of a patient from the front and from the left.
 
     Stretches that are passed once and twice have different colours; lesions are numbered in the order of
-    visits, and joined to their exits.
+    visits, and an arc that leaves along the airway joins each to its exit.
 
     FileError is raised if the file cannot be written.
     """
@@ -45,7 +48,7 @@ def tour_png(answer: TourAnswer, lung: Lung, path: str | os.PathLike[str]) -> Pa
         figure,
         f"{lung.name}: {answer.title}, {tour.length_mm:.0f} mm ({answer.one_by_one_mm:.0f} mm one by one)",
     )
-    figure.legend(handles=_legend(), loc="lower center", ncol=5, frameon=False, fontsize=10)
+    figure.legend(handles=_legend(), loc="lower center", ncol=3, frameon=False, fontsize=10)
     return style.save_png(figure, path)
 
 
@@ -56,18 +59,29 @@ def _panel(axes: Axes, answer: TourAnswer, tree: AirwayTree, layers: Layers, vie
     drawing.outline(axes, lung, "#8A7B6B", 0.9)
     _stretches(axes, answer.shortest, tree, view)
     for number, visit in enumerate(answer.shortest.visits, 1):
-        ends = view.project(np.stack((tree.points_lps[visit.tree_point], answer.lesions_lps[visit.lesion])))
-        axes.plot(*ends.T, color=style.NEEDLE, lw=1.4, ls=(0, (3, 2)), zorder=8)
+        ends = view.project(_way_out(tree, visit.tree_point, answer.lesions_lps[visit.lesion]))
+        drawing.curve(axes, ends, style.NEEDLE, 1.6, 8)
         axes.plot(*ends[0], marker="o", ms=5, mfc="white", mec=style.NEEDLE, zorder=9, ls="none")
-        axes.plot(*ends[1], marker="o", ms=17, mfc=style.NODULE, mec="white", mew=1.2, zorder=10, ls="none")
+        axes.plot(*ends[-1], marker="o", ms=17, mfc=style.NODULE, mec="white", mew=1.2, zorder=10, ls="none")
         axes.text(
-            ends[1, 0], ends[1, 1], str(number), ha="center", va="center", color="white", fontsize=10,
+            *ends[-1], str(number), ha="center", va="center", color="white", fontsize=10,
             fontweight="bold", zorder=11,
         )  # fmt: skip
     drawing.fit_around(axes, lung, view.project(np.vstack((answer.lesions_lps, tree.points_lps))))
     drawing.dress(axes, view, ticks=False)
     drawing.title(axes, view.name)
     drawing.scale_bar(axes)
+
+
+def _way_out(tree: AirwayTree, point: int, lesion_lps: Float) -> Float:
+    """Return points `(N, 3)` from an exit to its lesion: the arc that leaves along the airway.
+
+    A lesion behind the exit is on no such arc, and is joined by a line.
+    """
+    begin, tangent = tree.points_lps[point], tree.tangents[point]
+    if (lesion_lps - begin) @ tangent <= 0.0:
+        return np.stack((begin, lesion_lps))
+    return np.asarray(direct_path(pose(begin, tangent), lesion_lps).sample(1.0)[0])
 
 
 def _stretches(axes: Axes, tour: Itinerary, tree: AirwayTree, view: View) -> None:
@@ -88,5 +102,5 @@ def _legend() -> list[Line2D]:
         Line2D([], [], marker="o", mfc="white", mec=style.NEEDLE, ls="none", label="exit"),
         Line2D([], [], marker="o", ms=12, mfc=style.NODULE, mec="white", ls="none",
                label="lesion, by the order of visits"),
-        Line2D([], [], color=style.NEEDLE, lw=1.4, ls=(0, (3, 2)), label="exit to lesion"),
+        Line2D([], [], color=style.NEEDLE, lw=1.6, label="exit to lesion: the arc that leaves along the airway"),
     ]  # fmt: skip

@@ -28,6 +28,10 @@ WIDTH_IN, HEIGHT_IN = 17.0, 6.6
 PANELS_IN = ((0.55, 0.6, 5.4, 5.3), (6.5, 0.6, 5.4, 5.3), (12.4, 0.6, 3.6, 5.3))
 BAR_IN = (16.2, 0.8, 0.16, 4.9)
 """Left, bottom, width and height of panels and colour bar."""
+NAME_SHIFTS_MM = tuple(range(6, 90, 3))
+"""A name is moved from the end of its bronchus so far as the first of these that leaves room for it."""
+NAME_ROOM_MM = np.array([20.0, 8.0])
+"""The middles of two names are farther apart than this, across or up: about the size of one."""
 
 
 @style.plain_look
@@ -35,7 +39,7 @@ def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw the airway tree of a patient over the airway mask, from three sides.
 
     Every branch has the colour of its generation (trachea 0) and a width that follows its radius;
-    the carina and every gap that was bridged are marked.
+    the carina and every gap that was bridged are marked.  Segmental bronchi have their names.
 
     FileError is raised if the file cannot be written.
     """
@@ -74,8 +78,29 @@ def _tree_panel(
         u, v = view.project(np.asarray(gap.position_lps))
         axes.plot(u, v, marker="x", ms=7, color="#00A0A0", mew=1.8, ls="none", zorder=9)
     drawing.fit_around(axes, lung, points)
+    _names(axes, tree, points)
     drawing.dress(axes, view, ticks=True)
     drawing.title(axes, view.name)
+
+
+def _names(axes: Axes, tree: AirwayTree, points: Float) -> None:
+    """Write the names of segmental bronchi beside their ends, moved outwards until none covers another."""
+    middle, placed = points.mean(axis=0), np.zeros((0, 2))
+    named = [n for n in np.flatnonzero(tree.bronchi.starts).tolist() if tree.bronchi.segments[n]]
+    for branch in named:
+        end = points[np.flatnonzero(tree.branch_of_point == branch)[-1]]
+        away = (end - middle) / max(float(np.linalg.norm(end - middle)), 1e-9)
+        place = end
+        for shift_mm in NAME_SHIFTS_MM:
+            place = end + shift_mm * away
+            if not (np.abs(placed - place) < NAME_ROOM_MM).all(axis=1).any():
+                break
+        placed = np.vstack([placed, place])
+        axes.plot(*np.transpose([end, place]), color=style.FAINT_INK, lw=0.5, zorder=8)
+        axes.text(
+            *place, tree.bronchi.names[branch], ha="center", va="center", fontsize=7, color=style.INK,
+            path_effects=drawing.halo(2.0), zorder=10,
+        )  # fmt: skip
 
 
 def _branches(tree: AirwayTree, points: Float, colours: Colormap, norm: BoundaryNorm) -> LineCollection:

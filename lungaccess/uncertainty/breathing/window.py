@@ -113,7 +113,8 @@ def require_motion(lung: Lung) -> Motion:
             f"Nothing is known of the breathing of {lung.name}",
             expected="a [motion] in the patient.toml of its folder, which may hold nothing else",
             remedy='Write into it motion = { file = "field.nrrd", maps_from = "end-exhale", '
-            "masks_phase = 0.0 }, or landmarks.csv as its file, or motion = { population = true, masks_phase = 0.0 } for a warning without data; "
+            "masks_phase = 0.0 }, or landmarks.csv as its file, or "
+            "motion = { population = true, masks_phase = 0.0 } for a warning without data; "
             "docs/explanation/breathing.md says more",
         )
     return lung.motion

@@ -102,5 +102,6 @@ def _legend() -> list[Line2D]:
         Line2D([], [], marker="o", mfc="white", mec=style.NEEDLE, ls="none", label="exit"),
         Line2D([], [], marker="o", ms=12, mfc=style.NODULE, mec="white", ls="none",
                label="lesion, by the order of visits"),
-        Line2D([], [], color=style.NEEDLE, lw=1.6, label="exit to lesion: the arc that leaves along the airway"),
+        Line2D([], [], color=style.NEEDLE, lw=1.6,
+               label="exit to lesion: an arc that leaves along the airway"),
     ]  # fmt: skip

@@ -58,6 +58,11 @@ class Goal:
         return self.of is not None
 
     @property
+    def is_share(self) -> bool:
+        """Whether it is a share, of procedures or of the breath, which is read as a number of 100."""
+        return self.name in (SUCCESS.name, WINDOW.name)
+
+    @property
     def words_with_unit(self) -> str:
         """The words for figures and tables."""
         return f"{self.words} ({self.unit})" if self.unit else self.words
@@ -104,7 +109,7 @@ class Goal:
 
     def said(self, value: float) -> str:
         """Return a value as people read it: shares of a hundred, other numbers with their unit."""
-        if self.name in (SUCCESS.name, WINDOW.name):
+        if self.is_share:
             return f"{of_hundred(value)} of 100"
         return f"{value:.4g} {self.unit}".rstrip()
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import csv
 import os
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
+from matplotlib.ticker import PercentFormatter
 
 from anatomy.base.files import atomic_write
 from anatomy.base.records import frozen_value
 from lungaccess.problem.goals import Goal
 from lungaccess.showing.report import drawing, style
+
+LABEL_LETTERS = 44
+"""The label of the vertical axis has no more letters on a line: as many fit beside it."""
 
 
 @style.plain_look
@@ -33,8 +38,8 @@ def cost_over_time_png(history: Sequence[CostPoint], path: str | os.PathLike[str
         _steps(axes, found, history[-1].elapsed_s, goal)
     else:
         axes.text(0.5, 0.5, "no plan was found", ha="center", va="center", transform=axes.transAxes)
-    drawing.graph(axes, "planning time (s)", goal.words_with_unit)
-    drawing.title(axes, f"Best plan over planning time: {goal.words}")
+    drawing.graph(axes, "planning time (s)", textwrap.fill(goal.words_with_unit, LABEL_LETTERS))
+    drawing.title(axes, "Best plan over planning time")
     return style.save_png(figure, path)
 
 
@@ -53,8 +58,12 @@ def _steps(axes: Axes, found: Sequence[CostPoint], end_s: float, goal: Goal) -> 
     if gained:
         _note(axes, times[-1], values[-1], f"best {goal.said(values[-1])}", (-4, 8), "right")
         axes.set_ylim(min(values) - 0.14 * gained, max(values) + 0.14 * gained)
+    if goal.is_share:
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
     if len(better) > 2 and times[-1] > 50 * max(times[0], 1e-3):
         axes.set_xscale("log")
+    else:
+        axes.set_xlim(left=0.0)
 
 
 def _note(axes: Axes, x: float, y: float, text: str, shift: tuple[float, float], side: str) -> None:

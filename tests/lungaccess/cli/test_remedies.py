@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -39,19 +39,18 @@ def _text(node: ast.AST) -> str:
     return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else "{}"
 
 
-def remedies() -> Iterator[tuple[str, str]]:
-    """Yield what messages tell a user to do, each with its file."""
-    for folder in ("anatomy", "stages", "lungaccess"):
-        for file in sorted((ROOT / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-                for keyword in node.keywords if isinstance(node, ast.Call) else ():
-                    if keyword.arg in ADVICE:
-                        yield str(file.relative_to(ROOT)), _text(keyword.value)
+@cache
+def remedies() -> tuple[str, ...]:
+    """Return what messages tell a user to do."""
+    files = [file for top in ("anatomy", "stages", "lungaccess") for file in (ROOT / top).rglob("*.py")]
+    nodes = (node for file in files for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    calls = (node for node in nodes if isinstance(node, ast.Call))
+    return tuple(_text(each.value) for call in calls for each in call.keywords if each.arg in ADVICE)
 
 
 def named(pattern: re.Pattern[str]) -> list[str]:
     """Return all that remedies name of a kind, once each."""
-    return sorted({found for _file, text in remedies() for found in pattern.findall(text)})
+    return sorted({found for text in remedies() for found in pattern.findall(text)})
 
 
 def test_commands_that_remedies_name_are_there() -> None:

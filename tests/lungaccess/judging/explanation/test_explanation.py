@@ -22,6 +22,7 @@ from lungaccess.judging.explanation.blocking import MOST_ARCS
 from lungaccess.judging.explanation.explanation import Explanation
 from lungaccess.judging.explanation.kernels import STEP_MM
 from lungaccess.planning.coupled import DirectArcs
+from lungaccess.problem.preset_order import presets_by_invasiveness
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
@@ -175,6 +176,11 @@ class TestFar:
             arc.radius_mm < arc.least_radius_mm
             or arc.length_mm > arc.most_length_mm
             or arc.turn_deg > arc.most_turn_deg
+        )
+        needles = [each.needle for each in presets_by_invasiveness() if each.needle is not None]
+        assert any(
+            arc.radius_mm >= each.min_radius_of_curvature_mm and arc.length_mm <= each.max_length_mm
+            for each in needles
         )
 
     def test_presets_that_reach_it_have_plans_that_the_check_accepts(

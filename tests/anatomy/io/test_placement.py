@@ -129,7 +129,7 @@ def test_a_mask_that_reaches_out_of_the_images_loses_that_part_with_a_number(med
     wide = Volume(grid=grid.crop((-4, 0, 0), (12, 10, 8)), array=np.ones((16, 10, 8), dtype=bool))
     patient, said = load_with(med_rad_folder, "nodule", wide)
     assert patient.nodules.array.all()
-    assert "320 of its 1280 voxels (25.0%) lie outside the images" in said[0]
+    assert "320 of its 1280 voxels (25 %) lie outside the images" in said[0]
 
 
 def test_an_optional_mask_outside_the_images_is_absent_and_a_needed_one_refused(med_rad_folder, masks, grid):

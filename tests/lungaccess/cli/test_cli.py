@@ -150,10 +150,10 @@ def test_an_accepted_plan_writes_everything_and_exits_0(
     assert {file.name for file in out.iterdir() if file.is_file()} == WRITTEN
     assert Plan.load(out / "plan.json").digest == toy_plan.digest
     with (out / "cost_over_time.csv").open(newline="", encoding="utf-8") as file:
-        costs = [row["best_cost"] for row in csv.DictReader(file)]
+        costs = [row["best"] for row in csv.DictReader(file)]
     assert costs == ["", "20.0", "20.0", "12.34"]
     text = capsys.readouterr().out
-    assert text.index("Estimated to succeed in 3 of 100 procedures") < text.index("53.0 mm")
+    assert text.index("53.0 mm") < text.index("Estimated to succeed in 3 of 100 procedures")
     assert "likely to fail" in text and "3 arcs," in text and "cost map" not in text
     assert "[made by hand]" in text
 

@@ -65,7 +65,7 @@ def test_what_a_plan_states_is_shown_and_not_computed_again(toy_plan: Plan) -> N
     assert "not computed again" in stated.details[0] and "not computed again" not in computed.details[0]
     assert stated.to_mapping()["stated_by_plan"] and not computed.to_mapping()["stated_by_plan"]
     section = risk_section(again, "a region")
-    assert "<p>a region.</p>" in section and "not computed again" in section and "35.0 %" in section
+    assert "<p>a region.</p>" in section and "not computed again" in section and "35 %" in section
     with pytest.raises(PlanFileError, match="counts"):
         replace(STATED, successes=2001)
 
@@ -77,7 +77,7 @@ def test_procedures_that_measure_say_what_fails_and_what_measuring_corrects() ->
     assert "fails most because it has no path left (30 of 100). Procedure 'measured-tip'" in headline.text
     assert "planned again each time" in headline.details[0]
     section = risk_section(report, "")
-    for words in ("no path left", "30.0 %", "What measuring corrects", "1.50", "20.0 %", "1.25 mm", "–"):
+    for words in ("no path left", "30 %", "What measuring corrects", "1.50", "20 %", "1.25 mm", "–"):
         assert words in section
     assert risk_section(None, "") == "<p>.</p><p>Chance of success not computed.</p>"
 

@@ -67,7 +67,7 @@ def camera_frames(plan: Plan) -> dict[str, object]:
         "field_of_view_deg": math.degrees(2.0 * HALF_ANGLE_RAD),
         "frames": [
             {
-                "time_s": round(float(time_s), 4),
+                "time_s": float(time_s),
                 "moves": stage,
                 "eye": eye[:3, 3].tolist(),
                 "target": (eye[:3, 3] + 10.0 * eye[:3, 2]).tolist(),

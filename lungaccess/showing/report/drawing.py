@@ -16,6 +16,10 @@ BAR_LENGTHS_MM = (1, 2, 5, 10, 20, 50, 100)
 """Round lengths of a scale bar; the longest that fits is taken."""
 BORDER_MM = 4.0
 """Room for the letters at the edges of an anatomical picture."""
+WORD_SHIFTS_MM = tuple(range(6, 90, 3))
+"""A word is moved from its point so far as the first of these that leaves room for it."""
+WORD_MM = np.array([20.0, 8.0])
+"""About the size of a word of four letters in a picture of both lungs."""
 ROUNDING_PIXELS = 0.8
 """Silhouettes lose the steps of their pixels, and nothing that is larger."""
 
@@ -196,6 +200,22 @@ def _normals(uv: Float) -> Float:
     tangent = np.gradient(uv, axis=0)
     length = np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     return np.asarray(np.stack([-tangent[:, 1], tangent[:, 0]], axis=1) / length)
+
+
+def beside(axes: Axes, points: Float, middle: Float) -> Float:
+    """Return places `(N, 2)` for short words about points, outwards of `middle`, and draw a line to each.
+
+    No two places are nearer to each other than a word is large.
+    """
+    places = np.array(points, dtype=np.float64)
+    for n, point in enumerate(points):
+        away = (point - middle) / max(float(np.linalg.norm(point - middle)), 1e-9)
+        for shift_mm in WORD_SHIFTS_MM:
+            places[n] = point + shift_mm * away
+            if not (np.abs(places[:n] - places[n]) < WORD_MM).all(axis=1).any():
+                break
+        axes.plot(*np.transpose([point, places[n]]), color=style.FAINT_INK, lw=0.5, zorder=8)
+    return places
 
 
 def target_mark(axes: Axes, uv: Float, order: int = 12) -> None:

@@ -58,13 +58,17 @@ def _panel(axes: Axes, answer: TourAnswer, tree: AirwayTree, layers: Layers, vie
     drawing.see_through(axes, layers.footprint("airway", view), style.AIRWAY, 14.0, 0.5)
     drawing.outline(axes, lung, "#8A7B6B", 0.9)
     _stretches(axes, answer.shortest, tree, view)
-    for number, visit in enumerate(answer.shortest.visits, 1):
+    visits = answer.shortest.visits
+    lesions = view.project(answer.lesions_lps[[visit.lesion for visit in visits]])
+    places = drawing.beside(axes, lesions, view.project(tree.points_lps).mean(axis=0))
+    for number, (visit, place) in enumerate(zip(visits, places, strict=True), 1):
         ends = view.project(_way_out(tree, visit.tree_point, answer.lesions_lps[visit.lesion]))
         drawing.curve(axes, ends, style.NEEDLE, 1.6, 8)
         axes.plot(*ends[0], marker="o", ms=5, mfc="white", mec=style.NEEDLE, zorder=9, ls="none")
-        axes.plot(*ends[-1], marker="o", ms=17, mfc=style.NODULE, mec="white", mew=1.2, zorder=10, ls="none")
+        axes.plot(*ends[-1], marker="o", ms=7, mfc=style.NODULE, mec="white", mew=0.8, zorder=9, ls="none")
+        axes.plot(*place, marker="o", ms=15, mfc=style.NODULE, mec="white", mew=1.2, zorder=10, ls="none")
         axes.text(
-            *ends[-1], str(number), ha="center", va="center", color="white", fontsize=10,
+            *place, str(number), ha="center", va="center", color="white", fontsize=10,
             fontweight="bold", zorder=11,
         )  # fmt: skip
     drawing.fit_around(axes, lung, view.project(np.vstack((answer.lesions_lps, tree.points_lps))))

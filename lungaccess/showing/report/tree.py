@@ -28,10 +28,6 @@ WIDTH_IN, HEIGHT_IN = 17.0, 6.6
 PANELS_IN = ((0.55, 0.6, 5.4, 5.3), (6.5, 0.6, 5.4, 5.3), (12.4, 0.6, 3.6, 5.3))
 BAR_IN = (16.2, 0.8, 0.16, 4.9)
 """Left, bottom, width and height of panels and colour bar."""
-NAME_SHIFTS_MM = tuple(range(6, 90, 3))
-"""A name is moved from the end of its bronchus so far as the first of these that leaves room for it."""
-NAME_ROOM_MM = np.array([20.0, 8.0])
-"""The middles of two names are farther apart than this, across or up: about the size of one."""
 
 
 @style.plain_look
@@ -85,18 +81,9 @@ def _tree_panel(
 
 def _names(axes: Axes, tree: AirwayTree, points: Float) -> None:
     """Write the names of segmental bronchi beside their ends, moved outwards until none covers another."""
-    middle, placed = points.mean(axis=0), np.zeros((0, 2))
     named = [n for n in np.flatnonzero(tree.bronchi.starts).tolist() if tree.bronchi.segments[n]]
-    for branch in named:
-        end = points[np.flatnonzero(tree.branch_of_point == branch)[-1]]
-        away = (end - middle) / max(float(np.linalg.norm(end - middle)), 1e-9)
-        place = end
-        for shift_mm in NAME_SHIFTS_MM:
-            place = end + shift_mm * away
-            if not (np.abs(placed - place) < NAME_ROOM_MM).all(axis=1).any():
-                break
-        placed = np.vstack([placed, place])
-        axes.plot(*np.transpose([end, place]), color=style.FAINT_INK, lw=0.5, zorder=8)
+    ends = points[[np.flatnonzero(tree.branch_of_point == branch)[-1] for branch in named]]
+    for branch, place in zip(named, drawing.beside(axes, ends, points.mean(axis=0)), strict=True):
         axes.text(
             *place, tree.bronchi.names[branch], ha="center", va="center", fontsize=7, color=style.INK,
             path_effects=drawing.halo(2.0), zorder=10,

@@ -107,8 +107,8 @@ def test_a_radius_that_is_needed_is_that_of_the_system_that_is_named(
     radius_mm: float, gentlest: bool
 ) -> None:
     found = Obstruction(
-        place="reach", label=0, point_lps=np.zeros(3), limit="radius", radius_mm=radius_mm, direction_rad=0.5,
-        straight_mm=20.0,
+        place="reach", label=0, point_lps=np.zeros(3), limit="radius", radius_mm=radius_mm, proved=True,
+        direction_rad=0.5, straight_mm=20.0,
     )  # fmt: skip
     systems = re.findall(r"--system ([\w-]+)", reason_in_words(found))
     assert bool(systems) == gentlest

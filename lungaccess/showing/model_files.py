@@ -42,14 +42,14 @@ def export_models(plan: Plan, lung: Lung, folder: str | Path) -> tuple[str, ...]
         curve.name: (device_surface(curve), (*curve.colour, 1.0)) for curve in plan.curves(STEP_MM).present
     }
     for name, (colour, opacity) in STRUCTURES.items():
-        if (mesh := structure_surface(lung, name)) is not None:
-            surfaces[name] = mesh, (*colour, opacity)
+        if (found := structure_surface(lung, name)) is not None:
+            surfaces[name] = found, (*colour, opacity)
     scene = trimesh.Scene()
-    for name, (mesh, colour) in surfaces.items():
+    for name, (mesh, shade) in surfaces.items():
         solid = mesh.to_trimesh()
         _write(target / f"{name}.stl", solid.export(file_type="stl"))
         material = trimesh.visual.material.PBRMaterial(
-            baseColorFactor=colour, alphaMode="OPAQUE" if colour[3] == 1.0 else "BLEND", doubleSided=True
+            baseColorFactor=shade, alphaMode="OPAQUE" if shade[3] == 1.0 else "BLEND", doubleSided=True
         )
         solid.visual = trimesh.visual.TextureVisuals(material=material)
         scene.add_geometry(solid, node_name=name, geom_name=name, transform=GLTF_FROM_LPS)

@@ -48,7 +48,7 @@ def _needle_with(radius_mm: float) -> str:
     systems = [load_system(name) for name in (*preset_names(), *needle_preset_names())]
     radii = {each.name: each.needle.min_radius_of_curvature_mm for each in systems if each.needle is not None}
     name = max((each for each in radii if radii[each] <= radius_mm), key=lambda each: radii[each], default="")
-    return f", as --system {name} ({radii[name]:g} mm)" if name else ""
+    return f", which --system {name} has ({radii[name]:g} mm)" if name else ""
 
 
 def obstruction_rows(found: Obstruction, proved: bool, lobe: str = "") -> list[tuple[str, str]]:

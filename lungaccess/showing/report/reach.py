@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.patches import Patch
 
-from anatomy.base.typed import Float, UInt8
+from anatomy.base.typed import Bool, Float, UInt8
 from anatomy.base.words import percent
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
@@ -106,7 +106,7 @@ def _plane(axes: Axes, view: View, centre: Float) -> tuple[Float, tuple[float, f
     return lps, (left, left + len(u) * PIXEL_MM, bottom, bottom + len(v) * PIXEL_MM)
 
 
-def _between(reach: ReachMap, values: Float, lps: Float) -> Float:
+def _between(reach: ReachMap, values: Float | Bool, lps: Float) -> Float:
     """Return values of voxels at points `(..., 3)`, linear between the centres and 0 beyond the grid."""
     from scipy.ndimage import map_coordinates
 

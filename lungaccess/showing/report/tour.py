@@ -68,7 +68,7 @@ def _panel(axes: Axes, answer: TourAnswer, tree: AirwayTree, layers: Layers, vie
         axes.plot(*ends[-1], marker="o", ms=7, mfc=style.NODULE, mec="white", mew=0.8, zorder=9, ls="none")
         axes.plot(*place, marker="o", ms=15, mfc=style.NODULE, mec="white", mew=1.2, zorder=10, ls="none")
         axes.text(
-            *place, str(number), ha="center", va="center", color="white", fontsize=10,
+            place[0], place[1], str(number), ha="center", va="center", color="white", fontsize=10,
             fontweight="bold", zorder=11,
         )  # fmt: skip
     drawing.fit_around(axes, lung, view.project(np.vstack((answer.lesions_lps, tree.points_lps))))

@@ -85,8 +85,8 @@ def _names(axes: Axes, tree: AirwayTree, points: Float) -> None:
     ends = points[[np.flatnonzero(tree.branch_of_point == branch)[-1] for branch in named]]
     for branch, place in zip(named, drawing.beside(axes, ends, points.mean(axis=0)), strict=True):
         axes.text(
-            place[0], place[1], tree.bronchi.names[branch], ha="center", va="center", fontsize=7, color=style.INK,
-            path_effects=drawing.halo(2.0), zorder=10,
+            place[0], place[1], tree.bronchi.names[branch], ha="center", va="center", fontsize=7,
+            color=style.INK, path_effects=drawing.halo(2.0), zorder=10,
         )  # fmt: skip
 
 

@@ -34,6 +34,8 @@ BAR_IN = (14.1, 1.0, 0.15, 3.8)
 TEXT_IN = (14.2, 10.0)
 PIXEL_MM = 0.75
 CLEARANCE_MM = (0.0, 8.0)
+SMOOTH_VOXELS = 0.7
+"""Borders are drawn under a Gaussian of this width, which takes their steps."""
 
 COLOURS: dict[str, str] = {
     "direct arc": "#009E73",
@@ -48,7 +50,8 @@ def reach_png(reach: ReachMap, lung: Lung, path: str | os.PathLike[str]) -> Path
     """Draw a reachability map in three planes and write the picture to `path`.
 
     Each plane is the one with the most lung tissue.  Airways and vessels that it cuts are drawn over the
-    map.  The upper row shows what is reached, the lower one the clearance of the best path found.
+    map.  Borders are smoothed, so that a single voxel of a kind may vanish; shares and volumes count it.
+    The upper row shows what is reached, the lower one the clearance of the best path found.
 
     FileError is raised if the file cannot be written, as when the folder is missing.  Returns its path.
     """
@@ -107,11 +110,12 @@ def _plane(axes: Axes, view: View, centre: Float) -> tuple[Float, tuple[float, f
 
 
 def _between(reach: ReachMap, values: Float | Bool, lps: Float) -> Float:
-    """Return values of voxels at points `(..., 3)`, linear between the centres and 0 beyond the grid."""
-    from scipy.ndimage import map_coordinates
+    """Return values of voxels at points `(..., 3)`, smooth between the centres and 0 beyond the grid."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
 
     places = np.moveaxis(reach.kinds.grid.ijk(lps), -1, 0)
-    return np.asarray(map_coordinates(values.astype(np.float64), places, order=1, mode="constant"))
+    smooth = gaussian_filter(values.astype(np.float64), SMOOTH_VOXELS, mode="constant")
+    return np.asarray(map_coordinates(smooth, places, order=1, mode="constant"))
 
 
 def _likeliest(reach: ReachMap, lps: Float) -> tuple[UInt8, Float]:
@@ -136,11 +140,11 @@ def _clearance_colours(reach: ReachMap, lps: Float) -> Float:
     places, weight = _likeliest(reach, lps)
     found = reach.kinds.array > 0
     found &= reach.clearance_mm.array > 0.0
-    clearance = _between(reach, np.where(found, reach.clearance_mm.array, 0.0), lps)
-    clearance /= np.maximum(_between(reach, found, lps), 1e-9)
+    known = _between(reach, found, lps)
+    clearance = _between(reach, np.where(found, reach.clearance_mm.array, 0.0), lps) / np.maximum(known, 1e-9)
     image = matplotlib.colormaps["viridis"](Normalize(*CLEARANCE_MM)(clearance))
     # The first two kinds of `COLOURS` are reached.
-    image[places > 1] = (*to_rgb("#E6E6E6"), 1.0)
+    image[(places > 1) | (known <= 0.0)] = (*to_rgb("#E6E6E6"), 1.0)
     image[weight <= 0.0] = 0.0
     return np.asarray(image)
 

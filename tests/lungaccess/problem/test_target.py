@@ -81,7 +81,7 @@ def test_a_target_in_the_wrong_frame_is_told_the_other_one(lung: Lung, typed: st
 def test_an_array_in_the_wrong_frame_is_told_so_too(lung: Lung) -> None:
     with pytest.raises(TargetError, match="with x and y negated it lies inside") as caught:
         point_target(lung, np.array([-17.0, 0.0, 0.0]))
-    assert "LPS (17.0, 0.0, 0.0) mm" in caught.value.remedy
+    assert "LPS (17.0, 0.0, 0.0) = RAS (-17.0, 0.0, 0.0) mm" in caught.value.remedy
 
 
 def test_a_target_outside_in_both_frames_hears_where_the_lungs_are(lung: Lung) -> None:

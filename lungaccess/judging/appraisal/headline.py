@@ -181,20 +181,32 @@ class Headline:
         return f"geometry {self.geometry}{missing}{load}"
 
     @property
+    def reasons(self) -> str:
+        """Why the verdict is what it is, in one sentence without its full stop: failures and geometry."""
+        if self.geometry == Geometry.REFUSED:
+            return f"refused by the independent check ({plural(self.refusals, 'finding')})"
+        chance = "chance of success not computed" if self.success is None else self._why
+        return f"{chance}; {self.geometry_words}"
+
+    @property
+    def _why(self) -> str:
+        """Why procedures fail most often, with the numbers."""
+        failures = " and ".join(
+            f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in self.failures
+        )
+        return f"fails most because it {failures}" if failures else "none of them failed"
+
+    @property
     def chance_text(self) -> str:
         """How often the plan succeeds, why it fails, and under what, in sentences."""
         chance, success = self.chance, self.success
         if chance is None or success is None:
             return "Chance of success not computed."
-        failures = " and ".join(
-            f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in self.failures
-        )
-        why = f"fails most because it {failures}" if failures else "none of them failed"
         open_loop = self.without_measuring
         left = "" if open_loop is None else f" Without measuring: {of_hundred(open_loop.value)} of 100."
         return (
             f"Estimated to succeed in {of_hundred(success.value)} of 100 procedures (95 % interval "
-            f"{range_of_hundred(success.interval)}); {why}. "
+            f"{range_of_hundred(success.interval)}); {self._why}. "
             f"Procedure '{chance.procedure}', errors of '{chance.errors}'.{left}"
         )
 

@@ -15,8 +15,6 @@ SHARED_MODULES = (
     "solids.js", "scene.js", "orbit.js", "voxels.js", "voxel_image.js", "slices.js", "slice_views.js",
     "slice_panel.js", "structures.js", "view_tools.js", "anatomy_page.js",
 )  # fmt: skip
-TARGET_BUTTON = '<button type="button" id="view-target">Target</button>'
-"""Looks at the target; for `scene_figure`."""
 _IMPORT = re.compile(r"^import .*;\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(async )?(function|class|const|let) )", re.MULTILINE)
 _HOLE = re.compile(r"\{\{(\w+)\}\}")
@@ -47,9 +45,9 @@ def filled(template: str, parts: Mapping[str, str]) -> str:
     return _HOLE.sub(lambda hole: parts[hole.group(1)], template)
 
 
-def scene_figure(*, more_views: str = "", more_notes: str = "") -> str:
-    """Return the figure of the 3-D view, with further buttons and words as HTML."""
-    return filled(asset("scene.html"), {"more_views": more_views, "more_notes": more_notes})
+def scene_figure(*, more_notes: str = "") -> str:
+    """Return the figure of the 3-D view, with further words as HTML."""
+    return filled(asset("scene.html"), {"more_notes": more_notes})
 
 
 def slice_controls(*, more: str = "") -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.base.typed import Float
 from lungaccess.showing.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.showing.report.html import words
-from lungaccess.showing.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
+from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import structure_meshes
 from lungaccess.showing.report.html.volumes import page_image
 from lungaccess.showing.report.pack import Packed, pack
@@ -47,7 +47,7 @@ def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[s
         "headline": words.text(explanation.headline),
         "advice": words.text(explanation.advice or "Nothing that was tried reaches the target"),
         "slice_controls": slice_controls(more=PLACES),
-        "scene": scene_figure(more_views=TARGET_BUTTON),
+        "scene": scene_figure(),
         "sections": sections_html(explanation),
         "reasons": words.pairs("What was looked at, and what was ruled out", rows),
     }

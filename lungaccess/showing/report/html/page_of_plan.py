@@ -12,19 +12,19 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.base.words import of_hundred, plural, range_of_hundred
+from anatomy.base.words import of_hundred, range_of_hundred
 from lungaccess.judging.advice import Advice
 from lungaccess.judging.appraisal import Appraiser
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
-from lungaccess.judging.appraisal.headline import Geometry
 from lungaccess.planning import with_front
 from lungaccess.plans.chance import Chance
 from lungaccess.problem.error_files import error_preset_names, load_errors
 from lungaccess.problem.goals import SUCCESS
+from lungaccess.problem.nodules import target_words
 from lungaccess.problem.procedures import load_procedure, procedure_names
 from lungaccess.showing.report.html import breathing, tables, words
 from lungaccess.showing.report.html.deployment import device_points, packed_plan
-from lungaccess.showing.report.html.document import TARGET_BUTTON, scene_figure, slice_controls, write_page
+from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.showing.report.html.risk import resting_section, risk_section
 from lungaccess.showing.report.html.trade_off import CAPTION, trade_off_svg
@@ -118,15 +118,17 @@ def plan_page(
     data = page_data(plans, appraisals, lung, chosen, drawn)
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
-        "glance": glance_section(first),
-        "headline": words.headline(first.headline) + words.advice(chosen.advice),
+        "glance": glance_section(plan, first),
+        "headline": words.headline(first.headline),
+        "advice": words.advice(chosen.advice),
+        "details": words.estimate_details(first.headline),
         "breathing": breathing.window_headline(plan, lung, first.accepted),
         "phase_player": breathing.player(window, first.accepted),
         "phase_chart": breathing.chart(window),
         "phase_slices": breathing.slices_note(window),
         "limits": tables.limits_section(first),
-        "summary": summary(plan),
-        "scene": scene_figure(more_views=TARGET_BUTTON, more_notes=THICKER),
+        "summary": summary(plan, lung),
+        "scene": scene_figure(more_notes=THICKER),
         "image_source": words.text(
             f"{image_source(lung, chosen.ct_name if chosen.ct is not None else '')}. "
             f"The page holds {image_words(data)}"
@@ -240,18 +242,13 @@ def cost_history(path: Path | None) -> list[list[float]]:
     return [[float(row["elapsed_s"]), float(row["best"])] for row in rows if row.get("best")]
 
 
-def summary(plan: Plan) -> str:
-    """Return system, scope, tubes, needle and target of a plan in words."""
+def summary(plan: Plan, lung: Lung) -> str:
+    """Return system, scope, tubes and target of a plan in words; its lengths are among the numbers."""
     x, y, z = (float(c) for c in plan.target_lps)
-    needle = plan.needle
-    of_needle = "no needle: the tip of the tubes is at the target"
-    if needle is not None:
-        of_needle = f"needle {needle.length_mm:.1f} mm in {plural(len(needle.arcs), 'arc')}"
+    place = target_words(lung, plan.target_lps)
     facts = (
-        f"{plan.system.name}; scope to generation {plan.scope.generation}, "
-        f"{plan.scope.length_from_carina_mm:.0f} mm beyond the carina; {plan.insertions}; "
-        f"{of_needle}; target at LPS "
-        f"{x:.1f}, {y:.1f}, {z:.1f} mm{_aim_words(plan)}"
+        f"{plan.system.name}; scope to generation {plan.scope.generation}; {plan.insertions}; target"
+        f"{f': {place},' if place else ''} at LPS {x:.1f}, {y:.1f}, {z:.1f} mm{_aim_words(plan)}"
     )
     # Why this system, if it was chosen among several: the last sentence of its choice.
     return words.text(". ".join((facts, *plan.system_choice[-1:])))
@@ -269,10 +266,9 @@ def _aim_words(plan: Plan) -> str:
     )
 
 
-def glance_section(appraisal: Appraisal) -> str:
-    """Return a list of the few things that decide about a plan, each as a number with its mark."""
-    said = appraisal.headline
-    tiles = [_chance(said), *_failures(said), _geometry(said), *map(_limit, appraisal.limits[:1])]
+def glance_section(plan: Plan, appraisal: Appraisal) -> str:
+    """Return the numbers that decide about a plan: chance, length of the way, time, and the nearest limit."""
+    tiles = [_chance(appraisal.headline), _way(plan), _time(plan), *map(_limit, appraisal.limits[:1])]
     return f'<ul class="glance" aria-label="At a glance">{"".join(tiles)}</ul>'
 
 
@@ -301,20 +297,20 @@ def _chance(said: Headline) -> str:
     return _tile("Chance of success", grade_of_chance(success), value, note, bar)
 
 
-def _failures(said: Headline) -> list[str]:
-    """Return what fails most often, nothing where nothing failed."""
-    return [
-        _tile("Fails most", None, f"{of_hundred(share.value, up=True)} of 100", name)
-        for name, share in said.failures[:1]
-    ]
+def _way(plan: Plan) -> str:
+    scope, tubes = plan.scope.length_from_carina_mm, plan.tube.inner_insertion_mm
+    needle = 0.0 if plan.needle is None else plan.needle.length_mm
+    last = f"needle {needle:.0f}" if needle else "no needle: the tubes end at the target"
+    note = f"from the carina: scope {scope:.0f}, tubes {tubes:.0f}, {last}"
+    return _tile("Length of the way", None, f"{scope + tubes + needle:.0f} mm", note)
 
 
-def _geometry(said: Headline) -> str:
-    missing = " and ".join(said.not_counted)
-    note = f"without {missing}" if missing else "by the planner and by an independent check"
-    if said.geometry is not Geometry.PROVED:
-        note = "by the independent check" if said.geometry is Geometry.REFUSED else ""
-    return _tile("Geometry", said.geometry_grade, str(said.geometry), note)
+def _time(plan: Plan) -> str:
+    """Return how long planning took, and what was prepared for it."""
+    others = {name.removesuffix("_s"): seconds for name, seconds in plan.timing.items()}
+    planning = others.pop("planning", None)
+    value = "not stated" if planning is None else f"{planning:.1f} s"
+    return _tile("Planning time", None, value, ", ".join(f"{name} {s:.1f} s" for name, s in others.items()))
 
 
 def _limit(limit: Limit) -> str:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from lungaccess.uncertainty.risk import RestingRow, RiskReport, Sensitivity
 
 FAILS = "Why procedures fail"
+SHARES = "shares"
+"""The kind of a table whose values are not wrapped: a share and its interval stay on one line."""
 
 
 def risk_section(report: Estimate | None, start_words: str) -> str:
@@ -51,7 +53,7 @@ def _of_chance(chance: Chance) -> str:
     )
     rows = sorted(chance.failures.items(), key=lambda item: -item[1])
     failed = [(name, _share(Share(count=count, samples=chance.samples))) for name, count in rows]
-    return f"<p class='note'>{words.text(note)}</p>" + words.pairs(FAILS, failed)
+    return f"<p class='note'>{words.text(note)}</p>" + words.pairs(FAILS, failed, SHARES)
 
 
 def _of_procedures(report: ProcedureReport) -> str:
@@ -77,8 +79,10 @@ def _of_procedures(report: ProcedureReport) -> str:
     headings = ("planned again from", "times", "without a path", "would have missed by (median)")
     return (
         f"<p class='note'>{words.text(note)}</p>"
-        + words.pairs(FAILS, [(name, _share(share, fails=True)) for name, share in report.failures] + missed)
-        + words.table("What measuring corrects", headings, stages)
+        + words.pairs(
+            FAILS, [(name, _share(share, fails=True)) for name, share in report.failures] + missed, SHARES
+        )
+        + words.table("What measuring corrects", headings, stages, SHARES)
     )
 
 
@@ -104,8 +108,8 @@ def _of_deviations(report: RiskReport) -> str:
     )
     return (
         f"<p class='note'>{words.text(note)}</p>"
-        + words.pairs("If the devices deviate", rows)
-        + words.pairs("Success with errors of one kind only", alone)
+        + words.pairs("If the devices deviate", rows, SHARES)
+        + words.pairs("Success with errors of one kind only", alone, SHARES)
         + sensitivity_bars(report.sensitivity)
     )
 

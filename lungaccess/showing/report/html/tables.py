@@ -139,7 +139,7 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
         "nearness to obstacles",
     )  # fmt: skip
     more = ("share of the breath in the window",) if breathe else ()
-    return words.table("Plans to this target", (*headings, *more), rows)
+    return words.table("Plans to this target", (*headings, *more), rows, "plans")
 
 
 def _window(plan: Plan) -> str:

@@ -48,9 +48,9 @@ def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[Cell]],
     )
 
 
-def pairs(caption: str, rows: Iterable[tuple[str, object]]) -> str:
-    """Return a table of names and values, both plain text."""
-    return table(caption, (), [(text(name), text(value)) for name, value in rows], "pairs")
+def pairs(caption: str, rows: Iterable[tuple[str, object]], kind: str = "pairs") -> str:
+    """Return a table of names and values, both plain text; of the kind "shares" no value is wrapped."""
+    return table(caption, (), [(text(name), text(value)) for name, value in rows], kind)
 
 
 def steps(items: Iterable[str]) -> str:
@@ -72,14 +72,19 @@ def bullets(items: Iterable[object]) -> str:
 
 
 def headline(said: Headline) -> str:
-    """Return a headline whose colour and mark follow the worse of its parts; what it rests on is folded."""
-    details = "".join(f"<p class='note'>{text(each)}</p>" for each in said.details)
-    folded = f"<details><summary>What the estimate rests on</summary>{details}</details>" if details else ""
+    """Return a headline in one sentence, whose colour and mark follow the worse of its parts."""
     return (
-        f'<div class="headline grade-{said.grade.key}"><p><span class="mark">{said.grade.mark}</span> '
-        f"<strong>{text(said.verdict.capitalize())}.</strong> "
-        f'<span class="said">{text(said.text)}</span></p>{folded}</div>'
+        f'<p class="headline grade-{said.grade.key}"><span class="mark">{said.grade.mark}</span> '
+        f"<strong>{text(said.verdict.capitalize())}:</strong> "
+        f'<span class="said">{text(said.reasons)}.</span></p>'
     )
+
+
+def estimate_details(said: Headline) -> str:
+    """Return what the estimate of success rests on, folded; nothing where there is none."""
+    sentences = (said.chance_text, *said.details) if said.details else ()
+    details = "".join(f"<p class='note'>{text(each)}</p>" for each in sentences)
+    return f"<details><summary>What the estimate rests on</summary>{details}</details>" if details else ""
 
 
 def advice(given: Sequence[Advice]) -> str:
@@ -87,7 +92,7 @@ def advice(given: Sequence[Advice]) -> str:
     items = "".join(
         f"<li>{text(each.sentence)} <code>{text(shlex.join(each.options))}</code></li>" for each in given
     )
-    return f"<div class='note'>What was found to lift it:<ul>{items}</ul></div>" if items else ""
+    return f"<div class='advice'><strong>What lifts the chance</strong><ul>{items}</ul></div>" if items else ""
 
 
 def grade(which: Grade, said: str) -> str:

@@ -1,10 +1,12 @@
 // What the camera at the tip of the scope sees: the airway's surface from inside, the devices ahead, and which way to go.
 import { DEVICE_COLOURS } from "./colours.js";
-import { Solids } from "./solids.js";
+import { banded, Solids } from "./solids.js";
 import { add, cross, dot, minus, norm, rgb, times } from "./vectors.js";
 
 // Openings are named from so far on, and where they are not too near to the border of the round picture.
 const NAMED_MM = 45, NAMED_SHARE = 0.92;
+// Rings on the tubes, and their length: by them one sees a tube and how it bends, though it ends beyond a wall.
+const RINGS_MM = [0.8, 0.2], RING_SHADE = 0.25, ROUND_SIDES = 48;
 const TAKEN = "#7DF0B5", OTHER_WAY = "#F2F2F2";
 
 export class Bronchoscopy {
@@ -17,8 +19,11 @@ export class Bronchoscopy {
   draw(state, motion) {
     const radius = motion.plan.radius_mm, { camera_aside_mm: aside, half_angle_rad: halfAngle } = motion.plan.scope;
     const pose = { ...state.camera, eye: add(state.camera.eye, times(state.camera.up, aside)), halfAngle };
-    const solids = new Solids();
-    for (const key of ["outer", "inner"]) solids.tube(state[key], radius[key], rgb(DEVICE_COLOURS[key]));
+    const solids = new Solids(ROUND_SIDES);
+    for (const key of ["outer", "middle", "inner"]) {
+      const colour = rgb(DEVICE_COLOURS[key]), line = banded(state[key], colour, times(colour, RING_SHADE), RINGS_MM);
+      solids.tube(line.points, radius[key], line.colours);
+    }
     solids.tube(state.needle, radius.needle, state.needleColours);
     this.scene.drawInside(pose, solids, this.canvas);
     const place = state.scopeMm - (motion.ends.scope - motion.plan.scope.from_carina_mm);

@@ -30,9 +30,8 @@ export function lineChart(figure, { x, y, series, top, spans = [], marks = [] })
   const most = top || 1.08 * Math.max(...series.flatMap((each) => Array.from(each.ys)), 1e-9);
   const least = y.from || 0;
   const px = (value) => SIZE.left + ((value - low) / (high - low)) * (SIZE.width - SIZE.left - SIZE.right);
-  const py = (value) =>
-    SIZE.height - SIZE.bottom - ((Math.min(value, most) - least) / (most - least)) * (SIZE.height - SIZE.top - SIZE.bottom);
-  const floor = SIZE.height - SIZE.bottom;
+  const floor = SIZE.height - SIZE.bottom, width = SIZE.width - SIZE.left - SIZE.right;
+  const py = (value) => floor - ((value - least) / (most - least)) * (floor - SIZE.top);
   for (const span of spans) {
     const box = { x: px(span.from), width: Math.max(px(span.to) - px(span.from), 0), y: SIZE.top, height: floor - SIZE.top };
     element("rect", { ...box, class: "span" }, svg);
@@ -51,9 +50,12 @@ export function lineChart(figure, { x, y, series, top, spans = [], marks = [] })
     element("line", { x1: px(mark.at), x2: px(mark.at), y1: SIZE.top, y2: floor, class: "mark" }, svg);
     element("text", { x: px(mark.at) + 4, y: SIZE.top + 10 }, svg, mark.name);
   }
+  // What is above the top is cut off.
+  const frame = { x: SIZE.left, y: SIZE.top, width, height: floor - SIZE.top };
+  const inner = element("svg", { ...frame, viewBox: Object.values(frame).join(" "), style: `width: ${width}px; height: ${frame.height}px` }, svg);
   for (const each of series) {
     const style = { fill: "none", stroke: each.colour, "stroke-width": each.width || 2.2, "stroke-dasharray": each.dash || "" };
-    element("path", { d: pathOf(each, px, py), ...style, class: each.className || "" }, svg);
+    element("path", { d: pathOf(each, px, py), ...style, class: each.className || "" }, inner);
   }
   const cursor = element("line", { y1: SIZE.top, y2: floor, class: "cursor", visibility: "hidden" }, svg);
   figure.querySelectorAll("svg, ul").forEach((old) => old.remove());

@@ -29,13 +29,20 @@ export class DevicePage extends AnatomyPage {
     return end ? [...end.outer, ...end.middle, ...end.inner, ...end.needle] : [];
   }
 
-  // Name the devices beyond the scope and the end of the scope as what can be fitted, and bring out what is near them.
+  // Name what can be fitted, target and devices beyond the scope, and these with the end of the scope; bring out what is near.
   fitToPlan() {
     const { end, devices, target } = this;
     this.scene.setFocus(end && devices);
     if (!end) return;
-    const { centre, radius } = ballAround([...end.scope.slice(-SCOPE_POINTS), ...devices, target]);
-    this.orbit.setHome("plan", centre, radius + AROUND_PLAN_MM);
+    for (const [name, scope] of [["target", []], ["plan", this.way]]) {
+      const { centre, radius } = ballAround([...scope, ...devices, target]);
+      this.orbit.setHome(name, centre, radius + AROUND_PLAN_MM);
+    }
+  }
+
+  // The end of the scope that is in the view of the plan.
+  get way() {
+    return this.end.scope.slice(-SCOPE_POINTS);
   }
 
   // Look at the plan from the side from which it is seen long, or else at the target, or at the cross.

@@ -12,6 +12,7 @@ const START_MM = 1.1;
 const FAINT_START_MM = 0.6;
 const TARGET_MM = 2.2;
 const PATH_MM = 1.2;
+const AROUND_TARGET_MM = 44;
 
 // Return points as lists of three numbers.
 async function pointsOf(packed) {
@@ -32,7 +33,7 @@ class NoPlanPage extends AnatomyPage {
     for (const path of this.data.paths) path.lines = await Promise.all(path.curves.map(pointsOf));
     for (const group of this.data.starts) group.places = await pointsOf(group.points);
     if (await this.openScene((size) => 2.1 * Math.max(...size))) {
-      byId("view-target").addEventListener("click", () => this.orbit.approach(this.data.target_lps, 170));
+      this.orbit.setHome("target", this.data.target_lps, AROUND_TARGET_MM);
       this.makeSolids();
     }
     this.image = await VoxelImage.of(this.data);

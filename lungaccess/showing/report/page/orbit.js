@@ -64,13 +64,6 @@ export class Orbit {
     this.changed();
   }
 
-  // Look at a point from near by, from the side we are on.
-  approach(point, distance) {
-    this.centre = [...point];
-    this.distance = distance;
-    this.changed();
-  }
-
   zoom(factor) {
     this.distance = Math.min(Math.max(this.distance * factor, 15), 4000);
     this.changed();

@@ -33,7 +33,9 @@ const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
 const BREATH_S = 5;
 const LEAST_WIDTH = 0.0016;
 const MOST_ACROSS_MM = 60;
-const TARGET_MM = 1.6, AIM_MM = 1.1;
+const TARGET_MM = 1.6, AIM_MM = 1.1, ABOVE_CARINA_MM = 30;
+// The chart of distances reaches to so many times what is required, or what is nearest.
+const CHART_ROOM = 3;
 
 class PlanPage extends DevicePage {
   constructor(data) {
@@ -57,7 +59,7 @@ class PlanPage extends DevicePage {
     this.listSwitches();
     this.connectControls();
     if (await this.openScene(distanceOfAll)) {
-      this.addTarget();
+      this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));
       this.fitToPlan();
       this.lookAtPlan();
     }
@@ -80,10 +82,12 @@ class PlanPage extends DevicePage {
     return this.stateOf(this.followed, 1);
   }
 
-  addTarget() {
-    const target = this.data.plans[0].target_lps;
-    byId("view-target").addEventListener("click", () => this.orbit.approach(target, 170));
-    this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));
+  // The scope from a little above the carina on: the whole way.
+  get way() {
+    const { scope } = this.end, wanted = this.motion.plan.scope.from_carina_mm + ABOVE_CARINA_MM;
+    let first = scope.length - 1, mm = 0;
+    for (; first > 0 && mm < wanted; first--) mm += norm(minus(scope[first], scope[first - 1]));
+    return scope.slice(first);
   }
 
   nameOf(hit) {
@@ -204,6 +208,7 @@ class PlanPage extends DevicePage {
   draw() {
     if (this.breath) this.drawBreath();
     const state = this.stateOf(this.followed, this.player.position);
+    if (this.orbit && this.state && this.state.position !== state.position) this.goWith(state);
     this.state = state;
     this.player.say(this.motion.words(state));
     for (const button of document.querySelectorAll("button[data-stage]")) {
@@ -216,6 +221,12 @@ class PlanPage extends DevicePage {
     }
     for (const move of this.cursors) move(this.motion.alongMm(state));
     if (this.views && !this.leavesOut(this.slices.axial.canvas)) this.drawSlices();
+  }
+
+  // Let the 3-D view go with the scope while that moves, and back to what is fitted when it stands.
+  goWith(state) {
+    if (state.stage === 0) this.orbit.centre = [...state.tip];
+    else if (this.state.stage === 0) this.orbit.centre = [...this.orbit.home.centre];
   }
 
   // Return what is where at a place of the slider, in the phase of the breath.
@@ -381,10 +392,14 @@ class PlanPage extends DevicePage {
     this.drawClearance = (sample) => {
       this.clearanceAt = sample;
       const known = sample === null ? null : this.breath.plans[this.followed].samples;
-      const series = clearances.map((each) => (known ? { ...each, ys: known.clearance[each.key][sample] } : each));
+      const series = clearances.map((each) => {
+        const ys = known ? known.clearance[each.key][sample] : each.ys, least = leastOf(ys);
+        return { ...each, ys, least, name: `${each.name}: ${least < profile.cap_mm ? "" : "over "}${least.toFixed(1)} mm at least` };
+      });
+      const nearest = Math.min(...series.map(({ least }) => least)), top = CHART_ROOM * Math.max(nearest, ...required.ys);
       this.cursors[0] = lineChart(byId("chart-clearance"), {
         x: known ? { name: `${x.name}, at ${(100 * known.phases[sample]).toFixed(0)} % of the breath` } : x,
-        y: { name: "mm" }, series: [...series, required], top: profile.cap_mm, marks,
+        y: { name: "mm" }, series: [...series, required], top: Math.min(top, profile.cap_mm), marks,
         spans: [{ from: 0, to: Math.max(profile.exempt_to_mm, 0) }],
       });
     };
@@ -429,6 +444,9 @@ function swatchOf({ colour, bands }) {
   const px = (mm) => `${1.5 * mm}px`, [on, off] = bands;
   return `repeating-linear-gradient(90deg, ${colour} 0 ${px(on)}, #ffffff ${px(on)} ${px(on + off)})`;
 }
+
+// Return the least of distances; below 0 there is none.
+const leastOf = (values) => values.reduce((least, value) => (value >= 0 ? Math.min(least, value) : least), Infinity);
 
 // Return how far away the whole lung is seen at once, by its size in mm.
 function distanceOfAll(size) {

@@ -10,6 +10,8 @@ export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
 const RIM = 0.55, FAINT_GAIN = 1.5, DARK_GAIN = 1.4, DARK_FAINT_GAIN = 3.2, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
 const INSIDE = "inside";
 const NO_CUT = [0, 0, 0, 0];
+// The light at the tip of the scope falls off with the distance, as on the wall.
+const LAMP_PER_MM2 = 1 / 520;
 const OUTLINE_PX = 1.2;
 const LEAST_POINT_PX = 3;
 const SLACK_MM = 20;
@@ -21,7 +23,8 @@ const FINE = 2, RESTING = 1, COARSE = 0.6;
 export class Scene {
   constructor(canvas) {
     this.canvas = canvas;
-    this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
+    // The picture is kept after it was shown, so that the page can be printed.
+    this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!this.gl) throw new Error("WebGL 2 is not available");
     this.programs = programs(this.gl);
     this.layers = new Layers(this.gl);
@@ -351,6 +354,7 @@ export class Scene {
   drawSolids(view, only) {
     const gl = this.gl;
     this.use(this.programs.solid, view);
+    this.gl.uniform1f(this.programs.solid.places.lamp, only ? LAMP_PER_MM2 : 0);
     [...this.solids].forEach(([name, solid], n) => {
       if (only && name !== only) return;
       gl.uniform1f(this.programs.solid.places.number, n / 255);

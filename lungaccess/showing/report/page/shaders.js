@@ -80,13 +80,14 @@ void main() {
 const SOLID_FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 eye, facing, colour;
-uniform float number;
+uniform float number, lamp;
 layout(location=0) out vec4 result;
 layout(location=1) out vec4 known;
 ${STORED_DEPTH}
 void main() {
   float straight = abs(dot(normalize(facing), normalize(eye)));
   vec3 lit = colour * (0.35 + 0.65 * straight) + vec3(0.25) * pow(straight, 24.0);
+  lit /= 1.0 + lamp * dot(eye, eye);
   result = vec4(lit, 1.0);
   known = vec4(number, twoBytes(depthOf(eye.z)), 0.0);
 }`;

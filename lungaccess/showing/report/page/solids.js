@@ -1,11 +1,10 @@
 // Tubes around lines, and balls, as triangles with a colour at each vertex.
 import { add, cross, dot, minus, norm, times, unit } from "./vectors.js";
 
-const SIDES = 14;
-
-// Collects triangles of solid bodies.
+// Collects triangles of solid bodies, which are round by so many sides.
 export class Solids {
-  constructor() {
+  constructor(sides = 14) {
+    this.sides = sides;
     this.places = [];
     this.normals = [];
     this.colours = [];
@@ -40,8 +39,8 @@ export class Solids {
 
   ring(place, side, other, radius, colour) {
     let first = -1;
-    for (let k = 0; k < SIDES; k++) {
-      const angle = (2 * Math.PI * k) / SIDES;
+    for (let k = 0; k < this.sides; k++) {
+      const angle = (2 * Math.PI * k) / this.sides;
       const normal = add(times(side, Math.cos(angle)), times(other, Math.sin(angle)));
       const number = this.vertex(add(place, times(normal, radius)), normal, colour);
       if (k === 0) first = number;
@@ -50,28 +49,28 @@ export class Solids {
   }
 
   join(a, b) {
-    for (let k = 0; k < SIDES; k++) {
-      const next = (k + 1) % SIDES;
+    for (let k = 0; k < this.sides; k++) {
+      const next = (k + 1) % this.sides;
       this.faces.push(a + k, a + next, b + k, a + next, b + next, b + k);
     }
   }
 
   cap(ring, centre, normal, colour) {
     const middle = this.vertex(centre, normal, colour);
-    for (let k = 0; k < SIDES; k++) this.faces.push(middle, ring + k, ring + ((k + 1) % SIDES));
+    for (let k = 0; k < this.sides; k++) this.faces.push(middle, ring + k, ring + ((k + 1) % this.sides));
   }
 
   ball(centre, radius, colour, rows = 10) {
     const first = this.places.length / 3;
     for (let i = 0; i <= rows; i++) {
       const polar = (Math.PI * i) / rows;
-      for (let k = 0; k < SIDES; k++) {
-        const angle = (2 * Math.PI * k) / SIDES;
+      for (let k = 0; k < this.sides; k++) {
+        const angle = (2 * Math.PI * k) / this.sides;
         const normal = [Math.sin(polar) * Math.cos(angle), Math.sin(polar) * Math.sin(angle), Math.cos(polar)];
         this.vertex(add(centre, times(normal, radius)), normal, colour);
       }
     }
-    for (let i = 0; i < rows; i++) this.join(first + i * SIDES, first + (i + 1) * SIDES);
+    for (let i = 0; i < rows; i++) this.join(first + i * this.sides, first + (i + 1) * this.sides);
   }
 }
 

@@ -28,7 +28,7 @@ export class ViewTools {
 
   connectCut() {
     const changed = () => {
-      this.find("cut-row").hidden = !this.find("cut").checked;
+      this.find("cut-row").classList.toggle("off", !this.find("cut").checked);
       this.page.redrawView();
     };
     for (const id of ["cut", "cut-offset"]) this.find(id).addEventListener("input", changed);

@@ -13,7 +13,7 @@ from lungaccess.showing.report.pack import script_text
 SHARED_MODULES = (
     "decode.js", "vectors.js", "colours.js", "surfaces.js", "shaders.js", "layers.js", "picking.js",
     "solids.js", "scene.js", "orbit.js", "voxels.js", "voxel_image.js", "slices.js", "slice_views.js",
-    "slice_panel.js", "structures.js", "view_tools.js", "anatomy_page.js",
+    "structures.js", "slice_panel.js", "view_tools.js", "anatomy_page.js",
 )  # fmt: skip
 _IMPORT = re.compile(r"^import .*;\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(async )?(function|class|const|let) )", re.MULTILINE)

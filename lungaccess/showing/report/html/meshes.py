@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from stages.needle import StartRegion
 
 
-SURFACES_VERSION = 3
+SURFACES_VERSION = 4
 STEPS = 65535
 SMOOTHINGS = 6
 SHRINK, GROW = 0.5, -0.53
@@ -132,7 +132,11 @@ def packed_surface(volume: Volume, look: Look) -> Packed:
 
 
 def packed_mesh(vertices: Float, faces: Int, look: Look) -> Packed:
-    """Return triangles with their look; they are counted first to last."""
+    """Return triangles with their look; they are counted first to last, and their normals point outwards."""
+    a, b, c = (vertices[faces[:, n]] - vertices.mean(axis=0) for n in range(3))
+    # The volume of a body whose triangles go round the wrong way is negative.
+    if np.sum(a * np.cross(b, c)) < 0.0:
+        faces = faces[:, [0, 2, 1]]
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = np.maximum(high - low, 1e-6)
     return {

@@ -92,7 +92,7 @@ def advice(given: Sequence[Advice]) -> str:
     items = "".join(
         f"<li>{text(each.sentence)} <code>{text(shlex.join(each.options))}</code></li>" for each in given
     )
-    return f"<div class='advice'><strong>What lifts the chance</strong><ul>{items}</ul></div>" if items else ""
+    return f"<div class='advice'><b>What lifts the chance</b><ul>{items}</ul></div>" if items else ""
 
 
 def grade(which: Grade, said: str) -> str:

@@ -179,16 +179,6 @@ export class AnatomyPage {
     if (at) this.crossMark.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px)`;
   }
 
-  // Let a click in a slice choose the place.
-  followClicks() {
-    for (const slice of Object.values(this.slices)) {
-      slice.canvas.addEventListener("click", (event) => {
-        const scale = slice.canvas.width / slice.canvas.clientWidth;
-        this.moveTo(slice.pointAt(event.offsetX * scale, event.offsetY * scale));
-      });
-    }
-  }
-
   moveTo(place) {
     this.place = place;
     this.redraw();

@@ -329,7 +329,7 @@ class PlanPage extends DevicePage {
   across(state, following) {
     const widthMm = Math.min(this.views.widthMm, MOST_ACROSS_MM), line = wholeLine(state);
     if (following) return { ...planeAcross(state.direction), through: state.tip, widthMm };
-    const { place, direction } = nearestOn(line, this.views.place);
+    const { place, direction } = alongLine(line, this.views.place);
     return { ...planeAcross(direction), through: place, widthMm };
   }
 
@@ -456,19 +456,6 @@ function distanceOfAll(size) {
 // Return the line of everything that is out, from the scope on.
 function wholeLine({ scope, outer, middle, inner, needle }) {
   return [...scope, ...outer, ...middle, ...inner, ...needle];
-}
-
-// Return the point of a line that is nearest to a place, and the direction of the line there.
-function nearestOn(line, place) {
-  let found = null;
-  for (let n = 1; n < line.length; n++) {
-    const step = minus(line[n], line[n - 1]), size = dot(step, step);
-    if (size < 1e-9) continue;
-    const share = Math.min(Math.max(dot(minus(place, line[n - 1]), step) / size, 0), 1), at = mix(line[n - 1], line[n], share);
-    const away = norm(minus(place, at));
-    if (!found || away < found.away) found = { away, place: at, direction: unit(step) };
-  }
-  return found;
 }
 
 // Return radii that can be seen from a distance.

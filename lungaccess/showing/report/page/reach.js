@@ -2,7 +2,7 @@
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { reportData, unpack } from "./decode.js";
 import { STANDARD } from "./slices.js";
-import { addSwitch } from "./structures.js";
+import { addSwitch, swatch } from "./structures.js";
 import { minus, mix, norm, rgb } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
 
@@ -173,10 +173,7 @@ class ReachPage extends AnatomyPage {
       : Object.entries(this.data.colours);
     byId("key").replaceChildren(...entries.map(([name, colour]) => {
       const item = document.createElement("li");
-      const swatch = document.createElement("span");
-      swatch.className = "swatch";
-      swatch.style.background = colour;
-      item.append(swatch, ` ${name}`);
+      item.append(swatch(colour), ` ${name}`);
       return item;
     }));
   }

@@ -3,7 +3,7 @@ import { unpack } from "./decode.js";
 import { Layers } from "./layers.js";
 import { FAINTEST, Picker } from "./picking.js";
 import { MOST_SLICES, programs } from "./shaders.js";
-import { coarser, facesFrom, isInsideOut, nearnessOf, normalsOf } from "./surfaces.js";
+import { coarser, facesFrom, nearnessOf, normalsOf } from "./surfaces.js";
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
@@ -48,25 +48,14 @@ export class Scene {
   async addSurface(packed, breath = null) {
     const [places, differences] = await Promise.all([unpack(packed.vertices), unpack(packed.faces)]);
     const faces = facesFrom(differences);
-    const gl = this.gl;
-    const array = gl.createVertexArray();
-    gl.bindVertexArray(array);
-    const buffers = [
-      attribute(gl, 0, places, gl.UNSIGNED_SHORT, true, 3, 0),
-      attribute(gl, 1, normalsOf(places, faces, packed.size_mm), gl.BYTE, true, 3, 4),
-      ...(breath ? [attribute(gl, 2, breath.displacements(places, packed), gl.FLOAT, false, 3, 0)] : []),
-      gl.createBuffer(),
+    const { gl } = this;
+    const attributes = [
+      [places, gl.UNSIGNED_SHORT, true, 3, 0], [normalsOf(places, faces, packed.size_mm), gl.BYTE, true, 3, 4],
+      ...(breath ? [[breath.displacements(places, packed), gl.FLOAT, false, 3, 0]] : []),
     ];
-    const fine = buffers[buffers.length - 1];
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, fine);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
     this.removeSurface(packed.key);
     const surface = {
-      array,
-      buffers,
-      fine,
-      count: faces.length,
+      ...uploaded(gl, attributes, faces),
       name: packed.name,
       colour: rgb(packed.colour),
       opacity: packed.opacity,
@@ -76,7 +65,6 @@ export class Scene {
       ofMasks: packed.key.startsWith("start-"),
       places,
       faces,
-      outward: isInsideOut(places, faces, packed.size_mm) ? -1 : 1,
     };
     this.surfaces.set(packed.key, surface);
     this.enclose([packed.low_lps, packed.low_lps.map((low, axis) => low + packed.size_mm[axis])]);
@@ -85,48 +73,34 @@ export class Scene {
   }
 
   removeSurface(key) {
-    const surface = this.surfaces.get(key);
-    if (!surface) return;
-    surface.buffers.forEach((buffer) => this.gl.deleteBuffer(buffer));
-    this.gl.deleteVertexArray(surface.array);
-    this.surfaces.delete(key);
+    this.remove(this.surfaces, key);
     this.changes += 1;
   }
 
   // Put solid bodies under a name, or take them away with null.
   setSolids(name, solids) {
-    const gl = this.gl;
+    const { gl } = this;
     this.remove(this.solids, name);
     if (!solids || !solids.faces.length) return;
-    const array = gl.createVertexArray();
-    gl.bindVertexArray(array);
-    const buffers = [solids.places, solids.normals, solids.colours].map((values, n) =>
-      attribute(gl, n, new Float32Array(values), gl.FLOAT, false, 3, 0));
-    buffers.push(gl.createBuffer());
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[3]);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(solids.faces), gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
-    this.solids.set(name, { array, buffers, count: solids.faces.length });
+    const attributes = [solids.places, solids.normals, solids.colours].map((values) =>
+      [new Float32Array(values), gl.FLOAT, false, 3, 0]);
+    this.solids.set(name, uploaded(gl, attributes, new Uint32Array(solids.faces)));
     if (name !== INSIDE) this.enclose(corners(solids.places));
   }
 
   // Put coloured points under a name, or take them away with null: places `3 N` in LPS mm, colours `3 N` from 0 to 1,
   // and radii in mm, one for all or `N`.  None is drawn smaller than a few pixels.
   setPoints(name, points) {
-    const gl = this.gl;
+    const { gl } = this;
     this.remove(this.points, name);
     if (!points || !points.places.length) return;
     const places = Float32Array.from(points.places), count = places.length / 3;
     const radii = typeof points.radii === "number" ? new Float32Array(count).fill(points.radii) : Float32Array.from(points.radii);
-    const array = gl.createVertexArray();
-    gl.bindVertexArray(array);
-    const buffers = [
-      attribute(gl, 0, places, gl.FLOAT, false, 3, 0),
-      attribute(gl, 1, Uint8Array.from(points.colours, (value) => Math.round(255 * value)), gl.UNSIGNED_BYTE, true, 3, 0),
-      attribute(gl, 2, radii, gl.FLOAT, false, 1, 0),
+    const attributes = [
+      [places, gl.FLOAT, false, 3, 0], [radii, gl.FLOAT, false, 1, 0],
+      [Uint8Array.from(points.colours, (value) => Math.round(255 * value)), gl.UNSIGNED_BYTE, true, 3, 0],
     ];
-    gl.bindVertexArray(null);
-    this.points.set(name, { array, buffers, count, places, radii });
+    this.points.set(name, { ...uploaded(gl, attributes), count, places, radii });
     this.enclose(corners(places));
   }
 
@@ -263,7 +237,6 @@ export class Scene {
         // Of a closed surface only the outside, unless a cut lets one see into it.
         if (this.cut) gl.disable(gl.CULL_FACE);
         else gl.enable(gl.CULL_FACE);
-        gl.frontFace(surface.outward > 0 ? gl.CCW : gl.CW);
         gl.uniform1i(places.slice, n);
         this.drawSurface(surface, program, this.isHurried);
       });
@@ -389,7 +362,6 @@ export class Scene {
     gl.uniform3fv(places.low, surface.low);
     gl.uniform3fv(places.size, surface.size);
     gl.uniform1f(places.share, this.share);
-    if (places.outward) gl.uniform1f(places.outward, surface.outward);
     gl.bindVertexArray(surface.array);
     if (isCoarse) this.useCoarse(surface);
     gl.drawElements(gl.TRIANGLES, isCoarse ? surface.coarse.count : surface.count, gl.UNSIGNED_INT, 0);
@@ -401,11 +373,26 @@ export class Scene {
     const gl = this.gl;
     if (surface.coarse) return gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
     const faces = coarser(surface.places, surface.faces, surface.size);
-    surface.coarse = { buffer: gl.createBuffer(), count: faces.length };
-    surface.buffers.push(surface.coarse.buffer);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
-    return gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+    surface.coarse = { buffer: elements(gl, faces), count: faces.length };
+    return surface.buffers.push(surface.coarse.buffer);
   }
+}
+
+// Return a vertex array of attributes and, if there are any, of faces, with its buffers.
+function uploaded(gl, attributes, faces = []) {
+  const array = gl.createVertexArray();
+  gl.bindVertexArray(array);
+  const buffers = attributes.map((each, n) => attribute(gl, n, ...each)), fine = faces.length ? elements(gl, faces) : null;
+  gl.bindVertexArray(null);
+  return { array, buffers: [...buffers, fine], fine, count: faces.length };
+}
+
+// Return the buffer of faces, which belongs to the vertex array that is bound.
+function elements(gl, faces) {
+  const buffer = gl.createBuffer();
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+  return buffer;
 }
 
 function attribute(gl, place, values, type, normalised, size, stride) {

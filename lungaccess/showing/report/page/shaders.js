@@ -37,7 +37,6 @@ precision highp int;
 precision highp sampler2DArray;
 in vec3 eye, facing;
 in float near, kept;
-uniform float outward;
 uniform int slice, peeled;
 uniform sampler2DArray before;
 out vec4 result;
@@ -46,7 +45,7 @@ void main() {
   if (kept < 0.0) discard;
   float depth = depthOf(eye.z);
   if (peeled != 0 && depth <= stored(texelFetch(before, ivec3(gl_FragCoord.xy, slice), 0))) discard;
-  result = vec4(near, twoBytes(depth), 0.5 - 0.5 * outward * dot(normalize(facing), normalize(eye)));
+  result = vec4(near, twoBytes(depth), 0.5 - 0.5 * dot(normalize(facing), normalize(eye)));
 }`;
 
 // The inside of the airway by the light at the tip of the scope.
@@ -95,8 +94,8 @@ void main() {
 // A point is a disc that is shaded as a ball.  Alpha says that it has no outline: many small ones would be all outline.
 const POINT_VERTEX = `#version 300 es
 layout(location=0) in vec3 place;
-layout(location=1) in vec3 shade;
-layout(location=2) in float radius;
+layout(location=1) in float radius;
+layout(location=2) in vec3 shade;
 uniform mat4 clipFromEye, eyeFromLps;
 uniform vec2 pixels;
 out vec3 centre, colour;

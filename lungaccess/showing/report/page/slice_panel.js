@@ -1,4 +1,5 @@
 // The controls of slices (slices.html): field, window, what a drag does, opacities, and what is under the pointer.
+import { swatch } from "./structures.js";
 import { minus, norm } from "./vectors.js";
 
 // Connects the controls with slices.
@@ -63,10 +64,6 @@ export class SlicePanel {
 
   addOpacity({ name, colour, opacity }) {
     const item = document.createElement("li"), label = document.createElement("label"), slider = document.createElement("input");
-    const swatch = document.createElement("span");
-    swatch.className = "swatch";
-    swatch.style.background = colour;
-    swatch.setAttribute("aria-hidden", "true");
     Object.assign(slider, { type: "range", min: 0, max: 100, step: 5 });
     slider.value = Math.round(100 * opacity);
     slider.dataset.structure = name;
@@ -77,7 +74,7 @@ export class SlicePanel {
       this.views.image.setOpacity(name, Number(slider.value) / 100);
       this.views.changed();
     });
-    label.append(swatch, document.createTextNode(name), slider);
+    label.append(swatch(colour), document.createTextNode(name), slider);
     item.append(label);
     this.find("opacities").append(item);
   }

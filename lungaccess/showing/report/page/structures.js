@@ -1,18 +1,23 @@
 // The switches: one labelled box for each thing that can be shown.
 
+// Return a patch of a colour.
+export function swatch(colour) {
+  const made = document.createElement("span");
+  made.className = "swatch";
+  made.style.background = colour;
+  made.setAttribute("aria-hidden", "true");
+  return made;
+}
+
 // Add a switch to a list; changed receives whether it is on.
 export function addSwitch(list, { key, name, colour, shown }, changed) {
   const item = document.createElement("li");
   const label = document.createElement("label");
   const box = document.createElement("input");
-  const swatch = document.createElement("span");
   box.type = "checkbox";
   box.checked = shown;
   box.dataset.key = key;
-  swatch.className = "swatch";
-  swatch.style.background = colour;
-  swatch.setAttribute("aria-hidden", "true");
-  label.append(box, swatch, document.createTextNode(name));
+  label.append(box, swatch(colour), document.createTextNode(name));
   item.append(label);
   list.append(item);
   box.addEventListener("change", () => changed(box.checked));

@@ -44,20 +44,6 @@ export function normalsOf(places, faces, size) {
   return normals;
 }
 
-// Return whether the triangles go round the wrong way, so that their normals point into the body: by its volume.
-export function isInsideOut(places, faces, size) {
-  const scale = size.map((mm) => mm / 65535), middle = 32767.5;
-  let volume = 0;
-  for (let f = 0; f < faces.length; f += 3) {
-    const [a, b, c] = [faces[f], faces[f + 1], faces[f + 2]].map((v) => 3 * v);
-    const ax = places[a] - middle, ay = places[a + 1] - middle, az = places[a + 2] - middle;
-    const bx = places[b] - middle, by = places[b + 1] - middle, bz = places[b + 2] - middle;
-    const cx = places[c] - middle, cy = places[c + 1] - middle, cz = places[c + 2] - middle;
-    volume += ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx);
-  }
-  return volume * scale[0] * scale[1] * scale[2] < 0;
-}
-
 // Return triangles between fewer of the same vertices: in cells of a few edges one stands for all, and what shrinks to a
 // line is left out.
 export function coarser(places, faces, size) {
@@ -104,17 +90,19 @@ export function nearnessOf({ places, low, size }, line) {
   return found;
 }
 
-// Return how far a point is from a line of points, and how far along it the nearest place is, both in mm.
+// Return how far a point is from a line of points, where on it the nearest place is and how far along, both in mm, and the
+// direction of the line there.
 export function alongLine(line, point) {
-  let awayMm = Infinity, alongMm = 0, before = 0;
+  let found = { awayMm: Infinity, alongMm: 0 }, before = 0;
   for (let n = 0; n + 1 < line.length; n++) {
-    const step = minus(line[n + 1], line[n]), from = minus(point, line[n]);
-    const square = dot(step, step);
-    const share = square > 0 ? Math.min(Math.max(dot(from, step) / square, 0), 1) : 0;
-    const rest = minus(from, times(step, share));
-    const away = Math.sqrt(dot(rest, rest)), length = Math.sqrt(square);
-    if (away < awayMm) [awayMm, alongMm] = [away, before + share * length];
+    const step = minus(line[n + 1], line[n]), from = minus(point, line[n]), length = Math.sqrt(dot(step, step));
+    if (length < 1e-6) continue;
+    const share = Math.min(Math.max(dot(from, step) / (length * length), 0), 1), rest = minus(from, times(step, share));
+    const awayMm = Math.sqrt(dot(rest, rest));
+    if (awayMm < found.awayMm) {
+      found = { awayMm, alongMm: before + share * length, place: minus(point, rest), direction: times(step, 1 / length) };
+    }
     before += length;
   }
-  return { awayMm, alongMm };
+  return found;
 }

@@ -10,18 +10,6 @@ export const unit = (a) => times(a, 1 / Math.max(norm(a), 1e-9));
 export const mix = (a, b, s) => [a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1]), a[2] + s * (b[2] - a[2])];
 export const point = (array, n) => [array[3 * n], array[3 * n + 1], array[3 * n + 2]];
 
-export function product(a, b) {
-  const c = new Float32Array(16);
-  for (let column = 0; column < 4; column++) {
-    for (let row = 0; row < 4; row++) {
-      let sum = 0;
-      for (let k = 0; k < 4; k++) sum += a[4 * k + row] * b[4 * column + k];
-      c[4 * column + row] = sum;
-    }
-  }
-  return c;
-}
-
 // Right-handed, so that no side is exchanged: the camera looks along forward.
 export function eyeFromLps(eye, forward, up) {
   const right = unit(cross(forward, up));

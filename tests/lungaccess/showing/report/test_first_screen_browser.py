@@ -1,4 +1,4 @@
-"""The first screen of a report and its print, in a real browser: everything is in view, and nothing over another."""
+"""The first screen of a report and its print, in a real browser: all is in view, and nothing over another."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ for (const e of document.querySelectorAll('body *')) {
   if (!e.checkVisibility({ visibilityProperty: true }) || e.closest('.view, .sample, option')) continue;
   if (![...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) continue;
   let ground = e;
-  while (ground && getComputedStyle(ground).backgroundColor === 'rgba(0, 0, 0, 0)') ground = ground.parentElement;
+  const clear = 'rgba(0, 0, 0, 0)';
+  while (getComputedStyle(ground).backgroundColor === clear) ground = ground.parentElement;
   const ink = getComputedStyle(e)[e instanceof SVGElement ? 'fill' : 'color'];
   found.push([e.textContent.trim().slice(0, 30), ink, getComputedStyle(ground).backgroundColor]);
 }
@@ -105,7 +106,8 @@ def test_nothing_is_drawn_outside_of_the_view(window: browser.Browser) -> None:
     clipped = window.run(
         """const view = document.querySelector('.view');
         const inside = (e) => view.contains(e) && getComputedStyle(view).overflow === 'hidden';
-        return ['.scene-cross', '#scene-labels', '#pointed'].map((each) => inside(document.querySelector(each)))"""
+        const drawn = ['.scene-cross', '#scene-labels', '#pointed'];
+        return drawn.map((each) => inside(document.querySelector(each)))"""
     )
     assert clipped == [True, True, True]
 

@@ -113,7 +113,8 @@ def test_every_control_can_have_the_focus(page: browser.Browser) -> None:
     lost = page.run(
         """const all = [...document.querySelectorAll('input, select, button, summary, canvas[tabindex]')];
         const focused = (e) => { e.focus({ preventScroll: true }); return document.activeElement === e; };
-        const seen = all.filter((e) => e.checkVisibility({ contentVisibilityAuto: true, visibilityProperty: true }));
+        const kinds = { contentVisibilityAuto: true, visibilityProperty: true };
+        const seen = all.filter((e) => e.checkVisibility(kinds));
         return seen.filter((e) => !focused(e)).map((e) => e.outerHTML)"""
     )
     assert lost == []

@@ -31,9 +31,7 @@ def page(breathing_window: browser.Browser) -> browser.Browser:
     return breathing_window
 
 
-def test_the_view_of_the_target_fits_tubes_and_needle(
-    page: browser.Browser, plans: tuple[Plan, ...]
-) -> None:
+def test_the_view_of_the_target_fits_tubes_and_needle(page: browser.Browser, plans: tuple[Plan, ...]) -> None:
     """They are in it, and large; the view of all is from farther away."""
     page.run("document.querySelector('button[data-fit=target]').click(); window.lungaccessReport.set(1)")
     curves = plans[0].curves()

@@ -186,7 +186,7 @@ def _rules_out(rho: float, h: float, tolerance_mm: float, limit: str, limits: Li
     That holds for targets farther than the needle is long; for those behind the start, if paths never turn
     back; for those that lie in the torus of tightest
     circles by more than the tolerance, if paths turn by 180 degrees at most; and without a tolerance where
-    the workspace is exact: see "Workspace" in docs/explanation/proofs.md.
+    the workspace is exact: see "Workspace" in docs/theory/proofs.md.
     """
     if math.hypot(rho, h) - tolerance_mm > limits.max_length_mm:
         return True

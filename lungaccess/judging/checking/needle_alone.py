@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 WALL_ZONE_MM = 1.0
 LEAVING_DEG = 10.0
-"""The rule at the wall, stated a second time: docs/explanation/proofs.md."""
+"""The rule at the wall, stated a second time: docs/theory/proofs.md."""
 
 
 def check_needle_alone(

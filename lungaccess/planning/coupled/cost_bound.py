@@ -1,4 +1,4 @@
-"""A proved lower bound of the cost of every plan to a target; docs/explanation/cost_bound.md derives it."""
+"""A proved lower bound of the cost of every plan to a target; docs/theory/cost_bound.md derives it."""
 
 from __future__ import annotations
 

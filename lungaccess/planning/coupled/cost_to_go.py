@@ -1,4 +1,4 @@
-"""What paths of a needle to a target still cost at least; docs/explanation/cost_bound.md derives it."""
+"""What paths of a needle to a target still cost at least; docs/theory/cost_bound.md derives it."""
 
 from __future__ import annotations
 

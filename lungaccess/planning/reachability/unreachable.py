@@ -1,6 +1,6 @@
 """Proof that no deployment of a system reaches a target, or what of the deployments it leaves open.
 
-docs/explanation/unreachable.md derives it.
+docs/theory/unreachable.md derives it.
 """
 
 from __future__ import annotations

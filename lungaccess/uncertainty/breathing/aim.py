@@ -1,7 +1,7 @@
 """Where the needle has to end for a window: one aim for each place of the scope's tip.
 
 How far a deployment misses the moving target depends on the place of the scope's tip and on where the devices
-end, and on nothing else; see docs/explanation/proofs.md.
+end, and on nothing else; see docs/theory/proofs.md.
 """
 
 from __future__ import annotations

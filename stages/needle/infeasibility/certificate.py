@@ -6,7 +6,7 @@ plane the states, position times direction, lie in cells.  From one plane to the
 as curvature allows and more by what a cell is wide; cells vanish from which obstacles, or the places of start
 and target, leave no path.  If none is left on a plane, no path exists: none is missed, since every step
 over-estimates.  If some are left, those that lie on a chain of cells from start to target are cut into
-smaller ones and the same is done again.  docs/explanation/certificate.md has the inequalities.
+smaller ones and the same is done again.  docs/theory/no_path.md has the inequalities.
 """
 
 import math

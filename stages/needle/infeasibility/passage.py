@@ -1,7 +1,7 @@
 """The tightest place of the states that a proof of no path has left.
 
 The backward reachable set of a target tells where every path to it may come from, whatever its start;
-docs/explanation/unreachable.md derives it.
+docs/theory/unreachable.md derives it.
 """
 
 import math

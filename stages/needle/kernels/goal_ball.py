@@ -2,7 +2,7 @@
 
 With R the smallest radius and r the tolerance: where the shortest path CS to the goal itself has a straight
 piece of at least r, it is that path less its last r mm; else it is the arc C as far as the ball
-(docs/explanation/proofs.md, "Workspace").  With r = 0 all of this is about the goal itself.
+(docs/theory/proofs.md, "Workspace").  With r = 0 all of this is about the goal itself.
 """
 
 import math
@@ -53,7 +53,7 @@ def least_length(rho, h, limits, cosine, turn_left):
     """Return a length below which no path leads into the ball, inf if none does within the turning limits.
 
     Nothing within the limits is ruled out, and no length stated that a path could do without
-    (docs/explanation/proofs.md, "Workspace").  The limit of the angle counts where no tangent of a path can
+    (docs/theory/proofs.md, "Workspace").  The limit of the angle counts where no tangent of a path can
     lean from the tip by more than 90 degrees: else a tilted tip can wind around the reference, and reaches
     farther than by one arc.  The turn that is left counts up to 180 degrees.
 

@@ -1,6 +1,6 @@
 """The arcs from one start to the points of a ball: where an obstacle rules out all of them together.
 
-docs/explanation/reachability.md derives how far apart such arcs may be.
+docs/theory/proofs.md derives how far apart such arcs may be.
 """
 
 import math

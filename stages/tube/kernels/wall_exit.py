@@ -212,7 +212,7 @@ def refused_exits(tubes, s, lack, first_outer):
     """Return up to which arc length a hazard refuses all exits that is `lack` mm too near to the tube at `s`.
 
     On its last stretch before an exit, as long as its radius, a tube touches the wall; see
-    docs/explanation/proofs.md.  The outer tube, which is wider, ends at `first_outer` or farther.
+    docs/theory/proofs.md.  The outer tube, which is wider, ends at `first_outer` or farther.
     """
     end = s + lack
     if s <= first_outer:

@@ -2,7 +2,7 @@
 
 A box is a row of float64 with a range of each value of a deployment: its middles, and HALF columns further on
 its half widths.  Every box has a rotation of the tubes (rad) and two insertions (mm); where their scope tips
-are is for each kind of box to say.  docs/explanation/unreachable.md derives the bounds.
+are is for each kind of box to say.  docs/theory/unreachable.md derives the bounds.
 """
 
 from __future__ import annotations

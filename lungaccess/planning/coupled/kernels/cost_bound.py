@@ -1,6 +1,6 @@
 """Lower bounds of the cost of every path of a needle from a box of deployments to a target.
 
-docs/explanation/cost_bound.md derives them; boxes are those of `deployment_box`.
+docs/theory/cost_bound.md derives them; boxes are those of `deployment_box`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The least cost that a path of a needle still has before it, on shells about the target; a lower bound.
 
-docs/explanation/cost_bound.md derives it.  A direction from the target is a point of the plane, as in
+docs/theory/cost_bound.md derives it.  A direction from the target is a point of the plane, as in
 `stages.needle.infeasibility.kernels.backward_reach`: its stereographic projection from the direction opposite
 to an axis.
 """

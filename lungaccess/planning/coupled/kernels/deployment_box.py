@@ -2,7 +2,7 @@
 
 A box is one of `box_of_tubes`, from one scope tip.  Its first two sides say where the paths cross a sphere
 halfway to the target, as a rotation vector (rad) from the straight line; a half width below 0 is no such
-range.  docs/explanation/cost_bound.md derives what is ruled out.
+range.  docs/theory/cost_bound.md derives what is ruled out.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def least_sweep(tubes, box):
     """Return a sideways sweep (mm) that no deployment of a box goes below; see `stages.tube.lateral_sweep`.
 
     It looks at where the inner tube's curve ends, and at the sample at which the middle deployment sweeps
-    most.  docs/explanation/cost_bound.md derives how both change with the insertions.
+    most.  docs/theory/cost_bound.md derives how both change with the insertions.
     """
     curved, inner, outer = tubes[CURVED_LENGTH], box[INNER], box[OUTER]
     longest, first_outer = inner + box[HALF + INNER], max(outer - box[HALF + OUTER], 0.0)
@@ -192,7 +192,7 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
     A tube leaves its airway behind the last sample at which all tubes are in the lumen, and before the first
     at which all are out of every lumen.  Where they all leave one branch, other branches count as obstacles.
     A hazard also refuses tubes that leave beyond it and touch the wall from there on: see
-    `docs/explanation/cost_bound.md`.
+    `docs/theory/cost_bound.md`.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """A proof by boxes that no deployment has a target in its needle's workspace.
 
 What all deployments of a box have in common follows from the one in its middle and from bounds of how far the
-others differ.  A box that cannot be ruled out is halved; see docs/explanation/unreachable.md.
+others differ.  A box that cannot be ruled out is halved; see docs/theory/unreachable.md.
 
 `cones` (N, 7) holds tree points, LPS mm; for the tips that have one of them as the nearest, the middle of the
 directions that they may have; and the greatest angle (rad) from it.

@@ -4,7 +4,7 @@ Within the ball of `reach` mm about X, the place of the masks where the point is
 least `least` in all phases of the stretch, and d changes by at most `norm` a mm.  If no obstacle is nearer
 to X than `reach`, none is nearer to the point than `least reach`.  Going on by `step` along the device and
 by `half` in the share moves X by at most `(step + half speed) / least`; so the clearance stays above `least
-reach - step - half speed`.  The derivation stands in docs/explanation/proofs.md.
+reach - step - half speed`.  The derivation stands in docs/theory/proofs.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lungaccess.uncertainty.breathing.kernels.rigid import carried
 from lungaccess.uncertainty.breathing.kernels.warped import deformed_distance
 
 IN_LUMEN, BEFORE_WALL, IN_WALL, TUBE, NEEDLE_AT_EXIT, NEEDLE = range(6)
-"""Where a section of the devices is: the rule that holds for it, see docs/explanation/proofs.md."""
+"""Where a section of the devices is: the rule that holds for it, see docs/theory/proofs.md."""
 CLEAR, BLOCKED, UNDECIDED = range(3)
 TARGET_MISSED, LEAVES_LUMEN, HOLE_SHIFTS = -1, -2, -3
 """Reasons beside the label of the voxel that is too near."""

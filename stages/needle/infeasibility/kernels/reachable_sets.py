@@ -6,7 +6,7 @@ numbers (v, u, y, x) of the first cell.  Direction (v, u) is the slope `first sl
 position (y, x) lies `(y, x) * cell` beside the tangent of the start.  Cells are `2 cell / slope cell` apart
 in depth, so that half a slab with a slope (v, u) moves a position by (v, u) cells and nothing is rounded.
 
-Every function over-estimates; docs/explanation/certificate.md has the inequalities.
+Every function over-estimates; docs/theory/no_path.md has the inequalities.
 """
 
 import math

@@ -26,8 +26,6 @@ GEOMETRY_SHAPE = (3, 6)
 
 ROUNDING_MM = 2e-5
 """Bounds the rounding of a stored distance below 256 mm in single precision."""
-FLOAT32_ROUNDING = 2.0**-24
-"""Half a unit in the last place of 1 in single precision."""
 
 
 def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:
@@ -117,7 +115,8 @@ def distance_corners(mask: Mask, spacing_mm: ArrayLike, half_voxels: float = SOL
     np.logical_not(free, out=free)
     distance: Array = edt.edt(free, anisotropy=spacing, order="F", black_border=False, parallel=2)
     # Never too long: the transform adds up float32 voxel sizes, one rounding a voxel, half of it on average.
-    distance *= 1.0 - (max(free.shape) + 16) * FLOAT32_ROUNDING
+    # Half a unit in the last place of 1 in single precision.
+    distance *= 1.0 - (max(free.shape) + 16) * (2.0**-24)
     distance -= ROUNDING_MM
     distance *= kernel.UNITS_PER_MM
     np.clip(distance, 0, MAX_STORED, out=distance)

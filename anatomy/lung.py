@@ -19,8 +19,6 @@ from anatomy.tree.naming import SEGMENT_LOBES
 
 HEIGHT_STEP = 4
 """Every fourth voxel is looked at to find apex and base: within 2 mm or so of 250 mm."""
-SEGMENT_MARGIN_MM = 6.0
-"""A place is in a segment if its bronchi are nearer by this than any other: 9 of 10 are then right."""
 NEAREST_LOBE_MM = 10.0
 """A place in no lobe, such as a bronchus or vessel, is named after a lobe that is as near as this."""
 
@@ -119,7 +117,8 @@ class Lung(Organ):
         segments = np.array(tree.bronchi.segments)[tree.branch_of_point]
         other = near[segments != segments[first]].min(initial=np.inf)
         lobe, its = self.lobe_at(point_lps), LOBES.get(int(tree.bronchi.lobes[tree.branch_of_point[first]]))
-        sure = other - near[first] >= SEGMENT_MARGIN_MM and (not lobe or lobe == its)
+        # A place is in a segment if its bronchi are nearer by this than any other: 9 of 10 are then right.
+        sure = other - near[first] >= 6.0 and (not lobe or lobe == its)
         return str(segments[first]) if sure else ""
 
     def region_at(self, point_lps: Float) -> str:

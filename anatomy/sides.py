@@ -9,9 +9,6 @@ import numpy as np
 from anatomy.base.typed import Array, Float, Int32, Mask
 from anatomy.grid import Grid
 
-NECK_WIDTHS_MM = (0.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0)
-"""Erosions that are tried in turn: none if the lungs do not touch, up to the width of a broad bridge."""
-
 SMALLER_LUNG_SHARE = 0.1
 """The smaller of two lungs holds at least this share of the larger one."""
 
@@ -81,7 +78,8 @@ def grow_sides(core: Mask, tissue: Mask, axes: Float) -> Int32 | None:
     depth = edt.edt(core, anisotropy=spacing, order="F", black_border=True)
     # What erosion leaves of the smaller lung is at least this share of all tissue, else it is a crumb.
     least = 0.01 * float(np.count_nonzero(core))
-    for neck in NECK_WIDTHS_MM:
+    # Erosions that are tried in turn: none if the lungs do not touch, up to the width of a broad bridge.
+    for neck in (0.0, 2.0, 4.0, 7.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0):
         markers = _two_largest(depth > neck / 2, axes, least)
         if markers is not None:
             return np.asarray(watershed(-depth, markers, mask=tissue), dtype=np.int32)

@@ -6,8 +6,6 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 
-BreathEnd = Literal["end-exhale", "end-inhale"]
-
 
 @frozen_record
 class MotionSource:
@@ -41,7 +39,7 @@ class MotionSource:
     description: str
     masks_phase: float
     amplitude: float = 1.0
-    maps_from: BreathEnd = "end-exhale"
+    maps_from: Literal["end-exhale", "end-inhale"] = "end-exhale"
     grid: Grid | None = None
     vectors: Float | None = None
     exhale_lps: Float | None = None

@@ -21,7 +21,6 @@ EDGE_ROUNDING_MM = 9.0
 """Lungs have no sharp edges; rounder ones would lose the recesses beside the heart."""
 EMPHYSEMA_DEPTH, EMPHYSEMA_DESCENT, EMPHYSEMA_FLATTENING = 0.06, 14.0, 0.4
 """Severe emphysema: a barrel chest and a low, flat diaphragm; within what the imaged box holds."""
-LEFT_LOBES = (LEFT_UPPER, LEFT_LOWER)
 
 
 def _bump(u: Array, centre: float, width: float) -> Array:
@@ -164,7 +163,7 @@ def make_chest(
     `fills` is that of `Chest`; the side of a resected lobe has a raised diaphragm.  `emphysema` from 0 to 1
     deepens the chest and flattens the diaphragm.
     """
-    operated = 0.0 if not fills[0] else 1.0 if fills[0] in LEFT_LOBES else -1.0
+    operated = 0.0 if not fills[0] else 1.0 if fills[0] in (LEFT_UPPER, LEFT_LOWER) else -1.0
 
     def vary(value: float, fraction: float) -> float:
         return value * (1 + fraction * rng.uniform(-1, 1))

@@ -25,8 +25,6 @@ from anatomy.phantom.chest import LOBES
 from anatomy.phantom.patient import SCALES, Phantom
 from anatomy.phantom.rasterize import LABELS
 
-LEFT_SHARE = 0.85
-"""The heart hinders the left lung."""
 FIELD_MM = 4.0
 """Voxels of the field that is written."""
 BORDER_MM = 12.0
@@ -153,9 +151,8 @@ class PhantomBreathing:
         motion = 16.0 * SCALES[phantom.size] * phantom.traits.stature
         apex, base = float(z.max()), float(z.min())
         # At end-inhale, which the masks show, the height is longer by A.
-        return cls(
-            apex_z_mm=apex, height_mm=apex - base - motion, right_mm=motion, left_mm=LEFT_SHARE * motion
-        )
+        # The heart hinders the left lung.
+        return cls(apex_z_mm=apex, height_mm=apex - base - motion, right_mm=motion, left_mm=0.85 * motion)
 
     def _motion_mm(self, points: Float) -> Float:
         return np.where(points[:, 0] > 0.0, self.left_mm, self.right_mm)

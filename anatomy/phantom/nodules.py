@@ -16,8 +16,6 @@ FEWEST, MOST = 2, 8
 """How many bullae the mildest and the severest emphysema has."""
 LEAST_BULLA_MM, GREATEST_BULLA_MM = 5.0, 16.0
 """Air spaces count as bullae from 10 mm across."""
-UPPER_LOBES = (RIGHT_UPPER, LEFT_UPPER)
-"""Where smokers have most of them."""
 UPPER_SHARE = 0.75
 GAP_MM = 4.0
 """Between a bulla and the next one, and from its surface to the pleura at most."""
@@ -44,7 +42,8 @@ def place_bullae(
     found: list[Bulla] = []
     for index in rng.permutation(len(territory.points_lps)):
         centre = territory.points_lps[index]
-        upper = int(territory.lobe_of_point[index]) in UPPER_LOBES
+        # Where smokers have most of them.
+        upper = int(territory.lobe_of_point[index]) in (RIGHT_UPPER, LEFT_UPPER)
         radius = scale * rng.uniform(LEAST_BULLA_MM, GREATEST_BULLA_MM)
         depth = float(territory.pleura_depth_mm[territory.index(centre)])
         fits = (

@@ -243,8 +243,6 @@ def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...], hilar: Mask 
 
 AIR_HU = -1000.0
 """The scale defines air so."""
-PARENCHYMA_HU = -860.0
-"""Lung after breathing in."""
 WALL_HU = 0.0
 """Walls are soft tissue that thin airways share with air."""
 SOLID_HU = 40.0
@@ -284,7 +282,8 @@ def _materials(canvas: Canvas) -> Float32:
         table[LABELS[name]] = tissue
     y = canvas.grid.lps_from_ijk[1, 3] + canvas.spacing_mm * np.arange(shape[1])
     # Lung is denser towards the back of a patient who lies on it: about 70 HU over 200 mm.
-    lung = (PARENCHYMA_HU + 0.35 * y).astype(np.float32)[None, :]
+    # Lung after breathing in.
+    lung = ((-860.0) + 0.35 * y).astype(np.float32)[None, :]
     sheet = np.float32(min(1.0, FISSURE_THICKNESS_MM / canvas.spacing_mm))
     for k in range(shape[2]):
         labels = canvas.labels[:, :, k]

@@ -16,7 +16,6 @@ TRUNK_KNOTS = ((14.0, -46.0, -58.0), (10.0, -40.0, -40.0), (6.0, -31.0, -23.0))
 """Points of the central vessels of an adult, LPS mm from the carina, as in atlases."""
 RIGHT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (-6.0, -22.0, -24.0))
 LEFT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (18.0, -17.0, -2.0), (30.0, 2.0, 3.0))
-RIGHT_ARTERY_SIDE = (0.0, -1.0, 0.0)
 RIGHT_MAIN, LEFT_MAIN = 1, 2
 CENTRAL_ARTERIES = ("pulmonary trunk", "right pulmonary artery", "left pulmonary artery")
 
@@ -97,7 +96,7 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
     distance = outer_radius_mm + radius_mm + 0.5
     central = {0: TRUNK_KNOTS, RIGHT_MAIN: RIGHT_ARTERY_KNOTS, LEFT_MAIN: LEFT_ARTERY_KNOTS}
     children = airways.children()
-    side = np.tile(np.array(RIGHT_ARTERY_SIDE), (len(children), 1))
+    side = np.tile(np.array((0.0, -1.0, 0.0)), (len(children), 1))
     # The left artery runs above and behind its bronchus, the right one in front.
     side[LEFT_MAIN] = (0.3, 0.7, 0.65)
     arteries = Sprouts()

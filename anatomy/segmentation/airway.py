@@ -182,9 +182,6 @@ def _filled(lumen: Mask) -> Mask:
     return lumen
 
 
-LARGEST_SCALE_MM = 8.0
-"""... but not farther than this: larger elements would close small lungs."""
-
 _THREADS = 2
 
 
@@ -226,7 +223,8 @@ def local_minima_map(hu: Int16, spacing_mm: Float, upright: int) -> Int16:
 def scale_of(pixel_mm: Float) -> int:
     """Return the reach of the largest structuring element in pixels, for pixels of two sides in mm."""
     # N: the largest structuring element of the paper reaches this many pixels.
-    return int(np.clip(round(LARGEST_SCALE_MM / float(np.sqrt(pixel_mm.prod()))), 1, 12))
+    # ... but not farther than this: larger elements would close small lungs.
+    return int(np.clip(round(8.0 / float(np.sqrt(pixel_mm.prod()))), 1, 12))
 
 
 def _sliced(hu: Int16, axis: int, spacing_mm: Float) -> Int16:

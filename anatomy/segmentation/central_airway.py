@@ -13,8 +13,6 @@ from anatomy.morphology import bounds, window
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
 
-COLUMN_HU = -850.0
-"""The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`."""
 COLUMN_MEDIAN_HU = -920.0
 """The middle of a trachea is nearly pure air; lung is above this."""
 SHORTEST_COLUMN_MM = 20.0
@@ -182,7 +180,8 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
     middle = float((body * np.arange(len(body))).sum() / body.sum())
     for k in range(ct.hu.shape[2]):
         plane = ct.hu[:, :, k]
-        pieces, count = ndimage.label((plane < COLUMN_HU) & ~outside[:, :, k])
+        # The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`.
+        pieces, count = ndimage.label((plane < -850.0) & ~outside[:, :, k])
         sizes = np.bincount(pieces.ravel(), minlength=count + 1)
         for piece, box in enumerate(ndimage.find_objects(pieces), start=1):
             width, depth = (s.stop - s.start for s in box)

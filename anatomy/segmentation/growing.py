@@ -11,16 +11,12 @@ from anatomy.segmentation.kernels import thin_airways as kernel
 from anatomy.segmentation.kernels.neighbours import box_offsets, face_offsets
 from anatomy.segmentation.kernels.states import BANNED, LUMEN
 
-RING_VOXELS = (1.4, 2.0)
-"""Radii of the ring about a line.  A wall thinner than a voxel appears so far from its middle."""
 N_PLACES = 400
 """In so many places of the lung it is learnt how much of a tube appears where there is none."""
 LOOKED_AT = 100
 """This many voxels are looked at for each place."""
 FAR_MM = 4.0
 """They lie so far from the lumen."""
-BRIGHT_HU = 80.0
-"""It is learnt anywhere, and beside voxels this much above the lung, as airways lie; the greater counts."""
 DEVIATIONS = 3.0
 """An airway has a contrast so many standard deviations above that of such places."""
 WALL_HU = 60.0
@@ -45,8 +41,6 @@ EDGE_MM = 1.2
 GAP_MM = 3.0
 """Gaps in the open lumen are as thick as a slice: none accepted without a word is thicker."""
 
-WALL_DIFFERENCE_HU = 10.0
-"""T_dif of the paper: from one layer of the wall to the next the CT falls by more than noise."""
 WALL_MM = 2.0
 """The wall reaches no farther than this beyond its first layer."""
 
@@ -177,7 +171,8 @@ def _join_and_wall(
     layers = int(np.ceil(WALL_MM / ground.spacing_mm.mean()))
     near, wall = box_offsets(shape, 1), np.zeros(state.size, dtype=np.int64)
     # T_abs of the paper: what is darker is lung or air, not wall.
-    lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, -600.0, WALL_DIFFERENCE_HU, wall)
+    # T_dif of the paper: from one layer of the wall to the next the CT falls by more than noise.
+    lumen_edge.grow_wall(smooth, state, near, lumen, count, layers, -600.0, 10.0, wall)
 
 
 def levels(least_depth: float) -> Int:
@@ -221,16 +216,18 @@ def follow_thin_airways(
     per_mm = 1.0 / spacing_mm
     voxel_mm = float(np.prod(spacing_mm) ** (1.0 / 3.0))
     # Over the sphere: one every 13 degrees, 1.1 mm at the end of a stretch.
-    directions, radii_mm = spread_directions(260)[:, ::-1].copy(), voxel_mm * np.array(RING_VOXELS)
+    # Radii of the ring about a line. A wall thinner than a voxel appears so far from its middle.
+    directions, radii_mm = spread_directions(260)[:, ::-1].copy(), voxel_mm * np.array((1.4, 2.0))
     # An airway has some hundred ends, each with six places behind it.
     starts = np.zeros((3, 4096, 3))
     n_starts = _find_starts(state, lung, spacing_mm, lumen[:count], known, starts)
     if n_starts == 0:
         return Tubes(count=count, n_tubes=0)
     tissue_hu = float(np.median(smooth[lung]))
+    # It is learnt anywhere, and beside voxels this much above the lung, as airways lie; the greater counts.
     noise = [
         _false_contrast(hu, smooth, state, lung, spacing_mm, bright, directions, radii_mm)
-        for bright in (-np.inf, tissue_hu + BRIGHT_HU)
+        for bright in (-np.inf, tissue_hu + 80.0)
     ]
     least = max(noise)
     if least <= 0.0:

@@ -29,8 +29,6 @@ Progress = Callable[[str], None]
 
 FIRST_THRESHOLD_HU = -500.0
 """Half-way between air and tissue: lungs of any CT are below it."""
-THRESHOLD_RANGE_HU = (-600.0, -300.0)
-"""The middle between lung and tissue of healthy and of dense lungs lies in this range."""
 TISSUE_HU = (-150.0, 250.0)
 """Soft tissue: its median is one side of the threshold, that of the lung the other."""
 
@@ -193,7 +191,8 @@ def lung_threshold(hu: Float32, outside: Mask) -> float:
             remedy="Choose the series of the chest; for an inflated lung outside a body use --ex-vivo",
         )
     middle = 0.5 * (float(np.median(lung)) + float(np.median(tissue)))
-    return float(np.clip(middle, *THRESHOLD_RANGE_HU))
+    # The middle between lung and tissue of healthy and of dense lungs lies in this range.
+    return float(np.clip(middle, *(-600.0, -300.0)))
 
 
 def in_hounsfield(coarse: CoarseCt, seed: Float | None) -> tuple[CoarseCt, Mask, float]:

@@ -24,15 +24,11 @@ STEP_MM = 3.0
 """The step is wider than an airway's wall, and less than the distance of vessels."""
 SAMPLES = 200_000
 """The mean of so many voxels of a mask is known to 1 HU."""
-CLIPPED_HU = (-1100.0, 200.0)
-"""Bone, metal and contrast medium count as tissue."""
 LEAST_COVERED = 0.8
 """Share of the lungs that lobes cover: with less, one of them is missing."""
 WALL_MM, LEAST_AT_LUMEN = 4.0, 0.5
 """Walls are up to 3 mm thick."""
 
-LEAST_WIDE_MM = 2.5
-"""A branch this much wider than its parent, and at least so wide, looks like a leak into the lung."""
 
 TISSUE_HU = (-50.0, 150.0)
 """Muscle and blood, whose own texture is weak."""
@@ -223,7 +219,8 @@ def _leaks(tree: AirwayTree) -> list[str]:
     radius = np.asarray(tree.branch_mean_radius_mm)
     parent = np.asarray(tree.branch_parent)
     # A bronchus is never so much wider than its parent; a leak is.
-    wide = (parent >= 0) & (radius >= LEAST_WIDE_MM) & (radius > 1.6 * radius[np.maximum(parent, 0)])
+    # A branch this much wider than its parent, and at least so wide, looks like a leak into the lung.
+    wide = (parent >= 0) & (radius >= 2.5) & (radius > 1.6 * radius[np.maximum(parent, 0)])
     found = []
     for branch in np.flatnonzero(wide):
         place = ", ".join(f"{x:.0f}" for x in tree.points_lps[tree.branch_start[branch + 1] - 1])
@@ -327,7 +324,8 @@ def moved_by(ct: Volume, mask: Mask) -> Float:
     means = []
     for shift in (np.zeros(3, dtype=np.int64), *(s * np.diag(steps)[a] for a in range(3) for s in (-1, 1))):
         place = np.clip(voxels + shift, 0, np.array(mask.shape) - 1)
-        means.append(float(np.clip(ct.array[tuple(place.T)], *CLIPPED_HU).mean(dtype=np.float64)))
+        # Bone, metal and contrast medium count as tissue.
+        means.append(float(np.clip(ct.array[tuple(place.T)], *(-1100.0, 200.0)).mean(dtype=np.float64)))
     return np.asarray(means[1:], dtype=np.float64) - float(means[0])
 
 

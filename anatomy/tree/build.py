@@ -147,12 +147,6 @@ def _contacts(voxel_tree: VoxelTree, prepared: PreparedLumen) -> tuple[GapBridge
 ADULT_TRACHEA_MM = (5.0, 14.0)
 """Radii between which the trachea of an adult lies, wide disease included."""
 
-MAIN_LENGTH_RATIO = 0.8
-"""The left main bronchus is about twice as long as the right one; less than this share of it means a
-mirrored image."""
-SHORT_TRACHEA_RADII = 6.0
-"""A trachea is about twelve radii long; below half of that it is taken for cut."""
-
 
 def warnings_of(tree: AirwayTree) -> tuple[str, ...]:
     """List what is unusual about a tree, one sentence each."""
@@ -162,7 +156,8 @@ def warnings_of(tree: AirwayTree) -> tuple[str, ...]:
     if not ADULT_TRACHEA_MM[0] <= radius <= ADULT_TRACHEA_MM[1]:
         low, high = ADULT_TRACHEA_MM
         found.append(f"The trachea has the radius {radius:.1f} mm; in adults it is {low:g} to {high:g} mm.")
-    if length < SHORT_TRACHEA_RADII * radius:
+    # A trachea is about twelve radii long; below half of that it is taken for cut.
+    if length < 6.0 * radius:
         found.append(f"Only {length:.0f} mm of the trachea are in the mask.")
     if _looks_mirrored(tree):
         found.append(
@@ -180,7 +175,9 @@ def _looks_mirrored(tree: AirwayTree) -> bool:
     ends = tree.points_lps[[tree.branch_start[b + 1] - 1 for b in main]]
     left = main[int(np.argmax(ends[:, 0]))]
     right = main[int(np.argmin(ends[:, 0]))]
-    return bool(tree.branch_length_mm[left] < MAIN_LENGTH_RATIO * tree.branch_length_mm[right])
+    # The left main bronchus is about twice as long as the right one; less than this share of it means a
+    # mirrored image.
+    return bool(tree.branch_length_mm[left] < 0.8 * tree.branch_length_mm[right])
 
 
 VoxelPath = list[tuple[int, ...]]

@@ -11,14 +11,6 @@ from anatomy.base.typed import Bool, Float, Float32, Int
 from anatomy.tree.lumen import CONNECT_26, PreparedLumen
 from anatomy.tree.noise import require_at_most
 
-SIDE_RADII = 2.0
-"""A flattened airway is up to this many times as wide as its inscribed sphere."""
-
-END_RADII = 1.5
-"""At an end, a flat cap has its rim at 1.4 radii."""
-
-SLACK_VOXELS = 2.0
-"""Roughness of the mask by so many voxels beyond the skeleton's spheres is no branch."""
 MOST_PATHS = 500
 """An airway has some hundred branches; more paths than that come from noise in the mask."""
 
@@ -62,8 +54,11 @@ def _reached(voxels: Int, skeleton: Int, prepared: PreparedLumen) -> Bool:
     tree = KDTree(skeleton * spacing)
     voxel = float(spacing.max())
     neighbours = np.array([len(n) for n in KDTree(skeleton).query_ball_point(skeleton, 1.8)]) - 1
-    radii = np.where(neighbours <= 1, END_RADII, SIDE_RADII)
-    limit = np.maximum(prepared.solid_depth_mm[tuple(skeleton.T)], voxel / 2) * radii + SLACK_VOXELS * voxel
+    # A flattened airway is up to this many times as wide as its inscribed sphere.
+    # At an end, a flat cap has its rim at 1.4 radii.
+    radii = np.where(neighbours <= 1, 1.5, 2.0)
+    # Roughness of the mask by so many voxels beyond the skeleton's spheres is no branch.
+    limit = np.maximum(prepared.solid_depth_mm[tuple(skeleton.T)], voxel / 2) * radii + 2.0 * voxel
     reached = np.zeros(len(voxels), dtype=bool)
     for most in (4, 32, 256):
         todo = np.flatnonzero(~reached)

@@ -145,12 +145,8 @@ ODD, ODD_SHARE = 0.1, 0.04
 
 The probability falls to 1/e for every such share of all airways of the lung that lies on the branch.
 """
-SIZE_SPREAD = 1.0
-"""Segments have equal shares of a lung's airways within a factor of e, as masks end early or late."""
 TRACHEA_SHARE, LUNG_SHARE = 0.7, 0.15
 """The trachea goes on in a branch that leads to most airways, and to two lungs of at least this share."""
-DIVIDED_SHARE = 0.01
-"""A branch with a smaller share of a lung's airways does not lead to several segments."""
 LEAST_CONFIDENCE = 0.7
 """A name is given if it is at least this probable; it must exceed one half, or names could contradict."""
 
@@ -254,7 +250,8 @@ class _Lung:
         for group in self.groups:  # which grows while it is read
             parted = group
             if len(group) == 1:
-                divides = shape.beyond_mm[group[0]] >= DIVIDED_SHARE * whole_mm
+                # A branch with a smaller share of a lung's airways does not lead to several segments.
+                divides = shape.beyond_mm[group[0]] >= 0.01 * whole_mm
                 parted = tree.children(group[0]).tolist() if divides else []
             parts = shape.two_parts(parted)
             self._children.append(len(self.groups) if parts else 0)
@@ -277,7 +274,8 @@ class _Lung:
             group[0]
         ).size:  # the mask ends here: it does not tell how much lies beyond
             excess = np.maximum(excess, 0.0)
-        fit -= 0.5 * (excess / SIZE_SPREAD) ** 2
+        # Segments have equal shares of a lung's airways within a factor of e, as masks end early or late.
+        fit -= 0.5 * (excess / 1.0) ** 2
         fit[0] = np.log(ODD) - share / ODD_SHARE
         return np.asarray(fit)
 

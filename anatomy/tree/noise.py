@@ -9,10 +9,6 @@ from anatomy.base.typed import Int
 
 MOST_PIECES = 2000
 """A CT shows some hundred branches; every pair of pieces is looked at, which takes minutes for more."""
-MOST_TUNNELS = 500
-"""Airways never meet again: a tunnel is a fault of the mask, and a CT shows some hundred branches."""
-MOST_COUNTED = 50_000
-"""Middle lines of airways have some thousand voxels; among so many of noise are tunnels enough."""
 
 
 def require_at_most(count: int, most: int, what: str) -> None:
@@ -28,7 +24,9 @@ def require_at_most(count: int, most: int, what: str) -> None:
 def require_few_tunnels(skeleton: Int) -> None:
     """Raise AnatomyError if the lines of a skeleton `(M, 3)` meet again too often for a tree of airways."""
     if len(skeleton):
-        require_at_most(tunnels(skeleton[:MOST_COUNTED]), MOST_TUNNELS, "tunnels, where airways meet again")
+        # Airways never meet again: a tunnel is a fault of the mask, and a CT shows some hundred branches.
+        # Middle lines of airways have some thousand voxels; among so many of noise are tunnels enough.
+        require_at_most(tunnels(skeleton[:50_000]), 500, "tunnels, where airways meet again")
 
 
 def tunnels(voxels: Int) -> int:

@@ -8,9 +8,6 @@ from anatomy.tree.depth import exact_depth_mm, segments_inside
 from anatomy.tree.lumen import PreparedLumen
 from anatomy.tree.voxel_tree import VoxelTree
 
-CAP_FRACTION = 0.8
-"""The trachea begins where the inscribed sphere reaches this fraction of the trachea's radius."""
-
 
 def strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: float) -> list[Strand]:
     """Resample the branches of a voxel tree and measure their radius."""
@@ -44,8 +41,9 @@ def _drop_cap(branches: list[NodeBranch], mm: Float, depth_mm: Float) -> None:
     median = float(np.median(depth_mm[nodes]))
     hooks = {b.attach for b in branches}
     first = 0
+    # The trachea begins where the inscribed sphere reaches this fraction of the trachea's radius.
     while (
-        depth_mm[nodes[first]] < CAP_FRACTION * median
+        depth_mm[nodes[first]] < 0.8 * median
         and float(np.linalg.norm(mm[nodes[first]] - mm[nodes[0]])) < 2 * median
         and nodes[first] not in hooks
     ):

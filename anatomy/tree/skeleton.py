@@ -10,17 +10,9 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.tree.bridge import face_paths
 
-COST_RANGE = (1e-300, 1e300)
-"""The spanning tree leaves out edges that cost nothing, as it does those that are not there."""
 LOOP_EDGES = 12
 """A ring of fewer skeleton voxels is roughness of the mask, not two airways that touch."""
 
-RING_APART_MM = 3.0
-"""Rings that begin nearer to each other are one: a wide contact of two airways closes many."""
-
-CONTACT_COST = 100.0
-"""A step across a mere contact counts as this many steps in the lumen: it is taken only where nothing else
-joins."""
 
 SPUR_VOXELS = 1.5
 """A branch this far beyond the surface of its parent's sphere, or less, is roughness of the mask."""
@@ -88,7 +80,9 @@ def spanning_tree(
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     width = np.maximum(depth_mm, float(spacing_mm.min()) / 4)
     passable = _walkable(ijk[pairs[:, 0]], ijk[pairs[:, 1]], lumen)
-    tree, rings = span(ijk * spacing_mm, width, pairs, np.where(passable, 1.0, CONTACT_COST))
+    # A step across a mere contact counts as this many steps in the lumen: it is taken only where nothing
+    # else joins.
+    tree, rings = span(ijk * spacing_mm, width, pairs, np.where(passable, 1.0, 100.0))
     return replace(tree, ijk=ijk, depth_mm=depth_mm), rings
 
 
@@ -134,7 +128,8 @@ def span(
     a, b = pairs.T
     length = np.linalg.norm(mm[a] - mm[b], axis=1)
     cost = length / np.maximum(np.minimum(depth_mm[a], depth_mm[b]), 1e-3) ** 2 * factor
-    cost = np.clip(cost, *COST_RANGE)
+    # The spanning tree leaves out edges that cost nothing, as it does those that are not there.
+    cost = np.clip(cost, *(1e-300, 1e300))
     # Older versions of scipy (1.13 to 1.16) span graphs with indices of 32 bits only.
     edges = a.astype(np.int32), b.astype(np.int32)
     graph = coo_array((cost, edges), shape=(len(mm), len(mm))).tocsr()
@@ -171,7 +166,8 @@ def _rings(tree: SkeletonTree, left_out: list[tuple[int, int]]) -> list[tuple[in
         if len(nodes) < LOOP_EDGES:
             continue
         others = begins[: len(rings)]
-        if not (np.linalg.norm(others - tree.mm[p], axis=1) < RING_APART_MM).any():
+        # Rings that begin nearer to each other are one: a wide contact of two airways closes many.
+        if not (np.linalg.norm(others - tree.mm[p], axis=1) < 3.0).any():
             begins[len(rings)] = tree.mm[p]
             rings.append((p, q, tree.length_mm([*nodes, p])))
     return rings

@@ -13,23 +13,6 @@ from anatomy.base.typed import Float
 from anatomy.base.words import percent
 from anatomy.tree.skeleton import SkeletonTree
 
-MIN_RADIUS_MM = 2.0
-"""Half the tracheal diameter of a newborn."""
-
-ADULT_RADIUS_MM = 5.0
-"""The least radius of an adult trachea; lobar bronchi are thinner, and must not pass for one by size."""
-
-MIN_LENGTH_RADII = 3.0
-"""A trachea is about twelve radii long; of one that the image cuts, a quarter is enough to know it by."""
-MIN_CHILD_LENGTH_RADII = 6.0
-"""A trachea is about 12 radii long at any age; bronchi are 4 to 7 [Weibel1963]."""
-
-MIN_CHILD_LUNG_SHARE = 0.15
-"""Each main bronchus of a child must carry this share of the tree: a small vessel has a twig on one side."""
-
-MAIN_BRONCHUS_RATIO = 0.4
-"""Both main bronchi are wider than this fraction of the trachea; a twig on its wall is thinner."""
-
 BEYOND_RADII = 3.0
 """The width of a branch is judged from 1 to this many radii beyond where it begins."""
 
@@ -61,19 +44,25 @@ def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
         If nothing is like a trachea: the message says what is there instead.
     """
     trunks = [follow_trunk(tree, end) for end in tree.ends()]
-    long_ones = [t for t in trunks if t.divides and t.length_mm >= MIN_LENGTH_RADII * t.radius_mm]
+    # A trachea is about twelve radii long; of one that the image cuts, a quarter is enough to know it by.
+    long_ones = [t for t in trunks if t.divides and t.length_mm >= 3.0 * t.radius_mm]
     if not long_ones:
         _refuse(f"it has {len(trunks)} ends and none is a tube that is longer than wide and divides in two")
     trunk = max(long_ones, key=lambda t: t.radius_mm)
     radius, length = trunk.radius_mm, trunk.length_mm
     size = f"the widest tube that divides has the radius {radius:.1f} mm and the length {length:.0f} mm"
-    if radius < MIN_RADIUS_MM:
+    # Half the tracheal diameter of a newborn.
+    if radius < 2.0:
         _refuse(f"{size}, too narrow for any trachea")
-    if radius < ADULT_RADIUS_MM:
-        if length < MIN_CHILD_LENGTH_RADII * radius:
+    # The least radius of an adult trachea; lobar bronchi are thinner, and must not pass for one by size.
+    if radius < 5.0:
+        # A trachea is about 12 radii long at any age; bronchi are 4 to 7 [Weibel1963].
+        if length < 6.0 * radius:
             _refuse(f"{size}: too narrow for an adult's and too short for a child's trachea")
         share = _lesser_lung_share(tree, trunk)
-        if share < MIN_CHILD_LUNG_SHARE:
+        # Each main bronchus of a child must carry this share of the tree: a small vessel has a twig on one
+        # side.
+        if share < 0.15:
             _refuse(f"{size}, but all but {percent(share)} of the tree are on one side of its division")
     widest = _widest_elsewhere(tree, trunk)
     if widest > 1.25 * radius:
@@ -88,9 +77,8 @@ def follow_trunk(tree: SkeletonTree, end: int) -> Trunk:
     while True:
         radius = float(np.median(tree.depth_mm[nodes]))
         onwards = [tree.chain(nodes[-1], n) for n in tree.neighbours[nodes[-1]] if n != nodes[-2]]
-        wide = [
-            c for c in onwards if not _is_bulge(tree, c) and _beyond(tree, c) >= MAIN_BRONCHUS_RATIO * radius
-        ]
+        # Both main bronchi are wider than this fraction of the trachea; a twig on its wall is thinner.
+        wide = [c for c in onwards if not _is_bulge(tree, c) and _beyond(tree, c) >= 0.4 * radius]
         if len(wide) != 1:
             divides = len(wide) > 1
             return Trunk(nodes=nodes, radius_mm=radius, length_mm=tree.length_mm(nodes), divides=divides)

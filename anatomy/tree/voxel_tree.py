@@ -15,10 +15,6 @@ from anatomy.tree.skeleton import SkeletonTree
 ROUNDS = 30
 """Rounds of centring and smoothing; together they reach about 4 voxels and smooth over about 2 mm."""
 
-CENTRING_STEP_VOXELS = 0.25
-"""Steps so short cannot jump across the middle of the lumen."""
-SMOOTHING = 0.5
-"""Each point moves half-way to the mean of its neighbours: more would let a line swing to and fro."""
 HALVINGS = 4
 """A step that leaves the lumen is halved so often before it is given up: a sixteenth of it is nothing."""
 
@@ -90,7 +86,8 @@ def centred(voxel_tree: VoxelTree, prepared: PreparedLumen, rounds: int) -> Voxe
     base = mm.copy()
     for _ in range(rounds):
         mm += _centring_step(mm, voxel_tree.parent, prepared.depth_mm, spacing) * ~fixed[:, None]
-        mm += SMOOTHING * (average @ mm - mm) * ~fixed[:, None]
+        # Each point moves half-way to the mean of its neighbours: more would let a line swing to and fro.
+        mm += 0.5 * (average @ mm - mm) * ~fixed[:, None]
     return _kept_inside(voxel_tree, base / spacing, mm / spacing, prepared.lumen)
 
 
@@ -125,7 +122,8 @@ def _centring_step(mm: Float, parent: Int, depth_mm: Float32, spacing_mm: Float)
     np.add.at(along, parent[1:], along[1:].copy())
     along /= np.maximum(np.linalg.norm(along, axis=1), 1e-12)[:, None]
     gradient -= np.einsum("ij,ij->i", gradient, along)[:, None] * along
-    return gradient * (CENTRING_STEP_VOXELS * voxel)
+    # Steps so short cannot jump across the middle of the lumen.
+    return gradient * (0.25 * voxel)
 
 
 def _kept_inside(voxel_tree: VoxelTree, base: Float, wanted: Float, lumen: Bool) -> VoxelTree:

@@ -8,22 +8,12 @@ from cyclopts import Parameter, Token
 
 from anatomy.base.records import frozen_value
 
-LARGEST_PORT = 2**16 - 1
-"""TCP has no larger one."""
-FASTEST_HZ = 1000.0
-"""No tracker and no robot in a patient needs more."""
-LARGEST_SEED = 2**32 - 1
-"""Compiled kernels take seeds of 32 bits."""
 MOST = 10**9
 """A larger count of anything would run for years."""
-MOST_PROCESSES = 1024
-"""No machine that these commands run on has as many cores."""
 MOST_SAMPLES = 10_000_000
 """Their random numbers fit into memory, and shares are then known to 0.03 %."""
 LEAST = 1e-9
 """No length, speed or time above nothing is smaller; what is divides to more than numbers hold."""
-LONGEST_S = 1e8
-"""No command runs for three years."""
 ONE_TURN_DEG = 360.0
 """A tube that is turned farther comes back to where it was."""
 FARTHEST_MM = 1e4
@@ -68,16 +58,21 @@ def whole(kind: object, tokens: Sequence[Token]) -> int:
 
 
 Whole = Annotated[int, Parameter(converter=whole)]
-Seed = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=LARGEST_SEED))]
+# Compiled kernels take seeds of 32 bits.
+Seed = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=2**32 - 1))]
 Count = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST))]
 CountOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=MOST))]
-Processes = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST_PROCESSES))]
+# No machine that these commands run on has as many cores.
+Processes = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=1024))]
 Samples = Annotated[Whole, Parameter(validator=Within(at_least=1, at_most=MOST_SAMPLES))]
 SamplesOrNone = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=MOST_SAMPLES))]
-Port = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=LARGEST_PORT))]
-Hertz = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FASTEST_HZ))]
+# TCP has no larger one.
+Port = Annotated[Whole, Parameter(validator=Within(at_least=0, at_most=2**16 - 1))]
+# No tracker and no robot in a patient needs more.
+Hertz = Annotated[float, Parameter(validator=Within(above=0.0, at_most=1000.0))]
 Spacing = Annotated[float, Parameter(validator=Within(at_least=0.5, at_most=50.0))]
-Seconds = Annotated[float, Parameter(validator=Within(above=0.0, at_most=LONGEST_S))]
+# No command runs for three years.
+Seconds = Annotated[float, Parameter(validator=Within(above=0.0, at_most=1e8))]
 Positive = Annotated[float, Parameter(validator=Within(above=0.0, at_most=FARTHEST_MM))]
 NotNegative = Annotated[float, Parameter(validator=Within(at_least=0.0, at_most=FARTHEST_MM))]
 Angle = Annotated[float, Parameter(validator=Within(at_least=-ONE_TURN_DEG, at_most=ONE_TURN_DEG))]

@@ -16,8 +16,6 @@ from anatomy.base.unfinished import locked
 
 MARK = ".lungaccess"
 """A folder of results holds this one: by it the folder is known, and in it lies the lock."""
-EARLIER = "earlier-{}"
-"""A folder inside, into which the results of earlier runs are moved."""
 MOST_NAMED = 5
 """Files that a message names."""
 OUTPUTS = frozenset({"--out", "--page", "--film", "--movie", "--picture", "--csv", "--parquet"})
@@ -66,10 +64,11 @@ def claim_folder(out: Path, results: Sequence[str], *, force: bool = False) -> P
             expected="one command at a time for each folder",
             remedy="Wait until it has ended, or choose another folder with --out",
         ) from error
+    # A folder inside, into which the results of earlier runs are moved.
     aside = next(
         place
         for n in range(1, len(os.listdir(folder)) + 2)
-        if not (place := folder / EARLIER.format(n)).exists()
+        if not (place := folder / f"earlier-{n}").exists()
     )
     for path in there:
         if force:

@@ -32,8 +32,6 @@ LOOKED_PIXELS, SHOWN_PIXELS = 24, 80
 """Pictures among which one is chosen have as many pixels along an edge, and the chosen one."""
 LEAST_CLARITY = 0.0005
 """Openings are in view if each fills 0.2 % of the picture where they are 15 degrees apart, or the like."""
-LOOK_RAD = math.radians(15.0)
-"""Bends of the tip that are tried in order to see all openings are so far apart."""
 TOGETHER_MM = 10.0
 """Branches of the same parent that part within so many mm are openings of one bifurcation."""
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
@@ -216,7 +214,8 @@ def _look(
     length, held_rad = held.bending_length_mm, float(held.states[-1, 2])
     base = poses_on_arc(lps_from_tip, 0.0, held_rad / length, [-length])[0]
     looks = [(_clarity(lung, system, lps_from_tip, points), held_rad, lps_from_tip)]
-    for bend_rad in np.arange(*system.scope.bends_rad, LOOK_RAD).tolist():
+    # Bends of the tip that are tried in order to see all openings are so far apart.
+    for bend_rad in np.arange(*system.scope.bends_rad, math.radians(15.0)).tolist():
         tip = poses_on_arc(base, 0.0, bend_rad / length, [length])[0]
         looks.append((_clarity(lung, system, tip, points), bend_rad, tip))
     for _clear, bend_rad, tip in sorted(looks, key=lambda each: -each[0]):

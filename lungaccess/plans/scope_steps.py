@@ -21,8 +21,6 @@ from stages.scope import ScopeMotion, prover_of
 
 AHEAD_MM = 12.0
 """Where the way goes on is told by what the picture shows of the airway from so far ahead on."""
-AHEAD_PIXELS = 48
-"""Along an edge of the picture in which that is looked for."""
 MOST_DECIMALS = 6
 """Steps are written with as many decimals as their proof takes, at most so many: no motor is finer."""
 NEAR_MM, NEAR_RAD = 0.1, math.radians(0.1)
@@ -276,7 +274,8 @@ def _goes_on(lung: Lung, route: Int, lps_from_eye: Float) -> str:
     points, depth = lung.tree.points_lps[route], lung.tree.distance_from_root_mm[route]
     here = int(np.linalg.norm(points - lps_from_eye[:3, 3], axis=1).argmin())
     ahead = min(int(np.searchsorted(depth, depth[here] + AHEAD_MM)), len(route) - 1)
-    (hole,) = Picture(lung, lps_from_eye, AHEAD_PIXELS).holes([int(route[ahead])])
+    # Along an edge of the picture in which that is looked for.
+    (hole,) = Picture(lung, lps_from_eye, 48).holes([int(route[ahead])])
     return goes_on_words(clock_hour(lps_from_eye, hole.place_lps))
 
 

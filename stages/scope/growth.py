@@ -25,8 +25,6 @@ START_MM = 30.0
 """The first straight section may begin so far down the trachea."""
 TURNED_A_LAYER = 16
 """States of a layer from which tips are turned, spread over those that it keeps, the best among them."""
-FROM_FORK = (2.0, 4.0)
-"""Motions into a branch part from those into others so many lengths of the section before the fork."""
 
 
 @frozen_record
@@ -116,7 +114,8 @@ class Growth:
         if branch == 0 and not self._begin(route):
             return
         # States kept in a layer, and those kept where fewer did not get as far as the scope passes the axis.
-        for beam, lengths in zip((24, 96), FROM_FORK, strict=True):
+        # Motions into a branch part from those into others so many lengths of the section before the fork.
+        for beam, lengths in zip((24, 96), (2.0, 4.0), strict=True):
             layers = self._follow(branch, points, route, beam, lengths * self._device.length)
             known = self._layers.get(branch, [])
             if not known or (layers and layers[-1][1] > known[-1][1]):

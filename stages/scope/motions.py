@@ -134,10 +134,7 @@ class ScopeMotions:
         direction = np.asarray(forward, dtype=np.float64)
         cosine = self.tips[:, 3:6] @ (direction / np.linalg.norm(direction))
         angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-        return int(np.argmin(np.hypot(away, angle / MM_AS_ANGLE_RAD)))
-
-
-MM_AS_ANGLE_RAD = math.radians(10.0)
+        return int(np.argmin(np.hypot(away, angle / math.radians(10.0))))
 
 
 def _no_tip() -> Exception:
@@ -223,8 +220,6 @@ def _worth_a_try(tree: AirwayTree, radius_mm: float) -> Bool:
 TURNED_COARSER = 2.0
 """Turned tips are so much farther apart: each place has many directions, and nearer ones give about the same
 poses."""
-TURN_RINGS_PER_MM = (0.004, 0.008, 0.014, 0.022, 0.032, 0.045, 0.06)
-"""Curvatures beside that of a state: they turn the tip of a section of 15 mm by 3 to 50 degrees."""
 TURN_SPOKES = 12
 KINDS = (math.floor(MAX_TURN_AT_TIP_RAD / turning.POLAR_RAD + 0.5) + 1) * turning.AZIMUTHS * turning.SIDES
 """Kinds of tips at a place, by angle from the axis, direction and side."""
@@ -258,7 +253,8 @@ def find_tips(
     """
     places, ahead, count = _places(tree, wanted, spacing_mm)
     from_states = states.states[states.turned_from]
-    offsets = rings(TURN_RINGS_PER_MM, TURN_SPOKES)[1:]
+    # Curvatures beside that of a state: they turn the tip of a section of 15 mm by 3 to 50 degrees.
+    offsets = rings((0.004, 0.008, 0.014, 0.022, 0.032, 0.045, 0.06), TURN_SPOKES)[1:]
     best = np.full((count, turning.TRIES), -1, dtype=np.int64)
     costs = np.full((count, turning.TRIES), np.inf)
     turning.sort_tips(device, max_curvature_per_mm, from_states, offsets, places, best, costs)

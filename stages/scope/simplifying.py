@@ -21,8 +21,6 @@ SAMPLE_MM = 2.0
 """Spacing of the places of a leg that are looked at as it is fitted: less than a lumen is wide."""
 LADDER = ((3, 2), (4, 3), (6, 4), (8, 5), (11, 7), (15, 10), (20, 14))
 """Legs and twists that are tried at once, the simplest first."""
-SHORTEST_LEG_MM = 1.0
-"""Shorter advances are not asked of hands."""
 TURN_MM, STEP_MM = 0.2, 0.1
 """Longest parts of changes in place and longest steps along the body in which room is measured."""
 STEPS, GAIN = 40, 0.005
@@ -279,7 +277,8 @@ class Simplifier:
         if legs.bends[0] == 0.0:
             bends[0] = (0.0, 0.0)
         turns = [(-MOST_TWIST_RAD, MOST_TWIST_RAD)] * len(legs.twists)
-        return np.array(turns + bends + [(SHORTEST_LEG_MM, math.inf)] * legs.count)
+        # Shorter advances are not asked of hands.
+        return np.array(turns + bends + [(1.0, math.inf)] * legs.count)
 
     def _orders(self, legs: Legs) -> Int | None:
         """Return in which orders legs change twist and bend, None if they are not proved."""

@@ -19,9 +19,6 @@ from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
 
 KEPT = 4
 """Designs in memory: a system, and variants of it that are compared with it."""
-ATLAS_ROTATIONS = 12
-"""Relative rotations 30 degrees apart: long tubes take up part of that as twist, and the minutes that an
-atlas of a patient takes grow with them."""
 
 
 def shapes_of(tubes: ConcentricTubes) -> TubeShapes:
@@ -90,7 +87,9 @@ def shapes_digest(tubes: ConcentricTubes) -> str:
 def _grid(tubes: tuple[Tube, ...]) -> ShapeGrid:
     """Return the grid for an atlas, which is as coarse in rotations as time allows."""
     grid = ShapeGrid.default(tubes)
-    return replace(grid, rotations=min(grid.rotations, ATLAS_ROTATIONS))
+    # Relative rotations 30 degrees apart: long tubes take up part of that as twist, and the minutes that an
+    # atlas of a patient takes grow with them.
+    return replace(grid, rotations=min(grid.rotations, 12))
 
 
 @lru_cache(maxsize=KEPT)

@@ -20,8 +20,6 @@ DEFAULT_STEP_RAD = 0.1
 """Largest motion of a joint between two steps: small against the bends, so that branches are followed."""
 SAMPLE_MM = 0.25
 """Spacing of the points of the body that are looked at; the tip is always one of them."""
-TRACK_SPACING_MM = 0.1
-"""Spacing of the final centreline, which is taken to be straight in between: good to 1e-4 mm."""
 
 HALVINGS = 12
 """How often a step is halved before its branch of equilibria is said to end there."""
@@ -212,7 +210,8 @@ def motion_by_step(steps: SequenceOf[Equilibrium]) -> tuple[Float, Float]:
     arcs = [_samples(step.length_mm) for step in steps]
     bodies = np.concatenate([step.backbone(arc) for step, arc in zip(steps, arcs, strict=True)])
     places = final.backbone(np.minimum(np.concatenate(arcs), final.length_mm))
-    track = final.backbone(_samples(final.length_mm, TRACK_SPACING_MM))
+    # Spacing of the final centreline, which is taken to be straight in between: good to 1e-4 mm.
+    track = final.backbone(_samples(final.length_mm, 0.1))
     first = np.cumsum([0, *(len(arc) for arc in arcs[:-1])])
     sweep = np.maximum.reduceat(np.linalg.norm(bodies - places, axis=1), first)
     error = np.maximum.reduceat(_distance_to_track(bodies, track), first)

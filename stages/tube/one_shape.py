@@ -24,8 +24,6 @@ STAYS = "the tube does not leave the airway"
 """Why joint values are refused before their way is followed."""
 KEPT = 16
 """Designs in memory: a system, and variants of it that are compared with it."""
-WAY_STEP_MM = 2.0
-"""Insertion between two looks at the tubes on their way: as in the shapes of two tubes."""
 
 
 @lru_cache(maxsize=KEPT)
@@ -33,7 +31,8 @@ def design_arrays(tubes: ConcentricTubes) -> DesignArrays:
     """Return a design and its limits for the kernels."""
     mechanics = TubeMechanics(tubes.nested, needle=tubes.needle_shaft)
     limits = np.zeros(kernel.N_LIMITS)
-    limits[kernel.STEP], limits[kernel.STOP] = mechanics.step_rad, WAY_STEP_MM
+    # Insertion between two looks at the tubes on their way: as in the shapes of two tubes.
+    limits[kernel.STEP], limits[kernel.STOP] = mechanics.step_rad, 2.0
     limits[kernel.BEND], limits[kernel.MAX_EXTENSION] = BEND_RAD, tubes.max_extension_mm
     limits[kernel.MAX_SWEEP], limits[kernel.MAX_STRAIN] = tubes.max_lateral_sweep_mm, tubes.max_strain
     bent = np.array([bool(tube.bends) for tube in tubes.nested])

@@ -23,9 +23,6 @@ from stages.tube.mechanics import TubeMechanics
 from stages.tube.one_shape import deployed, design_arrays, without_limits
 from stages.tube.sequences import Sequence, alternating, inner_first, together
 
-INCREMENTS_MM = (2.0, 5.0, 10.0)
-"""Increments of the alternating sequences that are compared."""
-
 WALLS, LENGTHS, CURVATURES = 4, 13, 36
 """How many values of each dimension are tried."""
 SAME_MM, SAME_RAD = 0.05, 0.02
@@ -116,7 +113,8 @@ def _makers(
         "together": partial(together, tubes, angles, insertions_mm),
         "inner first": partial(inner_first, tubes, angles, insertions_mm),
     }
-    for increment in INCREMENTS_MM:
+    # Increments of the alternating sequences that are compared.
+    for increment in (2.0, 5.0, 10.0):
         name = f"alternating by {increment:g} mm"
         makers[name] = partial(alternating, tubes, angles, insertions_mm, increment_mm=increment)
     if np.ptp(angles) > 0.0:

@@ -213,16 +213,13 @@ def joint_steps(
     return steps[:, : sequence.n_tubes], beta, np.concatenate(moves)
 
 
-NUDGE_MM = 1e-12
-"""The last digit of a length is less."""
-
-
 def _in_order(beta: Float, lengths: Float) -> Float:
     """Undo what rounding did to the order of tips that are flush, and of bases at the scope tip."""
     beta = np.minimum(np.maximum(beta, -lengths), 0.0)
     for tube in range(len(lengths) - 2, -1, -1):
         behind = beta[:, tube + 1] + lengths[tube + 1] - (beta[:, tube] + lengths[tube])
-        beta[:, tube] += np.where(behind > 0.0, behind + NUDGE_MM, 0.0)
+        # The last digit of a length is less.
+        beta[:, tube] += np.where(behind > 0.0, behind + 1e-12, 0.0)
     return beta
 
 

@@ -35,8 +35,6 @@ SWEEPS = "the tubes would sweep tissue sideways"
 STRAINS = "a tube would be strained too much"
 SAME_SHARE = 1e-9
 """Rounding of stiffness factors."""
-ARCS_A_DEPLOYMENT = 16
-"""Room for arcs at first; it is doubled where that is too little."""
 
 
 @settings
@@ -311,7 +309,8 @@ def _follow(
     results, tips = np.zeros((len(states), kernel.SHAPE_COLUMNS)), np.zeros(states.shape)
     first = np.zeros(len(states) + 1, dtype=np.int64)
     radii = np.array([tube.radius_mm for tube in mechanics.tubes])
-    room = ARCS_A_DEPLOYMENT * len(states)
+    # Room for arcs at first; it is doubled where that is too little.
+    room = 16 * len(states)
     while True:
         arcs = np.zeros((room, kernel.ARC_COLUMNS))
         count = kernel.follow_all(

@@ -34,8 +34,6 @@ It is taken as Young's modulus times a factor between 0.7 (a slender beam on an 
 dogs 1.5 to 2 times the pressure of inflation [LaiFook1976]."""
 ELEMENT_MM = 0.5
 """Longest arc of the discretised beam."""
-SHORTEST_SHAFT_MM = 1e-6
-"""A tube whose rear end is at the front plate is held there: its shaft is as good as rigid."""
 LEAST_SHARE = 2.0**-20
 """A step that has to be shortened to less than this goes nowhere."""
 ROUNDING = 1e-13
@@ -143,7 +141,8 @@ def held_shape(
         across=np.eye(3) - frames[:, :3, 2, None] * frames[:, None, :3, 2],
     )
     twisting = np.array([tube.torsional_stiffness_n_mm2 for tube in mechanics.tubes])
-    shaft = twisting / np.maximum(-before.beta_mm, SHORTEST_SHAFT_MM)
+    # A tube whose rear end is at the front plate is held there: its shaft is as good as rigid.
+    shaft = twisting / np.maximum(-before.beta_mm, 1e-6)
     base = np.array(base_angles_rad, dtype=np.float64)
     curvature = _pulled(unloaded, angles) / unloaded.stiffness[:, None]
     curvature = _settled(beam, tissue, (twisting, shaft, base), curvature, angles)

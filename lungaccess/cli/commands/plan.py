@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from lungaccess.problem.system import System
 
 PICTURE, PAGE = "no_plan.png", "no_plan.html"
-MORE_TIME = (
-    "The explanation took {:.1f} s of processor time, without compiling kernels; "
-    "a longer --explain-time tries the rest."
-)
 
 
 def plan(
@@ -172,4 +168,7 @@ def show_explanation(explanation: Explanation) -> None:
     terminal.show(terminal.table(each.title, each.headings, each.rows) for each in sections(explanation))
     terminal.show_reasons(explanation.failure)
     if explanation.ran_out_of_time:
-        terminal.say(MORE_TIME.format(explanation.time_s))
+        terminal.say(
+            f"The explanation took {explanation.time_s:.1f} s of processor time, without compiling kernels; "
+            "a longer --explain-time tries the rest."
+        )

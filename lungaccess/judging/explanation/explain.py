@@ -39,8 +39,6 @@ DEFAULT_TIME_S = 10.0
 """All parts of a patient whose atlases are cached take about so long, and a user still waits."""
 ITERATIONS = 20
 """Each preset is searched this long: those that reach the target mostly do so with a direct arc."""
-PROOF_BOXES = 2_000_000
-"""Boxes for the proof: a tenth of what `certify` looks at, which can take half a minute."""
 NO_NEEDLE = "the system has no needle"
 
 SHARED, KEPT, TO_BE_MADE = range(3)
@@ -282,6 +280,7 @@ class Explainer:
             task.lung, task.system, with_fissures=task.with_fissures, between=self._alive
         )
         self._alive()
+        # Boxes for the proof: a tenth of what `certify` looks at, which can take half a minute.
         self._found["verdict"] = proof.prove(
-            task.target.lps_mm, most_boxes=PROOF_BOXES, progress=self._alive_share
+            task.target.lps_mm, most_boxes=2_000_000, progress=self._alive_share
         )

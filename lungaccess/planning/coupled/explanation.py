@@ -14,8 +14,6 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.task import Task
 from stages.needle import needle_environment
 
-WITH_A_NEEDLE = "A system with a needle goes on from where the tubes end; `--system auto` tries every preset"
-
 
 def explain(
     task: Task, atlas: Atlas, blocked: Counter[str], iterations: int, *, counterfactuals: bool = True
@@ -78,7 +76,8 @@ def _explain_tubes(
         f"No plan to the target after {iterations} iterations: {main_reason}",
         reasons=reasons,
         main_reason=main_reason,
-        advice=advice or WITH_A_NEEDLE,
+        advice=advice
+        or "A system with a needle goes on from where the tubes end; `--system auto` tries every preset",
         counterfactuals={str(change): change.plan for change in changes},
     )
 

@@ -19,9 +19,6 @@ from anatomy.io.liver import LUMENS, is_liver, load_liver
 if TYPE_CHECKING:
     from stages.scope.route import Centreline, Route
 
-CENTRELINE_SUFFIXES = (".vtp", ".vtu")
-PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-
 
 @frozen_record
 class RouteSource:
@@ -104,12 +101,12 @@ def open_source(
             | {name: pose[:3, 3] for name, pose in zip(lung.start_names, lung.starts, strict=True)},
             warnings=lung.warnings,
         )
-    if suffix in CENTRELINE_SUFFIXES:
+    if suffix in (".vtp", ".vtu"):
         from anatomy.io.centerlines import read_centerline_graph
 
         graph = read_centerline_graph(path, frame=frame)
         return RouteSource(name=path.stem, kind="centreline", centreline=from_graph(*graph))
-    if suffix in PICTURE_SUFFIXES:
+    if suffix in (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"):
         if pixel_mm is None:
             raise SettingsError(
                 f"The size of a pixel of {path} is not known",

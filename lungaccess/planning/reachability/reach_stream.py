@@ -21,8 +21,6 @@ from stages.needle import DIRECT, NeedleEnvironment, direct_arcs, needle_environ
 
 FIRST_POINTS, MOST_POINTS = 32, 256
 """Points of the first part, and of any: a point takes a millisecond or several, and a viewer waits."""
-STREAM_SPACING_MM = 8.0
-"""Coarse enough that a whole lung takes seconds; a map of 3 mm is `map_reach`."""
 
 
 @frozen_record
@@ -69,7 +67,8 @@ class ReachStream:
 
     def __init__(self, lung: Lung, system: System, atlas: Atlas) -> None:
         require_same(atlas, lung, system)
-        self.grid: Grid = reach_grid(lung, STREAM_SPACING_MM)
+        # Coarse enough that a whole lung takes seconds; a map of 3 mm is `map_reach`.
+        self.grid: Grid = reach_grid(lung, 8.0)
         self.counted: Int = np.flatnonzero(counted_voxels(lung, self.grid, atlas.with_fissures))
         self._lung, self._system, self._atlas = lung, system, atlas
 

@@ -9,8 +9,6 @@ import numpy as np
 from anatomy.base.typed import Float
 from stages.needle import ArcPath, arc_transform, bend_direction
 
-AIM_MM = 1e-10
-"""Largest distance of an aimed path from the target: far below what a plan states, above rounding."""
 PROBE = 1e-6
 """Step of the central differences in scaled variables: their error is then some 1e-10."""
 LENGTH_SCALE_MM = 5.0
@@ -71,7 +69,8 @@ def aimed(lps_from_start: Float, rows: Float, target: Float, max_curvature_per_m
     # Newton steps converge quadratically: what has not arrived after these does not.
     for _ in range(6):
         miss = target - _end(lps_from_start, values * scale)
-        if np.linalg.norm(miss) <= AIM_MM:
+        # Largest distance of an aimed path from the target: far below what a plan states, above rounding.
+        if np.linalg.norm(miss) <= 1e-10:
             return np.asarray((values * scale).reshape(-1, 3), dtype=np.float64)
         jacobian = np.zeros((3, len(values)))
         for n in range(len(values)):

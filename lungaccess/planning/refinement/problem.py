@@ -48,8 +48,6 @@ TUBE_SLACK_MM = 0.1
 CURVATURE_SLACK = 1e-3
 ANGLE_SLACK_RAD = math.radians(2.0)
 """The program keeps so far from the limits of curvature and wall angle, for the same reason."""
-EASED = ("zone", "needle", "tube", "wall", "slope")
-"""Constraints on field values, which the candidate may break in the program though it is proved."""
 
 
 class Weights(NamedTuple):
@@ -148,7 +146,8 @@ class Problem:
         So the program starts from where it may be, though its fields are not exact.
         """
         least = self.numbers.least.copy()
-        for name in EASED:
+        # Constraints on field values, which the candidate may break in the program though it is proved.
+        for name in ("zone", "needle", "tube", "wall", "slope"):
             place = self.layout.constraints[name]
             # The candidate lies so far inside the eased constraints, so that it is a strictly feasible start.
             least[place] = np.minimum(least[place], values[place] - 1e-4)

@@ -20,9 +20,6 @@ Estimate = RiskReport | ProcedureReport | Chance
 """What a chance of success is read from: an estimate with all its parts, or what a plan states of one."""
 
 
-UNCORRECTED = "The devices are not corrected on their way."
-
-
 def estimate_success(
     plan: Plan,
     lung: Lung,
@@ -63,7 +60,7 @@ def chance_of(found: Estimate) -> Chance:
     """Return the chance of success that an estimate counts."""
     if isinstance(found, Chance):
         return found
-    procedure = Procedure(name=DEFAULT_PROCEDURE, description=UNCORRECTED)
+    procedure = Procedure(name=DEFAULT_PROCEDURE, description="The devices are not corrected on their way.")
     procedure = found.procedure if isinstance(found, ProcedureReport) else procedure
     return Chance(
         errors=found.model.label,

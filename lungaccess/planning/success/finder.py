@@ -43,20 +43,12 @@ from lungaccess.problem.task import Task
 
 BY_COST = 300
 """Iterations of the search by cost whose plans take part: more make them only a little cheaper."""
-OF_COST = 6
-"""So many of its plans take part: the first, and the last ones, which are the cheapest."""
-SCREENED = 3
-"""So many of the best in open loop take part where a procedure measures."""
 SHRINK = 0.98
 """Variations become smaller with every one that fails: after 35 they are half as large."""
 RARE, ENOUGH = 0.05, 0.3
 """Where hardly a draw succeeds, the errors are made smaller until so many do: few successes tell nothing."""
 SMALLER, LEAST_FACTOR = 0.7, 0.1
 """The step by which the errors are made smaller, and the least size."""
-SHRUNKEN_ROUNDS = 2
-"""Rounds that smaller errors decide where successes are rare: later ones have enough draws."""
-LEAST_STATED = 250
-"""Draws of the chance that a plan states at least: one half is then known to 3 %."""
 STEPS = 20
 """Steps of the search by cost for one challenge, which take as long as some thousand draws."""
 
@@ -154,7 +146,8 @@ class ContestFinder:
             made = self._of_step(step)
             found += [] if made is None else [made]
             yield Turn(iteration=0, phase=step.phase)
-        some = [first, *found[1:][-OF_COST + 1 :]]
+        # So many of its plans take part: the first, and the last ones, which are the cheapest.
+        some = [first, *found[1:][-6 + 1 :]]
         return [replace(each, stays=each in (some[0], some[-1])) for each in some]
 
     def _screened(self, of_cost: Sequence[Contender]) -> Generator[Turn, None, list[Contender]]:
@@ -165,7 +158,8 @@ class ContestFinder:
         others = (made for made in map(partial(self._entry, rating=rating), entries) if made)
         again = [self._contender(each.candidate, rating) for each in of_cost]
         order = yield from self._halved(rating, [*again, *islice(others, rating.rounds.pool)], leads=False)
-        best = [self._contender(each.candidate) for each in order[:SCREENED]]
+        # So many of the best in open loop take part where a procedure measures.
+        best = [self._contender(each.candidate) for each in order[:3]]
         return [replace(each, stays=n == 0) for n, each in enumerate(best)]
 
     def _of_step(self, step: Step) -> Contender | None:
@@ -203,7 +197,8 @@ class ContestFinder:
             for each in left:
                 counted.append(_counted(each, number, draws))
                 yield Turn(iteration=0, phase="contest", message=self._message)
-            if draws > 1 and number < SHRUNKEN_ROUNDS and max(each.share for each in counted) < RARE:
+            # Rounds that smaller errors decide where successes are rare: later ones have enough draws.
+            if draws > 1 and number < 2 and max(each.share for each in counted) < RARE:
                 factor = factor if factor < 1.0 else _factor(counted, number, draws)
                 counted = [replace(each, shrunken=each.scorer(number, draws, factor)) for each in counted]
             order = sorted(counted, key=lambda each: each.order, reverse=True)
@@ -300,7 +295,8 @@ class ContestFinder:
         if self._shown is not None or self._leader is None:
             return None
         # Where the time is over, no more is counted than the contest did.
-        return self._stated(self._leader, iteration, elapsed_s, max(self._leader.draws, LEAST_STATED))
+        # Draws of the chance that a plan states at least: one half is then known to 3 %.
+        return self._stated(self._leader, iteration, elapsed_s, max(self._leader.draws, 250))
 
     def no_plan(self, iteration: int) -> NoPlan:
         """Return why there is no plan."""

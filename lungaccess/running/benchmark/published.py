@@ -44,7 +44,6 @@ BORDER_MM = 30.0
 """Obstacles are cut out so far around a query; a path that leaves this box is too long."""
 
 NO_STARTS = "no query: the patient came without start poses"
-NO_TARGETS = "no query: the patient came without targets"
 
 
 @frozen_record
@@ -87,7 +86,7 @@ def why_no_query(patient: PatientImages | LiverImages | Organ) -> str:
     """Return why a patient has no query; "" if it has one."""
     if not patient.starts:
         return NO_STARTS
-    return "" if patient.targets_lps else NO_TARGETS
+    return "" if patient.targets_lps else "no query: the patient came without targets"
 
 
 def patients_of(folder: Path) -> list[Path]:

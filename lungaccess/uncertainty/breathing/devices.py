@@ -24,8 +24,6 @@ POINT_MM = 0.05
 """Distance of the points: between two the chord of the tightest arc is off by less than 0.00005 mm."""
 WALL_ZONE_MM = 1.0
 """Length of tube that is spent on piercing the wall."""
-FLATTEST_RAD = math.radians(10.0)
-"""The least angle at which the tubes of the presets may pierce a wall."""
 SHORTEST_MM = 1e-9
 
 
@@ -98,7 +96,8 @@ def device_points(plan: Plan) -> DevicePoints:
 
 def exit_zone_mm(hole_mm: float, wall_angle_rad: float) -> float:
     """Return how far along the tube, either way of the exit, a hole is that shifts sideways by its limit."""
-    return WALL_ZONE_MM + hole_mm / math.sin(max(wall_angle_rad, FLATTEST_RAD))
+    # The least angle at which the tubes of the presets may pierce a wall.
+    return WALL_ZONE_MM + hole_mm / math.sin(max(wall_angle_rad, math.radians(10.0)))
 
 
 def _edges(lengths: list[float], most: float) -> list[float]:

@@ -43,8 +43,6 @@ LARGEST_DEPTH_MM = 12.5
 """Greatest distance of the planes, however little the needle bends."""
 LEAST_DISTANCE_MM = 1e-3
 """Nearer targets are left undecided; targets outside the workspace by less are not ruled out at once."""
-STEEPEST = 0.995
-"""Largest sine of the angle between paths and the planes' normal for which planes are tried."""
 MAX_BYTES = 1 << 30
 """A gigabyte, which any computer that segments a CT has."""
 
@@ -222,7 +220,8 @@ class NoPathProof:
         # Distance of the planes as a share of the radius of curvature.
         self._count = math.ceil(last / min(0.1 / self._kappa, LARGEST_DEPTH_MM))
         self._depth = last / self._count
-        self._proved_steepest = self._paths.steepest <= STEEPEST
+        # Largest sine of the angle between paths and the planes' normal for which planes are tried.
+        self._proved_steepest = self._paths.steepest <= 0.995
         sine = self._paths.steepest if self._proved_steepest else 1.0 - self._kappa * self._depth
         self._scale[bounds.TOP_SINE] = sine
         if self._along <= 0.0 or math.sqrt(max(1.0 - self._along**2, 0.0)) >= sine:

@@ -18,8 +18,6 @@ from stages.needle.replanning.reaiming import Attempts, Bend, Root, Source, as_p
 ROLLS = 8
 STEP_MM = 0.25
 """Lengths of the arcs that are tried differ by this: half a voxel."""
-SLACK_MM = 0.1
-"""By so much an arc that leads away from an obstacle may come nearer to it first: bending takes a while."""
 
 
 def structure_name(label: int) -> str:
@@ -91,7 +89,8 @@ def roots_of_tip(
     if not blocker_at(environment, pose, query.inserted_mm, query.branch):
         return [Root(query=query)], required
     clearance, _label = tip_clearance(environment, query)
-    relaxed = min(max(environment.needle.radius_mm, clearance - SLACK_MM), required)
+    # By so much an arc that leads away from an obstacle may come nearer to it first: bending takes a while.
+    relaxed = min(max(environment.needle.radius_mm, clearance - 0.1), required)
     near = with_limits(environment, required_mm=relaxed)
     roots = []
     for bend in _bends(environment, query):

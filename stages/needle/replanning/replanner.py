@@ -43,8 +43,6 @@ from stages.needle.search.base import root_of
 ITERATIONS = 1500
 """Iterations of the search in a replan; see docs/explanation/replanning.md for what they take."""
 
-MAX_ESCAPES_SEARCHED = 3
-
 
 class Failure(StrEnum):
     """Why there is no path."""
@@ -274,7 +272,7 @@ class Replanner:
             attempts.by_legs()
             tried.append(attempts)
         tried.sort(key=lambda attempts: attempts.total)
-        to_search = tried[:1] if tried[0].path is not None else tried[:MAX_ESCAPES_SEARCHED]
+        to_search = tried[:1] if tried[0].path is not None else tried[:3]
         spent = 0
         for n, attempts in enumerate(to_search):
             share = (iterations - spent) // (len(to_search) - n)

@@ -28,9 +28,6 @@ PATIENCE = 1600
 afterwards most of it while it fills cubes."""
 CUBES, MORE_CUBES = 2, 300
 """Cubes that the proof fills for an iteration, before and afterwards; an iteration takes as long as ten."""
-STATES_PER_ITERATION = 100
-"""States on a plane of the proof for one iteration of the searches; these take a third of the time of so many
-iterations, so that the searches wait only where the proof has no core of its own."""
 
 
 class Decision:
@@ -162,6 +159,8 @@ class _PlanesInThread:
         if self._step is not None or self._proof.outcome != "running":
             return self._proof.outcome if self._step is None else "running"
         # Iterations for a step of the proof on top.
-        self._due = iterations + 300 + self._proof.states // STATES_PER_ITERATION
+        # States on a plane of the proof for one iteration of the searches; these take a third of the time
+        # of so many iterations, so that the searches wait only where the proof has no core of its own.
+        self._due = iterations + 300 + self._proof.states // 100
         self._step = self._pool.submit(self._proof.advance)
         return "running"

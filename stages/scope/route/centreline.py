@@ -25,7 +25,6 @@ THIN_VOXELS = 6.0
 """Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to half."""
 TINY_MM = 1e-9
 """The rounding of lengths is less."""
-SMOOTHING_ROUNDS = 30
 
 
 @frozen_record
@@ -291,7 +290,7 @@ def _smoothed(nodes: Float, edges: Int, walls: _Walls) -> Float:
     degree = np.bincount(edges.ravel(), minlength=len(nodes))
     free = degree == 2
     current = nodes.copy()
-    for _ in range(SMOOTHING_ROUNDS):
+    for _ in range(30):
         total = np.zeros_like(current)
         np.add.at(total, edges[:, 0], current[edges[:, 1]])
         np.add.at(total, edges[:, 1], current[edges[:, 0]])

@@ -30,8 +30,6 @@ BROKEN = 1e4
 """Cost of a broken limit, the paper's 10000."""
 FEASIBLE = 1e3
 """Costs below this break no limit: the other terms stay far below it."""
-POINT_SPACING_MM = 1.0
-"""Spacing of the path points that are fitted and tested, about a voxel of a CT."""
 AROUND_MM = 10.0
 """A segment keeps the nodes of the centreline this near: fits do not move farther."""
 
@@ -116,7 +114,8 @@ def cut_segments(
 
     Runs that then touch become one.
     """
-    count = max(round(tentative.length_mm() / POINT_SPACING_MM), 2 * DEGREE)
+    # Spacing of the path points that are fitted and tested, about a voxel of a CT.
+    count = max(round(tentative.length_mm() / 1.0), 2 * DEGREE)
     parameters = np.linspace(tentative.breaks[0], tentative.breaks[-1], count + 1)
     points = np.array(tentative.at(parameters)[0])
     bends = tentative.curvature_per_mm(parameters) > limits.max_curvature_per_mm

@@ -13,30 +13,6 @@ SMALLER_LUNG_SHARE = 0.1
 """The smaller of two lungs holds at least this share of the larger one."""
 
 
-def septum(lung: Mask, airway: Mask, grid: Grid) -> Mask | None:
-    """Return the voxels on both sides of the border between the two lungs.
-
-    The mask without its airways is eroded until its two largest parts come apart side by side; each
-    part then grows back over the mask, and the septum is where they meet.  This is done on coarse voxels
-    that are tissue if any voxel in them is: neighbours in the fine mask are then neighbours or the same in
-    the coarse one, so no chain of face neighbours passes from lung to lung without entering the septum.
-
-    Parameters
-    ----------
-    lung, airway : (ni, nj, nk) bool
-        Filled lungs; lumen and wall, which join the lungs at the carina and are left out.
-    grid : Grid
-        The grid of both.
-
-    Returns
-    -------
-    (ni, nj, nk) bool or None
-        None if two lungs could not be told apart.
-    """
-    found = coarse_sides(lung & ~airway, grid)
-    return None if found is None else border_of(*found, lung & ~airway)
-
-
 def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | None:
     """Return the lung, 1 or 2, or 0 for none, of every coarse voxel of `tissue`, and its size in voxels.
 

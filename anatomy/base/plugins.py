@@ -8,8 +8,6 @@ A package states, for instance in its ``pyproject.toml``::
 From then on the name is known to the command line, to studies and to Python alike.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.metadata import entry_points
 from typing import Any

@@ -52,7 +52,6 @@ first_compilation = FirstCompilation()
 def compile_ahead(
     commands: list[str],
     *,
-    processes: int | None = None,
     fewest: int = 1,
     tell: Callable[[str], None] = lambda words: None,
 ) -> int:
@@ -62,8 +61,6 @@ def compile_ahead(
     ----------
     commands : list of str
         Such as "plan"; all that are known if empty.
-    processes : int, optional
-        As many as this process may use cores if None.
     fewest : int
         Fewer missing kernels are left to be compiled when they are called.
     """
@@ -71,7 +68,7 @@ def compile_ahead(
     if len(missing) < fewest:
         return 0
     done = 0
-    for _ in _compiled_in_order(_waits_for(missing), processes or usable_cores()):
+    for _ in _compiled_in_order(_waits_for(missing), usable_cores()):
         done += 1
         tell(f"{done} of {len(missing)}")
     return done

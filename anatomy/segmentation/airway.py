@@ -223,7 +223,7 @@ def local_minima_map(hu: Int16, spacing_mm: Float, upright: int) -> Int16:
 def scale_of(pixel_mm: Float) -> int:
     """Return the reach of the largest structuring element in pixels, for pixels of two sides in mm."""
     # N: the largest structuring element of the paper reaches this many pixels.
-    # ... but not farther than this: larger elements would close small lungs.
+    # The closing reaches no farther than this: larger elements would close small lungs.
     return int(np.clip(round(8.0 / float(np.sqrt(pixel_mm.prod()))), 1, 12))
 
 

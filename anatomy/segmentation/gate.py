@@ -1,7 +1,5 @@
 """Whether what was segmented can be the lungs and airways of a patient, by the CT and by anatomy."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -21,17 +21,13 @@ from anatomy.tree.voxel_tree import ROUNDS, VoxelTree, centred, rooted_voxel_tre
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 
 
-def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float = 0.75) -> AirwayTree:
+def tree_from_mask(lumen: Volume) -> AirwayTree:
     """Make the airway tree of a lumen mask.
 
     Parameters
     ----------
     lumen : Volume
         Mask of the airway lumen, trachea included; non-zero is lumen.
-    max_gap_mm : float
-        Longest break of the lumen that is bridged.
-    spacing_mm : float
-        Distance between points along a branch (about; at least one point a branch).
 
     Returns
     -------
@@ -48,7 +44,7 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
     ----------
     [Lee1994] for the thinning; `docs/explanation/airway_tree.md` for the rest.
     """
-    prepared = prepare_lumen(lumen, max_gap_mm)
+    prepared = prepare_lumen(lumen, max_gap_mm=5.0)
     grid = prepared.grid
     thinned = thin(prepared.solid)
     require_few_tunnels(thinned)
@@ -76,7 +72,7 @@ def tree_from_mask(lumen: Volume, *, max_gap_mm: float = 5.0, spacing_mm: float 
         voxels_dropped=prepared.voxels_dropped,
         cavity_voxels=prepared.cavity_voxels,
     )
-    tree = assemble(strands_along(voxel_tree, prepared, spacing_mm), report)
+    tree = assemble(strands_along(voxel_tree, prepared, spacing_mm=0.75), report)
     return replace(tree, report=replace(report, warnings=warnings_of(tree)))
 
 

@@ -1,7 +1,5 @@
 """Where commands write: one question, one folder, one command at a time, and nothing of others is lost."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Sequence

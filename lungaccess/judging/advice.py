@@ -1,7 +1,5 @@
 """What would lift the chance of success of a plan: tried, each by itself, and never guessed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Answers to requests: plans with one system, or with the least invasive of several that can."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

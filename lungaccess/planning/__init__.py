@@ -1,7 +1,5 @@
 """From a request to plans, and from a measurement to the next step."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

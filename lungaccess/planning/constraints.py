@@ -1,7 +1,5 @@
 """Constraints of a request on the plans of a search: the stated place, and the phases of the breath."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -12,8 +10,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request, StatedPlace
 from stages.tube import exit_points
 
-WITHIN_MM = 5.0
-"""How near an exit is to a stated one: a point placed by hand is meant to a few millimetres."""
 TIP_WITHIN_MM = 1.5
 """How near a scope tip is to a stated one: tips of the atlas are 1 mm apart along the airway."""
 
@@ -47,10 +43,10 @@ def place_part(request: Request, atlas: Atlas) -> Atlas:
     return _of_tips(atlas, place) if place.kind == "scope tip" else _of_exits(atlas, place)
 
 
-def tips_near(atlas: Atlas, tip_lps: ArrayLike, within_mm: float = TIP_WITHIN_MM) -> Int:
+def tips_near(atlas: Atlas, tip_lps: ArrayLike) -> Int:
     """Return the scope tips of an atlas near a point, by their numbers `(N,)`: one place, all directions."""
     away = np.linalg.norm(atlas.motions.tips[:, :3] - np.asarray(tip_lps), axis=1)
-    return np.flatnonzero(away <= within_mm)
+    return np.flatnonzero(away <= TIP_WITHIN_MM)
 
 
 def _of_tips(atlas: Atlas, place: StatedPlace) -> Atlas:

@@ -1,7 +1,5 @@
 """A diverse plan set: plans to one target that are separated, and which of them are Pareto-optimal."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

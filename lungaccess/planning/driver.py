@@ -1,7 +1,5 @@
 """The driver of all searches, whatever the goal and the constraints, within the limits of a request."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """From a request for one system to plans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 from lungaccess.planning.constraints import place_part

@@ -1,7 +1,5 @@
 """The searches for whole plans by their names, and the plans of what they find."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace

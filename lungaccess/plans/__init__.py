@@ -1,7 +1,5 @@
 """Plans: what they hold, their files and costs, and their devices as curves."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Join the three stages into a `Plan`, with exact clearances and costs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The bifurcations on the way of a plan's scope: which openings the picture shows, and which one to take."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, replace
 from itertools import combinations

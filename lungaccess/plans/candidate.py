@@ -1,7 +1,5 @@
 """A candidate for a plan: the choices of all three stages, from which everything else follows."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

@@ -1,7 +1,5 @@
 """The chance of success of a plan as it is stated: counts of simulated procedures, and what they rest on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from anatomy.base.errors import PlanFileError

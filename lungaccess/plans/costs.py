@@ -1,7 +1,5 @@
 """What devices in tissue cost in a lung: the path of the needle, or without one of the tubes, and both."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from anatomy.base.typed import Float

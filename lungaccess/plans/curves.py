@@ -3,8 +3,6 @@
 Reports and exports use these curves.  The independent check integrates the devices by itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """How a plan looks in a notebook: its figures, and its devices drawn from the front and from the feet."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from anatomy.base.typed import Float

@@ -1,7 +1,5 @@
 """The evaluator of candidates: it proves them by the tests of all stages, and computes their cost."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from functools import cached_property

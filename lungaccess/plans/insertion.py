@@ -1,7 +1,5 @@
 """What a plan states of the motion of its bronchoscope."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The picture of a bronchoscope: its camera, the openings of the airway in it, and their hours on a clock."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import cache

@@ -1,7 +1,5 @@
 """Records: immutable values of a plan, whose arrays have the declared shape and whose mappings are sorted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from types import MappingProxyType

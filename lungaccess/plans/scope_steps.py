@@ -1,7 +1,5 @@
 """What hands do with the bronchoscope of a plan: the steps from each proved state to the next, in words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Scope tips beside a tip along its own motion, each proved: what local search and refinement may choose."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """The version of the software that plans and results state, and what its arithmetic was compiled from."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from anatomy.machine_code.sources import kernel_digest

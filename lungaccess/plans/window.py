@@ -1,7 +1,5 @@
 """The window of a plan in the breath: the phases in which it is proved clear and on target."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import field

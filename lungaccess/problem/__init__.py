@@ -1,7 +1,5 @@
 """What is asked: a patient, a system of devices, a target, and the task that they make."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """What tubes in the working channel ask of the bronchoscope's handle."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

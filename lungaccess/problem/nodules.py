@@ -1,7 +1,5 @@
 """The nodules of a patient: number, size, and where they lie."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import TargetError

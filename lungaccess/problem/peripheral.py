@@ -1,7 +1,5 @@
 """Random targets in the periphery of the lung, as in the studies of [Kuntz2015]."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import TargetError

@@ -1,7 +1,5 @@
 """What is at a point of the lung: its tissue, its lobe, and how far every structure is away."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

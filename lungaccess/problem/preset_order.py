@@ -1,7 +1,5 @@
 """How invasive a system is, from the sizes of its devices: the order in which systems are tried."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The target: a stated point, or a point in the nodule mask."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import TargetError

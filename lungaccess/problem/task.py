@@ -1,7 +1,5 @@
 """The task of a search: patient, devices, target and objective, tested together."""
 
-from __future__ import annotations
-
 from anatomy.base.records import frozen_record
 from anatomy.lung import Lung
 from anatomy.organ import Organ

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
         obstacle_clearance_mm,
         path_costs,
         voxel_sum,
-        voxels_crossed,
     )
     from stages.needle.device import Needle
     from stages.needle.environment import (

@@ -1,7 +1,5 @@
 """What a plan costs, evaluated exactly: 1 / clearance, the cost map by mm and by voxel, length, tissue."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
@@ -57,25 +55,6 @@ def inverse_clearance(obstacles: Obstacles, path: ArcPath) -> float:
     points, lengths = path.sample(SAMPLE_MM)
     clearance = np.maximum(obstacle_clearance_mm(obstacles, points), kernel.CLEARANCE_FLOOR_MM)
     return float(np.trapezoid(1.0 / clearance, lengths))
-
-
-def voxels_crossed(grid: Grid, path: ArcPath) -> Int:
-    """Return the indices `(V, 3)` of the voxels that a path crosses, each once, the first index slowest.
-
-    They are those that hold more than 1e-9 mm of an arc, or an end of one.  What lies beyond the grid is
-    left out.
-
-    Examples
-    --------
-    >>> grid = Grid.from_spacing((4, 4, 4), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
-    >>> path = ArcPath(lps_from_start=np.eye(4), arcs=np.array([[2.0, 0.0, 0.0]]))
-    >>> voxels_crossed(grid, path).tolist()
-    [[0, 0, 0], [0, 0, 1], [0, 0, 2]]
-    """
-    voxels, _lengths = _crossings(grid, path)
-    inside = np.unique(voxels[voxels != kernel.OFF_GRID])
-    indices = np.stack(np.unravel_index(inside, grid.shape, order="F"), axis=1)
-    return np.asarray(indices[np.lexsort(indices.T[::-1])], dtype=np.int64)
 
 
 def map_integral(cost_map: Volume | None, path: ArcPath) -> float:

@@ -1,7 +1,5 @@
 """Where the tip of a resting shaft lies and looks, over what is not known of scope, wall and friction."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

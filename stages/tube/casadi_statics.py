@@ -66,7 +66,6 @@ def derive_loaded(
     *,
     tissue_n_mm2: float = 0.0,
     tissue_from_mm: float = 0.0,
-    guess_rad: ArrayLike | None = None,
 ) -> LoadedShape:
     """Return the shape of tubes that stood in tissue without a needle, when its tip is at `needle_mm`.
 
@@ -82,8 +81,6 @@ def derive_loaded(
         Arc length of the needle's tip from the front plate.
     tissue_n_mm2, tissue_from_mm : float
         See `stages.tube.tissue.held_shape`; far stiffer tissue than lungs makes the problem too steep.
-    guess_rad : (n,) float64, optional
-        Tip angles without a needle, nearby; see `CasadiTubes.solve`.
 
     Raises
     ------
@@ -93,7 +90,7 @@ def derive_loaded(
         As `CasadiTubes.solve`, or if nothing is ahead of the front plate.
     """
     beta, base = np.asarray(beta_mm, dtype=np.float64), np.asarray(base_angles_rad, dtype=np.float64)
-    before = CasadiTubes(tubes).solve(base, beta, guess_rad)
+    before = CasadiTubes(tubes).solve(base, beta)
     pieces = _pieces(tubes, needle, beta, needle_mm, tissue_from_mm)
     if not pieces:
         raise SettingsError("No tube is ahead of the front plate", expected="deployed tubes")

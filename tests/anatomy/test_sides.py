@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from anatomy.base.typed import Float
 from anatomy.grid import Grid
-from anatomy.sides import septum
+from anatomy.sides import border_of, coarse_sides
 
 LEFT, RIGHT = (32.0, 0.0, 0.0), (-32.0, 0.0, 0.0)
 
@@ -48,7 +48,9 @@ class Chest:
         return np.asarray(((self.points >= low) & (self.points <= high)).all(axis=-1))
 
     def septum(self) -> np.ndarray | None:
-        return septum(self.lung, self.airway, self.grid)
+        tissue = self.lung & ~self.airway
+        found = coarse_sides(tissue, self.grid)
+        return None if found is None else border_of(*found, tissue)
 
     def parts_at(self, border: np.ndarray | None, *points: Sequence[float]) -> list[int]:
         """Return in which part of the lung, without airway and border, points lie; faces connect."""

@@ -1,7 +1,5 @@
 """The coupled planner: it searches for plans of all stages, diverse plan sets, and counterfactuals."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

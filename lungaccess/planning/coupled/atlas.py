@@ -1,7 +1,5 @@
 """The deployment atlas: everything scope and tubes can do, enumerated once per patient and system."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A proved lower bound of the cost of every plan to a target; docs/theory/cost_bound.md derives it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -74,8 +72,6 @@ class CostBound:
     ----------
     task : Task
     atlas : Atlas
-    most_boxes : int
-        Boxes that may wait.
     beside_mm : float
         How far beside the target the needle may end.
 
@@ -86,9 +82,7 @@ class CostBound:
         curvature.
     """
 
-    def __init__(
-        self, task: Task, atlas: Atlas, *, most_boxes: int = MOST_BOXES, beside_mm: float = 0.0
-    ) -> None:
+    def __init__(self, task: Task, atlas: Atlas, *, beside_mm: float = 0.0) -> None:
         system = task.system
         needle = system.require_needle("A lower bound of the cost")
         system.tubes.require_planar("A lower bound of the cost")
@@ -99,7 +93,7 @@ class CostBound:
                 expected="a needle no longer than half a circle, so that its paths lie near a straight line",
                 remedy="Leave out the gap",
             )
-        self._most_boxes, self._beside_mm = most_boxes, beside_mm
+        self._beside_mm = beside_mm
         self._task = task
         self._tubes = tube_constants(system.tubes, system.margins)
         self._tips = atlas.motions.tips
@@ -152,7 +146,7 @@ class CostBound:
             for n in range(QUEUES):
                 tips = np.ascontiguousarray(self._tips[n::QUEUES])
                 about = (environment, self._tubes, insertions, tips, (x, y, z))
-                self.queues.append(BoxQueue(about, self._most_boxes // QUEUES))
+                self.queues.append(BoxQueue(about, MOST_BOXES // QUEUES))
         self._running = [self._workers.submit(each.go_on, cost, boxes // QUEUES) for each in self.queues]
 
     def finish(self) -> None:

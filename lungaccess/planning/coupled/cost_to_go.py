@@ -1,7 +1,5 @@
 """What paths of a needle to a target still cost at least; docs/theory/cost_bound.md derives it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

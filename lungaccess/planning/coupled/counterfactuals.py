@@ -1,7 +1,5 @@
 """Counterfactuals: the change of one device parameter that makes a target reachable, shown by a plan."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Why there is no plan: the reasons counted, and the smallest change of device that would help."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace

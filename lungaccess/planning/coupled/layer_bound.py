@@ -5,8 +5,6 @@ between those at both ends of a path somewhere on it.  So its cost is no less th
 values, of the least cost of a mm on each layer of one value.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Continue a search in several processes, repeatable from the seed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count, islice

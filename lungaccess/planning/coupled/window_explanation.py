@@ -1,7 +1,5 @@
 """Why there is no plan for a window of the breath: which phase and structure stop how many deployments."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Each stage alone, from a patient to an answer: needle, scope, tubes, route and tour."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

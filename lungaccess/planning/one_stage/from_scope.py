@@ -1,7 +1,5 @@
 """The search for tubes and needle from one tip of the scope after another."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The needle stage alone: from a given pose to a target, with any of its planners."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import Any
 

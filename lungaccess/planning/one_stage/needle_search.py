@@ -1,7 +1,5 @@
 """One search for a needle path, by our planners or those of OMPL, and what stands in the way of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

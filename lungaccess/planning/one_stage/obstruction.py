@@ -1,7 +1,5 @@
 """What stands in the way of a needle, in words and as plain values."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Plan the rest from a measured pose: tubes and needle from a scope's tip, or a needle from a tube's tip."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

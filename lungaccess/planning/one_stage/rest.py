@@ -1,7 +1,5 @@
 """The rest of a plan: what is left to do from a measured pose."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any

@@ -1,7 +1,5 @@
 """The bronchoscope alone: the path of a patient's scope to a lesion, with instructions."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

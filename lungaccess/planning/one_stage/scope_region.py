@@ -1,7 +1,5 @@
 """From which poses of the scope's tip tubes and needle still reach the target of a plan."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

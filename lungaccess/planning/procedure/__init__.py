@@ -1,7 +1,5 @@
 """What a procedure measures and corrects on its way, and how often it then succeeds."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -4,8 +4,6 @@ What tubes do does not depend on where the scope's tip stands, so that a deploym
 the scope's frame; whether it is clear is looked at where the scope is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

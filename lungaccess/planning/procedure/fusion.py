@@ -4,8 +4,6 @@ A measurement no better than what is known without it would otherwise be followe
 All functions take many poses at once, `(..., 4, 4)`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float

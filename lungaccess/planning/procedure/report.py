@@ -1,7 +1,5 @@
 """What came of many simulated procedures: shares, reasons of failure, and what each stage corrected."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from anatomy.base.records import frozen_value

@@ -5,8 +5,6 @@ are taken as small and normal.  Then each point of a device has a normal error w
 over the kinds of error of `v v^T`, where `v` is what one standard deviation moves the point by.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The needle of a simulated procedure that is measured and planned again on its way."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float

@@ -1,7 +1,5 @@
 """What really happens in procedures: the devices with their errors, and what is measured of them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

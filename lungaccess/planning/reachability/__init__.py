@@ -1,7 +1,5 @@
 """What of a lung a system reaches, and proofs that it cannot reach a target."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

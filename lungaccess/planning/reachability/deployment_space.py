@@ -1,7 +1,5 @@
 """All deployments that a system may make in a lung, in boxes: what every proof of a target begins with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice

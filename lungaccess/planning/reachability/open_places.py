@@ -1,7 +1,5 @@
 """Where a proof of unreachability is open: stretches of airway from which deployments were not ruled out."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

@@ -1,7 +1,5 @@
 """The reach of a system as a stream: points of a grid, those around a place first."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

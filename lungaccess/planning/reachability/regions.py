@@ -1,7 +1,5 @@
 """Lungs and lobes of a patient, for figures by region."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 

@@ -1,7 +1,5 @@
 """Where the tip of the scope may be, piece by piece of the airway, and the directions that it may have."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -3,8 +3,6 @@
 docs/theory/unreachable.md derives it.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Boxes of lattice values cut out of a patient's fields around a candidate."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

@@ -1,7 +1,5 @@
 """Needle paths as lengths and curvature vectors in a frame that does not roll, and back."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

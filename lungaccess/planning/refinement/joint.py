@@ -1,7 +1,5 @@
 """Joint refinement of a proved candidate: scope, tubes and needle together."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

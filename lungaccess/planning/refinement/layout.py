@@ -1,7 +1,5 @@
 """The layout of the refinement's program: the place of each variable, parameter and constraint."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Any
 

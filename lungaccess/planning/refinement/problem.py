@@ -1,7 +1,5 @@
 """The numbers of the refinement's program for one candidate."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import NamedTuple

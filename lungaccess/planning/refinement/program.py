@@ -8,8 +8,6 @@ at a point are looked up by number (`_look_up`); the program itself sees the qua
 the point.  At that point it has the derivatives of the spline, so what CasADi derives from it is exact.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from functools import cache

@@ -1,7 +1,5 @@
 """Tubes near a shape: polynomials of second order in their joints, from the mechanics."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import cache

@@ -1,7 +1,5 @@
 """Plans that succeed: the search for the plan whose procedure most often ends well under given errors."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """The chance of success of a plan under errors and a procedure."""
 
-from __future__ import annotations
-
 from anatomy.lung import Lung
 from lungaccess.planning.procedure import ProcedureReport, simulate_procedure
 from lungaccess.plans.chance import Chance

@@ -5,8 +5,6 @@ plan and plans of several arcs take part and stay to the end: no winner is worse
 error of the draws that all have in common.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Ratings of a contest of plans: by draws of their chance of success, or by a function of the plan."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Search a device by successive halving over the targets of a cohort [Jamieson2016]."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ How far a deployment misses the moving target depends on the place of the scope'
 end, and on nothing else; see docs/theory/proofs.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

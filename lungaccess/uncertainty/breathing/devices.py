@@ -1,7 +1,5 @@
 """Tubes and needle of a plan as points with the rule that holds for each stretch of them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

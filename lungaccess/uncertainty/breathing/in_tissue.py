@@ -3,8 +3,6 @@
 These are figures of samples, not a proof: no mechanics of needle and tissue is modelled.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.errors import SettingsError

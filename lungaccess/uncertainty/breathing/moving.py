@@ -1,7 +1,5 @@
 """Where the tissue of a lung and the devices of a plan are in a phase, for whoever shows them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Self
 

@@ -1,7 +1,5 @@
 """The window of a plan: the phases of the breath in which it is proved clear and on target."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How likely a plan succeeds if the devices deviate from it, and how large an error it survives."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """The risk of a plan: how likely it succeeds, and what it may touch, when the devices deviate from it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """A plan in its lung, ready to be deviated from: what becomes of many deviated plans, compiled."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

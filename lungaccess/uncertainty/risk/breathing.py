@@ -8,8 +8,6 @@ from 0 at end-exhale, where the image was taken, to 1; the procedure is at any t
 of `anatomy.motion.population`.  Where the motion of the patient is known, it takes the place of this model.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

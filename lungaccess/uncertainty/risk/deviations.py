@@ -1,7 +1,5 @@
 """Deviations from a plan, and the deviated devices as arcs."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -8,8 +8,6 @@ no draw weighs more than 1 / DEFENSIVE [Hesterberg1995].  Each draw has the weig
 the mixture, so that the estimate has no bias wherever the centres are; they only decide how exact it is.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Errors about where the shaft of the scope comes to rest on the wall, instead of about the plan."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Which errors decide about a plan: the effect of each kind alone, and together with the others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

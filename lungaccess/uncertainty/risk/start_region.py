@@ -1,7 +1,5 @@
 """The safe start region of a plan: from which poses of the tubes' tip its needle still reaches the target."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -23,8 +21,6 @@ AHEAD_MM = 10.0
 """The cone of directions is drawn so far ahead: about as long as a view of the tip is wide."""
 SIDES, RINGS = 32, 16
 """Corners of a circle, and circles of a half ball: smooth to the eye at the size of a tube."""
-DIRECTIONS_SHARE = 0.5
-"""The body of the tried starts holds the places from which at least this share of directions has a path."""
 
 
 def safe_start_region(
@@ -139,8 +135,8 @@ def proved_body(region: StartRegion) -> SurfaceMesh | None:
     )
 
 
-def tried_body(region: StartRegion, share: float = DIRECTIONS_SHARE) -> SurfaceMesh | None:
-    """Return the places from which at least a share of directions has a path; None where there is none.
+def tried_body(region: StartRegion) -> SurfaceMesh | None:
+    """Return the places from which at least half of the directions have a path; None where there is none.
 
     The surface lies between the places that were tried, by linear interpolation.
     """
@@ -150,11 +146,11 @@ def tried_body(region: StartRegion, share: float = DIRECTIONS_SHARE) -> SurfaceM
     low = tried.lattice.min(axis=0) - 1
     field = np.zeros(tried.lattice.max(axis=0) - low + 2, dtype=np.float32)
     field[tuple((tried.lattice - low).T)] = tried.share_by_place
-    if field.max() < share:
+    if field.max() < 0.5:
         return None
     # A level between two possible shares: no vertex falls on a place of the lattice.
     vertices, faces, _, _ = marching_cubes(
-        field, level=share - 0.5 / tried.kinds.shape[1], gradient_direction="ascent"
+        field, level=0.5 - 0.5 / tried.kinds.shape[1], gradient_direction="ascent"
     )
     local = tried.spacing_mm * (vertices + low)
     return SurfaceMesh(

@@ -1,7 +1,5 @@
 """Shares of samples and their confidence."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

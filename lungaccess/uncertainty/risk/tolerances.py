@@ -1,7 +1,5 @@
 """How large the errors of each kind may be, all others being 0, before a plan fails."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

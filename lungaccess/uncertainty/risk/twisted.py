@@ -1,7 +1,5 @@
 """Tubes that are not planar with errors of their rear ends: the shapes that they take instead."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float, Int

@@ -5,8 +5,6 @@ of the logarithm of a factor: the true curvature over the commanded one.  A trac
 the factor; both show in where the tip goes.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import field
 

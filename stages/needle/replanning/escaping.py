@@ -1,7 +1,5 @@
 """Where to plan from: the tip, or where a tip that has lost its clearance gets it back."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

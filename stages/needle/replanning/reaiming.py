@@ -1,7 +1,5 @@
 """Paths from the tip of a needle to its target: along what is left of a plan, directly, or by a search."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import field, replace

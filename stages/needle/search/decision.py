@@ -1,7 +1,5 @@
 """Decides a query: a path, or a proof that there is none, whichever comes first."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor

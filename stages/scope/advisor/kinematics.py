@@ -61,17 +61,16 @@ class ScopeModel:
         return self.links * self.link_mm
 
 
-def model_of(scope: Bronchoscope, *, links: int = 10, link_mm: float = 1.0) -> ScopeModel:
+def model_of(scope: Bronchoscope, *, links: int = 10) -> ScopeModel:
     """Return the chain of a device: its radius with the gap it keeps, its bends, twists of 90 degrees.
 
     Its bends are those of its whole bending section; a shorter chain bends at most as tightly as that of
     [Rosell2012], 120 degrees in 10 mm.
     """
     # The tip of a device is bent at most so much for each mm of its chain, as that of [Rosell2012].
-    most = 12.0 * links * link_mm
+    most = 12.0 * links
     return ScopeModel(
         links=links,
-        link_mm=link_mm,
         radius_mm=scope.radius_mm + scope.lumen_margin_mm,
         twist_low_deg=-FREEST_TWIST_DEG,
         twist_high_deg=FREEST_TWIST_DEG,

@@ -80,7 +80,6 @@ def repair_genetic(
     limits: RouteLimits,
     *,
     seed: int,
-    settings: GeneticSettings | None = None,
     executor: Executor | None = None,
 ) -> tuple[Curve, bool]:
     """Return a curve with its bends refitted, and whether each segment passed the paper's own tests.
@@ -94,7 +93,7 @@ def repair_genetic(
     executor : concurrent.futures.Executor, optional
         Searches the segments side by side.
     """
-    chosen = settings or GeneticSettings()
+    chosen = GeneticSettings()
     points, parts = cut_segments(tentative, centreline, limits, chosen.margin_share)
     if not parts:
         return tentative, True

@@ -16,12 +16,12 @@ from anatomy.grid import Grid, Volume
 from anatomy.structures import VESSEL
 from stages.needle.costs import (
     InTissue,
+    _crossings,
     inverse_clearance,
     map_integral,
     obstacle_clearance_mm,
     path_costs,
     voxel_sum,
-    voxels_crossed,
 )
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment, environment_of_labels
@@ -53,6 +53,12 @@ def start(position: list[float], direction: list[float]) -> Float:
 
 def line(position: list[float], direction: list[float], length: float) -> ArcPath:
     return ArcPath(lps_from_start=start(position, direction), arcs=np.array([[length, 0.0, 0.0]]))
+
+
+def voxels_crossed(grid: Grid, path: ArcPath) -> np.ndarray:
+    """Return the indices `(V, 3)` of the voxels that hold more than 1e-9 mm of an arc or an end of one."""
+    voxels = np.unique(_crossings(grid, path)[0])
+    return np.stack(np.unravel_index(voxels[voxels != kernel.OFF_GRID], grid.shape, order="F"), axis=1)
 
 
 def crossed(grid: Grid, path: ArcPath) -> set[tuple[int, ...]]:

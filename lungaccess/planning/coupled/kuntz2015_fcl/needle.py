@@ -1,7 +1,5 @@
 """The needle RRT of [Kuntz2015, sec. IV-C] after [Patil2014], with FCL: plain, slow, without fields."""
 
-from __future__ import annotations
-
 import math
 import time
 

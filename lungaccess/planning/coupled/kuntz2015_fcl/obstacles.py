@@ -1,7 +1,5 @@
 """What the reference mode collides with: surface meshes under FCL, and the voxels for what lies inside."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Algorithm 1 of [Kuntz2015] as printed, with FCL on surface meshes instead of clearance fields."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import Counter, defaultdict

@@ -1,7 +1,5 @@
 """Deployments of the tubes validated with FCL: they leave the airway once and touch nothing beyond it."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

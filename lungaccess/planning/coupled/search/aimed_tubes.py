@@ -1,7 +1,5 @@
 """Tubes aimed at a target from the scope tips of an atlas: what a system without a needle can do."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search over the deployment atlas: direct arcs first, then rounds of all ways to improve on them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Direct arcs from the deployments of an atlas to a target: the first phase of a search."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import cached_property

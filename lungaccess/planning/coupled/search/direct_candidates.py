@@ -1,7 +1,5 @@
 """The simplest ways to a target from the deployments of an atlas, with a needle and without one."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from anatomy.base.typed import Float, Int

@@ -1,7 +1,5 @@
 """Which deployments of an atlas are similar."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Int

@@ -1,7 +1,5 @@
 """Algorithm 1 of [Kuntz2015] on clearance fields, for comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from lungaccess.planning.coupled.atlas import Atlas

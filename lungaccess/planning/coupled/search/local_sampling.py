@@ -1,7 +1,5 @@
 """Local sampling: random deployments near those of the atlas, each with a direct arc."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random placements of scope and tubes: lines 3 to 7 of Algorithm 1 of [Kuntz2015]."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

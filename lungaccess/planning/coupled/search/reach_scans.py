@@ -1,7 +1,5 @@
 """Which of many points a system reaches: by its needle, by its tubes alone, or in phases of the breath."""
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Ways to a target that are separated from each other: the candidates of a diverse plan set."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

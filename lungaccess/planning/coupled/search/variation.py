@@ -1,7 +1,5 @@
 """Variations of a candidate: other rotation and insertions with a direct arc, or tubes aimed anew."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

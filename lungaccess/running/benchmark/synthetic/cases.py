@@ -72,9 +72,9 @@ class BenchmarkQuery:
     target_lps: Point
 
 
-def queries_of(case: BenchmarkPhantom, systems: Iterable[str] = SYSTEMS) -> Iterator[BenchmarkQuery]:
+def queries_of(case: BenchmarkPhantom) -> Iterator[BenchmarkQuery]:
     """Yield the queries of a phantom, device by device."""
-    for system in systems:
+    for system in SYSTEMS:
         for number, point in enumerate(entries()[case.name].targets_lps, start=1):
             name = f"{case.name}/{system}/{number:02d}"
             yield BenchmarkQuery(name=name, phantom=case.name, system=system, target=number, target_lps=point)

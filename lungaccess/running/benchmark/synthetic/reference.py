@@ -114,7 +114,7 @@ def _case(folder: Path, case: BenchmarkPhantom, system: str, targets: int | None
     )
 
 
-def submissions_of(path: Path, machine: str = "") -> list[Submission]:
+def submissions_of(path: Path) -> list[Submission]:
     """Return the submissions that the results of a study of the benchmark make, one of each method.
 
     Times are processor time of the search; where it found nothing, of the whole run.  Of several runs
@@ -141,7 +141,7 @@ def submissions_of(path: Path, machine: str = "") -> list[Submission]:
             answer = SubmittedAnswer(query=query.name, cpu_s=cpu_s) if not text else _answer(query, text)
             answers.setdefault(planner, {})[query.name] = answer
     return [
-        Submission(planner=planner, machine=machine, answers=tuple(own[name] for name in sorted(own)))
+        Submission(planner=planner, answers=tuple(own[name] for name in sorted(own)))
         for planner, own in sorted(answers.items())
     ]
 

@@ -1,7 +1,5 @@
 """Scores of a submission: every answer is checked anew, by the independent check and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import groupby

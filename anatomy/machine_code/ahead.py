@@ -50,10 +50,7 @@ first_compilation = FirstCompilation()
 
 
 def compile_ahead(
-    commands: list[str],
-    *,
-    fewest: int = 1,
-    tell: Callable[[str], None] = lambda words: None,
+    commands: list[str], *, fewest: int = 1, tell: Callable[[str], None] = lambda words: None
 ) -> int:
     """Compile kernels that commands call and that are not on disk; return how many were compiled.
 

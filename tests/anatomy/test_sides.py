@@ -48,9 +48,7 @@ class Chest:
         return np.asarray(((self.points >= low) & (self.points <= high)).all(axis=-1))
 
     def septum(self) -> np.ndarray | None:
-        tissue = self.lung & ~self.airway
-        found = coarse_sides(tissue, self.grid)
-        return None if found is None else border_of(*found, tissue)
+        return _septum(self.lung, self.airway, self.grid)
 
     def parts_at(self, border: np.ndarray | None, *points: Sequence[float]) -> list[int]:
         """Return in which part of the lung, without airway and border, points lie; faces connect."""
@@ -59,6 +57,11 @@ class Chest:
             open_space &= ~border
         parts, _count = ndimage.label(open_space)
         return [int(parts[tuple(np.rint(self.grid.ijk(point)).astype(int))]) for point in points]
+
+
+def _septum(lung: np.ndarray, airway: np.ndarray, grid: Grid) -> np.ndarray | None:
+    found = coarse_sides(lung & ~airway, grid)
+    return None if found is None else border_of(*found, lung & ~airway)
 
 
 def _touching(spacing_mm: Sequence[float]) -> Chest:
@@ -164,7 +167,7 @@ def test_any_order_of_axes_gives_the_same_sides(axes: tuple[int, int, int]) -> N
     matrix[:3, :3] = matrix[:3, list(axes)]
     turned = Grid(shape=tuple(np.take(chest.grid.shape, axes)), lps_from_ijk=matrix)
     lung, airway = (np.asfortranarray(np.transpose(m, axes)) for m in (chest.lung, chest.airway))
-    border = septum(lung, airway, turned)
+    border = _septum(lung, airway, turned)
     assert border is not None
     parts, _count = ndimage.label(lung & ~border)
     left, right = (parts[tuple(np.rint(turned.ijk(p)).astype(int))] for p in (LEFT, RIGHT))

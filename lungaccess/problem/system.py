@@ -90,7 +90,9 @@ class System:
             self._check_needle(self.needle)
         if self.needle_preloaded:
             self._check_shaft()
-        object.__setattr__(self, "tubes", self.tubes.with_needle(self._shaft_in_tubes))
+        # The shaft bends with the tubes while they are deployed, if it is in them then.
+        shaft = self.needle_tube if self.needle_preloaded else None
+        object.__setattr__(self, "tubes", self.tubes.with_needle(shaft))
 
     def _check_aim(self) -> None:
         """Without a needle the tip of the tubes must come to points in space, not on a line only."""
@@ -113,7 +115,7 @@ class System:
         # Tubes that share a bend are bent by no more than the most bent of them is at rest.
         at_rest = [tube.max_precurvature_per_mm for tube in self.tubes.nested]
         bent = max(self.tubes.channel_curvature_per_mm, *at_rest)
-        most = needle.most_bent_per_mm(self.needle_passing_mm)
+        most = needle.most_bent_per_mm(self.tubes.passing_mm + needle.max_length_mm)
         if bent > most:
             raise impossible(
                 "needle.diameter_mm",
@@ -123,11 +125,6 @@ class System:
                 f"{needle.max_strain:g}. Slots (needle.slotted_segments) or a smaller "
                 "tubes.max_channel_curvature_per_mm allow more",
             )
-
-    @property
-    def _shaft_in_tubes(self) -> Tube | None:
-        """The shaft that bends with the tubes while they are deployed."""
-        return self.needle_tube if self.needle_preloaded else None
 
     def _check_shaft(self) -> None:
         """What slides through bent tubes while the needle is inserted must be alike, or they move."""
@@ -150,11 +147,6 @@ class System:
     def stages(self) -> tuple[str, ...]:
         """The devices that go one through the other, the first to move first."""
         return ("scope", "tube") if self.needle is None else ("scope", "tube", "needle")
-
-    @property
-    def needle_passing_mm(self) -> float:
-        """Length of needle, from its tip, that passes bends when it is inserted farthest."""
-        return self.tubes.passing_mm + (0.0 if self.needle is None else self.needle.max_length_mm)
 
     @property
     def needle_tube(self) -> Tube | None:

@@ -148,7 +148,7 @@ class MotionProver:
         shifts_mm : (K,) float64
             How much farther the base stops, see `stages.scope.motion_proof.shifted`.
         """
-        shifts = as_shifts(shifts_mm)
+        shifts = np.ascontiguousarray(np.atleast_1d(np.asarray(shifts_mm, dtype=np.float64)))
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
         shifted_tips(
             self._walls,
@@ -318,11 +318,6 @@ def evenly(step_mm: float, reach_mm: float) -> Float:
     """Return shifts `(K,)` a step apart as far as `reach_mm` each way, 0 in the middle."""
     count = round(reach_mm / step_mm)
     return step_mm * np.arange(-count, count + 1, dtype=np.float64)
-
-
-def as_shifts(values: ArrayLike) -> Float:
-    """Return shifts as a float64 array `(K,)`."""
-    return np.ascontiguousarray(np.atleast_1d(np.asarray(values, dtype=np.float64)))
 
 
 State = tuple[float, ...]

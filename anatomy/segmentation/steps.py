@@ -1,9 +1,7 @@
 """The steps of a segmentation; each is run only if what it is made from has changed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from anatomy.io.images import read_mask, read_volume
 from anatomy.io.mask_values import require_label_values
 from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
 from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
-from anatomy.segmentation.airway import wall_around
+from anatomy.segmentation.airway import Airways, wall_around
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.central_airway import without_larynx
 from anatomy.segmentation.folder import (
@@ -35,9 +33,6 @@ from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
 from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import SegmentationRequest
 from anatomy.segmentation.scan_warnings import misplaced, scan_warnings
-
-if TYPE_CHECKING:
-    from anatomy.segmentation.airway import Airways
 
 Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]

@@ -1,10 +1,8 @@
 """Plan a tour of the airway to several lesions of one patient."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +12,11 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
+from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.one_system import run
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.request import Request
+from lungaccess.problem.target import Target
 from stages.needle import DEFAULT
 from stages.scope.tour import (
     MOST_COMBINATIONS,
@@ -37,10 +37,6 @@ from stages.scope.tour import (
     shortest_tour,
     subtree_to,
 )
-
-if TYPE_CHECKING:
-    from lungaccess.planning.coupled.atlas import Atlas
-    from lungaccess.problem.target import Target
 
 FARTHEST_MM = 200.0
 """No exit farther from a lesion is of use: a lung is not wider."""

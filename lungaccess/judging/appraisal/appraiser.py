@@ -1,33 +1,28 @@
 """Appraise plans: check them, estimate their chance of success, and list their limits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from numpy.typing import ArrayLike
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_value
+from anatomy.lung import Lung
 from lungaccess.judging.appraisal.headline import Headline
 from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 from lungaccess.judging.checking import Checker, CheckReport
 from lungaccess.planning.success import Estimate, chance_of, estimate_success
 from lungaccess.plans.costs import known_costs
+from lungaccess.plans.plan import Plan
 from lungaccess.plans.scope_steps import motion_record
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import DEFAULT_PROCEDURE, Procedure, load_procedure
+from lungaccess.problem.system import System
 from lungaccess.uncertainty.risk import Share, assess
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from anatomy.lung import Lung
-    from lungaccess.plans.plan import Plan
-    from lungaccess.problem.system import System
-
 
 DRAWS = 2000
 """A share of one half is then known to 2 % with 95 % confidence, within a tenth of a second."""

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 from anatomy.base.records import frozen_value
 from anatomy.base.words import of_hundred, plural, range_of_hundred
 from anatomy.lobes import FISSURES_UNKNOWN
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+from lungaccess.judging.checking import CheckReport
 from lungaccess.judging.checking.needle_load import FINDING as NEEDLE_LOAD
 from lungaccess.planning.procedure.report import NO_PATH
 from lungaccess.planning.success.estimate import Estimate, chance_of
 from lungaccess.plans.chance import Chance
 from lungaccess.uncertainty.risk.assessment import MISSES
 from lungaccess.uncertainty.risk.statistics import Share
-
-if TYPE_CHECKING:
-    from lungaccess.judging.checking import CheckReport
 
 FAILURES = {
     "vessel": "touches a vessel",

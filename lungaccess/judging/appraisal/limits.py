@@ -1,18 +1,13 @@
 """How near a plan comes to its limits: one row for each that matters, in words and in usual units."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
 from anatomy.base.records import frozen_value
+from lungaccess.judging.checking import Finding
 from lungaccess.judging.checking.clearances import REACH_MM
-
-if TYPE_CHECKING:
-    from lungaccess.judging.checking import Finding
-    from lungaccess.plans.plan import Plan
+from lungaccess.plans.plan import Plan
 
 SHOWN_LIMITS = 10
 """As many rows as a reader takes in at once; the others are in the list of findings."""

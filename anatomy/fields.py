@@ -115,7 +115,7 @@ def distance_corners(mask: Mask, spacing_mm: ArrayLike, half_voxels: float = SOL
     np.logical_not(free, out=free)
     distance: Array = edt.edt(free, anisotropy=spacing, order="F", black_border=False, parallel=2)
     # Never too long: the transform adds up float32 voxel sizes, one rounding a voxel, half of it on average.
-    # Half a unit in the last place of 1 in single precision.
+    # Single precision rounds 1 by half a unit in the last place.
     distance *= 1.0 - (max(free.shape) + 16) * (2.0**-24)
     distance -= ROUNDING_MM
     distance *= kernel.UNITS_PER_MM

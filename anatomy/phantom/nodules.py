@@ -42,7 +42,7 @@ def place_bullae(
     found: list[Bulla] = []
     for index in rng.permutation(len(territory.points_lps)):
         centre = territory.points_lps[index]
-        # Where smokers have most of them.
+        # Smokers have most of their nodules in the upper lobes.
         upper = int(territory.lobe_of_point[index]) in (RIGHT_UPPER, LEFT_UPPER)
         radius = scale * rng.uniform(LEAST_BULLA_MM, GREATEST_BULLA_MM)
         depth = float(territory.pleura_depth_mm[territory.index(centre)])

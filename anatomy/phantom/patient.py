@@ -282,8 +282,8 @@ def _materials(canvas: Canvas) -> Float32:
         table[LABELS[name]] = tissue
     y = canvas.grid.lps_from_ijk[1, 3] + canvas.spacing_mm * np.arange(shape[1])
     # Lung is denser towards the back of a patient who lies on it: about 70 HU over 200 mm.
-    # Lung after breathing in.
-    lung = ((-860.0) + 0.35 * y).astype(np.float32)[None, :]
+    # The lung has this density after breathing in.
+    lung = (-860.0 + 0.35 * y).astype(np.float32)[None, :]
     sheet = np.float32(min(1.0, FISSURE_THICKNESS_MM / canvas.spacing_mm))
     for k in range(shape[2]):
         labels = canvas.labels[:, :, k]

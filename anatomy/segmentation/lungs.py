@@ -192,7 +192,7 @@ def lung_threshold(hu: Float32, outside: Mask) -> float:
         )
     middle = 0.5 * (float(np.median(lung)) + float(np.median(tissue)))
     # The middle between lung and tissue of healthy and of dense lungs lies in this range.
-    return float(np.clip(middle, *(-600.0, -300.0)))
+    return float(np.clip(middle, -600.0, -300.0))
 
 
 def in_hounsfield(coarse: CoarseCt, seed: Float | None) -> tuple[CoarseCt, Mask, float]:

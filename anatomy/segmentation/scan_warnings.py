@@ -325,7 +325,7 @@ def moved_by(ct: Volume, mask: Mask) -> Float:
     for shift in (np.zeros(3, dtype=np.int64), *(s * np.diag(steps)[a] for a in range(3) for s in (-1, 1))):
         place = np.clip(voxels + shift, 0, np.array(mask.shape) - 1)
         # Bone, metal and contrast medium count as tissue.
-        means.append(float(np.clip(ct.array[tuple(place.T)], *(-1100.0, 200.0)).mean(dtype=np.float64)))
+        means.append(float(np.clip(ct.array[tuple(place.T)], -1100.0, 200.0).mean(dtype=np.float64)))
     return np.asarray(means[1:], dtype=np.float64) - float(means[0])
 
 

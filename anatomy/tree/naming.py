@@ -275,7 +275,7 @@ class _Lung:
         ).size:  # the mask ends here: it does not tell how much lies beyond
             excess = np.maximum(excess, 0.0)
         # Segments have equal shares of a lung's airways within a factor of e, as masks end early or late.
-        fit -= 0.5 * (excess / 1.0) ** 2
+        fit -= 0.5 * excess**2
         fit[0] = np.log(ODD) - share / ODD_SHARE
         return np.asarray(fit)
 

@@ -129,7 +129,7 @@ def span(
     length = np.linalg.norm(mm[a] - mm[b], axis=1)
     cost = length / np.maximum(np.minimum(depth_mm[a], depth_mm[b]), 1e-3) ** 2 * factor
     # The spanning tree leaves out edges that cost nothing, as it does those that are not there.
-    cost = np.clip(cost, *(1e-300, 1e300))
+    cost = np.clip(cost, 1e-300, 1e300)
     # Older versions of scipy (1.13 to 1.16) span graphs with indices of 32 bits only.
     edges = a.astype(np.int32), b.astype(np.int32)
     graph = coo_array((cost, edges), shape=(len(mm), len(mm))).tocsr()

@@ -51,7 +51,7 @@ def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
     trunk = max(long_ones, key=lambda t: t.radius_mm)
     radius, length = trunk.radius_mm, trunk.length_mm
     size = f"the widest tube that divides has the radius {radius:.1f} mm and the length {length:.0f} mm"
-    # Half the tracheal diameter of a newborn.
+    # Half of the tracheal diameter of a newborn is 2 mm.
     if radius < 2.0:
         _refuse(f"{size}, too narrow for any trachea")
     # The least radius of an adult trachea; lobar bronchi are thinner, and must not pass for one by size.

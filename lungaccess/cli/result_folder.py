@@ -62,7 +62,7 @@ def claim_folder(out: Path, results: Sequence[str], *, force: bool = False) -> P
             expected="one command at a time for each folder",
             remedy="Wait until it has ended, or choose another folder with --out",
         ) from error
-    # A folder inside, into which the results of earlier runs are moved.
+    # The results of earlier runs are moved into a folder inside.
     aside = next(
         place
         for n in range(1, len(os.listdir(folder)) + 2)

@@ -272,7 +272,7 @@ def _goes_on(lung: Lung, route: Int, lps_from_eye: Float) -> str:
     points, depth = lung.tree.points_lps[route], lung.tree.distance_from_root_mm[route]
     here = int(np.linalg.norm(points - lps_from_eye[:3, 3], axis=1).argmin())
     ahead = min(int(np.searchsorted(depth, depth[here] + AHEAD_MM)), len(route) - 1)
-    # Along an edge of the picture in which that is looked for.
+    # A picture of 48 pixels along each edge shows where the lumen goes on.
     (hole,) = Picture(lung, lps_from_eye, 48).holes([int(route[ahead])])
     return goes_on_words(clock_hour(lps_from_eye, hole.place_lps))
 

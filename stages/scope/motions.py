@@ -134,6 +134,7 @@ class ScopeMotions:
         direction = np.asarray(forward, dtype=np.float64)
         cosine = self.tips[:, 3:6] @ (direction / np.linalg.norm(direction))
         angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+        # Ten degrees count as much as a mm.
         return int(np.argmin(np.hypot(away, angle / math.radians(10.0))))
 
 

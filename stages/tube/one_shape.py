@@ -31,7 +31,7 @@ def design_arrays(tubes: ConcentricTubes) -> DesignArrays:
     """Return a design and its limits for the kernels."""
     mechanics = TubeMechanics(tubes.nested, needle=tubes.needle_shaft)
     limits = np.zeros(kernel.N_LIMITS)
-    # Insertion between two looks at the tubes on their way: as in the shapes of two tubes.
+    # The tubes are looked at every 2 mm of insertion on their way, as in the shapes of two tubes.
     limits[kernel.STEP], limits[kernel.STOP] = mechanics.step_rad, 2.0
     limits[kernel.BEND], limits[kernel.MAX_EXTENSION] = BEND_RAD, tubes.max_extension_mm
     limits[kernel.MAX_SWEEP], limits[kernel.MAX_STRAIN] = tubes.max_lateral_sweep_mm, tubes.max_strain

@@ -113,7 +113,7 @@ def _makers(
         "together": partial(together, tubes, angles, insertions_mm),
         "inner first": partial(inner_first, tubes, angles, insertions_mm),
     }
-    # Increments of the alternating sequences that are compared.
+    # The alternating sequences that are compared have these increments, mm.
     for increment in (2.0, 5.0, 10.0):
         name = f"alternating by {increment:g} mm"
         makers[name] = partial(alternating, tubes, angles, insertions_mm, increment_mm=increment)

@@ -309,7 +309,7 @@ def _follow(
     results, tips = np.zeros((len(states), kernel.SHAPE_COLUMNS)), np.zeros(states.shape)
     first = np.zeros(len(states) + 1, dtype=np.int64)
     radii = np.array([tube.radius_mm for tube in mechanics.tubes])
-    # Room for arcs at first; it is doubled where that is too little.
+    # The room for arcs is doubled where that is too little.
     room = 16 * len(states)
     while True:
         arcs = np.zeros((room, kernel.ARC_COLUMNS))

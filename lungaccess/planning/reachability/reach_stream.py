@@ -65,7 +65,7 @@ class ReachStream:
 
     def __init__(self, lung: Lung, system: System, atlas: Atlas) -> None:
         require_same(atlas, lung, system)
-        # Coarse enough that a whole lung takes seconds; a map of 3 mm is `map_reach`.
+        # At 8 mm a whole lung takes seconds; a map of 3 mm is `map_reach`.
         self.grid: Grid = reach_grid(lung, 8.0)
         self.counted: Int = np.flatnonzero(counted_voxels(lung, self.grid, atlas.with_fissures))
         self._lung, self._system, self._atlas = lung, system, atlas

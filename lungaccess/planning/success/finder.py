@@ -144,8 +144,8 @@ class ContestFinder:
             made = self._of_step(step)
             found += [] if made is None else [made]
             yield Turn(iteration=0, phase=step.phase)
-        # So many of its plans take part: the first, and the last ones, which are the cheapest.
-        some = [first, *found[1:][-6 + 1 :]]
+        # Six of its plans take part: the first, and the last ones, which are the cheapest.
+        some = [first, *found[1:][-5:]]
         return [replace(each, stays=each in (some[0], some[-1])) for each in some]
 
     def _screened(self, of_cost: Sequence[Contender]) -> Generator[Turn, None, list[Contender]]:
@@ -156,7 +156,7 @@ class ContestFinder:
         others = (made for made in map(partial(self._entry, rating=rating), entries) if made)
         again = [self._contender(each.candidate, rating) for each in of_cost]
         order = yield from self._halved(rating, [*again, *islice(others, rating.rounds.pool)], leads=False)
-        # So many of the best in open loop take part where a procedure measures.
+        # Three of the best in open loop take part where a procedure measures.
         best = [self._contender(each.candidate) for each in order[:3]]
         return [replace(each, stays=n == 0) for n, each in enumerate(best)]
 
@@ -195,7 +195,7 @@ class ContestFinder:
             for each in left:
                 counted.append(_counted(each, number, draws))
                 yield Turn(iteration=0, phase="contest", message=self._message)
-            # Rounds that smaller errors decide where successes are rare: later ones have enough draws.
+            # Smaller errors decide two rounds where successes are rare: later rounds have enough draws.
             if draws > 1 and number < 2 and max(each.share for each in counted) < RARE:
                 factor = factor if factor < 1.0 else _factor(counted, number, draws)
                 counted = [replace(each, shrunken=each.scorer(number, draws, factor)) for each in counted]
@@ -293,7 +293,7 @@ class ContestFinder:
         if self._shown is not None or self._leader is None:
             return None
         # Where the time is over, no more is counted than the contest did.
-        # Draws of the chance that a plan states at least: one half is then known to 3 %.
+        # The chance that a plan states is of 250 draws at least: one half is then known to 3 %.
         return self._stated(self._leader, iteration, elapsed_s, max(self._leader.draws, 250))
 
     def no_plan(self, iteration: int) -> NoPlan:

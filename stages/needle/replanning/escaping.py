@@ -87,7 +87,7 @@ def roots_of_tip(
     if not blocker_at(environment, pose, query.inserted_mm, query.branch):
         return [Root(query=query)], required
     clearance, _label = tip_clearance(environment, query)
-    # By so much an arc that leads away from an obstacle may come nearer to it first: bending takes a while.
+    # An arc that leads away from an obstacle may come nearer by 0.1 mm first: bending takes a while.
     relaxed = min(max(environment.needle.radius_mm, clearance - 0.1), required)
     near = with_limits(environment, required_mm=relaxed)
     roots = []

@@ -272,6 +272,7 @@ class Replanner:
             attempts.by_legs()
             tried.append(attempts)
         tried.sort(key=lambda attempts: attempts.total)
+        # From three at most of the arcs that lead away a path is searched.
         to_search = tried[:1] if tried[0].path is not None else tried[:3]
         spent = 0
         for n, attempts in enumerate(to_search):

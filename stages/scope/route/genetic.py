@@ -113,8 +113,8 @@ def cut_segments(
 
     Runs that then touch become one.
     """
-    # Spacing of the path points that are fitted and tested, about a voxel of a CT.
-    count = max(round(tentative.length_mm() / 1.0), 2 * DEGREE)
+    # The path points that are fitted and tested are 1 mm apart, about a voxel of a CT.
+    count = max(round(tentative.length_mm()), 2 * DEGREE)
     parameters = np.linspace(tentative.breaks[0], tentative.breaks[-1], count + 1)
     points = np.array(tentative.at(parameters)[0])
     bends = tentative.curvature_per_mm(parameters) > limits.max_curvature_per_mm

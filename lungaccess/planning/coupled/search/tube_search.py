@@ -1,5 +1,7 @@
 """The search for plans of a system without a needle: tubes aimed from the atlas, then along each motion."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -37,9 +39,9 @@ class TubeSearch(SearchInParts):
         After the direct steps the entries of the atlas with a deployment to the target, the cheapest first.
     """
 
-    def __init__(self, task: Task, atlas: Atlas) -> None:
+    def __init__(self, task: Task, atlas: Atlas, aimed: AimedTubes | None = None) -> None:
         self.task, self.atlas = task, atlas
-        self.arcs = AimedTubes(task, atlas)
+        self.arcs = aimed or AimedTubes(task, atlas)
         self.evaluator = self.arcs.evaluator
         super().__init__(self.evaluator.blocked)
         self.clear: Int = np.zeros(0, dtype=np.int64)

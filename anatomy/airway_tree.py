@@ -20,13 +20,6 @@ if TYPE_CHECKING:
 
     from anatomy.tree.naming import BronchialNames
 
-LEAST_CONTINUED_RADIUS = 0.85
-MOST_SIDE_RADIUS = 0.6
-"""A bronchus goes on behind a fork with at least the one share of its radius if all else is below the other.
-
-Real forks divide: main bronchi have 0.6 to 0.85 of the trachea's radius, lobar bronchi less of theirs.
-"""
-
 
 @frozen_record
 class AirwayTree:
@@ -207,7 +200,8 @@ class AirwayTree:
         """Tell whether a branch is the same bronchus as its parent, which only gave off narrow branches."""
         radius = self.branch_mean_radius_mm / self.branch_mean_radius_mm[parent]
         others = radius[np.setdiff1d(self.children(parent), branch)]
-        return bool(radius[branch] >= LEAST_CONTINUED_RADIUS and (others < MOST_SIDE_RADIUS).all())
+        # Real forks divide: main bronchi have 0.6 to 0.85 of the trachea's radius, lobar bronchi less of theirs.
+        return bool(radius[branch] >= 0.85 and (others < 0.6).all())
 
     @cached_property
     def bronchi(self) -> BronchialNames:

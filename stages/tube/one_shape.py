@@ -18,10 +18,6 @@ from stages.tube.nesting import SAME_MM
 from stages.tube.sequences import BEND_RAD
 from stages.tube.shapes import SNAPS, STRAINS, SWEEPS, TubeShapes, strained_radii
 
-TOO_LONG = "the tube would extend too far"
-PROTRUDES = "the inner tube is too short to protrude so far"
-STAYS = "the tube does not leave the airway"
-"""Why joint values are refused before their way is followed."""
 KEPT = 16
 """Designs in memory: a system, and variants of it that are compared with it."""
 
@@ -127,11 +123,11 @@ def shape_or_reason(design: DesignArrays, insertions_mm: Float, rotations_rad: F
         return shape_of_arrays(shape)
     inserted, limits, result = insertions_mm, design.limits, shape.result
     if inserted[0] > min(limits[kernel.MAX_EXTENSION], design.lengths[0]):
-        return TOO_LONG
+        return "the tube would extend too far"
     if (-np.diff(inserted) > -np.diff(design.lengths[: len(inserted)]) + SAME_MM).any():
-        return PROTRUDES
+        return "the inner tube is too short to protrude so far"
     if inserted[0] == 0.0:
-        return STAYS
+        return "the tube does not leave the airway"
     if result[columns.LEAST] <= 0.0:
         return SNAPS
     return STRAINS if result[columns.STRAIN] > limits[kernel.MAX_STRAIN] else SWEEPS

@@ -10,8 +10,6 @@ AXIS_DEGREE = 5
 """The airway's axis near the site is a polynomial of this degree in the arc length along it."""
 AXIS_SCALE_MM = 2.5
 """The scope moves at most so far either way; the polynomial's variable is the arc length in this unit."""
-ZONE_POINTS = 8
-NEEDLE_POINTS = 60
 TUBE_POINTS = 24
 WALL_CONTACT_MM = 6.0
 """Length of the tubes before the exit where they may touch the wall."""
@@ -47,7 +45,7 @@ class Layout:
     tubes: int
     turned: int
     weighs_tubes: bool = False
-    zone_points: int = ZONE_POINTS
+    zone_points: int = 8
     tube_points: int = TUBE_POINTS
     # Samples of the exempt length, the needle, the tubes behind the exit and before it, about one a mm. Slack
     # in the constraints covers what lies between.
@@ -95,8 +93,8 @@ class Layout:
 
     @property
     def arc_points(self) -> int:
-        """Number of samples of each arc: fewer of shorter arcs."""
-        return max(NEEDLE_POINTS // self.arcs, 1)
+        """Number of samples of each arc: 60 for the needle, fewer of shorter arcs."""
+        return max(60 // self.arcs, 1)
 
     @cached_property
     def parameters(self) -> dict[str, slice]:

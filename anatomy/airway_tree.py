@@ -200,7 +200,7 @@ class AirwayTree:
         """Tell whether a branch is the same bronchus as its parent, which only gave off narrow branches."""
         radius = self.branch_mean_radius_mm / self.branch_mean_radius_mm[parent]
         others = radius[np.setdiff1d(self.children(parent), branch)]
-        # Real forks divide: main bronchi have 0.6 to 0.85 of the trachea's radius, lobar bronchi less of theirs.
+        # Main bronchi have 0.6 to 0.85 of the trachea's radius where it forks, lobar bronchi less of theirs.
         return bool(radius[branch] >= 0.85 and (others < 0.6).all())
 
     @cached_property

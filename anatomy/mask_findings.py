@@ -1,11 +1,11 @@
 """Figures of the masks of a patient, each by itself and beside the others."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.base.typed import Array, Float, Mask
+from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.base.words import percent
 from anatomy.display import point
 from anatomy.grid import Grid
@@ -20,6 +20,12 @@ WALL_MM = 4.0
 """Walls are up to 3 mm thick, and their inner voxels share a face with the lumen."""
 PARTS = 3
 """Each lung is looked at in so many parts from apex to base, of the same volume."""
+AROUND = np.vstack([np.eye(3), -np.eye(3)])
+"""Directions in which what lies around a point is looked for."""
+RIM_MM = 3.0
+"""Fissures that end as near to the surface of the lungs reach it."""
+LEAST_CUT_NODULE = 50
+"""A nodule of fewer voxels may well have a flat face."""
 LEAST_PIECE = 0.05
 """A piece with less than this share of the lungs is no lung."""
 LEAST_CUT, GREATEST_CUT = 0.01, 0.1
@@ -61,7 +67,8 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     """Yield the figures that can be told, by the names of `anatomy.plausibility.LIMITS`."""
     ml = images.grid.voxel_volume_mm3 / 1000.0
     lung, lumen, vessels = images.lung.array, images.lumen.array, images.vessels.array
-    yield from _of_lungs(lung, vessels, images.grid, tree)
+    fissures = None if images.fissures is None else images.fissures.array
+    yield from _of_lungs(lung, {"vessels": vessels, "fissures": fissures}, images.grid, tree)
     yield "lungs_l", _count(lung) * ml / 1000.0
     yield "lumen_ml", _count(lumen) * ml
     yield "lumen_holes", tree.report.cavity_voxels / _count(lumen)
@@ -74,16 +81,22 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         yield "wall_in_lumen", _shared(images.wall.array, lumen)
         yield "wall_in_vessels", _shared(images.wall.array, vessels)
         yield "wall_at_lumen", _at_lumen(images.wall.array, lumen, images.grid)
-    if images.fissures is not None:
-        fissures = images.fissures.array
+        yield "least_wall", _least_wall(images.wall.array, images.grid, tree)
+    if fissures is not None:
         within = _count(fissures & lung)
         yield "fissures_of_lungs", within / _count(lung)
         yield "fissures_in_lungs", within / _count(fissures)
+        sheet = sampled(fissures & lung, images.grid, SAMPLE_MM / 2)
+        if len(sheet):
+            yield "fissures_at_rim", float((~_around(lung, images.grid, sheet, RIM_MM)).any(1).mean())
         yield "fissures_in_others", _count(fissures & (vessels | lumen)) / _count(fissures)
     if images.nodules is not None:
         nodules = images.nodules.array
         yield "nodules_ml", _count(nodules) * ml
         yield "nodules_in_others", _count(nodules & (vessels | lumen)) / _count(nodules)
+        if images.targets_lps:
+            there = images.grid.values_at(nodules, np.array(images.targets_lps), False)
+            yield "targets_in_nodules", float(there.mean())
         if _count(nodules) <= MOST_VOXELS:
             yield from _of_nodules(nodules, lung)
     if images.lobes is not None:
@@ -99,7 +112,31 @@ def _shared(one: Mask, other: Mask) -> float:
     return float(np.count_nonzero(one & other)) / min(_count(one), _count(other))
 
 
-def _of_lungs(lung: Mask, vessels: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:
+def _around(mask: Mask, grid: Grid, points: Float, far_mm: Float | float) -> Mask:
+    """Tell for points `(N, 3)` LPS mm whether a mask holds what lies so far off in each of `AROUND`."""
+    steps = np.reshape(far_mm, (-1, 1, 1)) * AROUND
+    return np.asarray(grid.values_at(mask, points[:, None] + steps, False))
+
+
+def _shares_of_parts(marks: Mask, points: Float, tree: AirwayTree) -> list[float]:
+    """Return the share of points that are marked in every part of either lung, from apex to base."""
+    left = points[:, 0] > tree.carina_lps[0]
+    ordered = [np.flatnonzero(side)[np.argsort(points[side, 2], kind="stable")] for side in (left, ~left)]
+    parts = [part for order in ordered for part in np.array_split(order, PARTS)]
+    return [float(marks[part].mean()) for part in parts if len(part)]
+
+
+def _least_wall(wall: Mask, grid: Grid, tree: AirwayTree) -> float:
+    """Return how much of the airway has a wall, in the part that has the least."""
+    walled = np.any(
+        [_around(wall, grid, tree.points_lps, tree.radius_mm + by).any(1) for by in (0, 0.5, 1, 2)], 0
+    )
+    return min(_shares_of_parts(walled, tree.points_lps, tree))
+
+
+def _of_lungs(
+    lung: Mask, others: Mapping[str, Mask | None], grid: Grid, tree: AirwayTree
+) -> Iterator[tuple[str, float]]:
     """Yield what about one voxel in every cube of `SAMPLE_MM` tells of the lungs."""
     from scipy import ndimage
 
@@ -112,17 +149,13 @@ def _of_lungs(lung: Mask, vessels: Mask, grid: Grid, tree: AirwayTree) -> Iterat
     outside, _ = ndimage.label(~coarse)
     yield "lung_holes", float(np.count_nonzero((outside != outside[0, 0, 0]) & ~coarse)) / total
     points = sampled(lung, grid, SAMPLE_MM)
-    has_vessel = vessels[lattice][lung[lattice]]
     left = points[:, 0] > tree.carina_lps[0]
     yield "smaller_lung", float(min(left.mean(), 1.0 - left.mean())) if len(points) else 0.0
-    mean = float(has_vessel.mean()) if has_vessel.any() else 1.0
-    shares = []
-    for side in (left, ~left):
-        order = np.flatnonzero(side)[np.argsort(points[side, 2], kind="stable")]
-        shares += [
-            float(has_vessel[part].mean()) / mean for part in np.array_split(order, PARTS) if len(part)
-        ]
-    yield "least_vessels", min(shares, default=0.0)
+    for name, other in others.items():
+        if other is not None:
+            marks = other[lattice][lung[lattice]]
+            mean = float(marks.mean()) if marks.any() else 1.0
+            yield f"least_{name}", min(_shares_of_parts(marks, points, tree), default=0.0) / mean
 
 
 def _of_airway(lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:
@@ -156,6 +189,17 @@ def _of_nodules(nodules: Mask, lung: Mask) -> Iterator[tuple[str, float]]:
     yield "nodules_at_lungs", float(touches[part].mean())
     largest = voxels[part == np.argmax(np.bincount(part))]
     yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
+    yield "nodule_end", max(_flattest(voxels[:, axis], part) for axis in range(3))
+
+
+def _flattest(places: Int, part: Int) -> float:
+    """Return how large the first or last slice along an axis is beside the largest one, in any nodule."""
+    length = int(places.max()) + 1
+    keys, counts = np.unique(part * length + places, return_counts=True)
+    first = np.flatnonzero(np.diff(keys // length, prepend=-1))
+    last = np.append(first[1:], len(keys)) - 1
+    ends = np.maximum(counts[first], counts[last]) / np.maximum.reduceat(counts, first)
+    return float(ends[np.bincount(part) >= LEAST_CUT_NODULE].max(initial=0.0))
 
 
 def _of_lobes(lobes: Array, lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:

@@ -158,7 +158,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             remedy="Look whether a part of the lungs is missing, or a mask lies beside the others",
         ),
         "least_ends": Limit(
-            check="bronchi", words="The airway has {} ends in the lung that has fewer", form="{:.0f}",
+            check="bronchi", words="The lung with fewer ends of the airway has {}", form="{:.0f}",
             usual=(4, MOST), possible=(1, MOST),
             reason="a lung has three lobes or two, with some segments each; "
             "reach in that lung is understated", remedy="Look where the mask of the airway stops",
@@ -201,6 +201,12 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             possible=(0.4, 1),
             reason="walls are up to 3 mm thick", remedy=_FILE,
         ),
+        "least_wall": Limit(
+            check="wall", words="The part of the airway with the least wall has a wall along {}",
+            form="{:.0%}", usual=(0.5, 1), possible=(0, 1),
+            reason="all has one; where the mask shows none, the margins alone cover it",
+            remedy="Look where the mask of the wall stops",
+        ),
         "fissures_of_lungs": Limit(
             check="fissures", words="Fissures take {} of the lungs", usual=(0.002, 0.05),
             possible=(0, 0.2), reason="a sheet of two voxels takes 1 to 2 %", remedy=_FILE,
@@ -208,6 +214,19 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "fissures_in_lungs": Limit(
             check="fissures", words="{} of the fissures lie in the lungs", usual=(0.9, 1),
             possible=(0.5, 1), reason="99 % do in phantoms and patients", remedy=_FILE,
+        ),
+        "fissures_at_rim": Limit(
+            check="lung", words="{} of the fissures lie at the surface of the lungs", form="{:.1%}",
+            usual=(0.02, 1), possible=(0, 1),
+            reason="fissures open at the surface, where phantoms have 10 % of them within 3 mm",
+            remedy="Look whether the mask of the lungs is wider than the lungs",
+        ),
+        "least_fissures": Limit(
+            check="fissures",
+            words="The part of the lungs with the fewest fissures has {} of their mean share",
+            form="{:.0%}", usual=(0.1, 1), possible=(0, 1),
+            reason="of three parts of each lung, from apex to base, the oblique fissure crosses all",
+            remedy="Look whether fissures are missing there: none is avoided",
         ),
         "fissures_in_others": Limit(
             check="overlap", words="{} of the fissures lie in vessels or airway",
@@ -227,6 +246,17 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "nodules_ml": Limit(
             check="nodules", words="Nodules have {}", form="{:.3f} ml", usual=(0.004, 120), possible=(0, 500),
             reason="a nodule of 2 mm has 0.004 ml, a mass of 6 cm 113 ml", remedy=_FILE,
+        ),
+        "targets_in_nodules": Limit(
+            check="nodules", words="{} of the stated targets lie in a nodule", form="{:.0%}", usual=(1, 1),
+            possible=(0, 1), reason="a target is a nodule of the mask, or is none",
+            remedy="Look whether a nodule is missing in the mask, or lies elsewhere",
+        ),
+        "nodule_end": Limit(
+            check="nodules", words="The first or last slice of a nodule has {} of its largest slice",
+            form="{:.0%}", usual=(0, 0.75), possible=(0, 1),
+            reason="nodules are round; a flat end is seen where a mask or image was cut",
+            remedy="Look whether the nodule is whole",
         ),
         "nodules_at_lungs": Limit(
             check="nodules", words="{} of the nodules lie in or at the lungs",

@@ -197,7 +197,7 @@ def _answer(words: list[str]) -> int:
     as_json = asks_json(words)
     first_compilation.command = words[0]
     try:
-        result_folder.refuse_inputs_as_outputs(words)
+        result_folder.protect_files(words)
         code = app.meta(with_nodule_number(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:
         return _explain(usage_error(error), as_json)

@@ -1,6 +1,8 @@
 """Where commands write: one question, one folder, one command at a time, and nothing of others is lost."""
 
 import contextlib
+import filecmp
+import itertools
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +13,7 @@ from cyclopts import Parameter
 from anatomy.base.errors import FileError
 from anatomy.base.files import require_writable_folder
 from anatomy.base.unfinished import locked
+from lungaccess.cli import terminal
 
 MARK = ".lungaccess"
 """A folder of results holds this one: by it the folder is known, and in it lies the lock."""
@@ -18,6 +21,10 @@ MOST_NAMED = 5
 """Files that a message names."""
 OUTPUTS = frozenset({"--out", "--page", "--film", "--movie", "--picture", "--csv", "--parquet"})
 """Options that name what is written; none of them names what is read."""
+MOVED = "{}.earlier-{}{}"
+"""A file that a command would overwrite is kept under this name: stem, number and suffix."""
+WRITTEN = frozenset({".png", ".svg", ".gif", ".mp4", ".html", ".csv", ".parquet", ".json"})
+"""Kinds of files that commands write anew; they go on with a `.db`, and a template is no result."""
 REMEDY = "Choose another with --out, or say --force where these files may be lost"
 
 Force = Annotated[
@@ -84,6 +91,28 @@ def require_empty_folder(out: Path, *, force: bool) -> None:
         raise _occupied(folder, there)
 
 
+def keep_earlier(path: Path) -> None:
+    """Move a result that lies where one is to be written aside until the command ends.
+
+    It comes back if no other one was written, goes if the new one is the same, and else stays beside it.
+    """
+    if path.suffix.lower() not in WRITTEN or path.is_symlink() or not path.is_file():
+        return
+    names = (MOVED.format(path.stem, n, path.suffix) for n in itertools.count(1))
+    aside = next(there for name in names if not (there := path.with_name(name)).exists())
+    path.rename(aside)
+    held.callback(_settle, path, aside)
+
+
+def _settle(path: Path, aside: Path) -> None:
+    if not path.exists():
+        aside.rename(path)
+    elif filecmp.cmp(path, aside, shallow=False):
+        aside.unlink()
+    else:
+        terminal.progress_console.print(f"The earlier {path} is kept as {aside.name}.", soft_wrap=True)
+
+
 def require_new_file(path: Path, *, force: bool) -> None:
     """Raise FileError if there is a file of that name, unless it may be lost."""
     if path.exists() and not force:
@@ -100,10 +129,14 @@ def _occupied(folder: Path, there: Sequence[Path]) -> FileError:
     )
 
 
-def refuse_inputs_as_outputs(words: Sequence[str]) -> None:
-    """Raise FileError if a file that a command line wants written is, or lies in, what it wants read.
+def protect_files(words: Sequence[str]) -> None:
+    """Keep results that a command line wants overwritten, see `keep_earlier`.
 
-    New files may be written beside inputs; those that are there may not be overwritten.
+    Raises
+    ------
+    FileError
+        If a file that is to be written is, or lies in, what is to be read: new files may be written beside
+        inputs; those that are there may not be overwritten.
     """
     pairs = [word.partition("=")[::2] for word in words]
     written = [value for name, value in pairs if name in OUTPUTS and value]
@@ -121,6 +154,8 @@ def refuse_inputs_as_outputs(words: Sequence[str]) -> None:
                 expected="results in files of their own",
                 remedy="Choose another file with --out",
             )
+    for output in filter(_exists, map(Path, written)):
+        keep_earlier(output)
 
 
 def _exists(path: str | Path) -> bool:

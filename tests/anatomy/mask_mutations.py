@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,8 +73,9 @@ def mirrored(masks: Masks, role: str, rng: np.random.Generator) -> Mutation:
 
 
 def widened(masks: Masks, role: str, rng: np.random.Generator) -> Mutation:
-    """Grow a mask by five voxels, 6 mm."""
-    return _with(masks, role, ndimage.binary_dilation(masks[role].array > 0, iterations=5), f"dilate {role}")
+    """Grow a mask by 6 mm."""
+    mask, steps = masks[role].array > 0, round(6.0 / float(masks[role].grid.spacing_mm.min()))
+    return _with(masks, role, ndimage.binary_dilation(mask, iterations=steps), f"dilate {role}")
 
 
 def without_part(masks: Masks, role: str, rng: np.random.Generator) -> Mutation:
@@ -87,13 +88,13 @@ def without_part(masks: Masks, role: str, rng: np.random.Generator) -> Mutation:
 
 def swapped(masks: Masks, role: str, rng: np.random.Generator) -> Mutation:
     """Exchange the roles of two masks."""
-    other = str(rng.choice([each for each in ROLES if each != role]))
+    other = str(rng.choice([each for each in masks if each != role]))
     return Mutation(name=f"swap {role} {other}", masks={**masks, role: masks[other], other: masks[role]})
 
 
 def copied(masks: Masks, role: str, rng: np.random.Generator) -> Mutation:
     """Put a copy of another mask in the place of one."""
-    other = str(rng.choice([each for each in ROLES if each != role]))
+    other = str(rng.choice([each for each in masks if each != role]))
     return Mutation(name=f"{role} is a copy of {other}", masks={**masks, role: masks[other]})
 
 
@@ -110,17 +111,25 @@ def _with(masks: Masks, role: str, array: Array, name: str, *, same: bool = Fals
 def drawn(masks: Mapping[str, Volume], rng: np.random.Generator) -> Mutation:
     """Draw a mutation of a role."""
     kind = KINDS[int(rng.integers(len(KINDS)))]
-    role = str(rng.choice(ROLES))
-    # A nodule that is wider is a nodule: nothing in the masks contradicts it.
-    return kind(dict(masks), "lumen" if kind is widened and role == "nodules" else role, rng)
+    return kind(dict(masks), str(rng.choice(list(masks))), rng)
 
 
-def write(folder: Path, masks: Mapping[str, Volume]) -> Path:
-    """Write masks as a patient folder."""
+def write(
+    folder: Path,
+    masks: Mapping[str, Volume],
+    others: Mapping[str, Volume] | None = None,
+    targets_lps: Sequence[Array] = (),
+) -> Path:
+    """Write masks as a patient folder; those that `others` has too lie in the folder `whole` beside it."""
     folder.mkdir(parents=True, exist_ok=True)
     keys = {"nodules": "nodule"}
-    lines = [f'{keys.get(role, role)} = "{role}.nii.gz"' for role in masks]
+    lines = [f"targets = {['lps:' + ','.join(map(repr, point.tolist())) for point in targets_lps]}"]
     for role, mask in masks.items():
-        write_volume(folder / f"{role}.nii.gz", mask)
+        file = f"{role}.nii"
+        if others and others.get(role) is mask:
+            file = f"../whole/{file}"
+        else:
+            write_volume(folder / file, mask)
+        lines.append(f'{keys.get(role, role)} = "{file}"')
     (folder / "patient.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return folder

@@ -20,6 +20,22 @@ BINARY = (
     struct.pack("<f", 347.9), struct.pack("<i", -1), struct.pack("<i", 2**31 - 1), struct.pack("<h", -1),
     struct.pack("<h", 32767), struct.pack("<h", 0), struct.pack("<q", 2**62), b"\0\0\0\0", b"\x7f",
 )  # fmt: skip
+VALUES = (np.nan, np.inf, -np.inf, 1e9, 1e300, 5e-324, -1.0, 0.0)
+NUMBER = re.compile(rb"(?<![\w.])[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?![\w.])")
+
+
+def replaced_number(rng: np.random.Generator, content: bytes) -> bytes:
+    """Return content with another value in the place of one of its numbers."""
+    value = float(VALUES[int(rng.integers(len(VALUES)))])
+    with np.errstate(over="ignore"):
+        words = [repr(value).encode(), struct.pack("<f", np.float32(value)), struct.pack("<d", value)]
+    if b"\0" not in content:
+        spans = [found.span() for found in NUMBER.finditer(content)]
+        start, end = spans[int(rng.integers(len(spans)))]
+        return content[:start] + words[0] + content[end:]
+    word = words[1 + int(rng.integers(2))]
+    start = 2 * int(rng.integers(len(content) // 2))
+    return (content[:start] + word + content[start + len(word) :])[: len(content)]
 
 
 def mutated(rng: np.random.Generator, content: bytes, first_bytes: int | None = None) -> bytes:

@@ -116,11 +116,34 @@ def _centerlines(folder: Path) -> None:
 def _read_centerlines(name: str) -> Callable[[Path], Any]:
     from anatomy.io.centerlines import read_centerline_graph, read_centerlines
 
-    def read(folder: Path) -> None:
-        read_centerline_graph(folder / name)
-        read_centerlines(folder / name)
+    def read(folder: Path) -> Any:
+        return read_centerline_graph(folder / name), read_centerlines(folder / name)
 
     return read
+
+
+def _transform(name: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        transform = SimpleITK.AffineTransform(3)
+        transform.SetTranslation((1.5, -2.0, 12.0))
+        transform.SetCenter((3.0, 4.0, 5.0))
+        SimpleITK.WriteTransform(transform, str(folder / name))
+
+    return make
+
+
+def _transform_target(name: str) -> Target:
+    from anatomy.io.motion_files import read_transform
+
+    return Target(name, _transform(name), lambda folder: read_transform(folder / name, GRID))
+
+
+def _markups(folder: Path) -> None:
+    places = [[1.5, -20.0, 30.0], [1.5, -20.0, -31.0]]
+    points = [{"label": f"p-{n}", "position": place, "orientation": [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+              for n, place in enumerate(places)]  # fmt: skip
+    markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+    (folder / "p.mrk.json").write_text(json.dumps({"markups": [markup]}))
 
 
 def _template(name: str) -> Callable[[Path], None]:
@@ -131,6 +154,7 @@ def _template(name: str) -> Callable[[Path], None]:
 def _text_targets() -> dict[str, Target]:
     from anatomy.io.frames import read_points, read_pose
     from anatomy.io.label_names import stored_names
+    from anatomy.io.markups import read_markups
     from anatomy.io.motion_files import read_landmarks
     from anatomy.io.own_masks import _read_description, thick_slices_mm
     from anatomy.segmentation.nodules import nodule_from_contours
@@ -148,9 +172,8 @@ def _text_targets() -> dict[str, Target]:
         text = (resources.files("lungaccess.problem") / "presets" / "ultrathin.toml").read_bytes()
         (folder / "system.toml").write_bytes(text)
 
-    def description(folder: Path) -> None:
-        _read_description(folder / "patient.toml")
-        thick_slices_mm(folder)
+    def description(folder: Path) -> Any:
+        return _read_description(folder / "patient.toml"), thick_slices_mm(folder)
 
     def points(folder: Path) -> None:
         (folder / "points.txt").write_text("1.5 -20 30\n-4e1 5 -6.25\n")
@@ -181,6 +204,9 @@ def _text_targets() -> dict[str, Target]:
             _template("contours.json"),
             lambda f: nodule_from_contours(f / "contours.json", _CONTOURED),
         ),
+        "transform": _transform_target("a.tfm"),
+        "transform-minc": _transform_target("a.xfm"),
+        "markups": Target("p.mrk.json", _markups, lambda f: read_markups(f / "p.mrk.json")),
         "labels": Target("labels.json", labelled, lambda f: stored_names(f / "labels.nii.gz")),
         "plan": Target(
             "plan.json", lambda f: make_plan().save(f / "plan.json"), lambda f: Plan.load(f / "plan.json")
@@ -292,3 +318,17 @@ def damaged(rng: np.random.Generator, target: Target, intact: bytes) -> tuple[by
     if target.file.endswith(".gz") and rng.random() < 0.5:
         return gzip.compress(mutated(rng, gzip.decompress(intact), 352), 1), True
     return mutated(rng, intact), target.file.endswith(".gz")
+
+
+def with_a_number(rng: np.random.Generator, target: Target, intact: bytes) -> tuple[bytes, bool]:
+    """Return content one of whose numbers, wherever the file has one, is not finite, huge, tiny, or below 1.
+
+    Numbers are the words of a text that read as such, and in what is no text any four or eight bytes.
+    """
+    from tests.fuzz.mutations import replaced_number
+
+    is_packed = target.file.endswith(".gz")
+    content = gzip.decompress(intact) if is_packed else intact
+    first = target.header_bytes(content) if target.header_bytes else 352 if is_packed else len(content)
+    new = replaced_number(rng, content[:first]) + content[first:]
+    return gzip.compress(new, 1) if is_packed else new, False

@@ -19,12 +19,12 @@ from tests.fuzz.targets import GRID, Target, targets
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 TARGETS = targets()
-IN_CI, IN_ALL = 2000, 100_000
+IN_CI, IN_ALL, NUMBERS_IN_CI = 2000, 100_000, 30
 
 
-def _run(names: Iterable[str], seed: int, count: int, keep: Path) -> dict[str, Any]:
+def _run(names: Iterable[str], seed: int, count: int, keep: Path, kind: str = "bytes") -> dict[str, Any]:
     """Return what a process of its own says of each target, and under "stderr" why it ended too early."""
-    command = [sys.executable, "-m", "tests.fuzz.run", str(seed), str(count), str(keep), *names]
+    command = [sys.executable, "-m", "tests.fuzz.run", kind, str(seed), str(count), str(keep), *names]
     done = subprocess.run(command, capture_output=True, text=True, cwd=CHECKOUT, check=False)
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     return {line.pop("target"): line for line in lines} | {"stderr": f"{keep}\n{done.stderr[-2000:]}"}
@@ -46,6 +46,17 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 @pytest.mark.parametrize("name", TARGETS)
 def test_damaged_files_are_refused_in_words(said: dict[str, Any], name: str):
     _require_refusals(said, name, IN_CI // len(TARGETS))
+
+
+@pytest.fixture(scope="module")
+def said_of_numbers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return _run(TARGETS, 0, NUMBERS_IN_CI, tmp_path_factory.mktemp("fuzz") / "input", "numbers")
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_no_number_of_a_file_is_read_as_none_or_takes_for_ever(said_of_numbers: dict[str, Any], name: str):
+    assert name in said_of_numbers, f"{name}: crashed, here or before, on {said_of_numbers['stderr']}"
+    assert not said_of_numbers[name]["faults"], json.dumps(said_of_numbers[name]["faults"][:3], indent=1)
 
 
 @pytest.mark.slow

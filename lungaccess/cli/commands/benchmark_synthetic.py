@@ -15,6 +15,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, CountOrNone, Processes, SamplesOrNone, Seconds
 from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import claim_folder
 
 if TYPE_CHECKING:
     from lungaccess.running.benchmark.synthetic.scoring import Score
@@ -73,6 +74,7 @@ def make(
     """
     from lungaccess.running.benchmark.synthetic.cases import write_benchmark
 
+    claim_folder(out, ())
     with progress("making synthetic patients") as shown:
         made = write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
     if output.json:

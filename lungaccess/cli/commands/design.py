@@ -14,6 +14,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Processes
 from lungaccess.cli.options import CacheOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import claim_folder
 
 if TYPE_CHECKING:
     from lungaccess.running.design.search import DesignFound
@@ -48,6 +49,7 @@ def design(
     from lungaccess.showing.report import front_png
 
     asked = read_design(design) if design else design_of(tomllib.loads(template_text("design")))
+    claim_folder(out, ())
     with progress(asked.study.name) as shown:
         found = run_design(
             asked, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step

@@ -14,6 +14,7 @@ from lungaccess.cli.numbers import CountOrNone, SamplesOrNone, Seed
 from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions
 from lungaccess.cli.plan_search import HISTORY_FILE
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import keep_earlier
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -67,6 +68,7 @@ def report(
     page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)
+    keep_earlier(page)
     stored, model, followed = Plan.load(plan), errors.given(), errors.given_procedure()
     lung = output.load(patient)
     stored.require_lung(lung)

@@ -12,6 +12,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Angle, NotNegative
 from lungaccess.cli.options import DEFAULT_SYSTEM, OutputOptions, require_picture
+from lungaccess.cli.result_folder import keep_earlier
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -212,6 +213,7 @@ def _proposal(proposal: DesignProposal) -> dict[str, object]:
 def _draw(answer: TubeAnswer, out: Path) -> None:
     from lungaccess.showing.report import tubes_png
 
+    keep_earlier(out)
     deployed = answer.deployed
     notes = [
         f"tip {_numbers(answer.final.base_from_tip[:3, 3], 2)} mm",

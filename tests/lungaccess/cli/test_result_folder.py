@@ -11,7 +11,7 @@ from anatomy.base.errors import FileError
 from anatomy.base.unfinished import locked
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.result_folder import MARK, claim_folder, held
+from lungaccess.cli.result_folder import MARK, claim_folder, held, keep_earlier
 
 
 @pytest.fixture(autouse=True)
@@ -49,6 +49,28 @@ def test_two_commands_do_not_share_a_folder(tmp_path):
     with locked(tmp_path / MARK):
         assert main(["plan", str(tmp_path), "--nodule", "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
     claim_folder(tmp_path, ())
+
+
+@pytest.mark.parametrize("new", ["first", "second", None])
+def test_a_single_file_of_another_question_is_kept(tmp_path, new, capsys):
+    path = tmp_path / "a.png"
+    path.write_text("first")
+    keep_earlier(path)
+    assert not path.exists()
+    if new:
+        path.write_text(new)
+    held.close()
+    assert path.read_text() == (new or "first")
+    kept = [each.read_text() for each in tmp_path.iterdir() if each != path]
+    assert kept == (["first"] if new == "second" else [])
+    assert ("kept as a.earlier-1.png" in " ".join(capsys.readouterr().err.split())) == bool(kept)
+
+
+def test_a_wrong_command_line_leaves_results_where_they_are(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_text("first")
+    assert main(["tubes", "--outer", "nan", "--inner", "30", "--out", str(path)]) == ExitCode.BAD_INPUT
+    assert [each.read_text() for each in tmp_path.iterdir()] == ["first"]
 
 
 @pytest.mark.parametrize("words", [["template", "patient", "--out", "x.toml"], ["phantom", "--out", "."]])

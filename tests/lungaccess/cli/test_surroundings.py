@@ -28,7 +28,7 @@ def test_a_crash_is_no_answer_and_leaves_a_report(monkeypatch, capsys, tmp_path)
     def crash(words):
         raise ZeroDivisionError("of the program")
 
-    monkeypatch.setattr(cli.result_folder, "refuse_inputs_as_outputs", crash)
+    monkeypatch.setattr(cli.result_folder, "protect_files", crash)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert cli.main(["presets", "--json"]) == ExitCode.CRASHED == 70
     told = capsys.readouterr()

@@ -174,3 +174,21 @@ def test_a_path_is_proved_arc_by_arc() -> None:
     assert blocker_on_path(environment, clear, -1) == 0
     assert blocker_on_path(environment, blocked, -1) == VESSEL
     assert blocker_on_path(environment, around, -1) == 0
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        (0, 0, 0), (0, 0, 30), (1e-320, 0, 0), (0, 1e-12, 1e-12), (5, 0, 0), (1e-9, 0, 30), (1e-200, 0, 1),
+        (1e-9, 0, -30), (0, 0, 5e-324), (-1e9, 0, 1e-9),
+    ],
+)  # fmt: skip
+def test_the_arc_to_a_coincident_or_collinear_point_ends_there(target: tuple[float, float, float]) -> None:
+    path = direct_path(np.eye(4), target)
+    assert np.isfinite(path.arcs).all()
+    error_mm = np.linalg.norm(path.frames()[-1][:3, 3] - target)
+    assert error_mm <= 1e-9 + 16 * np.finfo(float).eps * path.arcs[0, 0]
+
+
+def test_no_arc_leads_straight_back() -> None:
+    assert direct_path(np.eye(4), (0, 0, -30)).arcs[0, 0] == math.inf

@@ -224,7 +224,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         "least_fissures": Limit(
             check="fissures",
             words="The part of the lungs with the fewest fissures has {} of their mean share",
-            form="{:.0%}", usual=(0.1, 1), possible=(0, 1),
+            form="{:.0%}", usual=(0.1, MOST), possible=(0, MOST),
             reason="of three parts of each lung, from apex to base, the oblique fissure crosses all",
             remedy="Look whether fissures are missing there: none is avoided",
         ),

@@ -122,20 +122,11 @@ def _read_centerlines(name: str) -> Callable[[Path], Any]:
     return read
 
 
-def _transform(name: str) -> Callable[[Path], None]:
-    def make(folder: Path) -> None:
-        transform = SimpleITK.AffineTransform(3)
-        transform.SetTranslation((1.5, -2.0, 12.0))
-        transform.SetCenter((3.0, 4.0, 5.0))
-        SimpleITK.WriteTransform(transform, str(folder / name))
-
-    return make
-
-
-def _transform_target(name: str) -> Target:
-    from anatomy.io.motion_files import read_transform
-
-    return Target(name, _transform(name), lambda folder: read_transform(folder / name, GRID))
+def _transform(folder: Path) -> None:
+    transform = SimpleITK.AffineTransform(3)
+    transform.SetTranslation((1.5, -2.0, 12.0))
+    transform.SetCenter((3.0, 4.0, 5.0))
+    SimpleITK.WriteTransform(transform, str(folder / "a.tfm"))
 
 
 def _markups(folder: Path) -> None:
@@ -155,7 +146,7 @@ def _text_targets() -> dict[str, Target]:
     from anatomy.io.frames import read_points, read_pose
     from anatomy.io.label_names import stored_names
     from anatomy.io.markups import read_markups
-    from anatomy.io.motion_files import read_landmarks
+    from anatomy.io.motion_files import read_landmarks, read_transform
     from anatomy.io.own_masks import _read_description, thick_slices_mm
     from anatomy.segmentation.nodules import nodule_from_contours
     from lungaccess.planning.one_stage.tubes import load_tubes
@@ -204,8 +195,7 @@ def _text_targets() -> dict[str, Target]:
             _template("contours.json"),
             lambda f: nodule_from_contours(f / "contours.json", _CONTOURED),
         ),
-        "transform": _transform_target("a.tfm"),
-        "transform-minc": _transform_target("a.xfm"),
+        "transform": Target("a.tfm", _transform, lambda f: read_transform(f / "a.tfm", GRID)),
         "markups": Target("p.mrk.json", _markups, lambda f: read_markups(f / "p.mrk.json")),
         "labels": Target("labels.json", labelled, lambda f: stored_names(f / "labels.nii.gz")),
         "plan": Target(

@@ -203,7 +203,7 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         ),
         "least_wall": Limit(
             check="wall", words="The part of the airway with the least wall has a wall along {}",
-            form="{:.0%}", usual=(0.5, 1), possible=(0, 1),
+            usual=(0.5, 1), possible=(0, 1),
             reason="all has one; where the mask shows none, the margins alone cover it",
             remedy="Look where the mask of the wall stops",
         ),
@@ -216,15 +216,15 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             possible=(0.5, 1), reason="99 % do in phantoms and patients", remedy=_FILE,
         ),
         "fissures_at_rim": Limit(
-            check="lung", words="{} of the fissures lie at the surface of the lungs", form="{:.1%}",
-            usual=(0.02, 1), possible=(0, 1),
+            check="lung", words="{} of the fissures lie at the surface of the lungs", usual=(0.02, 1),
+            possible=(0, 1),
             reason="fissures open at the surface, where phantoms have 10 % of them within 3 mm",
             remedy="Look whether the mask of the lungs is wider than the lungs",
         ),
         "least_fissures": Limit(
             check="fissures",
             words="The part of the lungs with the fewest fissures has {} of their mean share",
-            form="{:.0%}", usual=(0.1, MOST), possible=(0, MOST),
+            usual=(0.1, 1), possible=(0, 1),
             reason="of three parts of each lung, from apex to base, the oblique fissure crosses all",
             remedy="Look whether fissures are missing there: none is avoided",
         ),
@@ -248,13 +248,13 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             reason="a nodule of 2 mm has 0.004 ml, a mass of 6 cm 113 ml", remedy=_FILE,
         ),
         "targets_in_nodules": Limit(
-            check="nodules", words="{} of the stated targets lie in a nodule", form="{:.0%}", usual=(1, 1),
+            check="nodules", words="{} of the stated targets lie in a nodule", usual=(1, 1),
             possible=(0, 1), reason="a target is a nodule of the mask, or is none",
             remedy="Look whether a nodule is missing in the mask, or lies elsewhere",
         ),
         "nodule_end": Limit(
             check="nodules", words="The first or last slice of a nodule has {} of its largest slice",
-            form="{:.0%}", usual=(0, 0.75), possible=(0, 1),
+            usual=(0, 0.75), possible=(0, 1),
             reason="nodules are round; a flat end is seen where a mask or image was cut",
             remedy="Look whether the nodule is whole",
         ),

@@ -162,13 +162,9 @@ class Headline:
 
         A refusal stands first: such a plan has no chance.
         """
-        parts = [self.chance_text, self._geometry()]
-        return " ".join(reversed(parts) if self.geometry == Geometry.REFUSED else parts)
-
-    def _geometry(self) -> str:
         if self.geometry == Geometry.REFUSED:
-            return f"Refused by the independent check ({plural(self.refusals, 'finding')})."
-        return f"{self.geometry_words.capitalize()}."
+            return f"{self.reasons.capitalize()}. {self.chance_text}"
+        return f"{self.chance_text} {self.geometry_words.capitalize()}."
 
     @property
     def geometry_words(self) -> str:

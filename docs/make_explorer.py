@@ -15,8 +15,7 @@ from lungaccess.showing.explorer import PatientSource
 from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served
 
 COMMAND = "lungaccess phantom --out phantom"
-SIZE = 1440, 1000
-COLOURS = 256
+SIZE = 1440, 900
 TARGET = "nodule 1"
 SETTLED = (
     f"{PLANNED} && s.reach && s.reach.share === 1 && Object.values(s.finer).every(Boolean)"
@@ -46,9 +45,7 @@ def make() -> None:
         folder = Path(name)
         output_of(COMMAND, folder)
         photograph(folder / "phantom", folder / "cache", folder / "explorer.png")
-        image = Image.open(folder / "explorer.png").convert("RGB")
-        few = image.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE)
-        few.save(IMAGES / "explorer.png", optimize=True)
+        Image.open(folder / "explorer.png").convert("RGB").save(IMAGES / "explorer.png", optimize=True)
 
 
 if __name__ == "__main__":

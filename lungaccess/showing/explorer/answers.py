@@ -12,6 +12,7 @@ import numpy as np
 from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Float, Int
+from anatomy.base.words import plural
 from anatomy.lung import Lung
 from lungaccess.planning import ProgressEvent, run, tips_near
 from lungaccess.planning.coupled import Atlas, atlas_is_kept, feasible_exits, open_atlas
@@ -197,7 +198,7 @@ class Answers:
                     curve.append((time.monotonic() - began, float(found.iterations), value))
                 if time.monotonic() - told >= TELL_EVERY_S:
                     told, shown = time.monotonic(), found
-                    yield self._plan_part(asked, found, curve, system, place, final=False)
+                    yield self._plan_part(asked, found, curve, system, place, told - began, final=False)
                 else:
                     yield None
         except NoPlan as failure:
@@ -207,7 +208,8 @@ class Answers:
         if last is None:
             return
         final = last if last.window is not None else with_window(last, self.lung)
-        yield self._plan_part(asked, final, curve, system, place, final=True, known=shown is final)
+        elapsed_s, known = time.monotonic() - began, shown is final
+        yield self._plan_part(asked, final, curve, system, place, elapsed_s, final=True, known=known)
 
     def _plan_part(
         self,
@@ -216,6 +218,7 @@ class Answers:
         curve: list[tuple[float, float, float]],
         system: System,
         place: ChosenPlace | None,
+        elapsed_s: float,
         *,
         final: bool,
         known: bool = False,
@@ -226,18 +229,11 @@ class Answers:
         message = {
             "answer": "plan", "final": final, "digest": found.digest, "curve": curve,
             "cost": float(found.cost), "goal": _goal_words(goal_of(question.goal, self.lung), found),
-            "iterations": found.iterations, "system": system.name,
-            "objective": found.objective, "generation": found.scope.generation,
-            "needle_mm": None if found.needle is None else found.needle.length_mm,
-            "arcs": 0 if found.needle is None else len(found.needle.arcs), "insertions": found.insertions,
-            "window": None if found.window is None else found.window.words,
+            "iterations": found.iterations, "system": system.name, "way": _way_words(found, self.lung),
+            "elapsed_s": elapsed_s, "needle_mm": None if found.needle is None else found.needle.length_mm,
             "scope_tip_lps": np.asarray(found.scope.lps_from_scope_tip)[:3, 3].tolist(),
             "exit_lps": np.asarray(found.tube.exit.point_lps).tolist(),
-            "clearance_mm": {
-                device: {name: float(mm) for name, mm in each.items()}
-                for device, each in found.clearance_mm.items()
-            },
-            "required_mm": {name: float(mm) for name, mm in found.required_clearance_mm.items()},
+            **_least_clearance(found),
             "command": plan_command(
                 self._source.folder, question, system, own, self._source.cache, place
             ),
@@ -257,6 +253,7 @@ class Answers:
     def _appraise(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         from lungaccess.judging.advice import advise
         from lungaccess.judging.appraisal import Appraiser
+        from lungaccess.showing.explorer.exports import appraisal_words
 
         found = self._plan_asked(asked)
         if self._appraiser is None:
@@ -267,7 +264,8 @@ class Answers:
         yield Part(
             {
                 "answer": "appraisal", "digest": found.digest, **appraisal.to_mapping(),
-                "window": window or motion, "breathing_known": window is not None,
+                **appraisal_words(appraisal), "window": window or motion,
+                "breathing_known": window is not None,
                 "findings": len(appraisal.check.findings), "refusals": len(appraisal.check.refusals),
                 # Seconds for what would lift the chance of success.
                 "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=3.0)],
@@ -341,6 +339,29 @@ def _goal_words(goal: Goal, found: Plan) -> dict[str, str]:
     value = goal.value(found)
     text = "not known yet" if value is None else goal.said(value)
     return {"words": goal.words_with_unit, "value": text, "loss_words": goal.words_with_unit}
+
+
+def _least_clearance(found: Plan) -> dict[str, Any]:
+    """Return the least clearance of a plan in mm, and in words of what to what."""
+    values = [
+        (mm, f"{device.replace('_', ' ')} to {'pleura' if name == 'outside' else name}")
+        for device, each in found.clearance_mm.items()
+        for name, mm in each.items()
+    ]
+    least, words = min(values)
+    return {"least_mm": float(least), "risk": f"least clearance: {words} {least:.1f} mm"}
+
+
+def _way_words(found: Plan, lung: Lung) -> str:
+    """Return how the devices come to the target."""
+    scope, needle = found.scope, found.needle
+    last = "no needle"
+    if needle is not None:
+        last = f"needle {needle.length_mm:.0f} mm in {plural(len(needle.arcs), 'arc')}"
+    return (
+        f"scope {scope.length_from_carina_mm:.0f} mm beyond the carina; out of airway "
+        f"{lung.branch_words(found.tube.exit.branch)}; {found.insertions}; {last}"
+    )
 
 
 def _why(failure: LungaccessError) -> dict[str, Any]:

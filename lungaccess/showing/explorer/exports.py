@@ -18,7 +18,8 @@ from anatomy.base.files import write_json, write_text
 from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Int
 from anatomy.lung import Lung
-from lungaccess.judging.appraisal import appraise, plan_record
+from lungaccess.judging.appraisal import Appraisal, appraise, plan_record
+from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan, sections
 from lungaccess.planning import run
 from lungaccess.planning.coupled import Atlas
@@ -87,6 +88,18 @@ def export_file(
             for each in sorted(scene.rglob("*")):
                 packed.write(each, Path("slicer") / each.relative_to(scene))
     return file
+
+
+def appraisal_words(appraisal: Appraisal) -> dict[str, str]:
+    """Return verdict and geometry in one sentence, the chance of success, and what is most at risk."""
+    said = appraisal.headline
+    failures = [f"{name} ({of_hundred(share.value, up=True)} of 100)" for name, share in said.failures]
+    nearest = [f"nearest limit: {each.words}" for each in appraisal.limits[:1]]
+    return {
+        "said": f"{said.verdict.capitalize()}: {said.geometry_words}.",
+        "chance": said.chance_words,
+        "risk": "; ".join([*failures, *nearest]),
+    }
 
 
 def explanation_part(

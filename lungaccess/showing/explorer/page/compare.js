@@ -3,7 +3,7 @@ import { byId } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
 import { Motion } from "../report/motion.js";
 import { MOST_COMPARED, planKey, planQuestion } from "./state.js";
-import { button, errorWords, made, mm } from "./widgets.js";
+import { button, errorWords, fillRows, made, mm } from "./widgets.js";
 
 export class Compared {
   constructor(page) {
@@ -77,7 +77,7 @@ export class Compared {
   list() {
     byId("compare-table").hidden = !this.rows.length;
     byId("compare-none").hidden = this.rows.length > 0;
-    byId("compare").replaceChildren(...this.rows.flatMap((row, n) => this.row(row, n)));
+    fillRows(byId("compare"), this.rows.map((row, n) => this.row(row, n)));
     this.page.redraw();
   }
 
@@ -88,18 +88,12 @@ export class Compared {
       this.hidden[target.checked ? "delete" : "add"](key);
       this.page.redraw();
     } });
-    const of = plan ? plan.system : asked.system, from = asked.exit !== null ? ", from an exit" : asked.tip !== null ? ", from a tip" : "";
-    const open = button(`${number}: ${asked.target}; ${of}${from}`, `Show plan ${n + 1} again`, () => this.page.state.set({ ...asked }));
-    const remove = button("Remove", `Remove plan ${n + 1}`, () => this.page.state.compare(this.page.state.compared.filter((_, k) => k !== n)));
-    const success = plan && plan.appraisal && plan.appraisal.headline.success;
-    const checked = plan && plan.appraisal ? (plan.appraisal.accepted ? "" : "refused") : "not checked";
-    const chance = success ? `${(100 * success.probability).toFixed(0)} %` : checked || "not estimated";
-    const least = plan ? Math.min(...Object.values(plan.clearance_mm).flatMap((values) => Object.values(values)), 5) : null;
-    const cells = plan ? [chance, plan.cost.toPrecision(4), mm(plan.needle_mm), mm(least, 2)] : [error || "…", "", "", ""];
-    return [
-      made("tr", { className: "plan-name" }, made("th", { scope: "rowgroup", colSpan: 4 }, box, swatch, open, remove)),
-      made("tr", {}, ...cells.map((text) => made("td", {}, text))),
-    ];
+    const system = plan ? plan.system : asked.system, from = asked.exit !== null ? ", from an exit" : asked.tip !== null ? ", from a tip" : "";
+    const open = button(`${number}: ${asked.target.replaceAll(",", ", ")}; ${system}${from}`, `Show plan ${n + 1} again`, () => this.page.state.set({ ...asked }));
+    const remove = button("✕", `Remove plan ${n + 1}`, () => this.page.state.compare(this.page.state.compared.filter((_, k) => k !== n)));
+    const chance = plan && (plan.appraisal ? (plan.appraisal.accepted ? plan.appraisal.chance : "refused") : "not checked");
+    const cells = plan ? [chance, mm(plan.needle_mm, 0), mm(plan.least_mm)] : [error || "…", "", ""];
+    return [made("span", {}, box, swatch, open), ...cells, remove];
   }
 
   report() {

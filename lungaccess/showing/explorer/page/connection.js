@@ -31,7 +31,7 @@ export class Connection {
     const done = new Promise((resolve, reject) => this.waiting.set(id, { part, resolve, reject, parts: Promise.resolve() }));
     if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ ask, id, ...values }));
     else this.finish(id, { id, answer: "error", error: LOST });
-    return { done, cancel: () => this.waiting.has(id) && this.socket.send(JSON.stringify({ ask: "cancel", id })) };
+    return { done };
   }
 
   received(data) {

@@ -3,7 +3,7 @@ import { DEVICE_COLOURS, planStyle } from "../report/colours.js";
 import { banded, Solids } from "../report/solids.js";
 import { rgb } from "../report/vectors.js";
 
-const { scope: SCOPE, outer: OUTER, middle: MIDDLE, inner: INNER, needle: NEEDLE, target: TARGET } = DEVICE_COLOURS;
+const TUBES = ["scope", "outer", "middle", "inner"];
 const WHITE = [1, 1, 1];
 const LEAST_WIDTH = 0.0016, TARGET_MM = 1.6;
 export const COMPARED = "compared ";
@@ -22,12 +22,8 @@ function put(scene, name, fill) {
 // Put the devices of a motion at a state into the scene, or take them away with null.
 export function showDevices(scene, motion, state, distance) {
   const radius = motion && thickened(motion.plan.radius_mm, distance);
-  const show = (name, fill) => put(scene, name, motion && fill);
-  show("scope", (s) => s.tube(state.scope, radius.scope, rgb(SCOPE)));
-  show("outer", (s) => s.tube(state.outer, radius.outer, rgb(OUTER)));
-  show("middle", (s) => s.tube(state.middle, radius.middle, rgb(MIDDLE)));
-  show("inner", (s) => s.tube(state.inner, radius.inner, rgb(INNER)));
-  show("needle", (s) => s.tube(state.needle, radius.needle, state.needleColours));
+  for (const name of TUBES) put(scene, name, motion && ((solids) => solids.tube(state[name], radius[name], rgb(DEVICE_COLOURS[name]))));
+  put(scene, "needle", motion && ((solids) => solids.tube(state.needle, radius.needle, state.needleColours)));
 }
 
 // Put the whole of other plans into the scene, each in the colour and the bands of its number; most is the largest one.
@@ -48,17 +44,14 @@ export function showCompared(scene, compared, most, distance) {
 }
 
 export function showTarget(scene, point) {
-  put(scene, "target", point && ((solids) => solids.ball(point, TARGET_MM, rgb(TARGET))));
+  put(scene, "target", point && ((solids) => solids.ball(point, TARGET_MM, rgb(DEVICE_COLOURS.target))));
 }
 
 // Return the devices as lines of a slice.
 export function deviceLines(motion, state) {
   const { radius_mm: radius } = motion.plan;
-  return [
-    { points: state.scope, radius: radius.scope, colour: SCOPE }, { points: state.outer, radius: radius.outer, colour: OUTER },
-    { points: state.middle, radius: radius.middle, colour: MIDDLE }, { points: state.inner, radius: radius.inner, colour: INNER },
-    { points: state.needle, radius: radius.needle, colour: NEEDLE },
-  ].filter(({ points }) => points.length > 1);
+  return [...TUBES, "needle"].map((name) => ({ points: state[name], radius: radius[name], colour: DEVICE_COLOURS[name] }))
+    .filter(({ points }) => points.length > 1);
 }
 
 export function comparedLines(compared) {

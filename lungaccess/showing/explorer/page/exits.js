@@ -49,21 +49,21 @@ export class Exits {
 
   // Say in words how many there are.
   words() {
-    const { deployments, in_workspace: held, tried, complete, blocked } = this.answer;
-    const more = complete ? "" : `, ${tried} of ${held} tried so far`;
-    if (this.count) return `${this.count} places of exit with ${deployments} clear direct arcs of ${held} deployments in reach${more}`;
-    if (!held) return "No deployment of the atlas has the target in its needle's workspace";
+    const { in_workspace: held, tried, complete, blocked } = this.answer;
+    const more = complete ? "" : ` (${tried} of ${held} positions of the tubes tried so far)`;
+    if (this.count) return `${this.count} ${this.count === 1 ? "place" : "places"} to leave the airway with one clear arc${more}`;
+    if (!held) return "From no position of the tubes does the needle get as far as the target in one arc";
     const stopped = Object.entries(blocked).sort((a, b) => b[1] - a[1]).map(([name, count]) => `${name} stops ${count}`);
-    return `No direct arc is clear of ${held} deployments in reach${more}: ${stopped.join(", ")}`;
+    return `No single arc is clear from ${held} positions of the tubes${more}: ${stopped.join(", ")}`;
   }
 
   // List them in a table body, the least costly first; choose receives an entry.
   list(body, chosen, choose) {
-    const { cost, clearance_mm: clearance, length_mm: length, count } = this.answer.arrays;
+    const { clearance_mm: clearance, length_mm: length, count } = this.answer.arrays;
     const rows = this.places.slice(0, MOST_LISTED).map((_, n) => made("tr", {},
       made("th", { scope: "row" }, button(`${n + 1}`, `Plan from exit ${n + 1}`, () => choose(this.entries[n]),
         { ariaPressed: String(n === chosen) })),
-      ...[cost[n].toPrecision(4), mm(clearance[n], 2), mm(length[n]), String(count[n])].map((text) => made("td", {}, text))));
+      ...[mm(clearance[n]), mm(length[n], 0), String(count[n])].map((text) => made("td", {}, text))));
     body.replaceChildren(...rows);
     return this.places.length - rows.length;
   }

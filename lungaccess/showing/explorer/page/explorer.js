@@ -1,5 +1,6 @@
 // The page of the explorer: what is asked, what is shown, and how both follow from the address.
 import { byId, openPage } from "../report/anatomy_page.js";
+import { Bronchoscopy } from "../report/bronchoscopy.js";
 import { planStyle } from "../report/colours.js";
 import { DevicePage } from "../report/device_page.js";
 import { Motion } from "../report/motion.js";
@@ -15,12 +16,13 @@ import { Connection } from "./connection.js";
 import { CtSource } from "./ct_source.js";
 import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
 import { connectHelp, connectKeys } from "./keys.js";
+import { Panes } from "./panes.js";
 import { PlanPanel } from "./plan_panel.js";
 import { connectPointer } from "./pointer.js";
 import { Search } from "./search.js";
 import { MOST_COMPARED, planKey, State } from "./state.js";
 import { WhatIfPanel } from "./what_if.js";
-import { errorWords, fillRows, lpsText, made, mm, placeWords } from "./widgets.js";
+import { errorWords, lpsText, made, mm } from "./widgets.js";
 
 const KEPT_PLANS = 30, REST_MS = 250;
 
@@ -40,6 +42,12 @@ class ExplorerPage extends DevicePage {
     this.redrawScene = () => later(mark({ scene: true }));
     // At once, and as coarsely as a slow machine draws what moves.
     this.redrawFast = () => this.show("moving", mark({ slices: true }));
+    const { dataset } = document.documentElement;
+    dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+    byId("theme").addEventListener("click", () => {
+      dataset.theme = dataset.theme === "dark" ? "light" : "dark";
+      this.redraw();
+    });
   }
 
   async open() {
@@ -80,6 +88,9 @@ class ExplorerPage extends DevicePage {
     byId("warnings").replaceChildren(...facts.warnings.map((words) => made("li", {}, words)));
     byId("nodule").replaceChildren(new Option(facts.targets.length ? "choose" : "none", ""), ...facts.targets.map(({ text, lobe }) =>
       new Option(lobe ? `${text}, ${lobe}` : text, text)));
+    for (const kind of ["direct arc", "unreachable"]) {
+      document.documentElement.style.setProperty(`--${kind.replace(" ", "-")}`, facts.reach_colours[kind]);
+    }
     this.start = [...(facts.targets[0] ? facts.targets[0].lps_mm : facts.carina_lps)];
     this.state = new State(facts.first_system, () => this.follow());
     this.whatIfPanel = new WhatIfPanel(facts, this.state);
@@ -103,10 +114,12 @@ class ExplorerPage extends DevicePage {
   async takeStructures(structures) {
     this.structures = structures;
     const isOpen = await this.openScene((size) => (1.05 * Math.max(...size)) / Math.tan((15 * Math.PI) / 180) / 2 + size[1] / 2);
+    this.panes = new Panes(this.redraw);
     this.linkSlices({ placed: () => this.describe(), picked: (place) => this.chooseTarget(lpsText(place)) });
     this.views.lookAt(this.start);
     if (isOpen) {
       this.orbit.changed = this.redrawScene;
+      this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));
       connectPointer(this);
     }
     this.redraw();
@@ -155,12 +168,12 @@ class ExplorerPage extends DevicePage {
 
   describe() {
     this.asker.latest("place", { point: this.place }, (found) => {
-      byId("place-table").hidden = false;
-      const lobe = found.lobe ? `, ${found.lobe}` : "";
-      byId("place-words").textContent = `${found.tissue}${lobe} at LPS ${placeWords(found.lps_mm)} mm`;
-      fillRows(byId("place"), Object.entries(found.distance_mm).map(([name, value]) =>
-        [`to ${name}`, value >= 30 ? "30 mm or more" : mm(value, 2)]));
       const isTarget = this.targetLps && norm(minus(this.place, this.targetLps)) < 0.1;
+      const known = isTarget && this.facts.targets.find(({ text }) => text === this.state.asked.target);
+      const near = Object.entries(found.distance_mm).filter(([, value]) => value < 30).map(([name, value]) => `${mm(value)} to ${name}`);
+      byId("place-words").textContent = [
+        (known ? [known.text, known.lobe] : [found.tissue, found.lobe]).filter(Boolean).join(", "), ...near, lpsText(found.lps_mm),
+      ].join("; ");
       byId("cross-target").hidden = !found.may_be_target || Boolean(isTarget);
       this.placeFound = found;
     });
@@ -177,8 +190,9 @@ class ExplorerPage extends DevicePage {
 
   // Choose the next place of the scope along the airway.
   moveTip(way) {
-    const from = this.tips && (this.tips.chosen(this.state.asked.tip) ?? this.tips.nearest(this.motion ? this.motion.plan.scope_tip_lps : this.place));
-    const next = this.tips && this.tips.next(from, way, this.targetLps);
+    const { tips, motion, state: { asked } } = this;
+    const from = tips && (tips.place(asked.tip) ? asked.tip : tips.nearest(motion ? motion.plan.scope_tip_lps : this.place));
+    const next = tips && tips.next(from, way, this.targetLps);
     if (next !== null && next !== undefined) this.state.set({ tip: next, exit: null });
   }
 
@@ -338,25 +352,23 @@ class ExplorerPage extends DevicePage {
   draw() {
     const state = this.motion ? this.motion.at(this.player.position) : null;
     if (state) this.player.say(this.motion.words(state));
+    if (state && this.orbit) this.goWith(state);
     const { scene, slices } = this.stale;
     this.stale = { scene: false, slices: false };
     if (scene && this.scene && this.orbit && this.views) {
       this.drawDevices(state);
-      this.scene.fit();
-      this.drawScene();
+      if (this.panes.isShown("scene")) this.scene.fit();
+      if (state && this.panes.isShown("bronchoscopy")) this.bronchoscopy.draw(state, this.motion);
+      if (this.panes.isShown("scene")) this.drawScene();
     }
     if (slices && this.views) this.drawSlices();
     byId("reach-key").hidden = !byId("reach-slices").checked && !byId("reach-scene").checked;
-    if (!byId("reach-key").childElementCount && this.facts) this.listReachKey();
   }
 
-  listReachKey() {
-    const names = { "direct arc": "reached by a single arc", unreachable: "no needle can end there" };
-    byId("reach-key").append(...Object.entries(names).map(([kind, words]) => {
-      const swatch = made("span", { className: "swatch" });
-      swatch.style.background = this.facts.reach_colours[kind];
-      return made("li", {}, swatch, words);
-    }));
+  // Keep the tip of what plays in the middle; at the end all of the plan is.
+  goWith({ position, tip }) {
+    if (this.shownAtShare !== undefined && this.shownAtShare !== position) this.orbit.centre = [...(position < 1 ? tip : this.orbit.home.centre)];
+    this.shownAtShare = position;
   }
 
   // The solid bodies are made again only where they changed.
@@ -371,7 +383,8 @@ class ExplorerPage extends DevicePage {
   drawSlices(isCoarse = this.hurriesSlices()) {
     this.image.overlay = byId("reach-slices").checked && this.reach ? this.reach.painter() : null;
     const of = this.motion ? deviceLines(this.motion, this.motion.at(this.player.position)) : [];
-    this.views.draw(STANDARD, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps }, isCoarse);
+    const planes = Object.fromEntries(Object.entries(STANDARD).filter(([name]) => this.panes.isShown(name)));
+    this.views.draw(planes, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps }, isCoarse);
   }
 
   // What a test may read.

@@ -1,17 +1,7 @@
-// Keys, and the help that lists them.
+// Keys, and the help, which lists them.
 import { byId } from "../report/anatomy_page.js";
-import { made } from "./widgets.js";
-
-const KEYS = [
-  ["n", "next nodule or target"], ["e / Shift e", "next or previous exit: plan from it"], ["[ and ]", "scope tip back and forward: plan from there"],
-  ["x", "exit and tip free again"], ["k", "keep the plan to compare"], ["v", "look at the plan"], ["p", "play the deployment"],
-  ["Ctrl Z, Ctrl Shift Z", "undo and redo"], ["?", "this help"],
-  ["in a slice: arrows, page up and down", "move the cross by a voxel; shift moves the pictures"], ["in a slice: Enter, or a click", "make the place the target"],
-  ["in 3-D: arrows, + and -, 0, f", "turn, zoom, all from the front, the plan; shift moves"], ["in 3-D: Enter, m, c", "name what is in the middle, measure from there, put the cross there"],
-];
 
 export function connectHelp() {
-  byId("keys").replaceChildren(...KEYS.map(([key, words]) => made("tr", {}, made("th", { scope: "row" }, made("kbd", {}, key)), made("td", {}, words))));
   byId("help-open").addEventListener("click", () => byId("help").showModal());
   byId("help-close").addEventListener("click", () => byId("help").close());
 }

@@ -1,14 +1,9 @@
 // What is said of the plan: headline, numbers, curve, why there is none, files, and the command.
 import { byId } from "../report/anatomy_page.js";
-import { lineChart } from "../report/charts.js";
 import { planKey, whatIf } from "./state.js";
 import { errorWords, fillRows, made, mm } from "./widgets.js";
 
-const GRADES = ["good", "fair", "unknown", "poor"];
 const MOST_LIMITS = 6;
-const FILES = [
-  "plan.json", "report.html", "slicer.zip", "overview.png", "tree.png", "cost_over_time.png", "cost_over_time.csv", "summary.json", "system.toml",
-];
 
 export class PlanPanel {
   constructor(page) {
@@ -16,7 +11,6 @@ export class PlanPanel {
   }
 
   connect() {
-    byId("export").append(...FILES.map((name) => new Option(name, name)));
     byId("export").addEventListener("change", ({ target }) => {
       const what = target.value;
       target.value = "";
@@ -29,64 +23,41 @@ export class PlanPanel {
     byId("explain").addEventListener("click", () => this.explain());
   }
 
-  grade(name) {
-    const box = byId("headline");
-    for (const each of GRADES) box.classList.toggle(`grade-${each}`, each === name);
-  }
-
   say(words, grade = "unknown") {
     byId("headline-text").textContent = words;
-    this.grade(grade);
+    byId("headline").className = `headline grade-${grade}`;
   }
 
   clear(words) {
     this.say(words);
-    for (const id of ["plan-table", "limits-box", "curve", "no-plan", "plan-actions", "command-box"]) byId(id).hidden = true;
-    byId("window-words").textContent = "";
-  }
-
-  searching() {
-    this.clear("Searching…");
+    for (const id of ["plan-table", "details-table", "no-plan", "plan-actions", "command-box"]) byId(id).hidden = true;
+    for (const id of ["advice", "limits"]) byId(id).replaceChildren();
+    byId("estimate").textContent = "";
   }
 
   show(plan) {
+    const { final, system, goal, iterations, appraisal } = plan;
     byId("no-plan").hidden = true;
-    for (const id of ["plan-table", "plan-actions", "curve"]) byId(id).hidden = false;
-    if (!plan.appraisal) this.say(plan.final ? "Proved by the planner; the check is running…" : "Proved by the planner, not checked yet; better plans follow…");
-    const least = Object.entries(plan.clearance_mm).flatMap(([device, values]) =>
-      Object.entries(values).map(([name, value]) => ({ device, name, value }))).sort((a, b) => a.value - b.value)[0];
+    for (const id of ["plan-table", "details-table"]) byId(id).hidden = false;
+    if (!appraisal) this.say(final ? "Proved by the planner; the check is running…" : "Proved by the planner, not checked yet; better plans follow…");
     fillRows(byId("plan-rows"), [
-      ["system", plan.system], ["scope", `to generation ${plan.generation}`], ["tubes", plan.insertions],
-      ["needle", plan.needle_mm === null ? "none" : `${mm(plan.needle_mm)} in ${plan.arcs} ${plan.arcs === 1 ? "arc" : "arcs"}`],
-      ["least clearance", least ? `${least.device} to ${least.name === "outside" ? "pleura" : least.name}: ${mm(least.value, 2)}` : "5 mm or more"],
-      [plan.goal.words, plan.goal.value],
-      ["found at", `iteration ${plan.iterations}`],
+      ["Chance", appraisal ? appraisal.chance : "not estimated yet"], ["Way", plan.way],
+      ["Time", `planned in ${plan.elapsed_s.toFixed(1)} s. ${appraisal ? `${appraisal.window}.` : ""}`],
+      ["Risk", appraisal ? appraisal.risk : plan.risk],
     ]);
-    byId("window-words").textContent = "";
-    this.drawCurve(plan);
-    byId("plan-actions").hidden = !plan.final;
-    byId("command-box").hidden = !plan.final;
+    fillRows(byId("details-rows"), [["system", system], [goal.words, goal.value], ["found at", `iteration ${iterations}`]]);
+    for (const id of ["plan-actions", "command-box"]) byId(id).hidden = !final;
     byId("command").textContent = plan.command;
     byId("command-note").textContent =
       `The plan is the same, byte for byte but for its times.${plan.command.includes("system.toml") ? " Export system.toml first." : ""}`;
   }
 
-  drawCurve({ curve, goal }) {
-    if ((byId("curve").hidden = !curve.length)) return;
-    const xs = curve.map(([seconds]) => 1000 * seconds), ys = curve.map(([, , cost]) => cost);
-    if (xs.length === 1) [xs[1], ys[1]] = [xs[0] + 1, ys[0]];
-    lineChart(byId("curve"), {
-      x: { name: "ms" }, y: { name: goal.loss_words, from: 0.9 * Math.min(...ys) },
-      series: [{ name: "best so far", colour: "#3A9BD5", xs, ys, stairs: true }],
-      top: Math.max(...ys) * 1.02,
-    });
-  }
-
   appraised(plan) {
-    const { headline, limits, window: words, advice } = plan.appraisal;
-    this.say([headline.text, ...advice].join(" "), headline.grade);
-    byId("window-words").textContent = words;
-    byId("limits-box").hidden = false;
+    const { headline, limits, said, advice } = plan.appraisal;
+    this.show(plan);
+    this.say(said, headline.grade);
+    byId("advice").replaceChildren(...advice.map((words) => made("li", {}, words)));
+    byId("estimate").textContent = headline.text;
     fillRows(byId("limits"), limits.slice(0, MOST_LIMITS).map(({ what, value, bound, side, unit, ok }) => [
       what, `${Number(value).toPrecision(3)} ${unit}`, `${side} ${Number(bound).toPrecision(3)}`,
       made("span", { className: ok ? "good" : "bad" }, ok ? "ok" : "broken"),
@@ -95,7 +66,7 @@ export class PlanPanel {
 
   noPlan({ found, remedy, reasons }) {
     this.clear("No plan was found.");
-    this.grade("poor");
+    this.say("No plan was found.", "poor");
     byId("no-plan").hidden = false;
     byId("no-plan-why").textContent = [found, remedy].filter(Boolean).join(" ");
     fillRows(byId("no-plan-reasons"), Object.entries(reasons).map(([name, count]) => [name, String(count)]));

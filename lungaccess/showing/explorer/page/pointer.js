@@ -1,6 +1,6 @@
 // What a click in the 3-D view chooses, and how exit and scope tip are dragged.
 import { add, dot, minus, norm, times } from "../report/vectors.js";
-import { lpsText } from "./widgets.js";
+import { leastOf, lpsText } from "./widgets.js";
 
 const HANDLE_PX = 14;
 
@@ -16,14 +16,7 @@ export function connectPointer(page) {
     const seen = scene.project(point);
     return seen ? Math.hypot(seen[0] - at[0], seen[1] - at[1]) : Infinity;
   };
-  const nearestOf = (count, placeOf, at) => {
-    let least = Infinity, found = -1;
-    for (let n = 0; n < count; n++) {
-      const away = near(placeOf(n), at);
-      if (away < least) [least, found] = [away, n];
-    }
-    return { found, away: least };
-  };
+  const nearestExit = (at) => leastOf([...page.exits.places.keys()], (n) => near(page.exits.places[n], at));
 
   // Return what can be dragged at a place: the chosen exit, or the tip of the scope.
   const handleAt = (at) => {
@@ -37,19 +30,11 @@ export function connectPointer(page) {
   };
 
   const dragTo = (at) => {
-    if (dragged.kind === "exit") {
-      const { exits } = page;
-      const { found } = nearestOf(exits.count, (n) => exits.places[n], at);
-      dragged.value = exits.entries[found];
-      page.hint(`Exit ${found + 1}: let go to plan from it`);
-      page.preview(exits.places[found]);
-    } else {
-      const { tips } = page, usable = dragged.usable;
-      const { found } = nearestOf(usable.length, (n) => tips.place(usable[n]), at);
-      dragged.value = usable[found];
-      page.hint("Scope tip: let go to plan from there");
-      page.preview(tips.place(dragged.value));
-    }
+    const { exits, tips } = page, isExit = dragged.kind === "exit";
+    const found = isExit ? nearestExit(at) : leastOf(tips.usable, (n) => near(tips.place(n), at));
+    dragged.value = isExit ? exits.entries[found] : found;
+    page.tools.say(isExit ? `Exit ${found + 1}: let go to plan from it` : "Scope tip: let go to plan from there");
+    page.preview(isExit ? exits.places[found] : tips.place(found));
   };
 
   // Before the camera hears of it: a handle moves instead of the view.
@@ -57,9 +42,7 @@ export function connectPointer(page) {
     if (event.target !== canvas || event.button !== 0) return;
     const at = place(event), kind = event.shiftKey ? null : handleAt(at);
     if (!kind) return;
-    const { tips } = page;
-    const usable = kind === "tip" ? Array.from({ length: tips.count }, (_, n) => n).filter((n) => !tips.turned[n] && tips.deployments[n]) : [];
-    dragged = { kind, usable, value: null };
+    dragged = { kind, value: null };
     canvas.setPointerCapture(event.pointerId);
     event.stopPropagation();
   }, { capture: true });
@@ -93,33 +76,26 @@ export function connectPointer(page) {
     scene.setPoints("preview", point ? { places: point, colours: [1, 1, 1], radii: 2.4 } : null);
     page.redrawScene();
   };
-  page.hint = (words) => page.tools.say(words);
 
   // Choose what is at a place of the view: an exit, a nodule, or a place in the plane through the cross.
   page.pickAt = (at) => {
-    if (!scene.view) return;
+    if (!scene.view) return undefined;
     const { exits } = page;
     if (exits && exits.count) {
-      const { found, away } = nearestOf(exits.count, (n) => exits.places[n], at);
-      if (away <= HANDLE_PX / 2) {
-        page.chooseExit(exits.entries[found]);
-        return;
-      }
+      const found = nearestExit(at);
+      if (near(exits.places[found], at) <= HANDLE_PX / 2) return page.chooseExit(exits.entries[found]);
     }
     const hit = scene.pick(...at, { pickable: ["nodule"] }), found = hit && hit.hits.find(({ key }) => key === "nodule");
     if (found) {
       const nodules = page.facts.targets.filter(({ text }) => text.startsWith("nodule "));
-      nodules.sort((a, b) => norm(minus(a.lps_mm, found.point)) - norm(minus(b.lps_mm, found.point)));
-      if (nodules.length) {
-        page.chooseTarget(nodules[0].text);
-        return;
-      }
+      const nodule = leastOf(nodules, ({ lps_mm: place }) => norm(minus(place, found.point)));
+      if (nodule) return page.chooseTarget(nodule.text);
     }
     const { eye, forward } = orbit.camera();
     const [x, y] = [(2 * at[0]) / canvas.clientWidth - 1, 1 - (2 * at[1]) / canvas.clientHeight];
     const ray = scene.picker.ray(x, y);
     const depth = dot(minus(page.place, eye), forward) / dot(ray, forward);
     page.moveTo(add(eye, times(ray, depth)));
-    page.chooseTarget(lpsText(page.place));
+    return page.chooseTarget(lpsText(page.place));
   };
 }

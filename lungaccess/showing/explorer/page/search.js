@@ -45,11 +45,13 @@ export class Search {
     page.takeReach(page.reach && page.reach.outdated());
     const last = await page.asker.latest("prepare", { what_if: whatIf(page.state.asked) }, (found) => {
       page.tips = new Tips(found);
-      page.whatIfPanel.prepared(found);
+      page.whatIfPanel.prepared();
       page.showExits();
     });
-    page.whatIfPanel.fail(last.answer === "error" ? errorWords(last.error) : "");
-    if (last.answer === "error") this.systemKey = null;
+    if (last.answer === "error") {
+      this.systemKey = null;
+      page.whatIfPanel.refuse(errorWords(last.error));
+    }
     if (last.answer !== "end") return last;
     page.asker.latest("ready", { what_if: whatIf(page.state.asked) }, () => null);
     this.seekReach(began);
@@ -82,7 +84,7 @@ export class Search {
     for (const name of ["exits", "plan"]) page.asker.forget(name);
     if (known) page.takePlan(known, key);
     else {
-      page.planPanel.searching();
+      page.planPanel.clear("Searching…");
       page.say("Planning…");
     }
     const { answer, error } = await preparing;

@@ -32,6 +32,13 @@ export class State {
     this.push();
   }
 
+  // Change something as if it had been so.
+  replace(changes) {
+    Object.assign(this.asked, changes);
+    history.replaceState(null, "", `#${this.text}`);
+    this.changed();
+  }
+
   // Keep a list of compared plans.
   compare(list) {
     this.compared = list.slice(0, MOST_COMPARED);

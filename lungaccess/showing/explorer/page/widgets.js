@@ -20,9 +20,14 @@ export function fillRows(body, rows) {
     made("tr", {}, made("th", { scope: "row" }, first), ...cells.map((cell) => made("td", {}, cell ?? "")))));
 }
 
+// Return the item with the least cost, null if none has one.
+export function leastOf(items, costOf) {
+  const costs = items.map(costOf), least = Math.min(...costs);
+  return least < Infinity ? items[costs.indexOf(least)] : null;
+}
+
 export const mm = (value, digits = 1) => (value === null || value === undefined ? "" : `${value.toFixed(digits)} mm`);
 export const lpsText = (point) => `lps:${point.map((value) => Number(value.toFixed(1))).join(",")}`;
-export const placeWords = (point) => point.map((value) => value.toFixed(1)).join(", ");
 
 // Return the words of a typed error of the server.
 export function errorWords({ found, expected, remedy }) {

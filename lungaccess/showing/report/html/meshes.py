@@ -58,7 +58,7 @@ class Look:
 
 LOOKS = (
     Look(
-        key="lung", name="Lungs", colour="#A8967F", opacity=0.07, shown=True, cell_mm=3.5, most_faces=40_000,
+        key="lung", name="Lungs", colour="#98A2AB", opacity=0.07, shown=True, cell_mm=3.5, most_faces=40_000,
         stride=2,
     ),
     Look(

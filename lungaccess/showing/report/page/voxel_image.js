@@ -2,9 +2,10 @@
 import { rgb } from "./vectors.js";
 import { linear, nearest, PackedSource, placedVolume, VoxelGrid } from "./voxels.js";
 
+// Each is at least 1.5 times as light as the one before, so that all are told apart on a dark ground, also without their hues.
 const STRUCTURE_COLOURS = {
-  outside: "#6B6B6B", lung: "#242424", "airway wall": "#6FA8CC", lumen: "#0E3A57", vessel: "#C4717A",
-  fissure: "#8F6FB8", nodule: "#009E73",
+  outside: "#000000", lung: "#2E3133", lumen: "#195281", fissure: "#7F63A9", vessel: "#D1797F", "airway wall": "#80B8DC",
+  nodule: "#74F2B8",
 };
 // What is painted over a CT at first, and how densely.
 const TINTED = ["airway wall", "vessel", "fissure", "nodule"];
@@ -114,9 +115,15 @@ export class VoxelImage {
       blue = grey + share * (blue - grey);
     }
     const over = this.overlay && !this.tinted[code] ? this.overlay(x, y, z) : null;
-    out[at] = over ? over[0] : red;
-    out[at + 1] = over ? over[1] : green;
-    out[at + 2] = over ? over[2] : blue;
+    if (over) {
+      const dense = over[3] ?? 1;
+      red += dense * (over[0] - red);
+      green += dense * (over[1] - green);
+      blue += dense * (over[2] - blue);
+    }
+    out[at] = red;
+    out[at + 1] = green;
+    out[at + 2] = blue;
     out[at + 3] = 255;
   }
 }

@@ -33,7 +33,7 @@ export class Panes {
     this.order.forEach((name, n) => {
       const pane = this.panes[name];
       pane.hidden = n >= AREAS.length;
-      Object.assign(pane.style, { gridArea: AREAS[n], order: n });
+      Object.assign(pane.style, { gridArea: AREAS[n] ?? "", order: n });
       pane.querySelector(":scope > select").value = name;
     });
   }

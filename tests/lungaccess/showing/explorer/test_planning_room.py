@@ -23,17 +23,25 @@ BOXES = """return arguments[0].map((id) => { const b = document.getElementById(i
 return [b.left, b.top, b.right, b.bottom]; })"""
 FAINT_TEXT = """const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
 const light = (c) => { const [r, g, b] = c.slice(0, 3).map((v) => v / 255)
-  .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)); return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+  return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
 const ground = (e) => { for (; e; e = e.parentElement) { const c = rgb(getComputedStyle(e).backgroundColor);
   if (c.length === 3 || c[3] > 0.99) return c; } return [255, 255, 255]; };
 return [...document.querySelectorAll('body *')].filter((e) => e.checkVisibility() && !e.disabled
-  && !e.closest('.view, option') && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())).map((e) => {
+  && !e.closest('.view, option') && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim()))
+.map((e) => {
   const [a, b] = [light(rgb(getComputedStyle(e).color)), light(ground(e))].sort((x, y) => y - x);
   return [(a + 0.05) / (b + 0.05), e.outerHTML.slice(0, 90)]; }).filter(([ratio]) => ratio < 4.5)"""
 """Visible text whose contrast with its ground is below 4.5 (WCAG 2.1, AA), and the contrast."""
+MOVE = (
+    "const e = document.getElementById('position'); e.value = arguments[0];"
+    "e.dispatchEvent(new Event('input'))"
+)
+"""Moves the slider of the deployment."""
 TISSUES = """const { scene } = window.lungaccessExplorer, { canvas } = scene, found = {};
 window.lungaccessExplorer.redraw.now();
-const sheet = document.createElement('canvas'); [sheet.width, sheet.height] = [canvas.clientWidth, canvas.clientHeight];
+const sheet = document.createElement('canvas');
+[sheet.width, sheet.height] = [canvas.clientWidth, canvas.clientHeight];
 const pen = sheet.getContext('2d'); pen.drawImage(canvas, 0, 0, sheet.width, sheet.height);
 for (let x = 6; x < sheet.width; x += 9) for (let y = 30; y < sheet.height; y += 9) {
   const hit = scene.pick(x, y, { pickable: ['airway', 'vessel', 'nodule'] });
@@ -108,9 +116,7 @@ def test_any_view_takes_the_place_of_any_other(room: Page) -> None:
     )
     assert room.run(shown) == ["scene", "axial", "coronal", "sagittal"]
     room.run(choose, "coronal", "bronchoscopy")
-    room.run(
-        "const e = document.getElementById('position'); e.value = 200; e.dispatchEvent(new Event('input'))"
-    )
+    room.run(MOVE, 200)
     room.frame()
     assert room.run(shown) == ["scene", "axial", "bronchoscopy", "sagittal"]
     lit = room.run(
@@ -162,8 +168,10 @@ def test_text_is_read_in_both_themes(room: Page, theme: str) -> None:
 def test_tissues_are_told_apart_on_dark_ground(room: Page) -> None:
     if room.run("return document.documentElement.dataset.theme") != "dark":
         room.click("theme")
-    painted = room.run("return Object.values(window.lungaccessExplorer.image.codes).map((code) =>"
-                       " [...window.lungaccessExplorer.image.table.slice(3 * code, 3 * code + 3)])")  # fmt: skip
+    painted = room.run(
+        "const { codes, table } = window.lungaccessExplorer.image;"
+        "return Object.values(codes).map((code) => [...table.slice(3 * code, 3 * code + 3)])"
+    )
     assert len(painted) == 7 and least_contrast(painted) >= 1.5
     seen = room.run(TISSUES)
     tissues = [np.median(seen[name], axis=0) for name in ("ground", "vessel", "airway")]
@@ -175,12 +183,11 @@ def test_the_3d_view_follows_what_plays_and_comes_back(room: Page) -> None:
     room.run("window.lungaccessExplorer.lookAtPlan()")
     centre = "return [...window.lungaccessExplorer.orbit.centre]"
     home = room.run(centre)
-    move = "const e = document.getElementById('position'); e.value = arguments[0]; e.dispatchEvent(new Event('input'))"
     for share in (150, 500, 900):
-        room.run(move, share)
+        room.run(MOVE, share)
         room.frame()
         np.testing.assert_allclose(room.run(centre), room.state()["tip_lps"], atol=1e-6)
-    room.run(move, 1000)
+    room.run(MOVE, 1000)
     room.frame()
     np.testing.assert_allclose(room.run(centre), home, atol=1e-6)
 

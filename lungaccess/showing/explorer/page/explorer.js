@@ -13,7 +13,7 @@ import { placedVolume } from "../report/voxels.js";
 import { Asker } from "./asker.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
-import { CtSource } from "./ct_source.js";
+import { ctSource } from "./ct_source.js";
 import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
 import { connectHelp, connectKeys } from "./keys.js";
 import { Panes } from "./panes.js";
@@ -29,7 +29,7 @@ const KEPT_PLANS = 30, REST_MS = 250;
 class ExplorerPage extends DevicePage {
   constructor() {
     super({ structures: [], breath: null });
-    this.player = new Player(this);
+    this.player = new Player({ redraw: () => this.redraw(), show: () => this.redrawFast() });
     this.plans = new Map();
     this.search = new Search(this);
     this.exits = this.tips = this.reach = this.motion = null;
@@ -105,7 +105,7 @@ class ExplorerPage extends DevicePage {
 
   takeImage(image) {
     this.image = image;
-    if (this.facts.has_ct) image.finer = new CtSource(this.connection);
+    if (this.facts.has_ct) image.finer = ctSource(this.connection);
     byId("ct-controls").hidden = !image.hasCt;
     this.openSlices();
     byId("reach-slices").checked = !image.hasCt;
@@ -286,17 +286,14 @@ class ExplorerPage extends DevicePage {
     this.showPlan();
     if (first && this.orbit) this.lookAtPlan();
     if (!plan.final) return;
-    this.say(`Plan with ${plan.goal.words} ${plan.goal.value} after ${this.state.asked.iterations} iterations.`);
-    if (!plan.appraisal) await this.appraise(plan);
-    else this.planPanel.appraised(plan);
-  }
-
-  appraise(plan) {
-    return this.asker.latest("appraise", { plan: plan.digest }, (found) => {
-      plan.appraisal = found;
-      if (this.plan === plan) this.planPanel.appraised(plan);
-      this.compared.list();
-    });
+    this.say("The plan is final.");
+    if (!plan.appraisal) {
+      await this.asker.latest("appraise", { plan: plan.digest }, (answer) => {
+        plan.appraisal = answer;
+      });
+    }
+    if (this.plan === plan && plan.appraisal) this.planPanel.appraised(plan);
+    this.compared.list();
   }
 
   takeNoPlan(found) {

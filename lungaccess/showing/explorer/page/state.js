@@ -26,17 +26,10 @@ export class State {
     this.compared = text.getAll("with").slice(0, MOST_COMPARED).map((each) => plainFrom(new URLSearchParams(each), this.first));
   }
 
-  // Change something, so that it can be undone.
-  set(changes) {
+  // Change something, so that it can be undone, or as if it had been so with "replaceState".
+  set(changes, how) {
     Object.assign(this.asked, changes);
-    this.push();
-  }
-
-  // Change something as if it had been so.
-  replace(changes) {
-    Object.assign(this.asked, changes);
-    history.replaceState(null, "", `#${this.text}`);
-    this.changed();
+    this.push(how);
   }
 
   // Keep a list of compared plans.
@@ -45,9 +38,9 @@ export class State {
     this.push();
   }
 
-  push() {
+  push(how = "pushState") {
     const address = `#${this.text}`;
-    if (address !== location.hash) history.pushState(null, "", address);
+    if (address !== location.hash) history[how](null, "", address);
     this.changed();
   }
 

@@ -74,7 +74,7 @@ export class WhatIfPanel {
   refuse(words) {
     const { possible } = this;
     this.possible = null;
-    if (possible) this.state.replace(possible);
+    if (possible) this.state.set(possible, "replaceState");
     this.fail(words);
   }
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.kernel_clock import working_cpu_s
 from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Float, Int
 from anatomy.base.words import plural
@@ -184,7 +185,7 @@ class Answers:
             self.lung, system, target, goal=question.goal, seed=question.seed,
             iterations=question.iterations, place=None if place is None else place.stated,
         )  # fmt: skip
-        began = time.monotonic()
+        began, cpu_began = time.monotonic(), working_cpu_s()
         curve: list[tuple[float, float, float]] = []
         told, last, shown = -np.inf, None, None
 
@@ -198,7 +199,9 @@ class Answers:
                     curve.append((time.monotonic() - began, float(found.iterations), value))
                 if time.monotonic() - told >= TELL_EVERY_S:
                     told, shown = time.monotonic(), found
-                    yield self._plan_part(asked, found, curve, system, place, told - began, final=False)
+                    yield self._plan_part(
+                        asked, found, curve, system, place, working_cpu_s() - cpu_began, final=False
+                    )
                 else:
                     yield None
         except NoPlan as failure:
@@ -208,8 +211,8 @@ class Answers:
         if last is None:
             return
         final = last if last.window is not None else with_window(last, self.lung)
-        elapsed_s, known = time.monotonic() - began, shown is final
-        yield self._plan_part(asked, final, curve, system, place, elapsed_s, final=True, known=known)
+        cpu_s, known = working_cpu_s() - cpu_began, shown is final
+        yield self._plan_part(asked, final, curve, system, place, cpu_s, final=True, known=known)
 
     def _plan_part(
         self,
@@ -218,7 +221,7 @@ class Answers:
         curve: list[tuple[float, float, float]],
         system: System,
         place: ChosenPlace | None,
-        elapsed_s: float,
+        cpu_s: float,
         *,
         final: bool,
         known: bool = False,
@@ -230,7 +233,7 @@ class Answers:
             "answer": "plan", "final": final, "digest": found.digest, "curve": curve,
             "cost": float(found.cost), "goal": _goal_words(goal_of(question.goal, self.lung), found),
             "iterations": found.iterations, "system": system.name, "way": _way_words(found, self.lung),
-            "elapsed_s": elapsed_s, "needle_mm": None if found.needle is None else found.needle.length_mm,
+            "cpu_s": cpu_s, "needle_mm": None if found.needle is None else found.needle.length_mm,
             "scope_tip_lps": np.asarray(found.scope.lps_from_scope_tip)[:3, 3].tolist(),
             "exit_lps": np.asarray(found.tube.exit.point_lps).tolist(),
             **_least_clearance(found),

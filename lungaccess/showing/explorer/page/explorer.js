@@ -24,7 +24,7 @@ import { MOST_COMPARED, planKey, State } from "./state.js";
 import { WhatIfPanel } from "./what_if.js";
 import { errorWords, lpsText, made, mm } from "./widgets.js";
 
-const KEPT_PLANS = 30, REST_MS = 250;
+const KEPT_PLANS = 30, REST_MS = 250, DARK_AIRWAY = "#A6D8F8";
 
 class ExplorerPage extends DevicePage {
   constructor() {
@@ -42,12 +42,16 @@ class ExplorerPage extends DevicePage {
     this.redrawScene = () => later(mark({ scene: true }));
     // At once, and as coarsely as a slow machine draws what moves.
     this.redrawFast = () => this.show("moving", mark({ slices: true }));
-    const { dataset } = document.documentElement;
-    dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-    byId("theme").addEventListener("click", () => {
-      dataset.theme = dataset.theme === "dark" ? "light" : "dark";
-      this.redraw();
-    });
+    this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+    byId("theme").addEventListener("click", () => this.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
+  }
+
+  // Put the page on a light or a dark ground, on which the airway is lighter, so that it differs from vessels.
+  setTheme(theme) {
+    document.documentElement.dataset.theme = theme;
+    const airway = this.structures.find(({ key }) => key === "airway");
+    if (this.scene && airway) this.scene.surfaces.get("airway").colour = rgb(theme === "dark" ? DARK_AIRWAY : airway.colour);
+    this.redraw();
   }
 
   async open() {
@@ -117,6 +121,7 @@ class ExplorerPage extends DevicePage {
     this.panes = new Panes(this.redraw);
     this.linkSlices({ placed: () => this.describe(), picked: (place) => this.chooseTarget(lpsText(place)) });
     this.views.lookAt(this.start);
+    this.setTheme(document.documentElement.dataset.theme);
     if (isOpen) {
       this.orbit.changed = this.redrawScene;
       this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));

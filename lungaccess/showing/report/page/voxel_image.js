@@ -4,8 +4,8 @@ import { linear, nearest, PackedSource, placedVolume, VoxelGrid } from "./voxels
 
 // Each is at least 1.5 times as light as the one before, so that all are told apart on a dark ground, also without their hues.
 const STRUCTURE_COLOURS = {
-  outside: "#000000", lung: "#2E3133", lumen: "#195281", fissure: "#7F63A9", vessel: "#D1797F", "airway wall": "#80B8DC",
-  nodule: "#74F2B8",
+  outside: "#000000", lung: "#2E3133", lumen: "#19507E", fissure: "#7B5FA5", vessel: "#CF777D", "airway wall": "#85BFE4",
+  nodule: "#80FBC4",
 };
 // What is painted over a CT at first, and how densely.
 const TINTED = ["airway wall", "vessel", "fissure", "nodule"];

@@ -42,7 +42,8 @@ TISSUES = """const { scene } = window.lungaccessExplorer, { canvas } = scene, fo
 window.lungaccessExplorer.redraw.now();
 const sheet = document.createElement('canvas');
 [sheet.width, sheet.height] = [canvas.clientWidth, canvas.clientHeight];
-const pen = sheet.getContext('2d'); pen.drawImage(canvas, 0, 0, sheet.width, sheet.height);
+const pen = sheet.getContext('2d', { willReadFrequently: true });
+pen.drawImage(canvas, 0, 0, sheet.width, sheet.height);
 for (let x = 6; x < sheet.width; x += 9) for (let y = 30; y < sheet.height; y += 9) {
   const hit = scene.pick(x, y, { pickable: ['airway', 'vessel', 'nodule'] });
   const name = !hit ? 'ground' : hit.kind === 'surface' ? hit.key : null;

@@ -20,10 +20,7 @@ export class Exits {
     this.entries = arrays.entry;
     this.tips = arrays.tip;
     this.places = Array.from({ length: arrays.entry.length }, (_, n) => point(arrays.points, n));
-  }
-
-  get count() {
-    return this.places.length;
+    this.count = this.places.length;
   }
 
   // Return a share from 0, worst, to 1, best, for each exit, by "cost" or "clearance".

@@ -127,7 +127,6 @@ class ExplorerPage extends DevicePage {
       this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));
       connectPointer(this);
     }
-    this.redraw();
   }
 
   connectControls() {
@@ -331,8 +330,7 @@ class ExplorerPage extends DevicePage {
       const tip = this.tips && this.tips.place(asked.tip);
       this.scene.setPoints("tip", tip ? { places: tip, colours: rgb("#56B4E9"), radii: 2.2 } : null);
     }
-    const of = asked.exit !== null ? "The plan starts from the chosen exit." : asked.tip !== null ? "The plan starts from the chosen place of the scope tip." : "Exit and scope tip are chosen by the planner.";
-    byId("chosen-words").textContent = of;
+    byId("chosen-words").textContent = asked.exit !== null ? "The plan starts from the chosen exit." : asked.tip !== null ? "The plan starts from the chosen place of the scope tip." : "Exit and scope tip are chosen by the planner.";
     byId("free").disabled = asked.exit === null && asked.tip === null;
     this.redraw();
   }

@@ -1,4 +1,4 @@
-// What is said of the plan: headline, numbers, curve, why there is none, files, and the command.
+// What is said of the plan: headline, numbers, advice, why there is none, files, and the command.
 import { byId } from "../report/anatomy_page.js";
 import { planKey, whatIf } from "./state.js";
 import { errorWords, fillRows, made, mm } from "./widgets.js";

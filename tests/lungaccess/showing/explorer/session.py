@@ -28,8 +28,8 @@ ITERATIONS = 50
 WINDOW = 700, 620
 """Small: where the processor draws, pictures take most of the time."""
 SLICES = ("slice-axial", "slice-coronal", "slice-sagittal")
-CLICKED_PX = 20.0, 180.0
-"""Clicks into slices are so far from their upper left."""
+CLICKED_PX = 40.0, 180.0
+"""Clicks into slices are so far from their upper left, where the list of views stands."""
 NO_PLAN = "!document.getElementById('no-plan').hidden"
 SHOWN = f"(s.failure || {NO_PLAN} || (s.exits && s.exits.complete && (s.plan || !s.exits.count)))"
 """A click is answered: with a plan, with no exit, with the reasons for no plan, or with why not."""

@@ -59,7 +59,7 @@ def test_choose_the_exit_with_the_most_clearance(planned: Page) -> None:
     clearances = planned.run(
         "document.getElementById('exits-box').open = true;"
         "return [...document.querySelectorAll('#exits tr')]"
-        ".map((row) => parseFloat(row.cells[2].textContent))"
+        ".map((row) => parseFloat(row.cells[1].textContent))"
     )
     best = int(np.argmax(clearances))
     planned.run("document.querySelectorAll('#exits tr')[arguments[0]].querySelector('button').click()", best)

@@ -1,7 +1,7 @@
 // What is said of the plan: headline, numbers, advice, why there is none, files, and the command.
 import { byId } from "../report/anatomy_page.js";
 import { planKey, whatIf } from "./state.js";
-import { errorWords, fillRows, made, mm } from "./widgets.js";
+import { errorWords, fillRows, made } from "./widgets.js";
 
 const MOST_LIMITS = 6;
 

@@ -42,7 +42,7 @@ export class PlanPanel {
     if (!appraisal) this.say(final ? "Proved by the planner; the check is running…" : "Proved by the planner, not checked yet; better plans follow…");
     fillRows(byId("plan-rows"), [
       ["Chance", appraisal ? appraisal.chance : "not estimated yet"], ["Way", plan.way],
-      ["Time", `planned in ${plan.cpu_s.toFixed(1)} s of processor time. ${appraisal ? `${appraisal.window}.` : ""}`],
+      ["Time", `planned in ${plan.cpu_s < 0.1 ? "less than 0.1" : plan.cpu_s.toFixed(1)} s of processor time. ${appraisal ? `${appraisal.window}.` : ""}`],
       ["Risk", appraisal ? appraisal.risk : plan.risk],
     ]);
     fillRows(byId("details-rows"), [["system", system], [goal.words, goal.value], ["found at", `iteration ${iterations}`]]);

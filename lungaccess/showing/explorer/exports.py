@@ -17,9 +17,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.files import write_json, write_text
 from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Int
+from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import Appraisal, appraise, plan_record
-from lungaccess.judging.appraisal.headline import of_hundred
 from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan, sections
 from lungaccess.planning import run
 from lungaccess.planning.coupled import Atlas

@@ -142,9 +142,7 @@ def free_environment() -> NeedleEnvironment:
 
     labels = np.zeros((8, 8, 8), dtype=np.uint16, order="F")
     grid = Grid.from_spacing(labels.shape, (BOX_MM / 8,) * 3, (0.0, 0.0, 0.0))
-    return environment_of_labels(
-        labels, grid, la.load_system("lung-default").needle, required_clearance_mm=1.0
-    )
+    return environment_of_labels(labels, grid, la.load_system("thin-scope").needle, required_clearance_mm=1.0)
 
 
 def mechanics(count: int) -> TubeMechanics:

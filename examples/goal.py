@@ -17,7 +17,7 @@ def beyond_carina(plan: la.Plan, lung: la.Lung) -> float:
 
 
 la.register_goal(la.Goal(name="shallow", words="scope beyond the carina", unit="mm", of=beyond_carina))
-lung, system = la.load_patient("phantom-3"), la.load_system("tight-inner")
+lung, system = la.load_patient("phantom-3"), la.load_system("lung-default")
 target, atlas = la.resolve_target(lung, nodule=1), la.open_atlas(lung, system)
 figure, ax = plt.subplots(figsize=(6, 4))
 for goal in ["default", "shallow"]:

@@ -110,7 +110,7 @@ def case_of(lung: la.Lung, checker: Checker, atlas: la.Atlas, place: Float, seed
 def cases_of(name: str, per_lung: int, seed: int) -> Iterator[Case]:
     """Yield the targets of a patient."""
     lung = anatomy(name)
-    atlas = la.open_atlas(lung, la.load_system("lung-default"))
+    atlas = la.open_atlas(lung, la.load_system("thin-scope"))
     pairs = sorted(require_data("breathing").glob("*.csv"))
     moving = [replace(lung, motion=borrowed_motion(each, lung)) for each in pairs]
     checkers = [Checker(each) for each in moving]
@@ -205,7 +205,7 @@ def main() -> None:
             "motion": "borrowed: fields of five patients in quiet breathing carried onto the lungs, in turn",
             "masks": "taken to show end-exhale",
             "targets": f"{per_lung} peripheral ones in each lung",
-            "plans": f"lung-default, {ITERATIONS} iterations; rigid: least cost in the masks' phase; window: "
+            "plans": f"thin-scope, {ITERATIONS} iterations; rigid: least cost in the masks' phase; window: "
             "widest window",
         },
         seeds=[options.seed],

@@ -182,7 +182,7 @@ def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
     parser.add_argument("--patient", default=default_anatomies()[-1], metavar="NAME")
-    parser.add_argument("--system", metavar="NAME", help="default: lung-default; phantom: flexure-needle")
+    parser.add_argument("--system", metavar="NAME", help="default: thin-scope; phantom: flexure-needle")
     options = parser.parse_args()
     size = SIZES[setting_of(options)]
     result = Result(
@@ -190,7 +190,7 @@ def main() -> None:
         setting=setting_of(options), seeds=[options.seed],
     )  # fmt: skip
     lung = anatomy(options.patient)
-    system = la.load_system(options.system or SYSTEMS.get(options.patient, "lung-default"))
+    system = la.load_system(options.system or SYSTEMS.get(options.patient, "thin-scope"))
     plans = plans_of(lung, system, 1.0, size[0], options.seed)
     if not plans:
         raise TargetError(

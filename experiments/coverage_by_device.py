@@ -25,21 +25,28 @@ PLAIN = {
     "tubes.max_channel_curvature_per_mm": None,
 }
 """Tubes without slots; the channel is as bent as their strain allows."""
-DEVICES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
-    "tight-inner": ("tight-inner", {}),
-    "tight-inner, needle's stiffness neglected": ("tight-inner", {"needle_preloaded": False}),
+COUNTED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "lung-default": ("lung-default", {}),
     "ultrathin": ("ultrathin", {}),
     "stylet-needle": ("stylet-needle", {}),
-    "lung-default": ("lung-default", {}),
+    "thin-scope": ("thin-scope", {}),
     "therapeutic-scope": ("therapeutic-scope", {}),
-    "lung-default, strain of 4 %": (
-        "lung-default",
+    "thin-scope, strain of 4 %": (
+        "thin-scope",
         {"tubes.max_strain": 0.04, "tubes.max_channel_curvature_per_mm": None},
     ),
-    "lung-default without slots": ("lung-default", PLAIN),
-    "lung-default without slots, strain of 4 %": ("lung-default", {**PLAIN, "tubes.max_strain": 0.04}),
+    "thin-scope without slots": ("thin-scope", PLAIN),
+    "thin-scope without slots, strain of 4 %": ("thin-scope", {**PLAIN, "tubes.max_strain": 0.04}),
 }
-"""Presets, and what differs from them.  `flexure-needle` is `lung-default` with the needle of 50 mm."""
+"""Presets, and what differs from them.  `flexure-needle` is `thin-scope` with the needle of 50 mm."""
+DEVICES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    **COUNTED,
+    **{
+        f"{device}, needle's stiffness neglected": (preset, {**changes, "needle_preloaded": False})
+        for device, (preset, changes) in COUNTED.items()
+    },
+}
+"""All of them with the needle in the equilibrium of the tubes, and without: what its stiffness costs."""
 
 
 def systems(device: str) -> Iterator[tuple[str, System]]:

@@ -132,7 +132,7 @@ def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
     parser.add_argument("--patients", nargs="+", default=default_anatomies())
-    parser.add_argument("--system", default="tight-inner")
+    parser.add_argument("--system", default="lung-default")
     options = parser.parse_args()
     per_lung = QUICK_TARGETS_A_LUNG if options.quick else TARGETS_A_LUNG
     setting = setting_of(options)

@@ -149,7 +149,7 @@ def main() -> None:
     parser.add_argument("--clicks", type=int, default=500)
     parser.add_argument("--cache", type=Path)
     given = parser.parse_args()
-    source = PatientSource(folder=given.patient, system="lung-default", cache=given.cache)
+    source = PatientSource(folder=given.patient, system="thin-scope", cache=given.cache)
     asyncio.run(measure(source, targets(given.patient, given.cache, given.clicks)))
 
 

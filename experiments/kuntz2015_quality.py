@@ -198,7 +198,7 @@ def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
     parser.add_argument("--patient", default=default_anatomies()[0])
-    parser.add_argument("--system", default="lung-default")
+    parser.add_argument("--system", default="thin-scope")
     parser.add_argument("--runs", type=Path, default=Path(".studies/kuntz2015_quality.jsonl"))
     options = parser.parse_args()
     size = QUICK if options.quick else FULL

@@ -59,7 +59,7 @@ class Size:
 FULL = Size(
     per_lung=25, ours_s=20.0, papers_s=5.0,
     systems=(
-        ("ultrathin", True), ("flexure-needle", True), ("ultrathin", False), ("lung-default", True),
+        ("ultrathin", True), ("flexure-needle", True), ("ultrathin", False), ("thin-scope", True),
     ),
 )  # fmt: skip
 QUICK = Size(per_lung=5, ours_s=5.0, papers_s=5.0, systems=(("ultrathin", True),))

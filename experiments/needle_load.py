@@ -32,8 +32,8 @@ from stages.tube import (
 )
 from stages.tube.mechanics import TubeMechanics
 
-PRESETS = ("lung-default", "flexure-needle", "ultrathin", "tight-inner", "therapeutic-scope", "stylet-needle")
-BASE = "tight-inner"
+PRESETS = ("thin-scope", "flexure-needle", "ultrathin", "lung-default", "therapeutic-scope", "stylet-needle")
+BASE = "lung-default"
 SLOTS = {"length_mm": 230.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
 PLAIN = {
     "tubes.inner.slotted_segments": (),

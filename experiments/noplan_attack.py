@@ -1,6 +1,6 @@
 """Look for plans where the planner says there is none: reference mode on the targets with NoPlan.
 
-    python -m experiments.noplan_attack PATIENT RESULTS.json [--system lung-default] [--time 60]
+    python -m experiments.noplan_attack PATIENT RESULTS.json [--system thin-scope] [--time 60]
 
 Random peripheral targets, see `lungaccess.problem.peripheral`.  Where the planner gives up, Algorithm 1 of
 [Kuntz2015] searches with FCL on meshes for `--time` s of processor time.  A plan of it that the check
@@ -128,7 +128,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("patient")
     parser.add_argument("results", type=Path)
-    parser.add_argument("--system", default="lung-default")
+    parser.add_argument("--system", default="thin-scope")
     parser.add_argument("--targets", type=int, default=50, help="per lung")
     parser.add_argument("--time", type=float, default=60.0, help="processor time of the reference, s")
     parser.add_argument("--planner-time", type=float, default=10.0, help="time of the planner, s")

@@ -38,7 +38,7 @@ MEASURED_PATIENTS = {
 """Two at inspiration and one at expiration: names in the picture, and places below the data."""
 OF_A_FAMILY, QUICK_OF_A_FAMILY = 3, 1
 CHILD = "child"
-SYSTEM = "lung-default"
+SYSTEM = "thin-scope"
 TARGETS_A_LUNG = 25
 SHOWN_GENERATIONS = GENERATIONS[:6]
 

@@ -63,7 +63,7 @@ def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
     parser.add_argument("--patient", default=default_anatomies()[-1], metavar="NAME")
-    parser.add_argument("--system", default="tight-inner", metavar="NAME")
+    parser.add_argument("--system", default="lung-default", metavar="NAME")
     options = parser.parse_args()
     n_targets, samples = SIZES[setting_of(options)]
     result = Result(

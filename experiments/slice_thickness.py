@@ -1,6 +1,6 @@
 """What thick slices cost: the share of peripheral targets for which there is a plan, by the slices of the CT.
 
-    python -m experiments.slice_thickness [--quick] [--results FOLDER] [--cts NAME ...] [--system tight-inner]
+    python -m experiments.slice_thickness [--quick] [--results FOLDER] [--cts NAME ...] [--system NAME]
 
 Each CT is averaged over thicker slices, segmented, and planned on.  The targets are drawn in the segmentation
 of the finest slices and stay at their place in the patient.  A target that lies in an obstacle of a
@@ -101,7 +101,7 @@ def main() -> None:
     """Run the study and store its result."""
     parser = study_parser(__doc__)
     parser.add_argument("--cts", nargs="+", default=(PHANTOM,) if data_folder() is None else (*CTS, PHANTOM))
-    parser.add_argument("--system", default="tight-inner")
+    parser.add_argument("--system", default="lung-default")
     options = parser.parse_args()
     system = la.load_system(options.system, fissures_allowed=True)
     result = Result(

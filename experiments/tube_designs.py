@@ -26,7 +26,7 @@ PAIRS: Mapping[str, Mapping[str, Any]] = {
     "inner tube curved by 1/80 mm": {"inner.precurvature_per_mm": 0.0125},
     "inner tube curved by 1/57 mm": {"inner.precurvature_per_mm": 0.0175},
     "inner tube curved by 1/29 mm": {"inner.precurvature_per_mm": 0.035},
-    "inner tube curved by 1/22 mm (`tight-inner`)": {"inner.precurvature_per_mm": 0.045},
+    "inner tube curved by 1/22 mm (`lung-default`)": {"inner.precurvature_per_mm": 0.045},
     "curve of 20 mm": {"inner.curved_length_mm": 20.0},
     "curve of 30 mm": {"inner.curved_length_mm": 30.0},
     "curve of 50 mm": {"inner.curved_length_mm": 50.0},

@@ -106,7 +106,7 @@ def small_lung(small_phantom: Phantom) -> Lung:
 
 @pytest.fixture(scope="session")
 def small_atlas(small_lung: Lung) -> la.Atlas:
-    """Return what the preset `ultrathin` can do in `small_lung`; the needle does not matter."""
+    """Return what the preset `ultrathin` can do in `small_lung`."""
     import lungaccess as la
 
     return la.build_atlas(small_lung, la.load_system("ultrathin"))

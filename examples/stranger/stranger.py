@@ -1,7 +1,7 @@
 """Answer queries of the benchmark synthetic-v1 with a planner that knows nothing of lungaccess.
 
     lungaccess benchmark synthetic-v1 make --phantoms adult-01 --out SYNTHETIC
-    python examples/stranger/stranger.py SYNTHETIC/adult-01 lung-default answers.json
+    python examples/stranger/stranger.py SYNTHETIC/adult-01 thin-scope answers.json
     lungaccess benchmark synthetic-v1 score answers.json SYNTHETIC --only-answered
 
 It reads the files of a case alone: masks, scope tips, device, targets.  From every published tip it lets the

@@ -68,7 +68,7 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
     "phantom_likeness": (
         "generation 1: length", "generation 4: inner diameter",
         "vessels 2 to 5 mm below the pleura, more than 60 mm from the carina",
-        "peripheral targets within reach of lung-default",
+        "peripheral targets within reach of thin-scope",
     ),
 }  # fmt: skip
 

@@ -262,7 +262,7 @@ def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool 
     Examples
     --------
     >>> load_system("lung-default").needle.diameter_mm
-    1.0
+    0.8
     """
     given = os.fspath(name_or_path)
     loaded = parse(System, _FILES.read(name_or_path), given, remedy=_FILES.remedy)

@@ -29,7 +29,7 @@ def test_a_target_is_decided_once(small_lung: Lung, tmp_path: Path, monkeypatch:
 
 
 def test_systems_have_names_of_their_own() -> None:
-    for _label, system in study.systems("tight-inner"):
+    for _label, system in study.systems("lung-default"):
         require_own_name(system)
 
 

@@ -50,7 +50,7 @@ def test_phantoms_are_compared_with_patients_by_medians(like: Likeness) -> None:
         assert row.paper is not None and row.ours is not None
         factor = 2.0 if "diameter" in row.quantity else 0.5 if "reach" in row.quantity else 1.0
         assert row.ours == pytest.approx(factor * row.paper)
-    assert rows["peripheral targets within reach of lung-default"].unit == "%"
+    assert rows["peripheral targets within reach of thin-scope"].unit == "%"
     assert small_png(draw(patients, made)).startswith(b"\x89PNG")
 
 

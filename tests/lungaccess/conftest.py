@@ -204,7 +204,7 @@ def _advance(pose: np.ndarray, pieces: list[tuple[float, float, float]]) -> np.n
 
 def make_plan() -> Plan:
     """Return a plan with the scope in the left main bronchus and a needle of three arcs."""
-    system = load_system("lung-default")
+    system = load_system("thin-scope")
     route = np.concatenate(
         [np.linspace([0, 10, 95], [0, 5, 30], 40), np.linspace([0, 5, 30], [46, 0.4, 2.4], 40)]
     )

@@ -58,7 +58,7 @@ class Atlas:
 
 
 def require_same(atlas: Atlas, lung: Lung, system: System) -> None:
-    """Raise SettingsError unless an atlas holds for a lung and a system: the needle does not matter."""
+    """Raise SettingsError unless an atlas holds for a lung and a system, whatever the needle does."""
     made, wanted = atlas.system, system
     same = (
         atlas.lung.key == lung.key

@@ -52,8 +52,9 @@ def open_atlas(
 ) -> Atlas:
     """Return the atlas from the cache, or make and keep it.
 
-    A system that differs in its needle alone finds the same file.  Parameters and errors are those of
-    `lungaccess.planning.coupled.atlas.build_atlas` and, for the cache, of `anatomy.kept_records.kept_record`.
+    A system with another needle finds the same file, unless another shaft lies in the tubes.  Parameters and
+    errors are those of `lungaccess.planning.coupled.atlas.build_atlas` and, for the cache, of
+    `anatomy.kept_records.kept_record`.
     """
     prover_of(lung, system.scope)  # Here: the first plan does not wait for it.
     depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)

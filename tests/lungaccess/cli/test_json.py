@@ -47,7 +47,7 @@ def test_presets_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["presets", "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     assert set(found) == set(shipped_names())
-    assert found["lung-default"]["needle"]["diameter_mm"] == 1.0
+    assert found["lung-default"]["needle"]["diameter_mm"] == 0.8
 
 
 @pytest.mark.parametrize("word", ["--quiet", "-q"])

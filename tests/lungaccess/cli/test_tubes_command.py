@@ -80,9 +80,9 @@ def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 def test_tables_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, "--outer", "30", "--inner", "50", "--propose") == ExitCode.NEGATIVE
     text = capsys.readouterr().out
-    assert "2.451 mm  EXCEEDS" in text and "Not allowed by this device" in text
-    assert "The tubes sweep 2.451 mm sideways, more than max_lateral_sweep_mm = 1." in text
-    for words in ("stable", "largest sideways sweep", "2.451 mm", "at most 1 mm", "follow-the-leader", "tip"):
+    assert "3.893 mm  EXCEEDS" in text and "Not allowed by this device" in text
+    assert "The tubes sweep 3.893 mm sideways, more than max_lateral_sweep_mm = 1." in text
+    for words in ("stable", "largest sideways sweep", "3.893 mm", "at most 1 mm", "follow-the-leader", "tip"):
         assert words in text
     assert "alternating by 5 mm" in text and "inner first: refused" in text and "proposal" in text
     assert (tmp_path / "tubes.png").read_bytes()[:8] == PNG
@@ -205,7 +205,7 @@ class TestFiles:
 
 
 def test_choices_reach_as_far_where_they_can() -> None:
-    answer = deploy_tubes(load_system("lung-default"), 30.0, 50.0)
+    answer = deploy_tubes(load_system("thin-scope"), 30.0, 50.0)
     present, choices = design_choices(answer)
     lengths = [each.tubes.inner.curved_length_mm for each in choices]
     assert len(set(lengths)) == len(lengths)

@@ -10,7 +10,7 @@ import lungaccess as la
 from lungaccess.problem.preset_order import invasiveness, least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.system import System
 
-DEFAULT = la.load_system("lung-default")
+DEFAULT = la.load_system("thin-scope")
 
 
 def test_every_preset_has_its_place_by_the_hole_it_makes() -> None:
@@ -18,7 +18,7 @@ def test_every_preset_has_its_place_by_the_hole_it_makes() -> None:
     assert sorted(system.name for system in ordered) == sorted(la.preset_names())
     holes = [system.tubes.outermost.outer_diameter_mm for system in ordered]
     assert holes == sorted(holes)
-    assert ordered[0].name == "ultrathin" and ordered[-1].name == "therapeutic-scope"
+    assert ordered[0].name == "lung-default" and ordered[-1].name == "therapeutic-scope"
 
 
 MORE_INVASIVE = {

@@ -24,7 +24,7 @@ from lungaccess.problem.system import (
 )
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-DEFAULT = preset_text("lung-default")
+DEFAULT = preset_text("thin-scope")
 
 
 def write(folder: Path, content: str) -> Path:
@@ -39,11 +39,12 @@ def test_presets_ship_with_the_package() -> None:
         "lung-default",
         "stylet-needle",
         "therapeutic-scope",
+        "thin-scope",
         "tubes-only",
         "ultrathin",
     )
     assert needle_preset_names() == ("med-rad-needle",)
-    assert tube_preset_names() == ("curved-outer", "tight-inner")
+    assert tube_preset_names() == ("curved-outer",)
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -70,24 +71,24 @@ def test_the_published_needle_keeps_a_millimetre_and_bends_as_published() -> Non
 
 
 def test_needle_radii_of_presets() -> None:
-    assert load_system("lung-default").needle.min_radius_of_curvature_mm == pytest.approx(121.0, rel=1e-15)
+    assert load_system("thin-scope").needle.min_radius_of_curvature_mm == pytest.approx(121.0, rel=1e-15)
     assert load_system("flexure-needle").needle.min_radius_of_curvature_mm == 50.0
 
 
-def test_default_needle_keeps_one_millimetre_in_all() -> None:
-    system = load_system("lung-default")
+def test_needle_and_margins_keep_one_millimetre_in_all() -> None:
+    system = load_system("thin-scope")
     assert system.needle.radius_mm + system.margins.total_mm == 1.0
 
 
 def test_presets_differ_in_what_they_are_named_for() -> None:
-    default, large, thin = map(load_system, ("lung-default", "therapeutic-scope", "ultrathin"))
-    assert thin.scope.outer_diameter_mm < default.scope.outer_diameter_mm < large.scope.outer_diameter_mm
+    middle, large, thin = map(load_system, ("thin-scope", "therapeutic-scope", "ultrathin"))
+    assert thin.scope.outer_diameter_mm < middle.scope.outer_diameter_mm < large.scope.outer_diameter_mm
     assert (thin.scope.channel_diameter_mm, large.scope.channel_diameter_mm) == (1.7, 2.8)
 
 
 def test_file_and_preset_give_the_same_system(tmp_path: Path) -> None:
     path = write(tmp_path, DEFAULT)
-    assert load_system(path) == load_system(str(path)) == load_system("lung-default")
+    assert load_system(path) == load_system(str(path)) == load_system("thin-scope")
 
 
 @pytest.mark.parametrize(
@@ -127,7 +128,7 @@ def test_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
 def test_unknown_names_list_the_presets() -> None:
     with pytest.raises(SettingsError, match="no system called 'lung'") as caught:
         load_system("lung")
-    assert "lung-default" in caught.value.expected
+    assert "thin-scope" in caught.value.expected
 
 
 def test_missing_file_is_a_file_error(tmp_path: Path) -> None:
@@ -138,7 +139,7 @@ def test_missing_file_is_a_file_error(tmp_path: Path) -> None:
 
 
 def test_fingerprint_depends_on_every_number_and_nothing_else() -> None:
-    system = load_system("lung-default")
+    system = load_system("thin-scope")
     assert system_fingerprint(system) == system_fingerprint(parse(System, to_mapping(system), ""))
     assert len(system_fingerprint(system)) == 64
     finer = math.nextafter(system.needle.diameter_mm, 0.0)
@@ -151,7 +152,7 @@ def test_fingerprint_depends_on_every_number_and_nothing_else() -> None:
 
 
 def test_a_needle_without_further_keys_is_a_solid_wire_of_nitinol() -> None:
-    stated = to_mapping(load_system("tight-inner"))
+    stated = to_mapping(load_system("lung-default"))
     needle = {key: stated["needle"][key] for key in ("diameter_mm", "max_curvature_per_mm", "max_length_mm")}
     system = parse(System, {**stated, "name": "bare", "needle_preloaded": False, "needle": needle}, "bare")
     assert system.needle_tube.bending_stiffness_n_mm2 == pytest.approx(60e3 * math.pi / 64.0 * 0.8**4)
@@ -162,18 +163,18 @@ def test_a_needle_without_further_keys_is_a_solid_wire_of_nitinol() -> None:
 def test_a_needle_states_its_shaft_as_tubes_do_and_may_be_neglected() -> None:
     slots = {"length_mm": 900.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
     changes = {"needle.inner_diameter_mm": 0.6, "needle.slotted_segments": [slots]}
-    shaft = override(load_system("tight-inner"), {"name": "other", **changes}).needle_tube
+    shaft = override(load_system("lung-default"), {"name": "other", **changes}).needle_tube
     plain = 60e3 * math.pi / 64.0 * (0.8**4 - 0.6**4)
     assert shaft.parts.stiffness_n_mm2 == pytest.approx([0.04 * plain])
     assert shaft.length_mm == 900.0
     changes = {"name": "other", "needle.youngs_modulus_gpa": 0.0}
-    assert override(load_system("tight-inner"), changes).needle_tube is None
+    assert override(load_system("lung-default"), changes).needle_tube is None
     assert load_system("tubes-only").needle_tube is None
 
 
 def test_a_system_warns_of_a_needle_that_bends_its_tubes_away() -> None:
     solid = {"needle.slotted_segments": (), "needle.inner_diameter_mm": 0.0}
-    system = override(load_system("tight-inner"), {"name": "other", "needle_preloaded": False, **solid})
+    system = override(load_system("lung-default"), {"name": "other", "needle_preloaded": False, **solid})
     load = needle_load(system)
     inner, kappa = 0.04 * system.tubes.inner.bending_stiffness_n_mm2, system.tubes.inner.precurvature_per_mm
     ratio = system.needle_tube.bending_stiffness_n_mm2 / inner
@@ -184,7 +185,7 @@ def test_a_system_warns_of_a_needle_that_bends_its_tubes_away() -> None:
     tips = [40.0 / turn * np.array([1.0 - math.cos(turn), math.sin(turn)]) for turn in (40.0 * kappa, left)]
     assert load.shift_mm == pytest.approx(np.linalg.norm(tips[1] - tips[0]), abs=1e-5)
     assert system_warnings(system) == (load.words,)
-    for name in ("stylet-needle", "tight-inner", "tubes-only"):
+    for name in (*preset_names(), *tube_preset_names()):
         assert not system_warnings(load_system(name))
     assert not system_warnings(replace(system, needle_preloaded=True))
     assert not system_warnings(override(system, {"needle.youngs_modulus_gpa": 0.0}))
@@ -204,7 +205,7 @@ def test_documentation_names_every_key() -> None:
         nested = (keys(value) for value in mapping.values() if isinstance(value, dict))
         return set(mapping).union(*nested)
 
-    assert not {key for key in keys(to_mapping(load_system("lung-default"))) if f"`{key}`" not in page}
+    assert not {key for key in keys(to_mapping(load_system("thin-scope"))) if f"`{key}`" not in page}
 
 
 def test_a_needle_that_lies_in_the_tubes_while_they_are_deployed_belongs_to_them() -> None:
@@ -212,7 +213,7 @@ def test_a_needle_that_lies_in_the_tubes_while_they_are_deployed_belongs_to_them
     segment = {"length_mm": 250.0, "stiffness_factor": 0.04, "strain_factor": 0.75}
     changes = {"name": "own", "needle_preloaded": True, "needle.slotted_segments": (segment,)}
     plain = override(
-        load_system("tight-inner"), {"name": "own", "needle_preloaded": False, "needle.slotted_segments": ()}
+        load_system("lung-default"), {"name": "own", "needle_preloaded": False, "needle.slotted_segments": ()}
     )
     system = override(plain, changes)
     assert system.tubes.needle_shaft == system.needle_tube
@@ -227,7 +228,7 @@ def test_a_needle_that_lies_in_the_tubes_while_they_are_deployed_belongs_to_them
 
 
 def test_what_slides_through_bent_tubes_must_be_alike() -> None:
-    system = override(load_system("tight-inner"), {"name": "own"})
+    system = override(load_system("lung-default"), {"name": "own"})
     assert system.needle_preloaded
     curved_mm, most_mm = system.tubes.inner.curved_length_mm, system.needle.max_length_mm
     segment = {"length_mm": curved_mm + most_mm, "stiffness_factor": 0.1, "strain_factor": 0.75}

@@ -12,7 +12,7 @@ VERSION = "synthetic-v1"
 Family = Literal["adult", "child", "resected", "emphysematous", "breathing"]
 FAMILIES: tuple[Family, ...] = ("adult", "child", "resected", "emphysematous", "breathing")
 OF_A_FAMILY = 10
-SYSTEMS = ("lung-default", "ultrathin", "therapeutic-scope")
+SYSTEMS = ("thin-scope", "ultrathin", "therapeutic-scope")
 """The three devices: presets, as `lungaccess presets NAME` prints them."""
 TARGETS_A_LUNG = 10
 ADULT_MM, CHILD_MM = 1.0, 0.8

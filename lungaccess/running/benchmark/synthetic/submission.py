@@ -165,7 +165,7 @@ def submission_of(content: object, where: str = "submission") -> Submission:
         if each.query not in known:
             raise SettingsError(
                 f"{where}, answer {n}: there is no query {each.query!r}",
-                expected="PHANTOM/DEVICE/NN, such as adult-01/lung-default/01",
+                expected="PHANTOM/DEVICE/NN, such as adult-01/thin-scope/01",
                 remedy="The names are in the files case.json",
             )
         if each.query in seen:

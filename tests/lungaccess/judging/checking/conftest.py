@@ -39,8 +39,8 @@ BRANCHES = (
 """From, to, radius (mm) and parent of trachea, two main bronchi, and a lobar bronchus."""
 LOBAR = 3
 SITE_STEP = 20
-OUTER_MM, INNER_MM = 20.0, 38.0
-STRAIGHTENED_RAD = 0.05
+OUTER_MM, INNER_MM = 20.0, 39.5
+STRAIGHTENED_RAD = 0.08
 TOWARDS = np.array([1.0, -0.2, 0.0])
 """Where the tubes bend to."""
 ARCS = ((6.0, 0.4, 0.0), (10.0, 1.1, 0.008), (9.0, -2.0, 0.004))
@@ -297,7 +297,7 @@ def relabelled(lung: Any, edit: Callable[[np.ndarray, np.ndarray], None]) -> Any
 
 @pytest.fixture(scope="session")
 def system() -> System:
-    return load_system("lung-default")
+    return load_system("thin-scope")
 
 
 @pytest.fixture(scope="session")

@@ -147,9 +147,9 @@ def test_the_command_leaves_what_it_learned_and_exits_1(
     said = capsys.readouterr().out
     stored = json.loads((tmp_path / "no_plan.json").read_text())
     done = [part["part"] for part in stored["parts"] if part["outcome"] == "done"]
-    assert done == ["preset stylet-needle"] and len(stored["parts"]) > 5
-    assert [each["system"] for each in stored["presets"] if each["tried"]] == ["stylet-needle"]
-    assert stored["headline"].count("not tried: tubes-only, lung-default") == 1
+    assert done == ["preset lung-default"] and len(stored["parts"]) > 5
+    assert [each["system"] for each in stored["presets"] if each["tried"]] == ["lung-default"]
+    assert stored["headline"].count("not tried: stylet-needle, tubes-only, thin-scope") == 1
     if as_json:
         record = json.loads(said)
         assert record["headline"] == stored["headline"] and record["files"] == ["no_plan.json"]

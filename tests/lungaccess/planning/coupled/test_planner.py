@@ -24,7 +24,7 @@ from lungaccess.planning.coupled import (
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
-from tests.lungaccess.planning.coupled.planning import KUNTZ_TARGET, SYSTEM, plans_of, same_run
+from tests.lungaccess.planning.coupled.planning import KUNTZ_SEED, KUNTZ_TARGET, SYSTEM, plans_of, same_run
 from tests.lungaccess.points import FAR_TARGET
 from tests.lungaccess.resample import problems
 
@@ -47,7 +47,7 @@ class TestRepeatability:
     ) -> None:
         target = la.resolve_target(small_lung, KUNTZ_TARGET)
         first, again = (
-            plans_of(small_lung, target, atlas, seed=1, method=method, iterations=iterations)
+            plans_of(small_lung, target, atlas, seed=KUNTZ_SEED, method=method, iterations=iterations)
             for _ in range(2)
         )
         assert len(first) >= 2
@@ -141,7 +141,7 @@ class TestBudget:
 @pytest.fixture(scope="module")
 def kuntz_plans(small_lung: Lung, atlas: la.Atlas) -> list[Plan]:
     target = la.resolve_target(small_lung, KUNTZ_TARGET)
-    return plans_of(small_lung, target, atlas, method="kuntz2015", seed=1, iterations=3000)
+    return plans_of(small_lung, target, atlas, method="kuntz2015", seed=KUNTZ_SEED, iterations=3000)
 
 
 class TestKuntz2015:

@@ -37,7 +37,7 @@ def patient2(data_dir: Path, cache: Path) -> Lung:
 def plan2(patient2: Lung) -> la.Plan:
     *_, best = la.plan(
         patient2,
-        la.load_system("lung-default"),
+        la.load_system("thin-scope"),
         la.resolve_target(patient2),
         iterations=ITERATIONS,
         goal="default",
@@ -76,7 +76,7 @@ def needle_samples(plan: la.Plan) -> tuple[Any, Any]:
 
 def test_patient2_nodule_has_a_plan_that_the_check_accepts(patient2: Lung, plan2: la.Plan) -> None:
     report = la.check(
-        plan2, patient2, la.load_system("lung-default"), target_lps=la.resolve_target(patient2).lps_mm
+        plan2, patient2, la.load_system("thin-scope"), target_lps=la.resolve_target(patient2).lps_mm
     )
     assert report.accepted, str(report)
     nodule = patient2.mask("nodule")
@@ -118,7 +118,7 @@ def test_patient2_plan_is_refused_where_a_vessel_is_put_back(patient2: Lung, pla
 def test_patient2_plan_is_the_same_again(patient2: Lung, plan2: la.Plan) -> None:
     *_, again = la.plan(
         patient2,
-        la.load_system("lung-default"),
+        la.load_system("thin-scope"),
         la.resolve_target(patient2),
         iterations=ITERATIONS,
         goal="default",
@@ -142,7 +142,7 @@ def test_patient1_nodule_is_reached_around_fissures_and_through_them(
     data_dir: Path, cache: Path, fissures_allowed: bool
 ) -> None:
     lung = la.load_patient(data_dir / "med-rad" / "Patient1", cache=cache)
-    system = replace(la.load_system("lung-default"), name="own", fissures_allowed=fissures_allowed)
+    system = replace(la.load_system("thin-scope"), name="own", fissures_allowed=fissures_allowed)
     target = la.resolve_target(lung)
     *_, found = la.plan(lung, system, target, iterations=ITERATIONS, goal="default")
     assert la.check(found, lung, system, target_lps=target.lps_mm).accepted
@@ -155,7 +155,7 @@ def test_patient1_nodule_is_reached_around_fissures_and_through_them(
 @pytest.mark.parametrize("patient", ["Patient1", "Patient2"])
 def test_random_peripheral_targets(data_dir: Path, cache: Path, patient: str) -> None:
     lung = la.load_patient(data_dir / "med-rad" / patient, cache=cache)
-    system = la.load_system("lung-default")
+    system = la.load_system("thin-scope")
     atlas = la.build_atlas(lung, system)
     reached = 0
     for point in peripheral_targets(lung, 15, seed=1):

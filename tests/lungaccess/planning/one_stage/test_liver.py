@@ -90,7 +90,7 @@ def test_a_start_far_outside_has_no_entry(folder):
     far = organ.starts[0].copy()
     far[:3, 3] = organ.grid.lps((1, 1, 1))
     answer = plan_needle(
-        organ, load_system("lung-default"), far, resolve_target(organ, "target"), iterations=500
+        organ, load_system("thin-scope"), far, resolve_target(organ, "target"), iterations=500
     )
     assert answer.path is None
 

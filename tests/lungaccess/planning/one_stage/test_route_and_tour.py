@@ -152,7 +152,7 @@ def test_exits_of_a_tour_with_required_plans_have_a_coupled_plan(
     small_lung: Lung, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each exit of a tour with required plans is a site from where a proved plan leads to the lesion."""
-    atlas = la.build_atlas(small_lung, la.load_system("lung-default"), rotations=12, site_spacing_mm=3.0)
+    atlas = la.build_atlas(small_lung, la.load_system("thin-scope"), rotations=12, site_spacing_mm=3.0)
     candidates = places(small_lung, 40)
     for lesion in candidates:
         try:
@@ -176,7 +176,7 @@ def test_exits_of_a_tour_with_required_plans_have_a_coupled_plan(
         place = small_lung.tree.points_lps[each.tree_point]
         sites = small_lung.tree.points_lps[atlas.motions.tree_point]
         assert np.linalg.norm(sites - place, axis=1).min() < 5.0
-    weak = override(la.load_system("lung-default"), {"name": "weak", "needle.max_length_mm": 1.0})
+    weak = override(la.load_system("thin-scope"), {"name": "weak", "needle.max_length_mm": 1.0})
     short = la.build_atlas(small_lung, weak, rotations=4, site_spacing_mm=20.0)
     with pytest.raises(TargetError, match="no plan was found in 2 iterations"):
         plan_tour(small_lung, lesion, atlas=short, iterations=2)

@@ -105,7 +105,8 @@ def test_imaging_finds_the_target_where_it_is(plan: Plan, small_lung: Lung) -> N
         simulate_procedure(plan, small_lung, errors=model, procedure=each, samples=30, radius_mm=1.5)
         for each in (seen, replace(seen, imaging=Imaging()))
     )
-    assert with_image.miss_mm[0.5] < 0.1 < 0.8 < without.miss_mm[0.5]
+    # The planned needle bends nearly as much as it can: where no path leads to the target seen, it stays out.
+    assert with_image.miss_mm[0.95] < 1.5 < without.miss_mm[0.95]
 
 
 def test_steering_corrects_what_nobody_measured_before(plan: Plan, small_lung: Lung) -> None:
@@ -282,7 +283,7 @@ def test_replan_asks_the_policy(
     file, record = str(tmp_path / "plan.json"), str(tmp_path / "record.json")
     plan.save(file)
     asked = ["replan", "patient", "--plan", file, "--scope", file, "--errors", "gated-ct"]
-    command = [*asked, "--procedure", "measured-tip", "--radius", "5", "--record", record]
+    command = [*asked, "--procedure", "measured-tip", "--radius", "5", "--record", record, "--placement", "3"]
     assert main([*command, "--json"]) == ExitCode.OK
     first = json.loads(capsys.readouterr().out)
     assert 0.0 < first["chance"] <= 1.0 and first["tube"] and first["needle"]

@@ -354,7 +354,7 @@ def test_bad_input_is_refused(
         with pytest.raises(SettingsError, match="spacing"):
             map_reach(small_lung, SYSTEM, spacing_mm=spacing, atlas=atlas)
     with pytest.raises(SettingsError, match="atlas was made for"):
-        map_reach(small_lung, la.load_system("lung-default"), atlas=atlas)
+        map_reach(small_lung, la.load_system("thin-scope"), atlas=atlas)
     with pytest.raises(SettingsError, match="at least 1 arc"):
         ReachScan(environment, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), arcs=0)
     finer = Volume(grid=reach_grid(small_lung, 10.0), array=np.zeros(reach_grid(small_lung, 10.0).shape))
@@ -376,10 +376,10 @@ def test_the_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.Monke
     assert json.loads((tmp_path / "reach.json").read_text()) == [written]
     assert (tmp_path / "reach.png").read_bytes().startswith(PNG)
     assert read_volume(tmp_path / "reach.nrrd").array.any()
-    assert main([*command, "--compare", "lung-default"]) == ExitCode.OK
+    assert main([*command, "--compare", "thin-scope"]) == ExitCode.OK
     shown = capsys.readouterr().out
-    assert "ultrathin" in shown and "lung-default" in shown and "gained" in shown
-    for stem in ("reach-1-ultrathin", "reach-2-lung-default"):
+    assert "ultrathin" in shown and "thin-scope" in shown and "gained" in shown
+    for stem in ("reach-1-ultrathin", "reach-2-thin-scope"):
         assert (tmp_path / f"{stem}.nrrd").is_file() and (tmp_path / f"{stem}.png").is_file()
     assert main([*command, "--spacing", "0"]) == ExitCode.BAD_INPUT
     assert main([*command, "--compare", "nonesuch"]) == ExitCode.BAD_INPUT

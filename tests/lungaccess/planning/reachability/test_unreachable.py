@@ -244,9 +244,9 @@ def test_what_direct_arcs_of_a_real_lung_reach_is_never_ruled_out(
 ) -> None:
     """Each accepted arc from a deployment of the atlas to a peripheral target: 2,500 of each set."""
     lung = la.load_patient(data_dir / "med-rad" / patient)
-    system = la.load_system("tight-inner", fissures_allowed=True)
+    system = la.load_system("lung-default", fissures_allowed=True)
     needle = replace(system.require_needle("The test"), max_curvature_per_mm=1.0 / radius_mm)
-    system = replace(system, name="tight-inner and a needle", needle=needle)
+    system = replace(system, name="lung-default and a needle", needle=needle)
     atlas, rng = la.build_atlas(lung, system), np.random.default_rng(3)
     real = UnreachableProof(lung, system, with_fissures=atlas.with_fissures)
     accepted = 0

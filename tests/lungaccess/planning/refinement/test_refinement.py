@@ -200,7 +200,8 @@ class TestProgram:
                 found.append(solver.evaluate(problem.start, problem.numbers, problem.boxes)[0])
             both, alone = (CandidateEvaluator(each).cost(candidate) for each in (task, needle))
             parts.append(both - alone)
-            assert found[0] - found[1] == pytest.approx(parts[-1], rel=0.3, abs=0.5)
+            # With the tubes' points, the program looks the needle's clearance up in a larger box.
+            assert found[0] - found[1] == pytest.approx(parts[-1], rel=0.3, abs=0.15 * alone)
         assert max(parts) > 1.0
 
     def test_tissue_is_reduced_under_its_own_objective(self, case: Case) -> None:

@@ -24,7 +24,7 @@ from lungaccess.problem.task import Task
 from lungaccess.uncertainty.risk import RiskAssessor
 from stages.needle import Objective
 
-SYSTEM = la.load_system("tight-inner", fissures_allowed=True)
+SYSTEM = la.load_system("lung-default", fissures_allowed=True)
 MANY = 20
 ERRORS = load_errors("gated-ct")
 RADIUS_MM = 5.0

@@ -194,8 +194,8 @@ def score(query: str, planner: str, status: str, **values: Any) -> Score:
 SCORES = [
     score("adult-01/ultrathin/01", "a", SOLVED, cost=4.0, cpu_s=1.0, success=0.5),
     score("adult-01/ultrathin/02", "a", SOLVED, cost=8.0, cpu_s=3.0, success=0.7),
-    score("child-01/lung-default/01", "a", REFUSED, reason="REFUSED x", cpu_s=2.0),
-    score("child-01/lung-default/02", "a", MISSING),
+    score("child-01/thin-scope/01", "a", REFUSED, reason="REFUSED x", cpu_s=2.0),
+    score("child-01/thin-scope/02", "a", MISSING),
     score("adult-01/ultrathin/01", "b", CLAIMED),
     score("adult-01/ultrathin/02", "b", SOLVED, cost=6.0),
 ]

@@ -109,7 +109,7 @@ def test_what_is_written_is_the_device_that_was_counted(
 def test_what_the_validator_refuses_is_counted_and_not_tried(tmp_path: Path, workers: ToyWorkers) -> None:
     """The needle has to fit the bore of 1.05 mm, and a thick one does not pass the bend."""
     asked = design_of(
-        design_content(design={"make_large": ["reach"], "vary": {"needle": {"diameter_mm": [0.5, 2.0]}}})
+        design_content(design={"make_large": ["reach"], "vary": {"needle": {"diameter_mm": [0.7, 2.2]}}})
     )
     found = run_design(asked, tmp_path)
     count, words = found.refused["needle.diameter_mm"]

@@ -46,7 +46,7 @@ def test_every_target_with_every_seed(runs: list[Run]) -> None:
         {"rotations": 9},
         {"stop_spacing_mm": 3.0},
         {"site_spacing_mm": 3.0},
-        {"system": load_system("lung-default")},
+        {"system": load_system("thin-scope")},
         {"case": "other"},
         {"errors": load_errors("gated-ct")},
         {"errors": load_errors(), "procedure": load_procedure("measured-tip")},

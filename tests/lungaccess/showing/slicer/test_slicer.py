@@ -342,7 +342,7 @@ def test_a_real_patient_is_of_a_size_to_send(data_dir: Path, tmp_path: Path) -> 
 
     lung = la.load_patient(data_dir / "med-rad" / "Patient1")
     found = next(
-        la.plan(lung, la.load_system("lung-default"), la.resolve_target(lung), iterations=0, goal="default")
+        la.plan(lung, la.load_system("thin-scope"), la.resolve_target(lung), iterations=0, goal="default")
     )
     written = export_slicer(found, lung, tmp_path)
     assert written.report.accepted

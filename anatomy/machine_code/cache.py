@@ -118,7 +118,7 @@ class KernelCache(caching._Cache):  # type: ignore[misc]
 
 
 def _stored(path: Path, key: tuple[Any, ...]) -> Any:
-    """Return what is stored in a file under a key, None if there is no such file or it is damaged."""
+    """Return what is stored in a file under a key, None if there is no such file or it cannot be read."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -126,7 +126,11 @@ def _stored(path: Path, key: tuple[Any, ...]) -> Any:
     seal, made = content[:_SEAL_BYTES], content[_SEAL_BYTES:]
     if hashlib.sha256(made).digest() != seal:
         return None
-    stated, reduced = pickle.loads(made)
+    try:
+        stated, reduced = pickle.loads(made)
+    except (ImportError, AttributeError):
+        # A kind of argument has moved to another module since: its name alone is part of the file's name.
+        return None
     return reduced if stated == key else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -116,6 +117,14 @@ def test_damaged_code_counts_as_none(tree: Tree) -> None:
         file.write_bytes(b"")
     assert tree.call(1.0) == [[3.0], COMPILED, []]
     assert tree.call(1.0) == [[3.0], [], []]
+
+
+def test_code_for_a_kind_of_argument_that_has_moved_counts_as_none(tree: Tree) -> None:
+    tree.call(1.0)
+    for file in tree.files():
+        made = b"cmodule_that_is_gone\nKind\n."
+        file.write_bytes(hashlib.sha256(made).digest() + made)
+    assert tree.call(1.0) == [[3.0], COMPILED, []]
 
 
 def test_code_of_another_processor_is_not_run(tree: Tree) -> None:

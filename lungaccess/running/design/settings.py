@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -61,6 +62,8 @@ class Number:
         low, high = self.range or (0.0, 1.0)
         if (self.range is None) == (not self.one_of) or low >= high:
             raise impossible(self.key, self.range, "a range [least, larger], or else one_of = [...]")
+        if not _is_finite(self.one_of):
+            raise impossible(self.key, self.one_of, "finite numbers")
 
 
 @settings
@@ -268,3 +271,12 @@ CRITERIA = {
     "strain-left": Criterion("strain left when straight, %", _strain_left),
 }
 """The criteria by the names that a file gives them: a new one is one more line."""
+
+
+def _is_finite(value: Any) -> bool:
+    """Tell whether all numbers of a value, an array or a table are finite."""
+    if isinstance(value, Mapping):
+        value = tuple(value.values())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return all(map(_is_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)

@@ -147,7 +147,7 @@ def test_a_mask_of_equal_size_elsewhere_is_placed_by_its_header_and_doubted(med_
     patient, said = load_with(med_rad_folder, "nodule", moved)
     assert (np.argwhere(patient.nodules.array) == [[2, 6, 4]]).all()
     assert "as many voxels as bronchialTree.nii.gz" in said[0] and "(-35.0, 0.0, 0.0) mm away" in said[0]
-    assert "By its header 100% of it lie in the lungs, voxel by voxel 100%" in said[0]
+    assert "By its header 100 % of it lie in the lungs, voxel by voxel 100 %" in said[0]
 
 
 def test_lungs_that_reach_beyond_the_airway_file_are_kept_whole(med_rad_folder, masks):

@@ -32,10 +32,10 @@ def test_default_design(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert run(tmp_path, "--out", str(table)) == ExitCode.OK
     said = " ".join(capsys.readouterr().out.split())
     assert "looked at 440 insertions every 2 mm, no relative rotation" in said
-    assert "allowed 251" in said
+    assert "allowed 230" in said
     with table.open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 251
+    assert len(rows) == 230
     assert max(float(row["lateral_sweep_mm"]) for row in rows) <= 1.0
     assert all(float(row["insertion_1_mm"]) >= float(row["insertion_2_mm"]) for row in rows)
 

@@ -129,7 +129,7 @@ def test_an_aim_is_drawn_and_told(plan: Plan, breathing_lung: Lung) -> None:
     place = np.asarray(plan.target_lps) + [0.0, 0.0, 1.5]
     aimed = replace(plan, aim=BreathingAim(point_lps=place, phases=np.array([[0.7, 1.0]])))
     assert packed_plan(aimed, breathing_lung, "")["aim_lps"] == place.tolist()
-    assert "the devices end 1.5 mm beside it, at their aim" in summary(aimed)
+    assert "the devices end 1.5 mm beside it, at their aim" in summary(aimed, breathing_lung)
 
 
 def test_what_strays_takes_from_what_is_to_spare(

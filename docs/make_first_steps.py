@@ -1,8 +1,8 @@
 """Make output and pictures of the tutorial anew, which are stored: `python -m docs.make_first_steps`.
 
 Each command of `docs/tutorials/first_steps.md` is run in an empty folder; what it prints replaces the
-`text` block behind it, of which `<!-- output: N lines -->` keeps the first N lines. Chromium and
-chromedriver draw the pictures of the report page.
+`text` block behind it, of which `<!-- output: N lines -->` keeps the first N lines, and
+`N lines and the last M` those, too. Chromium and chromedriver draw the pictures of the report page.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ WIDTH_PX = 1100
 """Wide enough to read on a page, small enough to be stored."""
 LEAST_HU, GREATEST_HU = -1350.0, 150.0
 """The usual window for lungs."""
-TALL_PX = 5000
-"""Of a window that holds a whole page: one that grew would draw it anew, and coarsely where it moves."""
+TALL_PX = 1100
+"""Height of the window: every part that is shown fits into it, and the 3-D view has its usual shape."""
 STEP = re.compile(
-    r"(```console\n(?P<command>[^\n]+)\n```\n\n)<!-- output: (?P<lines>\d+) lines -->\n```text\n.*?```",
+    r"(```console\n(?P<command>[^\n]+)\n```\n\n)"
+    r"<!-- output: (?P<lines>\d+) lines(?: and the last (?P<last>\d+))? -->\n```text\n.*?```",
     re.DOTALL,
 )
 DRAWN = {
@@ -43,18 +44,18 @@ DRAWN = {
 }
 """Pictures that the commands write."""
 SECTIONS = {
-    "headline": "header",
-    "page": "section:has(#h-scene)",
+    "headline": ".first",
+    "page": "#scene-figure .view",
     "slices": "section:has(#h-slices)",
     "charts": "section:has(#h-charts)",
     "risk": "section:has(#h-risk)",
     "cut": "#scene-figure .view",
 }
 """Parts of the report page that are shown."""
-BOX = """const at = document.querySelector(arguments[0]).getBoundingClientRect();
-return {x: at.x + scrollX, y: at.y + scrollY, width: at.width, height: Math.min(at.height, 900), scale: 1}"""
-LET_GO = "document.querySelector('.player').style.position = 'static'"
-"""The bar of the slider would lie over the pictures."""
+BOX = """const part = document.querySelector(arguments[0]);
+part.scrollIntoView({behavior: "instant"});
+const at = part.getBoundingClientRect();
+return {x: at.x, y: at.y, width: at.width, height: Math.min(at.height, 900), scale: 1}"""
 
 
 def output_of(command: str, folder: Path) -> str:
@@ -75,9 +76,11 @@ def run_commands(text: str, folder: Path) -> str:
 
     def step(match: re.Match[str]) -> str:
         lines = output_of(match["command"], folder).splitlines()
-        kept = int(match["lines"])
-        shown = "\n".join([*lines[:kept], "..."] if len(lines) > kept else lines)
-        return f"{match[1]}<!-- output: {kept} lines -->\n```text\n{shown}\n```"
+        kept, last = int(match["lines"]), int(match["last"] or 0)
+        behind = lines[-last:] if last else []
+        shown = "\n".join([*lines[:kept], "...", *behind] if len(lines) > kept + last else lines)
+        stated = f" and the last {last}" if last else ""
+        return f"{match[1]}<!-- output: {kept} lines{stated} -->\n```text\n{shown}\n```"
 
     return STEP.sub(step, text)
 
@@ -115,14 +118,15 @@ def photograph(page: Path, folder: Path) -> None:
         size = {"width": 1200, "height": TALL_PX, "deviceScaleFactor": 1, "mobile": False}
         window.command("Emulation.setDeviceMetricsOverride", size)
         window.open(page)
-        window.run(LET_GO)
         window.run("window.lungaccessReport.set(0.9)")
         for name, part in SECTIONS.items():
+            if name == "page":
+                window.run("document.querySelector('[data-fit=target]').click()")
             if name == "cut":
                 window.run("window.lungaccessReport.set(1); document.getElementById('cut').click()")
-            settle(window)
             clip = window.run(BOX, part)
-            shot = window.command("Page.captureScreenshot", {"clip": clip, "captureBeyondViewport": True})
+            settle(window)
+            shot = window.command("Page.captureScreenshot", {"clip": clip})
             (folder / f"{name}.png").write_bytes(base64.b64decode(shot["data"]))
             store(folder / f"{name}.png", name)
     for name, window in (("dark", Browser(1200, 1000, dark=True)), ("phone", Browser(390, 844, phone=True))):

@@ -122,7 +122,7 @@ class Adviser:
             if name == self._procedure.name or other.is_open_loop:
                 continue
             yield Advice(
-                words=f"procedure {name}: {other.description}",
+                words=f"procedure {name}, {other.description[:1].lower()}{other.description[1:].rstrip('.')}",
                 success=self._estimated(self._plan, self._errors, other),
                 options=("--procedure", name),
             )

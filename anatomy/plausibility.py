@@ -181,13 +181,11 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
         ),
         "vessels_in_lumen": Limit(
             check="overlap", words="{} of vessels or lumen, the smaller one, lie in the other one",
-
             usual=(0, 0.02), possible=(0, 0.3),
             reason="a voxel is one or the other; masks of two programs may share 5 %", remedy=_FILE,
         ),
         "wall_in_lumen": Limit(
             check="overlap", words="{} of wall or lumen, the smaller one, lie in the other one",
-
             usual=(0, 0.05), possible=(0, 0.8), reason="a voxel is one or the other, or the wall is filled",
             remedy=_FILE,
         ),

@@ -1,4 +1,4 @@
-"""What paths of a needle to a target still cost at least; docs/theory/cost_bound.md derives it."""
+"""Lower bounds of the cost that paths of a needle still have to a target; docs/theory/cost_bound.md."""
 
 import math
 from collections.abc import Callable

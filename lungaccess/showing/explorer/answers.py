@@ -341,7 +341,7 @@ def _goal_words(goal: Goal, found: Plan) -> dict[str, str]:
     """Return what a plan was made good at, and how good it is, in words."""
     value = goal.value(found)
     text = "not known yet" if value is None else goal.said(value)
-    return {"words": goal.words_with_unit, "value": text, "loss_words": goal.words_with_unit}
+    return {"words": goal.words_with_unit, "value": text}
 
 
 def _least_clearance(found: Plan) -> dict[str, Any]:

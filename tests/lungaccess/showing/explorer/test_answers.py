@@ -64,7 +64,8 @@ def test_a_click_its_plan_its_files_and_the_command(
             m for m, _ in await client.ask("plan", target=TARGET, what_if=SYSTEM, iterations=ITERATIONS)
         ][:-1]
         chances = [chance for _time, _iteration, chance in plans[-1]["curve"]]
-        assert chances == sorted(chances)
+        # The last plan may be that before with a simpler motion, whose chance is the same.
+        assert chances == sorted(chances) and len(set(chances)) >= len(chances) - 1
         assert plans[-1]["final"] and plans[0]["packed"]["target_lps"] == exits["target_lps"]
         seen["plan"] = plans[-1]
         appraisal, _none = await client.first("appraise", plan=plans[-1]["digest"])

@@ -135,7 +135,7 @@ def make() -> None:
             image.save(IMAGES / f"{stored}.png", optimize=True)
         ct = find_ct(folder / "BREATHING")
         if ct is not None:
-            draw_lobes(folder / "patient", ct, IMAGES / "lobes.png")
+            draw_lobes(folder / "patient", ct.path, IMAGES / "lobes.png")
         animate(frames(folder / "plan" / "report.html"), IMAGES / "breathing.gif")
 
 

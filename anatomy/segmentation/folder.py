@@ -234,6 +234,29 @@ def grid_digest(grid: Grid) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def digest_of_ct(ct: Volume) -> str:
+    """Return the hash of the voxels and the grid of a CT in the order of `canonical`."""
+    ordered = canonical(ct)
+    return key_of("ct", voxels=digest_of(ordered.array), grid=grid_digest(ordered.grid))
+
+
+def segmented_ct(folder: Path) -> dict[str, Any] | None:
+    """Return path, UID of the series and digest of the CT of a segmentation; None if they are not recorded.
+
+    Raises
+    ------
+    FileError
+        If the record of the segmentation is damaged.
+    """
+    if not (folder / STATE).is_file():
+        return None
+    record = _read_record(folder / STATE)
+    source = record.get("ct_source")
+    if source is None:
+        return None
+    return {"path": folder / source["path"], "series": source["series"], "digest": record["ct"]}
+
+
 def key_of(step: str, **parts: Any) -> str:
     """Return the key of a step: the hash of its name, its settings and what it is made from."""
     text = json.dumps({"step": step, **parts}, sort_keys=True)

@@ -1,6 +1,8 @@
 """From a CT to a patient folder: every step that is not up to date, in order."""
 
+import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,14 +18,7 @@ from anatomy.io.own_masks import DESCRIPTION
 from anatomy.plausibility import require_known_checks
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.folder import (
-    Description,
-    SegmentationFolder,
-    description_text,
-    digest_of,
-    grid_digest,
-    key_of,
-)
+from anatomy.segmentation.folder import Description, SegmentationFolder, description_text, digest_of_ct
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
 from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.parts import Parts
@@ -101,16 +96,16 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     grid = request.ct.grid
     stated = request.given.target
     target = None if stated is None else parse_point(stated)
-    ct_digest = key_of("ct", voxels=digest_of(request.ct.array), grid=grid_digest(grid))
+    digest = digest_of_ct(request.ct)
     inputs = [Path(name) for name in (*request.given.hashes(), *request.sources)]
-    folder = SegmentationFolder(request.out, grid, ct_digest, inputs=inputs, force=request.force)
+    folder = SegmentationFolder(request.out, grid, digest, inputs=inputs, force=request.force)
     description = Description(folder, DESCRIPTION)
-    steps = Steps(request, folder, description, ct_digest, tell)
+    steps = Steps(request, folder, description, digest, tell)
     parts = steps.run()
     if parts.nodule.any() and target is None:
         target = centre_of(parts.nodule, parts.ct.grid)
     warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
-    folder.save(provenance=_provenance(request, steps, warnings))
+    folder.save(provenance=_provenance(request, steps, warnings), ct_source=_ct_source(request))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
     sides = [side for side in (parts.left, parts.right) if side.any()]
     known = all(np.count_nonzero(parts.lobes[side]) > 0.5 * np.count_nonzero(side) for side in sides)
@@ -155,6 +150,16 @@ def target_warnings(target_lps: Float | None, parts: Parts, ct_grid: Grid) -> li
     if parts.large_vessels[i, j, k]:
         return [f"{place} lies in what was taken for a large vessel; give the nodule as a mask or contours."]
     return []
+
+
+def _ct_source(request: SegmentationRequest) -> Mapping[str, Any] | None:
+    """Return where the CT lies, seen from the folder where one can, so that both may move together."""
+    if request.ct_path is None:
+        return None
+    path = request.ct_path.resolve()
+    with suppress(ValueError):  # two drives of Windows
+        path = Path(os.path.relpath(path, request.out.resolve()))
+    return {"path": path.as_posix(), "series": request.ct_series}
 
 
 def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str]) -> Mapping[str, Any]:

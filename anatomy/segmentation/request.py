@@ -309,6 +309,10 @@ class SegmentationRequest:
         How reports call the patient; the folder's name if empty.
     sources : mapping of str to str
         Files the CT was read from, and their SHA-256.
+    ct_path : path, optional
+        The image or folder of DICOM that holds the CT; it is recorded, so that others can show the CT.
+    ct_series : str, optional
+        UID of its series, where the folder holds several.
     ex_vivo : bool
         The image shows an inflated lung in air.
     thick_slices : bool
@@ -330,6 +334,8 @@ class SegmentationRequest:
     out: Path
     name: str = ""
     sources: Mapping[str, str] = field(default_factory=dict)
+    ct_path: Path | None = None
+    ct_series: str | None = None
     ex_vivo: bool = False
     thick_slices: bool = False
     large_radius_mm: float = LARGE_RADIUS_MM

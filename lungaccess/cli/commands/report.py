@@ -19,6 +19,7 @@ from lungaccess.cli.result_folder import keep_earlier
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from lungaccess.plans.plan import Plan
+from lungaccess.cli.shown_ct import CtOption, shown_ct
 
 
 def report(
@@ -32,13 +33,7 @@ def report(
         CountOrNone,
         Parameter(help="So many other plans to the same target are searched and shown on demand."),
     ] = 0,
-    ct: Annotated[
-        Path | None,
-        Parameter(
-            help="CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, "
-            "if there is one, else the structures of the masks."
-        ),
-    ] = None,
+    ct: CtOption = None,
     movie: Annotated[
         Path | None, Parameter(help="WebP file for the flight through the airway to the scope's place.")
     ] = None,
@@ -63,7 +58,6 @@ def report(
     from lungaccess.cli.plan_search import advised
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.report.html import PageOptions, bronchoscopy_webp, plan_page
-    from lungaccess.showing.report.html.volumes import find_ct, read_ct
 
     page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
@@ -72,12 +66,12 @@ def report(
     stored, model, followed = Plan.load(plan), errors.given(), errors.given_procedure()
     lung = output.load(patient)
     stored.require_lung(lung)
-    image = ct if ct is not None else find_ct(patient)
+    image = shown_ct(ct, patient)
     with progress("making the page"):
         options = PageOptions(
             alternatives=_others(stored, lung, alternatives, output) if alternatives else (),
-            ct=None if image is None else read_ct(image),
-            ct_name="" if image is None else image.name,
+            ct=None if image is None else image.read(),
+            ct_name="" if image is None else image.path.name,
             cost_over_time=plan.parent / HISTORY_FILE,
             errors=model,
             procedure=followed,

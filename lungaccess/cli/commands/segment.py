@@ -147,6 +147,8 @@ def segment(
             out=out,
             name=name,
             sources=sources,
+            ct_path=ct,
+            ct_series=series,
             ex_vivo=ex_vivo,
             thick_slices=thick_slices,
             large_radius_mm=large_radius_mm,

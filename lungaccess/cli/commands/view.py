@@ -10,6 +10,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Port
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
+from lungaccess.cli.shown_ct import CtOption, shown_ct
 
 
 def view(
@@ -18,13 +19,7 @@ def view(
     system: Annotated[
         str, Parameter(help="System that is shown first: name of a preset, or path of a TOML file.")
     ] = DEFAULT_SYSTEM,
-    ct: Annotated[
-        Path | None,
-        Parameter(
-            help="CT for the slices, an image file or a folder of DICOM; ct.nii.gz of the patient's folder, "
-            "if there is one, else the structures of the masks."
-        ),
-    ] = None,
+    ct: CtOption = None,
     port: Annotated[Port | None, Parameter(help="Port of this machine; a free one if not given.")] = None,
     browser: Annotated[bool, Parameter(help="Whether the page is opened in the browser.")] = True,
     thick_slices: Annotated[
@@ -41,7 +36,6 @@ def view(
     import webbrowser
 
     from lungaccess.problem import load_system, shipped_names
-    from lungaccess.showing.report.html.volumes import find_ct, read_ct
 
     try:
         from lungaccess.showing.explorer import Address, Explorer, PatientSource
@@ -52,13 +46,14 @@ def view(
             remedy="pip install 'lungaccess[view]'",
         ) from error
     first = load_system(system)
-    if ct is not None:
-        read_ct(ct)  # Here, where a file that is none is refused before anything is shown.
+    shown = shown_ct(ct, patient)
+    if shown is not None:
+        shown.read()  # Here, where a file that is none is refused before anything is shown.
     output.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
     own = () if system in shipped_names() else ((Path(system).resolve(), first),)
     source = PatientSource(
         folder=patient.resolve(), system=first.name, own=own, cache=output.cache,
-        ct=find_ct(patient) if ct is None else ct, accept=output.accept,
+        ct=shown, accept=output.accept,
     )  # fmt: skip
 
     def started(address: Address) -> None:

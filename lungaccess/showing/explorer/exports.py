@@ -33,7 +33,7 @@ from lungaccess.showing import report
 from lungaccess.showing.explorer.questions import ExplainQuestion
 from lungaccess.showing.explorer.worker import Part, Turn
 from lungaccess.showing.report.html import PageOptions, plan_page
-from lungaccess.showing.report.html.volumes import read_ct
+from lungaccess.showing.report.html.volumes import CtFile
 from lungaccess.showing.slicer import export_slicer
 
 Reached = MutableMapping[tuple[Any, ...], Int]
@@ -46,7 +46,7 @@ Curve = Sequence[tuple[float, float, float]]
 
 
 def export_file(
-    plan: Plan, lung: Lung, what: str, folder: Path, curve: Curve = (), ct: Path | None = None
+    plan: Plan, lung: Lung, what: str, folder: Path, curve: Curve = (), ct: CtFile | None = None
 ) -> Path:
     """Write one of `lungaccess.showing.explorer.questions.FileKind` into a new folder in a folder.
 
@@ -70,8 +70,8 @@ def export_file(
     elif what == "report.html":
         history = made / "cost_over_time.csv"
         report.cost_over_time_csv(points, history)
-        image = None if ct is None else read_ct(ct)
-        name = "" if ct is None else ct.name
+        image = None if ct is None else ct.read()
+        name = "" if ct is None else ct.path.name
         plan_page(plan, lung, file, PageOptions(ct=image, ct_name=name, cost_over_time=history))
     elif what == "overview.png":
         report.overview_png(plan, lung, file, appraise(plan, lung))

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from lungaccess.problem import System, Target, load_system, preset_names, resolv
 from lungaccess.problem.nodules import nodules_of
 from lungaccess.showing.explorer.worker import PatientSource
 from lungaccess.showing.report.html.meshes import structure_meshes
-from lungaccess.showing.report.html.volumes import CODES, page_image, read_ct
+from lungaccess.showing.report.html.volumes import CODES, CtFile, page_image
 from lungaccess.showing.report.reach import COLOURS
 
 MOST_NODULES = 50
@@ -125,9 +124,9 @@ def _some(image: dict[str, Any], which: slice) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1)
-def patient_ct(path: Path | None) -> Volume | None:
+def patient_ct(ct: CtFile | None) -> Volume | None:
     """Return the CT that the explorer was started with, read once; None without one."""
-    return None if path is None else read_ct(path)
+    return None if ct is None else ct.read()
 
 
 def ct_slice(

@@ -14,6 +14,7 @@ from anatomy.base.records import frozen_value
 from lungaccess.problem import System
 from lungaccess.showing.explorer.messages import Frame, error_message, frame
 from lungaccess.showing.explorer.questions import Question
+from lungaccess.showing.report.html.volumes import CtFile
 
 GONE = (EOFError, BrokenPipeError, ConnectionResetError)
 """A connection raises one of these when the server is gone."""
@@ -35,7 +36,7 @@ class PatientSource:
         Systems from files, which the page offers beside the presets.
     cache : path or None
         Folder of prepared anatomy and atlases; the default one if None.
-    ct : path or None
+    ct : CtFile or None
         CT for the slices.
     accept : tuple of str
         Checks of the masks whose failure is accepted.
@@ -45,7 +46,7 @@ class PatientSource:
     system: str
     own: tuple[tuple[Path, System], ...] = ()
     cache: Path | None = None
-    ct: Path | None = None
+    ct: CtFile | None = None
     accept: tuple[str, ...] = ()
 
 

@@ -15,6 +15,7 @@ from anatomy.io.images import write_volume
 from anatomy.phantom import Phantom
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.showing.report.html.volumes import find_ct
 from tests.anatomy.io.series import write_series
 
 AS_IT_IS = ("--voxel-mm", "1.25")
@@ -54,6 +55,9 @@ def test_a_ct_becomes_a_patient_that_info_reads(
     assert "right lung" in shown
     assert "ends" in shown
     assert (out / "segmentation.png").read_bytes().startswith(PNG)
+    shown_later = find_ct(out)
+    assert shown_later is not None and shown_later.path.resolve() == ct_file.resolve()
+    assert shown_later.read().grid.is_close(small_phantom.ct.grid)
     quality = json.loads((out / "quality.json").read_text())
     truth_l = np.count_nonzero(small_phantom.images.lung.array) * small_phantom.grid.voxel_volume_mm3 * 1e-6
     both = quality["volumes_l"]["right lung"] + quality["volumes_l"]["left lung"]
@@ -240,9 +244,12 @@ def test_a_case_of_a_data_set_becomes_a_patient_with_its_own_masks(
     said = _one_line(capsys.readouterr().err)
     assert "there are no masks of vessels" in said and "lungaccess segment" in said
     out = tmp_path / "patient"
-    assert cli.main(["segment", str(case), "--out", str(out), "--no-pictures"]) == ExitCode.OK
+    words = ["segment", str(case), "--out", str(out), "--no-pictures", *AS_IT_IS]
+    assert cli.main(words) == ExitCode.OK
     patient = load_patient(out)
-    assert (patient.lumen.array == images.lumen.array).all()
-    truth = images.lung.array
+    start = small_phantom.grid.voxels(patient.grid.lps([0.0, 0.0, 0.0]))
+    box = tuple(slice(n, n + size) for n, size in zip(start, patient.grid.shape, strict=True))
+    assert (patient.lumen.array == images.lumen.array[box]).all()
+    truth = images.lung.array[box]
     assert np.count_nonzero(patient.lung.array & truth) > 0.9 * np.count_nonzero(truth)
     assert cli.main(["info", str(out), "--cache", str(tmp_path / "cache")]) == ExitCode.OK

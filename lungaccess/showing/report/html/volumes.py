@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.base.errors import AnatomyError
+from anatomy.base.errors import AnatomyError, FileError
+from anatomy.base.records import frozen_value
 from anatomy.base.typed import Array, Float, Int, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.kept_records import kept
@@ -35,23 +36,55 @@ HU_OF_BYTE: Int = np.concatenate(
 STORED_CT = ("ct.nii.gz", "ct.nii", "ct.nrrd", "ct.mha")
 
 
-def find_ct(patient: Path) -> Path | None:
-    """Return the CT stored in a patient's folder under the name ct, None if there is none."""
-    return next((patient / name for name in STORED_CT if (patient / name).is_file()), None)
+@frozen_value
+class CtFile:
+    """A CT on disk, to be shown beside the masks of a patient.
 
-
-def read_ct(path: Path) -> Volume:
-    """Return a CT in HU from an image file or a folder of DICOM slices.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read.
+    Parameters
+    ----------
+    path : path
+        An image file or a folder of DICOM slices.
+    series : str, optional
+        UID of the DICOM series, where the folder holds several.
+    digest : str
+        The `digest_of_ct` of the CT that was segmented; empty if the CT was chosen by a person.
     """
-    from anatomy.io.dicom import read_dicom
-    from anatomy.io.images import read_volume
 
-    return read_dicom(path) if path.is_dir() else read_volume(path)
+    path: Path
+    series: str | None = None
+    digest: str = ""
+
+    def read(self) -> Volume:
+        """Return the CT in HU.
+
+        Raises
+        ------
+        FileError
+            If it cannot be read, or is not the one that was segmented.
+        """
+        from anatomy.io.dicom import read_dicom
+        from anatomy.io.images import read_volume
+        from anatomy.segmentation.folder import digest_of_ct
+
+        volume = read_dicom(self.path, self.series) if self.path.is_dir() else read_volume(self.path)
+        if self.digest and digest_of_ct(volume) != self.digest:
+            raise FileError(
+                f"{self.path} is not the CT that was segmented",
+                expected="the CT whose masks the patient's folder holds",
+                remedy="Give the CT that the slices are to show with --ct",
+            )
+        return volume
+
+
+def find_ct(patient: Path) -> CtFile | None:
+    """Return the CT of a patient's folder: one named ct, or the one that was segmented, if it is recorded."""
+    from anatomy.segmentation.folder import segmented_ct
+
+    for name in STORED_CT:
+        if (patient / name).is_file():
+            return CtFile(path=patient / name)
+    source = segmented_ct(patient)
+    return None if source is None else CtFile(**source)
 
 
 def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packed:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lungaccess.showing.explorer.patient import ct_slice
-from lungaccess.showing.report.html.volumes import find_ct, read_ct
+from lungaccess.showing.report.html.volumes import CtFile, find_ct
 from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.showing.explorer.client import source_of
 from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served
@@ -59,7 +59,7 @@ def test_the_slices_have_the_values_of_the_whole_ct(scanned: Page, patient: Path
         "const { coronal } = window.lungaccessExplorer.slices;"
         "return [coronal.raster(), Array.from(coronal.fine.values, (v) => (Number.isNaN(v) ? null : v))]"
     )
-    ct = read_ct(patient / "ct.nii.gz")
+    ct = CtFile(path=patient / "ct.nii.gz").read()
     expected = ct_slice(ct, *(raster[key] for key in ("origin", "across", "down", "columns", "rows")))
     values = np.array(shown, dtype=np.float64).reshape(expected.shape)
     np.testing.assert_array_equal(np.isnan(values), np.isnan(expected))

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from anatomy.base.errors import AnatomyError
+from anatomy.base.errors import AnatomyError, FileError
 from anatomy.grid import Grid, Volume
+from anatomy.io.images import write_volume
 from anatomy.lung import Lung
+from anatomy.segmentation.folder import SegmentationFolder, digest_of_ct
+from lungaccess.cli.shown_ct import shown_ct
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report import pack
 from lungaccess.showing.report.html import deployment, meshes, movie, volumes
@@ -120,7 +123,26 @@ def test_a_ct_of_something_else_is_refused(small_lung: Lung, plans: tuple[Plan, 
 def test_a_ct_in_the_patients_folder_is_found(tmp_path: Path) -> None:
     assert volumes.find_ct(tmp_path) is None
     (tmp_path / "ct.nrrd").touch()
-    assert volumes.find_ct(tmp_path) == tmp_path / "ct.nrrd"
+    assert volumes.find_ct(tmp_path) == volumes.CtFile(path=tmp_path / "ct.nrrd")
+
+
+def test_a_segmented_patient_remembers_its_ct(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = Grid.from_spacing((4, 5, 6), [1.0, 1.0, 2.0], [-3.0, 0.0, 7.0])
+    ct = Volume(grid=grid, array=np.arange(120, dtype=np.int16).reshape(4, 5, 6))
+    image, folder = tmp_path / "disk" / "scan.nii.gz", tmp_path / "patient"
+    image.parent.mkdir()
+    write_volume(image, ct)
+    source = {"path": "../disk/scan.nii.gz", "series": None}
+    SegmentationFolder(folder, grid, digest_of_ct(ct)).save(ct_source=source)
+    found = shown_ct(None, folder)
+    assert found is not None
+    np.testing.assert_array_equal(found.read().array, ct.array)
+    write_volume(image, Volume(grid=grid, array=ct.array + 1))
+    with pytest.raises(FileError, match="is not the CT that was segmented"):
+        found.read()
+    image.unlink()
+    assert shown_ct(None, folder) is None
+    assert "no longer at" in capsys.readouterr().err
 
 
 def test_rays_meet_the_wall_where_the_lumen_ends(small_lung: Lung, plans: tuple[Plan, ...]) -> None:

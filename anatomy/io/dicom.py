@@ -105,6 +105,22 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
         return Volume(grid=grid, array=_pixels(paths, grid, float(headers[0][1].RescaleIntercept)))
 
 
+def series_headers(folder: Path, series_uid: str | None = None) -> list[FileDataset]:
+    """Return the headers of the slices of a series, by the names of their files.
+
+    Raises
+    ------
+    FileError
+        If the choice of series is open, or a slice cannot be read.
+    """
+    by_uid, _others = _headers_by_series(folder)
+    chosen = by_uid[_choose(by_uid, series_uid, folder)]
+    from pydicom import dcmread
+
+    with _reading(folder):
+        return [dcmread(path, stop_before_pixels=True) for path in sorted(path for path, _ in chosen)]
+
+
 @contextmanager
 def _reading(what: str | Path) -> Iterator[None]:
     """Do as `reading`, also for what pydicom alone raises."""

@@ -1,4 +1,4 @@
-"""Reading and writing of single image files: NIfTI, NRRD and MetaImage."""
+"""Reading and writing of single image files: NIfTI, NRRD and MetaImage, and masks of DICOM."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.files import DAMAGE, atomic_write, reading, reason, require_file
 from anatomy.base.typed import Array, Mask
 from anatomy.grid import Grid, Volume
+from anatomy.io.dicom_seg import is_dicom, read_segment_masks, read_segments
 from anatomy.io.frames import Frame
 from anatomy.io.image_header import ImageHeader
 from anatomy.io.mask_values import mask_of
@@ -51,9 +52,16 @@ def images_in(folder: Path) -> list[Path]:
     return [path for path in files if image_suffix(path) != ".gz" or begins_as_nifti(path)]
 
 
+def _holds_segments(path: Path) -> bool:
+    """Return whether a file whose name tells no image format is DICOM, in which masks are segments."""
+    return image_suffix(path) is None and is_dicom(path)
+
+
 def read_grid(path: str | Path, *, frame: Frame | None = None) -> Grid:
     """Read the grid of an image from its header alone; parameters and errors as `read_volume`."""
     path = require_file(path)
+    if _holds_segments(path):
+        return read_segments(path)[0].grid
     with reading(path):
         return open_image(path, frame)[0].grid
 
@@ -63,7 +71,7 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
 
     Parameters
     ----------
-    path : path of a .nii, .nii.gz (or .gz), .nrrd, .seg.nrrd, .mha or .mhd file
+    path : path of a .nii, .nii.gz (or .gz), .nrrd, .seg.nrrd, .mha or .mhd file, or a DICOM segmentation
     frame : "ras" or "lps", optional
         The frame to assume if, and only if, the file states none.
 
@@ -81,6 +89,8 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
         If the file states no frame and none is given, or its axes are not perpendicular.
     """
     path = require_file(path)
+    if _holds_segments(path):
+        return read_segments(path)[0]
     with reading(path):
         header, stream = open_image(path, frame)
         return Volume(grid=header.grid, array=read_array(header, stream, path))
@@ -128,6 +138,8 @@ def read_parts(
     Errors and meaning are those of `read_mask`.
     """
     path = require_file(path)
+    if _holds_segments(path):
+        return *read_segment_masks(path, parts), ()
     if not any(labels for _, labels in parts):
         with reading(path):
             plain = read_two_valued(*open_image(path, frame), path)
@@ -152,10 +164,12 @@ def read_labels(path: str | Path) -> Mapping[int, str]:
     Returns
     -------
     dict of label value to name
-        From the label table in the header extension of NIfTI, or the segments of .seg.nrrd; empty if
+        From the label table in the header extension of NIfTI, or the segments of .seg.nrrd or DICOM; empty if
         there is none.
     """
     path = require_file(path)
+    if _holds_segments(path):
+        return read_segments(path)[1]
     with reading(path):
         return open_image(path, "lps")[0].labels
 

@@ -11,6 +11,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import PatientOfPlan, PatientOptions, PlanFile
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
+from lungaccess.cli.shown_ct import shown_ct
 
 
 def export(
@@ -34,55 +35,70 @@ def export(
             "of a film."
         ),
     ] = None,
+    dicom: Annotated[
+        Path | None,
+        Parameter(
+            help="Folder for segments, structured report and overview as DICOM, beside the CT's series."
+        ),
+    ] = None,
+    ct: Annotated[
+        Path | None,
+        Parameter(
+            help="Folder of the CT's DICOM series for --dicom; the one that was segmented if not given."
+        ),
+    ] = None,
+    anonymise: Annotated[
+        bool, Parameter(help="Leave name, identity, dates and physicians out of what --dicom writes.")
+    ] = False,
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Write a stored plan for 3D Slicer, for robots, or as models; exit code 1 if the check refuses the plan.
+    """Write a stored plan for other programs and systems; exit code 1 if the check refuses it.
 
-    A refused plan is named so for 3D Slicer, and is not written for robots or as models.
+    A refused plan is named so for 3D Slicer, and is not written otherwise.
     """
-    if slicer is None and trajectory is None and models is None:
+    if all(folder is None for folder in (slicer, trajectory, models, dicom)):
         raise SettingsError(
-            "None of --slicer, --trajectory and --models is given",
-            expected="a folder for 3D Slicer, for the motion in time, or for models",
+            "None of --slicer, --trajectory, --models and --dicom is given",
+            expected="a folder for 3D Slicer, for the motion in time, for models, or for DICOM",
             remedy="Add --slicer DIR",
         )
     from lungaccess.cli.plan_tables import show_headline
-    from lungaccess.judging.appraisal import DRAWS, SEED, Headline
-    from lungaccess.judging.checking import check
+    from lungaccess.judging.appraisal import appraise
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.live import plan_trajectory, write_trajectory
     from lungaccess.showing.model_files import export_models
     from lungaccess.showing.slicer import export_slicer
-    from lungaccess.uncertainty.risk import assess
 
-    for folder in (slicer, trajectory, models):
+    for folder in (slicer, trajectory, models, dicom):
         if folder is not None:
             claim_folder(folder, ("*",), force=force)
     stored = Plan.load(plan)
     lung = output.load(patient)
     stored.require_lung(lung)
     written: dict[Path, tuple[str, ...]] = {}
-    if slicer is not None:
-        with progress("exporting") as shown:
-            exported = export_slicer(stored, lung, slicer, progress=shown.step)
-        written[slicer], report = exported.files, exported.report
-    else:
-        with progress("checking the plan"):
-            report = check(stored, lung)
-    if trajectory is not None and report.accepted:
-        written[trajectory] = write_trajectory(plan_trajectory(stored), trajectory)
-    if models is not None and report.accepted:
-        with progress("writing models"):
+    with progress("checking the plan") as shown:
+        appraisal = appraise(stored, lung)
+        if slicer is not None:
+            written[slicer] = export_slicer(stored, lung, slicer, progress=shown.step).files
+        if trajectory is not None and appraisal.accepted:
+            written[trajectory] = write_trajectory(plan_trajectory(stored), trajectory)
+        if models is not None and appraisal.accepted:
+            shown.step("writing models")
             written[models] = export_models(stored, lung, models)
-    accepted = report.accepted
+        if dicom is not None and appraisal.accepted:
+            from lungaccess.showing.dicom_files import export_dicom
+
+            shown.step("writing DICOM")
+            written[dicom] = export_dicom(
+                stored, lung, dicom, shown_ct(ct, patient), appraisal, anonymise=anonymise
+            )
     if output.json:
         folders = [{"folder": str(folder), "files": list(files)} for folder, files in written.items()]
-        answer = {**(folders[0] if folders else {}), "accepted": accepted}
+        answer = {**(folders[0] if folders else {}), "accepted": appraisal.accepted}
         terminal.show_json(answer | ({"others": folders[1:]} if folders[1:] else {}))
     else:
         for folder, files in written.items():
             terminal.say(f"Written to {folder}: {', '.join(files)}")
-        risk = assess(stored, lung, samples=DRAWS, seed=SEED, each_kind=False) if accepted else None
-        show_headline(Headline.of(report, risk))
-    return ExitCode.of(accepted)
+        show_headline(appraisal.headline)
+    return ExitCode.of(appraisal.accepted)

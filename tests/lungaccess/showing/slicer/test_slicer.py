@@ -22,6 +22,7 @@ from anatomy.io.images import read_labels, write_volume
 from anatomy.lung import Lung
 from anatomy.phantom import LOBES, Phantom
 from lungaccess.cli import app as cli
+from lungaccess.judging.appraisal import Appraisal
 from lungaccess.judging.checking import CheckReport
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.slicer import Exported, export, export_slicer
@@ -326,6 +327,8 @@ def test_the_command_says_what_it_wrote(
         "lungaccess.showing.slicer.export_slicer",
         lambda *_, **__: Exported(files=("scene.mrml",), report=report),
     )
+    appraisal = Appraisal(check=report, risk=None, limits=())
+    monkeypatch.setattr("lungaccess.judging.appraisal.appraise", lambda *_, **__: appraisal)
     plan.save(tmp_path / "plan.json")
     words = ["export", str(tmp_path / "plan.json"), "toy", "--slicer", str(tmp_path / "out")]
     assert cli.main(words) == code

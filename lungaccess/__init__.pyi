@@ -61,6 +61,7 @@ from lungaccess.running.design import run_design as run_design
 from lungaccess.running.study import read_study as read_study
 from lungaccess.running.study import run_study as run_study
 from lungaccess.showing.report.html import plan_page as plan_page
+from lungaccess.showing.report.html.notebook import view as view
 from lungaccess.showing.slicer import export_slicer as export_slicer
 from lungaccess.uncertainty.breathing.window import breathing_window as breathing_window
 from lungaccess.uncertainty.risk import assess as assess

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -333,3 +334,13 @@ def test_arc_lengths_add_up() -> None:
     points = np.array([[0.0, 0, 0], [3, 4, 0], [3, 4, 12]])
     assert arc_lengths(points).tolist() == [0.0, 5.0, 17.0]
     assert all(a <= b for a, b in pairwise(arc_lengths(points)))
+
+
+def test_a_notebook_shows_the_page_in_a_frame(
+    small_lung: Lung, plans: tuple[Plan, ...], tmp_path: Path
+) -> None:
+    shown = la.view(plans[0], small_lung, height_px=500)._repr_html_()
+    (page,) = re.findall(r'srcdoc="([^"]*)"', shown)
+    written = la.plan_page(plans[0], small_lung, tmp_path / "plan.html").read_text(encoding="utf-8")
+    assert len(html.unescape(page)) == pytest.approx(len(written), rel=0.01)
+    assert 'sandbox="allow-scripts"' in shown and 'height="500"' in shown

@@ -1,13 +1,15 @@
 """Finds out what kind of patient a path holds, and reads it."""
 
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 from typing import NoReturn
 
 from anatomy.base.errors import FileError
 from anatomy.io.assembly import describe_yourself
 from anatomy.io.ct_cases import cases_in, require_no_ct_case
-from anatomy.io.images import image_suffix, images_in
+from anatomy.io.dicom_seg import is_dicom
+from anatomy.io.images import image_suffix, images_in, read_volume
 from anatomy.io.liver import is_liver
 from anatomy.io.med_rad import is_med_rad, load_med_rad, lung_sources, require_no_brain, require_roles
 from anatomy.io.own_masks import DESCRIPTION, load_own_masks, motion_alone, with_motion
@@ -16,6 +18,12 @@ from anatomy.patient import PatientImages
 
 _SHOWN = 12
 """A long list shows this many of its names."""
+
+
+FILES_LOOKED_AT = 20
+"""So many files of a folder tell whether it holds DICOM; a few may be something else."""
+AIR_HU = -500.0
+"""A CT of the chest holds voxels of less density; masks and label maps hold none below 0."""
 
 
 def load_patient(path: str | Path) -> PatientImages:
@@ -66,6 +74,14 @@ def load_patient(path: str | Path) -> PatientImages:
     if images is None:
         _refuse(path)
     return images if motion is None else with_motion(images, motion, description)
+
+
+def is_ct(path: Path) -> bool:
+    """Return whether a path is a CT and no patient: a folder of DICOM slices, or an image that holds air."""
+    if path.is_dir():
+        files = (each for each in path.rglob("*") if each.is_file())
+        return not _here(path) and any(is_dicom(each) for each in islice(files, FILES_LOOKED_AT))
+    return image_suffix(path) is not None and float(read_volume(path).array.min()) <= AIR_HU
 
 
 def _load_file(path: Path) -> PatientImages:

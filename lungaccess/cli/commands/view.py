@@ -9,17 +9,30 @@ from anatomy.base.errors import SettingsError
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Port
-from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions
+from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions
 from lungaccess.cli.shown_ct import CtOption, shown_ct
 
 
 def view(
-    patient: PatientFolder,
+    patient: Annotated[
+        Path,
+        Parameter(
+            help="Folder of masks: Med-RAD, TotalSegmentator, or own masks with a patient.toml; or a CT, an "
+            "image file or a folder of DICOM, which is segmented first."
+        ),
+    ],
     *,
     system: Annotated[
         str, Parameter(help="System that is shown first: name of a preset, or path of a TOML file.")
     ] = DEFAULT_SYSTEM,
     ct: CtOption = None,
+    series: Annotated[
+        str | None, Parameter(help="UID of the DICOM series of a CT, where the folder holds several.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        Parameter(help="Patient folder for a CT; NAME-patient here if not given. It is taken up again."),
+    ] = None,
     port: Annotated[Port | None, Parameter(help="Port of this machine; a free one if not given.")] = None,
     browser: Annotated[bool, Parameter(help="Whether the page is opened in the browser.")] = True,
     thick_slices: Annotated[
@@ -27,7 +40,7 @@ def view(
     ] = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Explore a patient: click a target, see the feasible exits and better and better plans, ask what if.
+    """Explore a patient or a CT: click a target, see the feasible exits and better and better plans.
 
     The page is served to this machine alone, at the address that is printed, until Ctrl-C; nothing is fetched
     from elsewhere.  Needs the extra `view`.
@@ -35,6 +48,9 @@ def view(
     import asyncio
     import webbrowser
 
+    from anatomy.io.images import image_stem
+    from anatomy.io.patients import is_ct
+    from lungaccess.cli.commands.segment import segment
     from lungaccess.problem import load_system, shipped_names
 
     try:
@@ -46,6 +62,12 @@ def view(
             remedy="pip install 'lungaccess[view]'",
         ) from error
     first = load_system(system)
+    if is_ct(patient):
+        name = image_stem(patient) if patient.is_file() else patient.resolve().name
+        made = out or Path(f"{name}-patient")
+        terminal.console.quiet |= output.json  # Only the address is printed then.
+        segment(patient, out=made, series=series, thick_slices=thick_slices, accept=output.accept)
+        patient = made
     shown = shown_ct(ct, patient)
     if shown is not None:
         shown.read()  # Here, where a file that is none is refused before anything is shown.

@@ -12,8 +12,10 @@ import pytest
 from anatomy.base.errors import AnatomyError, FileError, FrameError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, write_volume
+from anatomy.io.patients import is_ct
 from anatomy.patient import PatientImages
 from tests.anatomy.io.label_maps import LABELS, add_label_table, label_map, require_same
+from tests.anatomy.io.series import write_series
 
 LOBES = {"lung_upper_lobe_left": "lung_left", "lung_lower_lobe_right": "lung_right"}
 ABSENT_LOBES = tuple(
@@ -240,3 +242,15 @@ def near(patient: PatientImages, mask: Volume, point_lps: np.ndarray) -> bool:
     """Whether the mask has a voxel within four voxels of a point."""
     i, j, k = np.rint(patient.grid.ijk(point_lps)).astype(int)
     return bool(mask.array[i - 4 : i + 5, j - 4 : j + 5, k - 4 : k + 5].any())
+
+
+def test_a_ct_is_told_from_a_patient(med_rad_folder: Path, masks: PatientImages, tmp_path: Path) -> None:
+    grid = Grid.from_spacing((6, 5, 4), [1.0, 1.0, 2.0], [0.0, 0.0, 0.0])
+    ct = Volume(grid=grid, array=np.where(np.arange(120).reshape(6, 5, 4) % 2, 40, -950).astype(np.int16))
+    write_volume(tmp_path / "scan.nrrd", ct)
+    write_volume(tmp_path / "labels.nrrd", Volume(grid=grid, array=np.ones(grid.shape, dtype=np.uint8)))
+    write_series(tmp_path / "series", ct)
+    assert is_ct(tmp_path / "scan.nrrd") and is_ct(tmp_path / "series")
+    assert not is_ct(tmp_path / "labels.nrrd") and not is_ct(med_rad_folder) and not is_ct(tmp_path / "none")
+    (tmp_path / "series" / "patient.toml").touch()
+    assert not is_ct(tmp_path / "series")

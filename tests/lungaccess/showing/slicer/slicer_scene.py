@@ -19,13 +19,13 @@ class SlicerScene:
 
     Parameters
     ----------
-    path : Path
-        A `.mrml`.
+    path : Path or None
+        A `.mrml`; None for an empty scene.
     scratch : Path
         Where bundles are unpacked.
     """
 
-    def __init__(self, path: Path, scratch: Path) -> None:
+    def __init__(self, path: Path | None, scratch: Path) -> None:
         import slicer
 
         self.scene = slicer.vtkMRMLScene()
@@ -42,8 +42,9 @@ class SlicerScene:
             logic.SetMRMLApplicationLogic(application)
             logic.SetMRMLScene(self.scene)
             self._kept.append(logic)
-        self.scene.SetURL(str(path))
-        assert self.scene.Connect() == 1, f"3D Slicer does not load {path}"
+        if path is not None:
+            self.scene.SetURL(str(path))
+            assert self.scene.Connect() == 1, f"3D Slicer does not load {path}"
 
     def node(self, name: str, kind: str = "") -> Any:
         """Return the node of a name, and of a class without `vtkMRML` and `Node` where several have it."""

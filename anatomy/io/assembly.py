@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError
 from anatomy.grid import Grid, Volume
-from anatomy.io.lungs import with_lobes
+from anatomy.io.lungs import with_contents, with_lobes
 from anatomy.io.masks import MaskSet
 from anatomy.io.placement import place
 from anatomy.io.voxels import from_stored
@@ -38,7 +38,7 @@ def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any
         If lumen, vessels or lung is missing, or a mask is empty.  An empty mask of fissures or nodules
         only causes a warning.
     """
-    masks = with_lobes(masks)
+    masks = with_contents(with_lobes(masks))
     missing = [words for role, words in LUNG_ROLES.items() if role not in masks.masks]
     if missing:
         raise AnatomyError(

@@ -1,4 +1,4 @@
-"""Lungs made of lobes: their union, the rims at airways and vessels, the fissures."""
+"""Lungs that are whole: made of lobes, or of a mask that leaves out what is in them; their fissures."""
 
 from dataclasses import replace
 
@@ -8,6 +8,10 @@ from anatomy.base.typed import Mask, UInt8
 from anatomy.io.masks import MaskSet
 from anatomy.lobes import LOBES, fissures_between, grown_into, main_pieces
 from anatomy.morphology import bounds, grown_by_one, window
+
+EXCLUDED_SHARE, TOUCHING_SHARE = 0.05, 0.5
+"""A label map has one label a voxel: of its vessels less than the first share lies in the lungs, and of their
+surface at least the second share touches the lungs.  Vessels that lie elsewhere do not touch them."""
 
 
 def with_lobes(masks: MaskSet) -> MaskSet:
@@ -72,3 +76,28 @@ def fill_lung(masks: MaskSet) -> MaskSet:
     closed = ~grown_by_one(~grown_by_one(lung[box]))
     lung[box] |= closed & grown_by_one(tubes[box]) & grown_by_one(grown_by_one(lobes[box]))
     return replace(masks, masks={**masks.masks, "lung": lung})
+
+
+def with_contents(masks: MaskSet) -> MaskSet:
+    """Count what a mask of the lungs leaves out of them as lung, where it has the air alone.
+
+    A label map cannot have a voxel twice, so that its lungs have holes where vessels, airways, fissures and
+    nodules are.  What is added is one of these, or a gap as in `fill_lung`; it is stated.
+    """
+    held = masks.masks
+    if not {"lung", "vessels"} <= held.keys() or not held["vessels"].any():
+        return masks
+    lung, vessels = held["lung"], held["vessels"]
+    if np.count_nonzero(vessels & lung) >= EXCLUDED_SHARE * np.count_nonzero(vessels):
+        return masks
+    surface = vessels & grown_by_one(~vessels)
+    if np.count_nonzero(surface & grown_by_one(lung)) < TOUCHING_SHARE * np.count_nonzero(surface):
+        return masks
+    inside = [held[role] for role in ("fissures", "nodules") if role in held]
+    filled = fill_lung(replace(masks, masks={**held, "lung": np.logical_or.reduce([lung, *inside])}))
+    added = np.count_nonzero(filled.masks["lung"]) - np.count_nonzero(lung)
+    said = (
+        "The mask of the lungs leaves out the vessels, as a label map does: they, airways, fissures and "
+        f"nodules count as lung, {added * masks.grid.voxel_volume_mm3 / 1000.0:.0f} ml."
+    )
+    return replace(filled, statements=(*masks.statements, said))

@@ -27,7 +27,7 @@ SEGMENTS = {
     "lumen": ("airway lumen", "airways", "lung_airways", "airway", "bronchi"),
     "wall": ("airway wall", "lung_airways_wall"),
     "vessels": ("vessel", "vessels", "lung_vessels", "pulmonary vessels"),
-    "lung": ("lungs", "lung", "right lung", "left lung"),
+    "lung": ("lungs", "lung", "lung tissue", "right lung", "left lung"),
     "fissures": ("fissure", "fissures"),
     "nodule": ("nodule", "nodules", "lesion"),
 }

@@ -16,6 +16,7 @@ import trimesh
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import FileError, PlanFileError
+from anatomy.grid import Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.centerlines import read_centerlines
 from anatomy.io.images import read_labels, write_volume
@@ -357,3 +358,35 @@ def test_a_real_patient_is_of_a_size_to_send(data_dir: Path, tmp_path: Path) -> 
         points = points_of(json.loads((tmp_path / f"{name}.mrk.json").read_text()))
         surface = trimesh.load(tmp_path / f"{name}.ply", process=False)
         assert np.abs(surface.bounds - [points.min(axis=0), points.max(axis=0)]).max() < 3.0
+
+
+ROLES = {
+    "lumen": "airway lumen",
+    "wall": "airway wall",
+    "vessels": "vessel",
+    "lung": "lung tissue",
+    "fissures": "fissure",
+    "nodule": "nodule",
+}
+
+
+def test_an_exported_label_map_is_a_patient_again(small_lung: Lung, tmp_path: Path) -> None:
+    """Its lungs leave out vessels and airways; with the vessels elsewhere they stay as they are."""
+    volume = label_map(small_lung)
+    segments = {each.name: each.value for each in SEGMENTS}
+    lines = [f'{role} = "map.nrrd#{segments[name]}"' for role, name in ROLES.items()]
+    (tmp_path / "patient.toml").write_text("\n".join(lines))
+    write_volume(tmp_path / "map.nrrd", volume)
+    images = load_patient(tmp_path)
+    assert any("leaves out the vessels, as a label map does" in said for said in images.warnings)
+    whole = ~small_lung.mask("outside").array
+    assert (images.lung.array & whole).sum() == whole.sum()
+    added = images.lung.array & ~whole
+    obstacles = images.lumen.array | images.wall.array | images.vessels.array
+    assert (added & ~obstacles).sum() <= 0.01 * whole.sum()
+    away = volume.array.copy()
+    away[volume.array == segments["vessel"]] = segments["lung tissue"]
+    outside = np.argwhere(away == 0)[:2000]
+    away[tuple(outside.T)] = segments["vessel"]
+    write_volume(tmp_path / "map.nrrd", Volume(grid=volume.grid, array=away))
+    assert not any("leaves out" in said for said in load_patient(tmp_path).warnings)

@@ -36,7 +36,7 @@ class PortfolioSearch:
 
     A path is varied until it is the cheapest near it, and the tree seldom finds a path elsewhere that is at
     once cheaper than a path made so cheap.  So further searches begin anew with random numbers of their own,
-    and are refined too before they are compared, in rounds of successive halving [JamiesonTalwalkar2016].
+    and are refined too before they are compared, in rounds of successive halving [Jamieson2016].
     The best path so far takes part in every round.
 
     Where more than length counts, such rounds alternate with rounds of guided searches: these begin with

@@ -170,7 +170,7 @@ class ResolutionSearch:
     """The search over words of arcs and straight pieces, from coarse to fine [Fu2021, Fu2022].
 
     It is a `stages.needle.search.base.Search`, and nothing in it is random;
-    docs/explanation/resolution_search.md says how it works.
+    docs/explanation/needle.md says how it works.
 
     Parameters
     ----------

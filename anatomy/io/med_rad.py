@@ -101,9 +101,14 @@ def _doubled_lobes(sources: Sequence[MaskSource]) -> Iterator[tuple[Path, Path]]
 
 
 def _not_read(folder: Path, sources: Sequence[MaskSource]) -> Iterator[str]:
-    """Say which images are not read, as another one comes first by the names of `LUNG_FILES`."""
+    """Say which images are not read: by the names of `LUNG_FILES` another one comes first, or none fits."""
     images = by_name(folder)
     read = {source.role: source.path for source in sources}
+    known = {*(plain(name) for names in LUNG_FILES.values() for name in names)}
+    taken = {source.path for source in sources}
+    for stem, path in images.items():
+        if path not in taken and stem not in known:
+            yield f"{path.name} is not read: a lung has no mask of this name, and nothing keeps clear of it."
     for role, names in LUNG_FILES.items():
         for path in (images[plain(name)] for name in names if plain(name) in images):
             if role in read and path != read[role]:

@@ -33,6 +33,12 @@ NOISE_PERCENTILE = 97.0
 """This percentage of the lung lies below the shallowest minimum that is followed."""
 SAMPLE_STEP = 7
 """Every so many voxels of the lung are looked at to learn its noise."""
+GREATEST_LUMEN_HU = -250.0
+"""Outside the lungs no bronchus is so thin that its lumen is denser; fat beside bright vessels is."""
+OPEN_HU = -700.0
+"""Air of a main bronchus that is blurred or lined with mucus is thinner."""
+LOST_MM, LEAST_LOST_ML = 3.0, 0.1
+"""Air of the central airway so far from the lumen is no edge of it; half a slice of it is that much."""
 GREATEST_HU = 16_383
 """More, which metal may have, is cut off."""
 
@@ -93,6 +99,7 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     smooth = _smoothed(hu, spacing_mm)
     upright = 2 - int(np.argmax(np.abs(ct.grid.lps_from_ijk[2, :3] / ct.grid.spacing_mm)))
     depth = local_minima_map(hu, spacing_mm, upright)
+    depth[(smooth > GREATEST_LUMEN_HU) & ~lung] = 0
     rough = np.ascontiguousarray(lungs.central_airway[box].T)
     sample = lung.reshape(-1)[::SAMPLE_STEP]
     lung_hu = float(np.median(smooth.reshape(-1)[::SAMPLE_STEP][sample]))
@@ -149,7 +156,28 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
     kept = np.bincount(pieces.ravel(), weights=certain[inner].ravel(), minlength=count + 1) > 0
     kept[0] = False
     certain[inner] = ndimage.binary_dilation(kept[pieces], iterations=reach, mask=air[inner])
-    labels, _ = ndimage.label(certain)
+    start = _piece_at(certain, seed)
+    # What the central airway holds is lumen, also where it is not dark.
+    around = window(*bounds(rough, reach))
+    held = (rough & (ground.smooth < OPEN_HU))[around]
+    far = distance_mm(~start[around].T, ground.spacing_mm[::-1]).T > LOST_MM
+    if np.count_nonzero(held & far) * float(np.prod(ground.spacing_mm)) >= 1000.0 * LEAST_LOST_ML:
+        certain[around] |= held
+        start = _piece_at(certain, seed)
+    return start
+
+
+def _piece_at(air: Mask, seed: tuple[int, int, int]) -> Mask:
+    """Return the piece of air that a voxel lies in.
+
+    Raises
+    ------
+    AnatomyError
+        If it lies in none.
+    """
+    from scipy import ndimage
+
+    labels, _ = ndimage.label(air)
     label = int(labels[seed]) if all(0 <= n < m for n, m in zip(seed, labels.shape, strict=True)) else 0
     if label == 0:
         raise AnatomyError(

@@ -5,13 +5,20 @@ import numpy as np
 from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 
+LAST_DIGIT = 5
+"""Decimals of the header in mm: formats of files round it differently beyond, by 0.001 mm over an image."""
+
 
 def canonical(volume: Volume) -> Volume:
     """Return an image with its voxels in the order right to left, front to back, feet to head.
 
-    Only the order of the voxels changes: every voxel keeps its place in the patient.  An image in this order
-    is returned as it is.
+    Only the order of the voxels changes: every voxel keeps its place in the patient, to `LAST_DIGIT`.
+    An image in this order is returned as it is.
     """
+    # Adding 0 makes -0 to 0, which are different bytes.
+    matrix = np.round(volume.grid.lps_from_ijk, LAST_DIGIT) + 0.0
+    if not np.array_equal(matrix, volume.grid.lps_from_ijk):
+        volume = Volume(grid=Grid(shape=volume.grid.shape, lps_from_ijk=matrix), array=volume.array)
     order, flipped = towards_lps(volume.grid.lps_from_ijk[:3, :3])
     if order == (0, 1, 2) and not any(flipped):
         return volume

@@ -1,6 +1,6 @@
 """Trachea and main bronchi on coarse voxels: found as a round column of air, followed to the lungs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,11 @@ SHORTEST_COLUMN_MM = 20.0
 
 GROWTH_HU = tuple(float(t) for t in range(-960, -699, 20))
 """Thresholds of the growth, from pure air to where every airway would leak into the lung."""
+USUAL_REACH_MM = 20.0
+"""The cross-section of a trachea is the median over this length above and below a place in it."""
+NARROW, CLOSED, WIDER = 0.75, 0.6, 1.15
+"""Shares of the trachea's cross-section: an open glottis is below the first, a closed one and partial slices
+are below the second, and larynx, pharynx or mouth are above the third."""
 GREATEST_STEP_SHARE, GREATEST_STEP_ML = 0.5, 12.0
 """Growing by more than both from one threshold to the next is a leak into the lung."""
 
@@ -36,17 +41,6 @@ class CentralAirway:
     main: Mask
     seed: Int
     warnings: tuple[str, ...] = ()
-
-
-def find_central_airway(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) -> CentralAirway:
-    """Find trachea and main bronchi: the first of `central_airways`.
-
-    Raises
-    ------
-    AnatomyError
-        If there is no column of air like a trachea, or the point does not lie in air.
-    """
-    return next(central_airways(ct, outside, seed_lps))
 
 
 def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) -> Iterator[CentralAirway]:
@@ -77,7 +71,7 @@ def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) 
             continue
         for seed in seeds:
             try:
-                airway = _long_enough(image, grow_from(image, outside, seed))
+                airway = _long_enough(image, grow_from(image, _with_throat(image, outside, seed), seed))
             except AnatomyError as error:
                 first = first or error
                 continue
@@ -85,6 +79,14 @@ def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) 
             yield airway
     if not found and first is not None:
         raise first
+
+
+def _with_throat(ct: CoarseCt, outside: Mask, seed_lps: Float) -> Mask:
+    """Return `outside` with all that lies above the glottis."""
+    air = np.asfortranarray((ct.hu < COLUMN_MEDIAN_HU + 20.0) & ~outside)
+    barred, seed = outside.copy(order="F"), _given_seed(ct, seed_lps)
+    barred[:, :, max(throat_level(air, seed, ct.spacing_mm[2]), int(seed[2]) + 1) :] = True
+    return barred
 
 
 def _smoothed(ct: CoarseCt) -> CoarseCt:
@@ -158,13 +160,23 @@ def _trachea_seeds(ct: CoarseCt, outside: Mask) -> list[Float]:
     seeds = []
     # Trachea, throat, stomach and bowel: so many columns are tried until one leads into lungs.
     for piece in np.argsort(-(sizes * tall), kind="stable")[: min(4, int(tall.sum()))]:
-        levels = boxes[piece][2]
+        levels, column = boxes[piece][2], pieces == piece + 1
+        # The column may go on through the glottis: its lower part tells where it narrows.
+        low = _middle(ct, column, levels.start + (levels.stop - levels.start) // 3)
+        top = min(levels.stop, throat_level(column, low, ct.spacing_mm[2]))
         # How far down the column the seed lies.
-        level = levels.stop - 1 - int(0.3 * (levels.stop - 1 - levels.start))
-        inside = ndimage.distance_transform_edt(pieces[:, :, level] == piece + 1, sampling=ct.spacing_mm[:2])
-        i, j = np.unravel_index(int(np.argmax(inside)), inside.shape)
-        seeds.append(ct.grid.lps((i, j, level)))
+        level = top - 1 - int(0.3 * (top - 1 - levels.start))
+        seeds.append(ct.grid.lps(_middle(ct, column, level)))
     return seeds
+
+
+def _middle(ct: CoarseCt, column: Mask, level: int) -> Int:
+    """Return the voxel of a column that lies deepest in its axial section."""
+    from scipy import ndimage
+
+    inside = ndimage.distance_transform_edt(column[:, :, level], sampling=ct.spacing_mm[:2])
+    i, j = np.unravel_index(int(np.argmax(inside)), inside.shape)
+    return np.array((i, j, level), dtype=np.int64)
 
 
 def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
@@ -268,8 +280,8 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
     return main, ()
 
 
-def without_larynx(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]:
-    """Cut the upper end of the airway off, as far as it is narrower than the trachea.
+def without_throat(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]:
+    """Cut the airway off at the throat, which `throat_level` finds.
 
     Vocal cords that are closed while the breath is held taper the airway to a point, which
     would be too narrow for any scope, although a scope passes them in fact.
@@ -277,6 +289,7 @@ def without_larynx(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]
     Parameters
     ----------
     lumen : (ni, nj, nk) bool
+        In the order of voxels of `canonical`.
     seed_ijk : (3,) int64
         A voxel in the trachea.
     grid : Grid
@@ -284,26 +297,62 @@ def without_larynx(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]
     Returns
     -------
     lumen : (ni, nj, nk) bool
-        One flat end at the top; the same array if nothing was narrow.
+        One flat end at the top; the same array if there is no throat.
     length_mm : float
         How much was cut off.
     """
-    axis = int(np.argmax(np.abs(grid.lps_from_ijk[2, :3]) / grid.spacing_mm))
-    up = 1 if grid.lps_from_ijk[2, axis] > 0 else -1
-    areas = np.count_nonzero(lumen, axis=tuple(a for a in range(3) if a != axis))[::up]
-    seed = int(seed_ijk[axis]) if up == 1 else len(areas) - 1 - int(seed_ijk[axis])
-    # The cross-section is the median over this length above and below the seed.
-    reach = max(1, round(20.0 / float(grid.spacing_mm[axis])))
-    around = areas[max(seed - reach, 0) : seed + reach + 1]
-    # An upper end below this share of the trachea's cross-section is larynx or a partial slice.
-    least = 0.6 * float(np.median(around[around > 0])) if around.any() else 0.0
-    top = int(np.flatnonzero(areas)[-1]) if areas.any() else 0
-    wide = np.flatnonzero(areas[seed : top + 1] >= least)
-    if not wide.size or seed + int(wide[-1]) == top:
+    slice_mm = float(grid.spacing_mm[2])
+    level = throat_level(lumen, seed_ijk, slice_mm)
+    top = int(np.flatnonzero(lumen.any(axis=(0, 1)))[-1]) + 1 if lumen.any() else 0
+    if level >= top:
         return lumen, 0.0
-    first = seed + int(wide[-1]) + 1
+    return below(lumen, level), (top - level) * slice_mm
+
+
+def below(lumen: Mask, level: int) -> Mask:
+    """Return an airway without what lies at an axial level and above."""
     cut = np.array(lumen, order="F")
-    removed = [slice(None)] * 3
-    removed[axis] = slice(first, None) if up == 1 else slice(0, len(areas) - first)
-    cut[tuple(removed)] = False
-    return cut, float((top + 1 - first) * grid.spacing_mm[axis])
+    cut[:, :, level:] = False
+    return cut
+
+
+def throat_level(air: Mask, seed_ijk: Int, slice_mm: float) -> int:
+    """Return the first axial level of the throat above a seed in the trachea; the image's end if none.
+
+    The trachea narrows at the glottis, and above it the airway ends or becomes wider than the trachea.  Where
+    it does neither, it is only narrow, as at mucus or a stenosis, and goes on.
+    """
+    reach = max(1, round(USUAL_REACH_MM / slice_mm))
+    first, count = int(seed_ijk[2]), air.shape[2]
+    lower = _areas(air, seed_ijk, range(first, max(first - reach, -1), -1))
+    upper = _areas(air, seed_ijk, range(first, count))
+    usual = float(np.median([*lower, *upper[1:reach]])) if lower else 0.0
+    for above, area in enumerate(upper):
+        most = max(upper[above:])
+        if area < NARROW * usual and (most < CLOSED * usual or most > WIDER * usual):
+            return first + above
+    return count
+
+
+def narrowest_level(lumen: Mask, seed_ijk: Int) -> int:
+    """Return the axial level above a seed where the airway is narrowest, but for its first two."""
+    upper = _areas(lumen, seed_ijk, range(int(seed_ijk[2]), lumen.shape[2]))[2:]
+    return int(seed_ijk[2]) + 2 + int(np.argmin(upper)) if upper else lumen.shape[2]
+
+
+def _areas(air: Mask, seed_ijk: Int, levels: Iterable[int]) -> list[int]:
+    """Return the voxels of the piece of air that a seed lies in, level by level, as far as it goes on."""
+    from scipy import ndimage
+
+    found: list[int] = []
+    piece = np.zeros(air.shape[:2], dtype=np.bool_)
+    piece[int(seed_ijk[0]), int(seed_ijk[1])] = True
+    for level in levels:
+        pieces, count = ndimage.label(air[:, :, level])
+        shared = np.bincount(pieces[piece], minlength=count + 1)
+        shared[0] = 0
+        if not shared.any():
+            break
+        piece = pieces == int(np.argmax(shared))
+        found.append(int(np.count_nonzero(piece)))
+    return found

@@ -12,8 +12,8 @@ from anatomy.segmentation.canonical import towards_lps, turned_grid
 
 COARSE_MM = 1.5
 """Blocks of voxels come as near to this size as whole numbers of voxels allow."""
-LEAST_HU = -1100
-"""Air that is shifted by 60 HU with its noise is above; scanners write lower values where they measured
+LEAST_HU = -1200
+"""Air that is shifted by 100 HU with its noise is above; scanners write lower values where they measured
 nothing."""
 
 
@@ -24,7 +24,7 @@ class CoarseCt:
     Parameters
     ----------
     hu : (Ni, Nj, Nk) float32
-        Hounsfield units, not below -1100; contiguous along axis 0.
+        Hounsfield units, not below -1200; contiguous along axis 0.
     grid : Grid
         The grid of `hu`.
     fine_shape : (3,) int

@@ -6,10 +6,12 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Mask
 from anatomy.grid import Volume
 from anatomy.landmarks import SAMPLE_MM, directions, landmarks
 from anatomy.morphology import sampled
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
+from anatomy.segmentation.input import FINE_SLICE_MM
 from anatomy.segmentation.lungs import Lungs
 from anatomy.segmentation.missing_lung import missing_lung, solid_tissue
 
@@ -20,7 +22,7 @@ THIN_HU, DENSE_HU = -925.0, -650.0
 
 
 def plausibility(
-    ct: Volume, lungs: Lungs, tree: AirwayTree | AnatomyError
+    ct: Volume, lungs: Lungs, tree: AirwayTree | AnatomyError, slices_mm: float = 0.0
 ) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
     """Check lungs and airway by anatomy, with the limits and signs that masks of any source have to meet.
 
@@ -31,6 +33,8 @@ def plausibility(
     lungs : Lungs
     tree : AirwayTree or AnatomyError
         Of the lumen of the airway, or why there is none.
+    slices_mm : float
+        How far the slices of the scan lie apart.
 
     Returns
     -------
@@ -42,9 +46,12 @@ def plausibility(
     median_hu = float(np.median(ct.array[lungs.mask]))
     found = [*_sizes(ct, lungs, median_hu)]
     warnings = [*_density_warnings(median_hu), *solid_tissue(ct, lungs.mask)]
+    correct = "correct the mask of the airway"
+    if slices_mm > FINE_SLICE_MM:
+        correct = f"take slices of 1 mm, since {slices_mm:.1f} mm hide thin bronchi, or {correct}"
     if isinstance(tree, AnatomyError):
         name = "axes" if "upside down" in tree.found else "airway"
-        remedy = "Check the header of the image" if name == "axes" else "Correct the mask of the airway"
+        remedy = "Check the header of the image" if name == "axes" else correct.capitalize()
         found.append(Finding(name=name, found=tree.found, remedy=remedy))
     else:
         for name, lung in (("left", lungs.left), ("right", lungs.right)):
@@ -52,8 +59,9 @@ def plausibility(
                 found.append(
                     Finding(
                         name="bronchi",
-                        found=f"No bronchus leads into the {name} lung",
-                        remedy="Look whether it is lung, and correct the masks of lungs or airway",
+                        found=f"The airway ends {_gap_mm(ct, lung, tree):.0f} mm before the {name} lung, so "
+                        "that no bronchus leads into it",
+                        remedy=f"Look whether it is lung, and where the airway ends: {correct}",
                     )
                 )
         left, right = (sampled(mask, ct.grid, SAMPLE_MM) for mask in (lungs.left, lungs.right))
@@ -62,6 +70,12 @@ def plausibility(
             warnings += missing_lung(lungs.left, lungs.right, ct.grid, tree.carina_lps)
     failed = tuple(each for each in found if each.verdict == REFUSED)
     return failed, (*warnings, *(each.found for each in found if each.verdict == DOUBTFUL))
+
+
+def _gap_mm(ct: Volume, lung: Mask, tree: AirwayTree) -> float:
+    from scipy.spatial import cKDTree
+
+    return float(cKDTree(sampled(lung, ct.grid, SAMPLE_MM)).query(tree.points_lps)[0].min())
 
 
 def _sizes(ct: Volume, lungs: Lungs, median: float) -> Iterator[Finding]:

@@ -1,9 +1,12 @@
 """Whether an image is a CT of the chest with air at -1000 HU: refused, mended or warned of if not."""
 
+from typing import Self
+
 import numpy as np
 
 from anatomy.base.errors import AnatomyError
-from anatomy.base.typed import Array, Mask
+from anatomy.base.records import frozen_value
+from anatomy.base.typed import Array, Float32, Mask
 from anatomy.grid import Volume
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
@@ -15,9 +18,11 @@ GREATEST_OFFSET_HU = 25.0
 GREATEST_SCATTER_HU = 45.0
 """Scatter and contrast medium raise the air in the trachea by up to 40 HU, so it tells less where it is
 alone."""
-AROUND_HU = (-1099.0, -880.0)
+AROUND_HU = (-1199.0, -880.0)
 """Air around the patient, shifted or not: lower values are padding, higher ones table and clothes."""
 
+MUSCLE_HU = (10.0, 80.0)
+"""Most soft tissue of a chest measures this, whatever a contrast medium does to its vessels."""
 GAS_HU, TISSUE_HU = -700.0, (-200.0, 200.0)
 """Air of lungs and outside lies below, and soft tissue between the two others."""
 LEAST_SHARE = 0.002
@@ -26,6 +31,8 @@ LEAST_SIZE_MM = 100.0
 """The lung of a small child is about so large."""
 SPACING_MM = (0.2, 2.5)
 """Sizes of voxels within a slice that are not doubted."""
+FINE_SLICE_MM = 1.5
+"""Thinner slices show segmental bronchi nearly as wide as they are."""
 THICK_SLICE_MM = 3.0
 """Segmental bronchi are 3 to 4 mm wide: thicker slices lose them."""
 THICKEST_SLICE_MM = 10.0
@@ -146,11 +153,70 @@ def _odd_values(values: Array) -> tuple[str, ...]:
     return (f"The image reaches {greatest:g} HU: metal, or not Hounsfield units.",)
 
 
-def air_offset_hu(coarse: CoarseCt, airway: Mask) -> float:
-    """Return by how much air, in the airway and around the patient, differs from -1000 HU; 0 if as usual."""
+@frozen_value
+class Scale:
+    """How the values of a CT become Hounsfield units.
+
+    `offset_hu` is taken from each, and the difference from air at -1000 HU is then multiplied by `gain`.
+    """
+
+    offset_hu: float = 0.0
+    gain: float = 1.0
+
+    @classmethod
+    def of(cls, coarse: CoarseCt, offset_hu: float) -> Self:
+        """Return the scale of a CT whose air is off by so much: its soft tissue tells a shift from a gain."""
+        if not offset_hu:
+            return cls()
+        low, high = MUSCLE_HU[0] + min(0.0, offset_hu), MUSCLE_HU[1] + max(0.0, offset_hu)
+        counts, edges = np.histogram(coarse.hu, bins=np.arange(low, high + 2.0, 2.0))
+        most = float(edges[int(np.argmax(np.convolve(counts, np.ones(5), mode="same")))]) + 1.0
+        moved = most - offset_hu
+        usual = moved if MUSCLE_HU[0] <= moved <= MUSCLE_HU[1] else float(np.clip(most, *MUSCLE_HU))
+        return cls(offset_hu=offset_hu, gain=(usual - AIR_HU) / (moved - AIR_HU))
+
+    def on(self, values: Array) -> Float32:
+        """Return values in Hounsfield units."""
+        moved = values - np.float32(self.offset_hu)
+        return (
+            moved
+            if self.gain == 1.0
+            else (moved - np.float32(AIR_HU)) * np.float32(self.gain) + np.float32(AIR_HU)
+        )
+
+    def image(self, ct: Volume) -> Volume:
+        """Return an image in Hounsfield units; the image itself if it has them."""
+        if self == Scale():
+            return ct
+        whole = np.rint(self.on(ct.array)).astype(np.float32)
+        return Volume(grid=ct.grid, array=np.clip(whole, -32768, 32767).astype(np.int16))
+
+    def warnings(self) -> tuple[str, ...]:
+        """Say what was done to an image that does not have Hounsfield units."""
+        if self == Scale():
+            return ()
+        done = f"{-self.offset_hu:+.0f} HU were added to every voxel"
+        if self.gain != 1.0:
+            done = (
+                f"air was set to {AIR_HU:.0f} HU and every difference from it multiplied by {self.gain:.3f}, "
+                "as soft tissue tells"
+            )
+        return (
+            f"Air measures {AIR_HU + self.offset_hu:.0f} HU instead of {AIR_HU:.0f}: {done}. Vessels are "
+            "told apart by their HU: if the scale is wrong in other ways, too many or too few are obstacles.",
+        )
+
+
+def air_in_hu(coarse: CoarseCt, airway: Mask) -> float:
+    """Return what air measures in the middle of the airway."""
     depth = distance_mm(np.asfortranarray(airway), coarse.spacing_mm)
     # At this share of the airway's greatest depth nothing but air is measured.
-    inside = float(np.median(coarse.hu[depth >= 0.6 * depth.max()])) - AIR_HU
+    return float(np.median(coarse.hu[depth >= 0.6 * depth.max()]))
+
+
+def air_offset_hu(coarse: CoarseCt, airway: Mask) -> float:
+    """Return by how much air, in the airway and around the patient, differs from -1000 HU; 0 if as usual."""
+    inside = air_in_hu(coarse, airway) - AIR_HU
     around = offset_around_hu(coarse)
     if around is None:
         return inside if abs(inside) > GREATEST_SCATTER_HU else 0.0
@@ -168,23 +234,3 @@ def offset_around_hu(coarse: CoarseCt) -> float | None:
     air = sides[(sides > AROUND_HU[0]) & (sides < AROUND_HU[1])]
     # Air over less than this share of the image's sides may be lung that the image cuts off.
     return float(np.median(air)) - AIR_HU if air.size >= 0.01 * sides.size else None
-
-
-def without_offset(ct: Volume, offset_hu: float) -> Volume:
-    """Return the image with its values lowered by an offset; the image itself if that is 0."""
-    if not offset_hu:
-        return ct
-    whole = np.rint(ct.array - np.float32(offset_hu)).astype(np.float32)
-    return Volume(grid=ct.grid, array=np.clip(whole, -32768, 32767).astype(np.int16))
-
-
-def offset_warning(offset_hu: float) -> tuple[str, ...]:
-    """Say what was done to an image whose values are shifted."""
-    if not offset_hu:
-        return ()
-    return (
-        f"Air measures {AIR_HU + offset_hu:.0f} HU instead of {AIR_HU:.0f}: "
-        f"{-offset_hu:+.0f} HU "
-        "were added to every voxel. Vessels are told apart by their HU: if the scale is wrong in other ways, "
-        "too many or too few of them are obstacles.",
-    )

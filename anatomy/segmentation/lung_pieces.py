@@ -12,6 +12,7 @@ from anatomy.morphology import bounds, window
 from anatomy.segmentation.central_airway import CentralAirway, grow_from
 from anatomy.segmentation.closing import closed, distance_mm, largest_piece, near, without_holes
 from anatomy.segmentation.coarse import CoarseCt
+from anatomy.segmentation.input import AIR_HU
 from anatomy.segmentation.labels import RIGHT, sides_from_right
 
 GREATEST_LUNG_HU = -200.0
@@ -109,8 +110,8 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
     return np.asfortranarray(lung[pieces])
 
 
-def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> Mask:
-    """Mark gas that no tissue runs through: a pneumothorax, or a bulla.
+def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> tuple[Mask, Mask]:
+    """Tell gas that no tissue runs through, a pneumothorax, a bulla or bowel, from lung.
 
     Parameters
     ----------
@@ -118,25 +119,38 @@ def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> Mask:
     lung : (Ni, Nj, Nk) bool
         What was taken for lung.
     air_hu : float
-        What air measures in this image.
+        What air measures in the trachea, where scatter raises it as it raises gas beside it.
+
+    Returns
+    -------
+    gas, lung : (Ni, Nj, Nk) bool
+        The gas, and what is left of the lung: pieces that are gas for the most part are none.
     """
     from scipy import ndimage
 
     found = np.zeros(lung.shape, dtype=np.bool_, order="F")
     box = window(*bounds(lung, 1))
-    # Gas outside the lung is as thin as air; lung with severe emphysema, at -950 HU, is denser than this.
-    thin = ndimage.uniform_filter(coarse.hu[box], 3, mode="nearest") < air_hu + 25.0
+    # Gas is as thin as air.  Tissue is denser, even of lungs with severe emphysema, at -950 HU; where scatter
+    # raises the air, the lungs themselves tell up to where.
+    thinnest = float(np.percentile(coarse.hu[lung], 65.0)) - 40.0
+    limit = max(AIR_HU + 25.0, min(air_hu + 25.0, thinnest))
+    thin = ndimage.uniform_filter(coarse.hu[box], 3, mode="nearest") < limit
     thin &= lung[box]
     core = distance_mm(np.asfortranarray(thin), coarse.spacing_mm) > GAS_RADIUS_MM
     if not core.any():
-        return found
+        return found, lung
     pocket = (distance_mm(np.asfortranarray(~core), coarse.spacing_mm) <= GAS_RADIUS_MM + 1.5) & lung[box]
     pieces, count = ndimage.label(pocket)
     volumes_ml = np.bincount(pieces.ravel(), minlength=count + 1) * coarse.voxel_ml
     volumes_ml[0] = 0.0
     # Holes of emphysema are smaller; a layer of gas over half a lung, 4 mm thick, is larger.
     found[box] = (volumes_ml >= 20.0)[pieces]
-    return found
+    pieces, count = ndimage.label(lung)
+    kept = np.bincount(pieces[found], minlength=count + 1) < 0.5 * np.bincount(
+        pieces.ravel(), minlength=count + 1
+    )
+    kept[0] = False
+    return found, np.asfortranarray(kept[pieces] & ~found)
 
 
 def notches(ct: CoarseCt, right: Mask, left: Mask, closing_mm: float) -> tuple[Mask, Mask]:

@@ -1,7 +1,8 @@
 """Both lungs in a CT of the chest: filled, apart from each other, without trachea and main bronchi."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,17 +12,10 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Float32, Int, Int32, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
 from anatomy.morphology import bounds, grown_by_one, window
-from anatomy.segmentation.central_airway import CentralAirway, central_airways, find_central_airway
+from anatomy.segmentation.central_airway import CentralAirway, central_airways
 from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
-from anatomy.segmentation.input import (
-    AIR_HU,
-    GREATEST_OFFSET_HU,
-    air_offset_hu,
-    offset_around_hu,
-    offset_warning,
-    without_offset,
-)
+from anatomy.segmentation.input import GREATEST_OFFSET_HU, Scale, air_in_hu, air_offset_hu, offset_around_hu
 from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right
 from anatomy.segmentation.lung_pieces import gas_pockets, lung_pieces, notches, outside_air
 
@@ -53,8 +47,8 @@ class Lungs:
         Lumen of trachea and main bronchi, roughly.
     threshold_hu : float
         What was taken for lung lies below.
-    offset_hu : float
-        How much must be taken from the values of the CT so that air measures -1000 HU.
+    scale : Scale
+        How the values of the CT become Hounsfield units.
     """
 
     left: Mask
@@ -62,7 +56,7 @@ class Lungs:
     trachea_seed_ijk: Int
     central_airway: Mask
     threshold_hu: float
-    offset_hu: float = 0.0
+    scale: Scale = Scale()
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -100,7 +94,8 @@ def segment_lungs(
     coarse = CoarseCt.of(ct)
     seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
     added: tuple[Mask | None, Mask | None]
-    offset = 0.0
+    scale = Scale()
+    gas = None
     if ex_vivo:
         from anatomy.segmentation.lung_pieces import coarse_lung_ex_vivo
 
@@ -108,19 +103,19 @@ def segment_lungs(
         added = (None, None)
     else:
         tell("lungs: trachea")
-        coarse, outside, offset = in_hounsfield(coarse, seed)
-        ct = without_offset(ct, offset)
+        coarse, outside, scale, airways = in_hounsfield(coarse, seed)
+        ct = scale.image(ct)
         tell("lungs: left and right")
         threshold = lung_threshold(coarse.hu, outside)
-        airway, tissue = _airway_and_lung(coarse, outside, seed, threshold)
-        gas = gas_pockets(coarse, tissue, AIR_HU)
-        sides, warnings = _coarse_sides(coarse, tissue & ~gas, airway)
-        warnings = (*offset_warning(offset), *warnings, *_gas_warning(coarse, gas))
+        airway, tissue = _airway_and_lung(coarse, outside, airways, threshold)
+        gas, tissue = gas_pockets(coarse, tissue, air_in_hu(coarse, airway.grown))
+        sides, warnings = _coarse_sides(coarse, tissue, airway)
+        warnings = (*scale.warnings(), *warnings, *_gas_warning(coarse, gas))
         tell("lungs: nodules on the pleura")
         added = notches(coarse, sides == RIGHT, sides == LEFT, CLOSING_MM)
     tell("lungs: boundary")
     right, left = (
-        _fine_lung(ct, coarse, sides == side, notch, airway, threshold)
+        _fine_lung(ct, coarse, sides == side, notch, airway, threshold, gas)
         for side, notch in zip((RIGHT, LEFT), added, strict=True)
     )
     _part(right, left)
@@ -132,7 +127,7 @@ def segment_lungs(
         trachea_seed_ijk=coarse.ct_voxel(airway.seed),
         central_airway=central,
         threshold_hu=threshold,
-        offset_hu=offset,
+        scale=scale,
         warnings=(*airway.warnings, *warnings, *truncation(left | right, ct.grid)),
     )
 
@@ -146,9 +141,8 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
         If there is no trachea.
     """
     seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
-    coarse, outside, offset = in_hounsfield(CoarseCt.of(ct), seed)
-    ct = without_offset(ct, offset)
-    airway = find_central_airway(coarse, outside, seed)
+    coarse, _, scale, airways = in_hounsfield(CoarseCt.of(ct), seed)
+    ct, airway = scale.image(ct), next(airways)
     main = _on_ct(coarse, _with_wall(coarse, airway.main))
     sides = [_filled(side, ct.grid) & ~main for side in (left, right)]
     _part(sides[1], sides[0])
@@ -158,8 +152,8 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
         trachea_seed_ijk=coarse.ct_voxel(airway.seed),
         central_airway=_on_ct(coarse, airway.main) & (ct.array < FIRST_THRESHOLD_HU),
         threshold_hu=FIRST_THRESHOLD_HU,
-        offset_hu=offset,
-        warnings=(*offset_warning(offset), *airway.warnings, *truncation(sides[0] | sides[1], ct.grid)),
+        scale=scale,
+        warnings=(*scale.warnings(), *airway.warnings, *truncation(sides[0] | sides[1], ct.grid)),
     )
 
 
@@ -195,8 +189,11 @@ def lung_threshold(hu: Float32, outside: Mask) -> float:
     return float(np.clip(middle, -600.0, -300.0))
 
 
-def in_hounsfield(coarse: CoarseCt, seed: Float | None) -> tuple[CoarseCt, Mask, float]:
-    """Return the coarse CT with air at -1000 HU, the air around the patient, and the offset that was taken.
+def in_hounsfield(
+    coarse: CoarseCt, seed: Float | None
+) -> tuple[CoarseCt, Mask, Scale, Iterator[CentralAirway]]:
+    """Return the coarse CT in Hounsfield units, the air around the patient, how its values became them, and
+    what may be its `central_airways`.
 
     Raises
     ------
@@ -204,26 +201,31 @@ def in_hounsfield(coarse: CoarseCt, seed: Float | None) -> tuple[CoarseCt, Mask,
         If there is no trachea.
     """
     outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
+    airways = central_airways(coarse, outside, seed)
     try:
-        offset = air_offset_hu(coarse, find_central_airway(coarse, outside, seed).grown)
+        first = next(airways)
+        offset = air_offset_hu(coarse, first.grown)
+        airways = chain([first], airways)
     except AnatomyError:
         # A shift can hide the trachea from the thresholds it is searched with.
         offset = offset_around_hu(coarse) or 0.0
         if abs(offset) <= GREATEST_OFFSET_HU:
             raise
+    scale = Scale.of(coarse, offset)
     if offset:
-        coarse = replace(coarse, hu=np.asfortranarray(coarse.hu - np.float32(offset)))
+        coarse = replace(coarse, hu=np.asfortranarray(scale.on(coarse.hu)))
         outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
-    return coarse, outside, offset
+        airways = central_airways(coarse, outside, seed)
+    return coarse, outside, scale, airways
 
 
 def _airway_and_lung(
-    coarse: CoarseCt, outside: Mask, seed: Float | None, threshold: float
+    coarse: CoarseCt, outside: Mask, airways: Iterator[CentralAirway], threshold: float
 ) -> tuple[CentralAirway, Mask]:
     """Return the first central airway that divides and has lungs at it, else the first with lungs."""
     found: list[tuple[CentralAirway, Mask]] = []
     failed: AnatomyError | None = None
-    for airway in central_airways(coarse, outside, seed):
+    for airway in airways:
         air = (coarse.hu < threshold) & ~outside & ~grown_by_one(airway.grown)
         try:
             found.append((airway, lung_pieces(coarse, air, airway.grown)))
@@ -249,8 +251,8 @@ def _gas_warning(coarse: CoarseCt, gas: Mask) -> tuple[str, ...]:
     place = ", ".join(f"{x:.0f}" for x in coarse.grid.lps(np.argwhere(gas).mean(axis=0)))
     return (
         f"{np.count_nonzero(gas) * coarse.voxel_ml:.0f} ml of gas without tissue lie in the lungs, about LPS "
-        f"({place}) mm: a pneumothorax or a bulla. Where it borders on the chest wall it is taken out; no "
-        "needle can be steered in what is left of it.",
+        f"({place}) mm: a pneumothorax, a bulla, or stomach or bowel beside the lung. It is no lung, and "
+        "no needle is steered in it; a lung beside a pneumothorax lies elsewhere once it is drained.",
     )
 
 
@@ -263,7 +265,13 @@ def _one_side(coarse: CoarseCt, tissue: Mask, airway: CentralAirway) -> tuple[In
 
 
 def _fine_lung(
-    ct: Volume, coarse: CoarseCt, side: Mask, notch: Mask | None, airway: CentralAirway, threshold: float
+    ct: Volume,
+    coarse: CoarseCt,
+    side: Mask,
+    notch: Mask | None,
+    airway: CentralAirway,
+    threshold: float,
+    gas: Mask | None,
 ) -> Mask:
     """Return one lung on the voxels of the CT: region below the threshold and notches, closed and filled.
 
@@ -284,6 +292,8 @@ def _fine_lung(
     region = largest_piece(region)
     filled = without_holes(closed(region, CLOSING_MM, ct.grid.spacing_mm))
     filled &= ~coarse.to_ct(_with_wall(coarse, airway.main), low, high)
+    if gas is not None and gas.any():
+        filled &= ~coarse.to_ct(gas, low, high)
     lung[box] = largest_piece(filled)
     return lung
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from anatomy.base.typed import Float, Int, Mask
+from anatomy.base.typed import Float, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, sampled, window
@@ -20,11 +20,8 @@ ABOVE_CARINA_MM = -10.0
 LEAST_BACK, LEAST_BASE = 0.24, 0.48
 """Of the width of both lungs: so far behind and below the carina each reaches.  In healthy phantoms these are
 0.33 and 0.58 at least; with fluid at the back 0.13, and with the lower third gone 0.39."""
-TILTS_DEG = tuple(float(t) for t in range(-20, 21, 4))
-"""Patients who lie askew lean to a side by as much."""
-LEAST_GAIN = 0.05
-"""Of both lungs: so much more must be alike on both sides for the patient to lie askew; missing lobes make
-less difference."""
+FITS = 20
+"""The midline settles after so many weighted fits, in which levels that lack a lobe count less and less."""
 SOLID_HU, SOLID_RADIUS_MM, LEAST_SOLID_ML = -200.0, 6.0, 10.0
 """A mass of 27 mm has 10 ml; vessels and nodules into which no ball of 12 mm fits are not counted."""
 
@@ -32,8 +29,8 @@ SOLID_HU, SOLID_RADIUS_MM, LEAST_SOLID_ML = -200.0, 6.0, 10.0
 def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tuple[str, ...]:
     """Warn of zones of the chest that hold hardly any lung.
 
-    In every section across the chest this is the convex hull of both lungs and their mirror images.  What is
-    missing on both sides alike is told by how far the lungs reach back and down.
+    In every section across the chest this is the convex hull of both lungs and their mirror images about the
+    `midline`.  What is missing on both sides alike is told by how far the lungs reach back and down.
 
     Parameters
     ----------
@@ -43,7 +40,8 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
     carina_lps : (3,) float64
     """
     points = sampled(left | right, grid, SAMPLE_MM)
-    chest, first = _on_cubes(untilted(points, carina_lps))
+    points[:, 0] -= midline(points, carina_lps)
+    chest, first = _on_cubes(points)
     zones = tuple(
         f"About {lost_ml / 1000.0:.2f} l of lung are missing in the {name}: only {percent(share)} of "
         "what lies there in a healthy chest is lung. It may be solid, full of fluid or collapsed. Its "
@@ -112,40 +110,36 @@ def _zones(chest: Mask, first: Float, carina_lps: Float) -> Iterator[tuple[str, 
                 yield f"{part} of the {name} lung", float(lung / whole), float(lost_ml)
 
 
-def untilted(points: Float, carina_lps: Float) -> Float:
-    """Return points of both lungs turned about the carina so that left and right are most alike.
+def midline(points: Float, carina_lps: Float) -> Float:
+    """Return x of the middle of the chest at the height of each point of both lungs, `(N,)` LPS mm.
 
-    The patient may lean to a side; in the axial sections of a tilted chest left and right differ.
+    It is a parabola along the height, between straight and what a spine curved to a side makes of it; the
+    patient may lean to a side, too.  Levels with lung on one side of the carina alone tell nothing.
     """
-    best, most = points, _alike(points) + LEAST_GAIN
-    for degrees in TILTS_DEG:
-        c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-        turned = (points - carina_lps) @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) + carina_lps
-        alike = _alike(turned)
-        if alike > most:
-            best, most = turned, alike
-    return best
-
-
-def _alike(points: Float) -> float:
-    """Return the share of cubes with lung whose mirror images hold lung, too."""
-    middle = 0.5 * float(np.percentile(points[:, 0], [2.0, 98.0]).sum())
-    cubes = np.floor((points - [middle, 0.0, 0.0]) / (2.0 * SAMPLE_MM)).astype(np.int64)
-    cubes[:, 1:] -= cubes[:, 1:].min(axis=0)
-    size = cubes[:, 1:].max(axis=0) + 1
-    half = int(np.abs(cubes[:, 0]).max()) + 1
-
-    def number(i: Int) -> Int:
-        return np.asarray(((i + half) * size[0] + cubes[:, 1]) * size[1] + cubes[:, 2])
-
-    return float(np.isin(np.unique(number(cubes[:, 0])), number(-1 - cubes[:, 0])).mean())
+    numbers = np.rint(points[:, 2] / SAMPLE_MM).astype(np.int64)
+    levels, middles = [], []
+    for number in np.unique(numbers):
+        x = points[numbers == number, 0]
+        left, right = x[x > carina_lps[0]], x[x < carina_lps[0]]
+        if min(len(left), len(right)) > 0.2 * len(x):
+            levels.append(SAMPLE_MM * number)
+            middles.append(0.5 * (np.percentile(left, 98.0) + np.percentile(right, 2.0)))
+    if len(levels) < 3:
+        return np.full(len(points), float(carina_lps[0]))
+    z, x, weights = np.array(levels), np.array(middles), np.ones(len(levels))
+    for _ in range(FITS):
+        fitted = np.polynomial.Polynomial.fit(z, x, 2, w=np.sqrt(weights))
+        weights = 1.0 / np.maximum(np.abs(x - fitted(z)), 1.0)
+    return np.asarray(fitted(np.clip(points[:, 2], z[0], z[-1])))
 
 
 def _on_cubes(points: Float) -> tuple[Mask, Float]:
-    """Return points on cubes along LPS whose middle is that of the chest, and the first cube's LPS mm."""
+    """Return points on cubes along LPS whose middle is at x = 0, and the first cube's LPS mm."""
     from scipy.ndimage import binary_closing
 
     low, high = points.min(axis=0) - 2.0 * SAMPLE_MM, points.max(axis=0) + 2.0 * SAMPLE_MM
+    high[0] = max(high[0], -low[0])
+    low[0] = -high[0]
     shape = np.ceil((high - low) / SAMPLE_MM).astype(np.int64) + 1
     chest = np.zeros(shape, dtype=np.bool_)
     chest[tuple(np.rint((points - low) / SAMPLE_MM).astype(np.int64).T)] = True

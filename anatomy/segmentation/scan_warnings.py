@@ -17,7 +17,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, window
 from anatomy.plausibility import LIMITS, Finding
 from anatomy.segmentation.closing import distance_mm
-from anatomy.segmentation.input import slice_mm
+from anatomy.segmentation.input import FINE_SLICE_MM, slice_mm
 from anatomy.segmentation.parts import Parts
 
 STEP_MM = 3.0
@@ -59,8 +59,7 @@ def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
             "found, and reach is understated by what they lead to. A reconstruction with a smoother "
             "kernel or thicker slices (up to 1.5 mm) shows more."
         )
-    # Thinner slices show segmental bronchi nearly as wide as they are.
-    if slice_mm(ct) > 1.5:
+    if slice_mm(ct) > FINE_SLICE_MM:
         warnings.append(
             f"The slices are {slice_mm(ct):.1f} mm apart: bronchi look narrower than they are, and thin "
             "ones are missing, so that reach is understated, most in the upper and lower lobes. Slices of "
@@ -155,6 +154,26 @@ def airway_warnings(tree: AirwayTree | AnatomyError, left: Mask, right: Mask, gr
             "enter: look at the branches of a plan."
         )
     return tuple(warnings)
+
+
+CUT_OFF_MM, LEAST_CUT_OFF_ML = 3.0, 0.3
+"""Air of a main bronchus so far from the lumen is no edge of it; a piece of that volume is 5 mm long."""
+
+
+def cut_off(central_airway: Mask, lumen: Mask, grid: Grid) -> tuple[str, ...]:
+    """Warn of air of trachea and main bronchi that the lumen does not hold; bool `(ni, nj, nk)`."""
+    box = window(*bounds(central_airway | lumen, 1))
+    lost = np.asfortranarray(central_airway[box])
+    lost &= distance_mm(np.asfortranarray(~lumen[box]), grid.spacing_mm) > CUT_OFF_MM
+    volume_ml = float(np.count_nonzero(lost)) * grid.voxel_volume_mm3 / 1000.0
+    if volume_ml < LEAST_CUT_OFF_ML:
+        return ()
+    middle = np.argwhere(lost).mean(axis=0) + [side.start for side in box]
+    place = ", ".join(f"{x:.0f}" for x in grid.lps(middle))
+    return (
+        f"{volume_ml:.1f} ml of air in a main bronchus or the trachea, about LPS ({place}) mm, are not in "
+        "the airway: it may end before its lung. What lies behind is not reached.",
+    )
 
 
 @frozen_record

@@ -16,7 +16,7 @@ from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
 from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
 from anatomy.segmentation.airway import Airways, wall_around
 from anatomy.segmentation.box import Box
-from anatomy.segmentation.central_airway import without_larynx
+from anatomy.segmentation.central_airway import below, narrowest_level, without_throat
 from anatomy.segmentation.folder import (
     IMAGES,
     Description,
@@ -26,7 +26,7 @@ from anatomy.segmentation.folder import (
     key_of,
 )
 from anatomy.segmentation.gate import plausibility
-from anatomy.segmentation.input import without_offset
+from anatomy.segmentation.input import Scale, slice_mm
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
 from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
@@ -38,7 +38,7 @@ Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
 Progress = Callable[[str], None]
 
-VERSION = 7
+VERSION = 8
 """Raise it when a step makes other images from the same input."""
 _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 
@@ -92,7 +92,7 @@ class Steps:
     def run(self) -> Parts:
         """Bring every step up to date and return all images."""
         lungs = self._lungs()
-        self._ct = self._box.image(without_offset(self._ct, lungs.offset_hu))
+        self._ct = self._box.image(lungs.scale.image(self._ct))
         airway = self._airway(lungs)
         tree = self._tree_of(airway["airway"])
         self._require_plausible(lungs, airway, tree)
@@ -142,7 +142,7 @@ class Steps:
                 "box": [box.low.tolist(), box.high.tolist()],
                 "seed": lungs.trachea_seed_ijk.tolist(),
                 "threshold_hu": lungs.threshold_hu,
-                "offset_hu": lungs.offset_hu,
+                "scale": [lungs.scale.offset_hu, lungs.scale.gain],
                 "warnings": list(lungs.warnings),
             }
             return images, facts
@@ -157,7 +157,7 @@ class Steps:
             trachea_seed_ijk=np.array(facts["seed"], dtype=np.int64),
             central_airway=images["central_airway"],
             threshold_hu=float(facts["threshold_hu"]),
-            offset_hu=float(facts["offset_hu"]),
+            scale=Scale(offset_hu=facts["scale"][0], gain=facts["scale"][1]),
             warnings=tuple(facts["warnings"]),
         )
 
@@ -177,7 +177,7 @@ class Steps:
 
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.airway import segment_airway
-            from anatomy.segmentation.scan_warnings import airway_warnings
+            from anatomy.segmentation.scan_warnings import airway_warnings, cut_off
 
             grid = self._folder.grid
             lumen, wall = self._source_mask("airway"), self._source_mask("airway_wall")
@@ -187,18 +187,32 @@ class Steps:
                 lumen = learned_airway(self._ct, network)
             if lumen is None:
                 found = segment_airway(self._ct, lungs, progress=self._tell)
-                lumen, cut_mm = without_larynx(found.lumen, lungs.trachea_seed_ijk, grid)
+                lumen, cut_mm = self._with_tree(
+                    *without_throat(found.lumen, lungs.trachea_seed_ijk, grid), lungs
+                )
                 # The wall of what was cut off stays: it is an obstacle.
                 wall = found.wall | (found.lumen & ~lumen) if wall is None else wall
                 if cut_mm:
                     warnings = (
-                        f"The upper {cut_mm:.0f} mm of the airway were too narrow for a trachea: left out.",
+                        f"The upper {cut_mm:.0f} mm of the airway were left out: it narrows there as at "
+                        "the larynx. Look at it in segmentation.png if the patient has a narrow trachea.",
                     )
             wall = wall_around(lumen, grid) if wall is None else wall
             said = airway_warnings(self._tree_of(lumen), lungs.left, lungs.right, grid)
+            said = (*said, *cut_off(lungs.central_airway, lumen, grid))
             return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": [*said, *warnings]}
 
         return self._bring_up_to_date("airway", names, key, compute)[0]
+
+    def _with_tree(self, lumen: Mask, cut_mm: float, lungs: Lungs) -> tuple[Mask, float]:
+        """Return a lumen of which no tree can be made without its top, if that gives it a tree."""
+        if isinstance(self._tree_of(lumen), AnatomyError):
+            level = narrowest_level(lumen, lungs.trachea_seed_ijk)
+            lower = below(lumen, level)
+            if not isinstance(self._tree_of(lower), AnatomyError):
+                top = int(np.flatnonzero(lumen.any(axis=(0, 1)))[-1]) + 1
+                return lower, cut_mm + (top - level) * float(self.grid.spacing_mm[2])
+        return lumen, cut_mm
 
     def _tree_of(self, lumen: Mask) -> AirwayTree | AnatomyError:
         """Return the tree of the lumen, which is made once, or why there is none."""
@@ -214,7 +228,7 @@ class Steps:
         if self._request.ex_vivo:
             return
         self._tell("checking lungs and airway")
-        failed, warnings = plausibility(self._ct, lungs, tree)
+        failed, warnings = plausibility(self._ct, lungs, tree, slice_mm(self._request.ct))
         lungs_on_ct = self._box.on_ct(lungs.mask)
         if self.from_elsewhere:
             on_ct = {"lungs": lungs_on_ct} | {name: self._box.on_ct(mask) for name, mask in airway.items()}

@@ -18,9 +18,9 @@ from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.canonical import canonical
 from anatomy.segmentation.gate import plausibility
-from anatomy.segmentation.input import require_chest_ct, without_offset
+from anatomy.segmentation.input import require_chest_ct
 from anatomy.segmentation.lungs import Lungs, segment_lungs
-from anatomy.segmentation.scan_warnings import airway_warnings, scan_warnings, tree_or_error
+from anatomy.segmentation.scan_warnings import airway_warnings, cut_off, scan_warnings, tree_or_error
 from experiments.support.segmentation.hard_images import HardImage, upright
 from experiments.support.segmentation.scores import dice
 
@@ -104,7 +104,7 @@ def segmented(
     ct = canonical(ct)
     found = segment_lungs(ct)
     box = Box.whole(ct.grid, VOXEL_MM).around(found)
-    finer, lungs = box.image(without_offset(ct, found.offset_hu)), box.lungs(found)
+    finer, lungs = box.image(found.scale.image(ct)), box.lungs(found)
     lumen = segment_airway(finer, lungs).lumen
     tree = tree_or_error(Volume(grid=finer.grid, array=lumen))
     failed, further = plausibility(finer, lungs, tree)
@@ -112,6 +112,7 @@ def segmented(
         *warnings,
         *lungs.warnings,
         *airway_warnings(tree, lungs.left, lungs.right, finer.grid),
+        *cut_off(lungs.central_airway, lumen, finer.grid),
         *further,
         *scan_warnings(ct, found.mask),
         *require_plausible(failed, accepted),

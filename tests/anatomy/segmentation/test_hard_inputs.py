@@ -10,7 +10,8 @@ from anatomy.grid import Volume
 from anatomy.phantom import Phantom
 from anatomy.plausibility import CHECKS, Finding, require_known_checks, require_plausible
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.input import without_offset
+from anatomy.segmentation.coarse import CoarseCt
+from anatomy.segmentation.input import Scale
 from experiments.support.segmentation.hard_cases import CASES
 from experiments.support.segmentation.hard_images import HardImage, phantom_image, turned
 from experiments.support.segmentation.hard_runs import plain_tree, run
@@ -103,8 +104,19 @@ def test_a_failed_check_is_refused_until_it_is_accepted_by_name() -> None:
         require_known_checks(("sidse",))
 
 
-def test_an_offset_is_taken_from_every_voxel(image: HardImage) -> None:
+def test_an_offset_is_taken_from_every_voxel_and_a_gain_from_what_lies_above_air(image: HardImage) -> None:
     ct = image.ct
-    assert without_offset(ct, 0.0) is ct
+    assert Scale().image(ct) is ct
     shifted = Volume(grid=ct.grid, array=ct.array + np.int16(57))
-    assert (without_offset(shifted, 57.0).array == ct.array).all()
+    assert (Scale(offset_hu=57.0).image(shifted).array == ct.array).all()
+    stretched = Volume(grid=ct.grid, array=(ct.array + 1000.0) * 1.25 - 1072.0)
+    assert np.abs(Scale(offset_hu=-72.0, gain=0.8).image(stretched).array - ct.array).max() <= 1
+
+
+@pytest.mark.parametrize(("factor", "added"), [(1.0, -60.0), (1.0, 60.0), (1.08, 0.0), (0.93, 0.0)])
+def test_soft_tissue_tells_a_gain_from_a_shift(image: HardImage, factor: float, added: float) -> None:
+    hu = 30.0 + (image.hu - 30.0) * factor + added
+    coarse = CoarseCt.of(image.with_hu(hu).ct)
+    scale = Scale.of(coarse, 30.0 - 1030.0 * factor + added + 1000.0)
+    assert scale.gain == pytest.approx(1.0 / factor, abs=0.012)
+    assert scale.on(np.array(30.0 - 1030.0 * factor + added)) == pytest.approx(-1000.0)

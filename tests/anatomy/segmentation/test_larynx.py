@@ -6,28 +6,27 @@ import numpy as np
 import pytest
 
 from anatomy.grid import Grid
-from anatomy.segmentation.central_airway import without_larynx
+from anatomy.segmentation.central_airway import narrowest_level, throat_level, without_throat
+
+SEED = np.array([20, 20, 35])
 
 
-def _trachea(taper_voxels: int) -> np.ndarray:
-    """A tube of 8 voxels radius along k that tapers to a point at its upper end."""
-    i, j, k = np.indices((40, 40, 60))
-    top = 55
-    radius = np.where(k > top - taper_voxels, 8.0 * (top - k) / max(taper_voxels, 1), 8.0)
-    return np.asfortranarray((np.hypot(i - 20, j - 20) <= radius) & (k < top) & (k > 2))
+def _trachea(*stretches: tuple[int, float]) -> np.ndarray:
+    """A tube along k from level 3 up: lengths and radii in voxels, each from the radius before on."""
+    i, j = np.indices((40, 40))
+    radii = [0.0] * 3
+    for length, radius in stretches:
+        radii += [radius] * length
+    return np.stack([np.hypot(i - 20, j - 20) <= r if r else i < 0 for r in radii], axis=2)
 
 
-@pytest.mark.parametrize("flipped", [False, True])
-def test_a_tapered_end_is_cut_to_a_flat_one(flipped: bool) -> None:
-    lumen = _trachea(10)
-    grid = Grid.from_spacing(lumen.shape, (1.0, 1.0, 1.5), (0, 0, 0))
-    seed = np.array([20, 20, 35])
-    if flipped:
-        matrix = grid.lps_from_ijk.copy()
-        matrix[:3, 1:3] *= -1
-        lumen, grid = lumen[:, :, ::-1], Grid(shape=grid.shape, lps_from_ijk=matrix)
-        seed = np.array([20, 20, 24])
-    cut, length_mm = without_larynx(lumen, seed, grid)
+def _cut(lumen: np.ndarray) -> tuple[np.ndarray, float]:
+    return without_throat(lumen, SEED, Grid.from_spacing(lumen.shape, (1.0, 1.0, 1.5), (0, 0, 0)))
+
+
+def test_a_tapered_end_is_cut_to_a_flat_one() -> None:
+    lumen = _trachea((42, 8.0), *((1, 0.8 * (10 - n)) for n in range(10)))
+    cut, length_mm = _cut(lumen)
     assert not (cut & ~lumen).any()
     levels = np.flatnonzero(cut.any(axis=(0, 1)))
     kept = np.count_nonzero(cut, axis=(0, 1))[levels]
@@ -36,10 +35,24 @@ def test_a_tapered_end_is_cut_to_a_flat_one(flipped: bool) -> None:
     assert 9.0 <= length_mm <= 15.0
 
 
+@pytest.mark.parametrize("share", [0.2, 0.56, 0.61, 0.66])
+def test_an_open_glottis_below_a_wide_pharynx_is_the_end(share: float) -> None:
+    lumen = _trachea((42, 8.0), (4, 8.0 * share**0.5), (10, 9.0), (20, 12.0))
+    assert throat_level(lumen, SEED, 1.5) == 45
+    assert _cut(lumen)[1] == pytest.approx(1.5 * 34)
+
+
+@pytest.mark.parametrize("above", [(42, 8.0), (42, 8.4)])
+def test_a_narrow_place_of_a_trachea_stays(above: tuple[int, float]) -> None:
+    lumen = _trachea((42, 8.0), (4, 6.0), above)
+    cut, length_mm = _cut(lumen)
+    assert length_mm == 0.0
+    assert (cut == lumen).all()
+    assert 45 <= narrowest_level(lumen, SEED) < 49
+
+
 def test_a_wide_end_stays() -> None:
-    lumen = _trachea(0)
-    cut, length_mm = without_larynx(
-        lumen, np.array([20, 20, 35]), Grid.from_spacing(lumen.shape, (1.0, 1.0, 1.5), (0, 0, 0))
-    )
+    lumen = _trachea((52, 8.0))
+    cut, length_mm = _cut(lumen)
     assert length_mm == 0.0
     assert (cut == lumen).all()

@@ -14,7 +14,7 @@ from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io import read_volume
 from anatomy.phantom import LABELS, Phantom, make_phantom
-from anatomy.segmentation.central_airway import find_central_airway
+from anatomy.segmentation.central_airway import central_airways
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.lungs import CLOSING_MM, Lungs, lungs_given, segment_lungs
@@ -235,7 +235,7 @@ def test_a_seed_in_a_lobar_bronchus_leads_to_the_trachea(patient: Phantom) -> No
     lobar = np.flatnonzero(airway.generation == 2)
     start, end = (airway.branch_start[lobar[0] + n] for n in (0, 1))
     outside = np.zeros(coarse.hu.shape, dtype=bool, order="F")
-    found = find_central_airway(coarse, outside, airway.points_lps[(start + end) // 2])
+    found = next(central_airways(coarse, outside, airway.points_lps[(start + end) // 2]))
     assert found.main[tuple(found.seed)]
     assert coarse.grid.lps(found.seed)[2] > 10.0  # above the carina, which is the origin
     assert abs(coarse.grid.lps(found.seed)[0]) < 5.0

@@ -20,6 +20,9 @@ ABOVE_CARINA_MM = -10.0
 LEAST_BACK, LEAST_BASE = 0.24, 0.48
 """Of the width of both lungs: so far behind and below the carina each reaches.  In healthy phantoms these are
 0.33 and 0.58 at least; with fluid at the back 0.13, and with the lower third gone 0.39."""
+LEAST_OF_OTHER = 0.5
+"""Share of the lung behind the carina, in the lowest third of the chest, that one side has of the other: 0.95
+in healthy phantoms, and at most 0.3 if 330 ml of one base are solid."""
 FITS = 20
 """The midline settles after so many weighted fits, in which levels that lack a lobe count less and less."""
 SOLID_HU, SOLID_RADIUS_MM, LEAST_SOLID_ML = -200.0, 6.0, 10.0
@@ -58,6 +61,18 @@ def _short(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> Iterator[s
     """Yield warnings of lungs that end too early at the back or at the base."""
     sides = {"right": sampled(right, grid, SAMPLE_MM), "left": sampled(left, grid, SAMPLE_MM)}
     width = float(np.subtract(*np.percentile(np.concatenate([*sides.values()])[:, 0], [98.0, 2.0])))
+    low, high = np.percentile(np.concatenate([*sides.values()])[:, 2], [0.5, 99.5])
+    deep = {
+        name: int(np.count_nonzero((p[:, 2] < low + BASE_SHARE * (high - low)) & (p[:, 1] > carina_lps[1])))
+        for name, p in sides.items()
+    }
+    if not (left | right)[:, :, 0].any() and min(deep.values()) < LEAST_OF_OTHER * max(deep.values()):
+        name = min(deep, key=lambda side: deep[side])
+        yield (
+            f"Lung seems to be missing at the base of the {name} lung: behind, it holds "
+            f"{percent(deep[name] / max(deep.values()))} of the lung of the other side. It may be solid, "
+            "under fluid or collapsed, or not breathed in; reach there is understated."
+        )
     for name, points in sides.items():
         lower = points[points[:, 2] < carina_lps[2]]
         if not len(lower):

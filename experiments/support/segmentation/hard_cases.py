@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -14,17 +14,22 @@ from experiments.support.segmentation.hard_changes import (
     abdomen,
     belly,
     blanket,
+    blocked,
     contrast,
+    curved,
     head,
     moved,
     pelvis,
     pet,
     pneumothorax,
     rings,
+    scaled,
     scattered,
     shifted,
     solid,
+    stomach,
     streaks,
+    throat,
     with_lung_hu,
 )
 from experiments.support.segmentation.hard_images import (
@@ -326,7 +331,130 @@ def _cases() -> list[HardCase]:
     add("scan", "metal with streaks", streaks, "metal|noise")
     add("scan", "rings of 40 HU", lambda i: rings(i, 40.0), "noise|rings")
     add("scan", "breathing while scanned", moved, "blurred by breathing")
+    found += [*_throats(), *_gas(), *_bronchi(), *_scales(), *_spines(), *_bases()]
     return found
+
+
+def _throats() -> Iterator[HardCase]:
+    """Yield chests with neck and head: open and closed glottis, upright and leaning, and much noise."""
+    for share in (0.0, 0.3, 0.5, 0.56, 0.61, 0.66, 0.75, 0.9):
+        for lean in (0.0, 25.0):
+            yield HardCase(
+                name=f"glottis of {share:.0%} of the trachea, neck leaning by {lean:g} mm",
+                group="throat",
+                make=lambda i, s=share, m=lean: throat(i, s, lean_mm=m),
+                never=MISSING,
+            )
+    for extra in (20.0, 40.0):
+        for share in (0.56, 0.66):
+            yield HardCase(
+                name=f"glottis of {share:.0%}, {extra:g} HU more noise",
+                group="throat",
+                make=lambda i, s=share, e=extra: noisy(throat(i, s), e),
+                words="noise",
+            )
+    for mm in (2.0, 3.0, 5.0):
+        yield HardCase(
+            name=f"glottis of 61%, slices of {mm:g} mm",
+            group="throat",
+            make=lambda i, m=mm: resampled(throat(i, 0.61), (0.8, 0.8, m)),
+            words="mm apart",
+            thick=mm > 3.0,
+        )
+
+
+def _gas() -> Iterator[HardCase]:
+    """Yield gas beside the lung, from pure air to that of a trachea which scatter raises."""
+    for hu, scatter in ((-1000, 0), (-985, 0), (-975, 30), (-966, 57), (-945, 57)):
+        for depth in (12.0, 20.0, 30.0):
+            yield HardCase(
+                name=f"pneumothorax of {depth:g} mm at {hu} HU, trachea at {-1000 + scatter}",
+                group="gas",
+                make=lambda i, h=hu, s=scatter, d=depth: pneumothorax(scattered(i, s), d, h),
+                words="pneumothorax",
+                warn=True,
+            )
+        for radius, fluid in ((28.0, 0.2), (28.0, 0.5), (38.0, 0.4)):
+            yield HardCase(
+                name=f"stomach of {radius:g} mm with {fluid:.0%} fluid, gas at {hu} HU",
+                group="gas",
+                make=lambda i, h=hu, s=scatter, r=radius, f=fluid: stomach(scattered(i, s), r, h, fluid=f),
+                words="stomach|missing",
+            )
+    for extra in (20.0, 40.0, 60.0):
+        yield HardCase(
+            name=f"pneumothorax of 20 mm at -975 HU, {extra:g} HU more noise",
+            group="gas",
+            make=lambda i, e=extra: noisy(pneumothorax(scattered(i, 30), 20.0, -975), e),
+            words="pneumothorax",
+            warn=True,
+        )
+        yield HardCase(
+            name=f"stomach of 38 mm, gas at -966 HU, {extra:g} HU more noise",
+            group="gas",
+            make=lambda i, e=extra: noisy(stomach(scattered(i, 57), 38.0, -966), e),
+            words="stomach|missing|noise",
+        )
+
+
+def _bronchi() -> Iterator[HardCase]:
+    """Yield main bronchi with a stretch of thin mucus or blur, which is no wall."""
+    for hu in (-920.0, -882.0, -850.0, -800.0):
+        for length in (6.0, 14.0, 25.0):
+            for side, name in ((1.0, "left"), (-1.0, "right")):
+                yield HardCase(
+                    name=f"{length:g} mm of the {name} main bronchus at {hu:g} HU",
+                    group="bronchus",
+                    make=lambda i, h=hu, n=length, s=side: blocked(i, h, n, side=s),
+                    words="main bronchus|stops early|airway ends",
+                )
+
+
+def _scales() -> Iterator[HardCase]:
+    """Yield scales that are wrong by a factor, and great shifts."""
+    for factor in (0.92, 0.96, 1.04, 1.07, 1.1):
+        yield HardCase(
+            name=f"differences from soft tissue {factor:g} times as great",
+            group="scale",
+            make=lambda i, f=factor: scaled(i, f),
+            words="HU",
+        )
+    for shift in (-96.0, 96.0):
+        yield HardCase(
+            name=f"{shift:+.0f} HU", group="shift", make=lambda i, s=shift: shifted(i, s), words="HU"
+        )
+
+
+def _spines() -> Iterator[HardCase]:
+    """Yield chests whose spine is curved to a side, to the back, or both."""
+    for side, back in ((8.0, 0.0), (-8.0, 0.0), (15.0, 0.0), (-15.0, 0.0), (0.0, 10.0), (10.0, 8.0)):
+        yield HardCase(
+            name=f"spine curved by {side:g} mm to a side and {back:g} mm to the back",
+            group="pose",
+            make=lambda i, s=side, b=back: curved(i, s, b),
+            words="cut off",
+            never=MISSING,
+        )
+
+
+def _bases() -> Iterator[HardCase]:
+    """Yield lungs of which the back of one base is solid, with open airways and without."""
+    for lobes, name in ((RIGHT_LUNG, "right"), (LEFT_LUNG, "left")):
+        for front in (5.0, 20.0):
+            for airways in (True, False):
+                yield HardCase(
+                    name=f"{name} base solid behind {front:g} mm, airways {'open' if airways else 'gone'}",
+                    group="lung",
+                    make=lambda i, k=lobes, f=front, a=airways: i.filled(
+                        of_lobes(i, k)
+                        & (i.coordinates()[1] > f)
+                        & (i.coordinates()[2] < -55.0)
+                        & ~(a & i.lumen),
+                        TISSUE_HU,
+                    ),
+                    words=MISSING,
+                    warn=True,
+                )
 
 
 CASES: Mapping[str, HardCase] = MappingProxyType({f"{case.group}: {case.name}": case for case in _cases()})

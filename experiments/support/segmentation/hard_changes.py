@@ -36,11 +36,11 @@ def with_lung_hu(image: HardImage, shift: float) -> HardImage:
     return image.with_hu(image.hu + shift * share)
 
 
-def pneumothorax(image: HardImage, depth_mm: float) -> HardImage:
+def pneumothorax(image: HardImage, depth_mm: float, hu: float = AIR_HU) -> HardImage:
     right = of_lobes(image, RIGHT_LUNG)
     depth = ndimage.distance_transform_edt(right, sampling=image.grid.spacing_mm)
     x, y, z = image.coordinates()
-    return image.filled(right & (depth < depth_mm) & (x < -35.0) & (z > -60.0) & (y < 40.0), AIR_HU)
+    return image.filled(right & (depth < depth_mm) & (x < -35.0) & (z > -60.0) & (y < 40.0), hu)
 
 
 def abdomen(image: HardImage, hu: float, *, below: float = -55.0) -> HardImage:
@@ -195,9 +195,9 @@ def pet(image: HardImage) -> HardImage:
     return resampled(belly(tabled(image, arms=True), AIR_HU), (1.4, 1.4, 3.0))
 
 
-def scattered(image: HardImage) -> HardImage:
-    """Return an image in which scatter raises the air in the airways by 35 HU, as in real CTs."""
-    return image.with_hu(image.hu + 35.0 * image.lumen)
+def scattered(image: HardImage, added_hu: float = 35.0) -> HardImage:
+    """Return an image in which scatter raises the air in the airways, as in real CTs."""
+    return image.with_hu(image.hu + added_hu * image.lumen)
 
 
 def shifted(image: HardImage, shift: float, *, clip: bool = False) -> HardImage:

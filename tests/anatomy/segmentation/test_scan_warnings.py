@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from anatomy.base.typed import Mask
 from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom
-from anatomy.segmentation.missing_lung import missing_lung, solid_tissue, untilted
+from anatomy.segmentation.missing_lung import midline, missing_lung, solid_tissue
 from anatomy.segmentation.scan_warnings import noise_hu, scan_warnings
 
 CARINA = np.zeros(3)
@@ -85,15 +85,33 @@ def test_what_is_missing_on_both_sides_alike_is_told_by_its_extent(patient: Phan
         assert f"missing at the {place} of the left lung" in said and f"{place} of the right lung" in said
 
 
-def test_a_patient_who_lies_askew_is_put_upright() -> None:
-    rng = np.random.default_rng(0)
-    ball = rng.uniform(-1.0, 1.0, (40_000, 3))
-    ball = ball[(ball**2).sum(axis=1) < 1.0] * [40.0, 70.0, 110.0]
-    lungs = np.concatenate([ball - [60.0, 0, 0], ball + [60.0, 0, 0]])
-    c, s = np.cos(np.deg2rad(12.0)), np.sin(np.deg2rad(12.0))
-    tilted = lungs @ np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
-    assert np.abs(untilted(tilted, CARINA) - lungs).max() < 1e-6
-    assert untilted(lungs, CARINA) is lungs
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_base_that_is_solid_behind_is_told_by_the_other_one(patient: Phantom, side: int) -> None:
+    lobes, points = patient.lobes.array, np.indices(patient.lobes.array.shape).reshape(3, -1).T
+    _, y, z = patient.grid.lps(points).T
+    lungs = [lobes >= 4, (lobes > 0) & (lobes < 4)]
+    lungs[side] = lungs[side] & ~((y > 15.0) & (z < -55.0)).reshape(lobes.shape)
+    (warning,) = missing_lung(lungs[0], lungs[1], patient.grid, CARINA)
+    assert f"missing at the base of the {('left', 'right')[side]} lung" in warning
+
+
+@pytest.mark.parametrize(("lean_mm", "bow_mm"), [(25.0, 0.0), (0.0, -25.0), (-10.0, 20.0)])
+def test_a_chest_that_leans_or_has_a_curved_spine_misses_nothing(
+    patient: Phantom, lean_mm: float, bow_mm: float
+) -> None:
+    grid = patient.grid.crop([-30, 0, 0], [patient.grid.shape[0] + 30, *patient.grid.shape[1:]])
+    height = np.linspace(-1.0, 1.0, grid.shape[2])
+    moved = np.rint((lean_mm * height + bow_mm * (1.0 - height**2)) / grid.spacing_mm[0]).astype(int)
+    wide = np.pad(patient.lobes.array, ((30, 30), (0, 0), (0, 0)))
+    bent = np.stack([np.roll(wide[:, :, k], n, axis=0) for k, n in enumerate(moved)], axis=2)
+    carina = CARINA + [moved[int(np.rint(grid.ijk(CARINA)[2]))] * grid.spacing_mm[0], 0.0, 0.0]
+    assert missing_lung(bent >= 4, (bent > 0) & (bent < 4), grid, carina) == ()
+    gone = bent * (bent != 4)
+    (warning,) = missing_lung(gone >= 4, (gone > 0) & (gone < 4), grid, carina)
+    assert "upper part of the left lung" in warning
+    points = grid.lps(np.argwhere(bent > 0))
+    middle = midline(points, carina)
+    assert abs(np.ptp(middle) - np.ptp(moved) * grid.spacing_mm[0]) < 6.0
 
 
 def test_a_mass_is_warned_of_and_vessels_are_not(patient: Phantom) -> None:

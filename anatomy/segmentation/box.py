@@ -170,11 +170,20 @@ class Box:
 
     def _smooth(self, mask: Mask) -> Mask:
         """Return a mask of the CT in the box, by its signed distances interpolated [Raya1990]."""
+        if self._is_ct or not mask.any():
+            return self.sampled(mask)
+        # Outside a border of the mask nothing is within it, and nothing tells its distances.
+        low, high = bounds(mask, 2)
+        low = np.maximum(np.floor(low / self.ratio).astype(np.int64), self.low)
+        high = np.minimum(np.ceil(high / self.ratio).astype(np.int64), self.high)
+        whole = np.zeros(self.high - self.low, dtype=np.bool_, order="F")
+        whole[window(low - self.low, high - self.low)] = self.part(low, high)._between_slices(mask)
+        return whole
+
+    def _between_slices(self, mask: Mask) -> Mask:
         start, stop = self._span(1)
         part, sides = np.asfortranarray(mask[window(start, stop)]), self.ct_grid.spacing_mm
         places = [self._middles(axis) - start[axis] for axis in range(3)]
-        if self._is_ct or not part.any():
-            return self.sampled(mask)
         deep = np.minimum(distance_mm(part, sides), np.float32(NEAR_MM))
         deep -= np.minimum(distance_mm(~part, sides), np.float32(NEAR_MM))
         return np.asfortranarray(between(deep, places, cubic=False) > 0.0)

@@ -44,6 +44,12 @@ def test_a_med_rad_folder_is_understood(med_rad_folder, masks, grid):
     assert len(patient.sources) == 7
 
 
+def test_a_mask_that_a_lung_does_not_have_is_named(med_rad_folder, masks):
+    write_volume(med_rad_folder / "heart.nii.gz", masks["nodule"])
+    (warning,) = load_patient(med_rad_folder).warnings
+    assert warning.startswith("heart.nii.gz is not read")
+
+
 def test_target_lies_in_the_nodule_only_if_both_are_flipped_alike(med_rad_folder):
     patient = load_patient(med_rad_folder)
     ijk = np.rint(patient.grid.ijk(patient.targets_lps[0])).astype(int)

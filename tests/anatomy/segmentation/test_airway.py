@@ -23,7 +23,7 @@ from anatomy.segmentation.kernels.lumen_edge import grow_wall, join_corners
 from anatomy.segmentation.kernels.neighbours import box_offsets
 from anatomy.segmentation.kernels.states import LUMEN
 from anatomy.segmentation.lungs import Lungs
-from anatomy.segmentation.scan_warnings import airway_warnings, tree_or_error
+from anatomy.segmentation.scan_warnings import airway_warnings, cut_off, tree_or_error
 
 CROSS = ndimage.generate_binary_structure(2, 1)
 FACES = ndimage.generate_binary_structure(3, 1)
@@ -222,6 +222,33 @@ def test_made_airway_is_found_to_its_ends_and_edges() -> None:
     assert inside[:, :, 14].any()
     assert leak(airways, lumen) == 0
     assert airways.leak_mm3 == 0.0
+
+
+def test_what_the_central_airway_holds_is_lumen_where_it_is_not_dark() -> None:
+    ct, lungs, lumen = made_airway()
+    x, y, z = np.indices(ct.grid.shape)
+    blurred = lumen & ((x - 45) ** 2 + (y - 25) ** 2 <= 7**2) & (z > 63) & (z < 78)
+    hu = np.where(blurred, np.maximum(ct.array, -882), ct.array).astype(np.int16)
+    central = ndimage.binary_erosion(lumen & (z > 50), FACES)
+    airways = segment_airway(
+        Volume(grid=ct.grid, array=hu),
+        replace(lungs, central_airway=central, trachea_seed_ijk=np.array([45, 25, 102])),
+    )
+    assert airways.lumen[blurred & central].all()
+    assert cut_off(central, airways.lumen, ct.grid) == ()
+    (warning,) = cut_off(central, airways.lumen & ((z > 77) | (z < 64)), ct.grid)
+    assert "main bronchus" in warning and "not reached" in warning
+
+
+def test_fat_beside_bright_vessels_is_no_lumen() -> None:
+    ct, lungs, lumen = made_airway()
+    x, y, z = np.indices(ct.grid.shape)
+    hu = np.where((np.abs(x - 45) < 14) & (z > 60) & (ct.array > 0), 300, ct.array)
+    fat = ((x - 45) ** 2 + (y - 37) ** 2 <= 4**2) & (z > 65) & ~lungs.mask
+    hu[fat] = -92
+    airways = segment_airway(Volume(grid=ct.grid, array=hu.astype(np.int16)), lungs)
+    assert not (airways.lumen & fat).any()
+    assert (airways.lumen & lumen)[:, :, 14].any()
 
 
 @pytest.fixture(scope="module")

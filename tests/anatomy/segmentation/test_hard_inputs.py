@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from anatomy.base.errors import AnatomyError
-from anatomy.grid import Volume
+from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom
 from anatomy.plausibility import CHECKS, Finding, require_known_checks, require_plausible
 from anatomy.segmentation.canonical import canonical
@@ -86,9 +86,21 @@ def test_voxels_come_into_one_order_whatever_the_file_has(
     assert canonical(again) is again
 
 
-def _small(rng: np.random.Generator) -> HardImage:
-    from anatomy.grid import Grid
+def test_a_header_that_formats_round_differently_gives_the_same_bytes() -> None:
+    image = _small(np.random.default_rng(0))
+    stated = np.array(image.grid.lps_from_ijk)
+    stated[:3, :3] = np.diag((0.7421879768371582, 0.7421879768371582, 2.5))
+    rounded = stated.astype(np.float32).astype(np.float64)
+    rounded[0, 1] = -1e-9
+    grids = [
+        canonical(Volume(grid=Grid(shape=image.grid.shape, lps_from_ijk=m), array=image.ct.array)).grid
+        for m in (stated, rounded)
+    ]
+    assert grids[0].lps_from_ijk.tobytes() == grids[1].lps_from_ijk.tobytes()
+    assert grids[0].is_close(Grid(shape=image.grid.shape, lps_from_ijk=stated))
 
+
+def _small(rng: np.random.Generator) -> HardImage:
     hu = rng.integers(-1000, 100, (4, 5, 6)).astype(np.float32)
     grid = Grid.from_spacing(hu.shape, (0.7, 0.8, 1.5), (-3.0, 8.0, 40.0))
     none = np.zeros(hu.shape, dtype=np.uint8)

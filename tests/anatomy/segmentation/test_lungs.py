@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from anatomy.phantom import LABELS, Phantom, make_phantom
 from anatomy.segmentation.central_airway import central_airways
 from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
+from anatomy.segmentation.lung_pieces import gas_pockets
 from anatomy.segmentation.lungs import CLOSING_MM, Lungs, lungs_given, segment_lungs
 
 LEAST_DICE = 0.98
@@ -314,3 +316,33 @@ def test_real_lungs_have_their_volume(
     assert right_l[0] < np.count_nonzero(lungs.right) * litre < right_l[1]
     assert ct.array[tuple(lungs.trachea_seed_ijk)] < -900
     assert not (lungs.mask & lungs.central_airway).any()
+
+
+@pytest.mark.parametrize(("gas_hu", "air_hu"), [(-1000.0, -1000.0), (-966.0, -943.0), (-945.0, -943.0)])
+def test_gas_is_told_from_lung_by_the_air_of_the_trachea(gas_hu: float, air_hu: float) -> None:
+    coarse, apart = _block(-860.0)
+    bubble = apart < 20.0
+    hu = np.where(bubble, np.float32(gas_hu), coarse.hu)
+    gas, lung = gas_pockets(replace(coarse, hu=np.asfortranarray(hu)), apart < 60.0, air_hu)
+    assert gas[apart < 17.0].all() and not gas[apart > 23.0].any()
+    assert (lung == ((apart < 60.0) & ~gas)).all()
+    alone = bubble | ((apart > 40.0) & (apart < 60.0))
+    assert not gas_pockets(replace(coarse, hu=np.asfortranarray(hu)), alone, air_hu)[1][apart < 30.0].any()
+
+
+def test_emphysema_is_no_gas_where_scatter_raises_the_air() -> None:
+    coarse, apart = _block(-950.0)
+    gas, lung = gas_pockets(coarse, apart < 60.0, -943.0)
+    assert not gas.any() and (lung == (apart < 60.0)).all()
+
+
+def _block(hu: float) -> tuple[CoarseCt, Float]:
+    """Return a block of lung and the distance of each voxel from its middle."""
+    shape, rng = (90, 90, 90), np.random.default_rng(0)
+    grid = Grid.from_spacing(shape, (1.5, 1.5, 1.5), (0, 0, 0))
+    apart = np.linalg.norm(np.moveaxis(np.indices(shape), 0, -1) - 44.5, axis=-1) * 1.5
+    values = np.asfortranarray(rng.normal(hu, 20.0, shape).astype(np.float32))
+    whole = (1, 1, 1)
+    return CoarseCt(
+        hu=values, grid=grid, fine_shape=shape, step=whole, order=(0, 1, 2), flipped=(False,) * 3
+    ), apart

@@ -109,9 +109,9 @@ def test_a_chest_that_leans_or_has_a_curved_spine_misses_nothing(
     gone = bent * (bent != 4)
     (warning,) = missing_lung(gone >= 4, (gone > 0) & (gone < 4), grid, carina)
     assert "upper part of the left lung" in warning
-    points = grid.lps(np.argwhere(bent > 0))
-    middle = midline(points, carina)
-    assert abs(np.ptp(middle) - np.ptp(moved) * grid.spacing_mm[0]) < 6.0
+    voxels = np.argwhere(bent > 0)
+    off_mm = midline(grid.lps(voxels), carina) - moved[voxels[:, 2]] * grid.spacing_mm[0]
+    assert np.ptp(off_mm) < 8.0
 
 
 def test_a_mass_is_warned_of_and_vessels_are_not(patient: Phantom) -> None:

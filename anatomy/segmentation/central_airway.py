@@ -15,6 +15,8 @@ from anatomy.segmentation.coarse import CoarseCt
 
 COLUMN_MEDIAN_HU = -920.0
 """The middle of a trachea is nearly pure air; lung is above this."""
+COLUMN_HU = -850.0
+"""The inside of a trachea is below this on coarse voxels."""
 SHORTEST_COLUMN_MM = 20.0
 """Bowel and emphysema hold shorter columns of air as wide as a trachea."""
 
@@ -83,7 +85,7 @@ def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) 
 
 def _with_throat(ct: CoarseCt, outside: Mask, seed_lps: Float) -> Mask:
     """Return `outside` with all that lies above the glottis."""
-    air = np.asfortranarray((ct.hu < COLUMN_MEDIAN_HU + 20.0) & ~outside)
+    air = np.asfortranarray((ct.hu < COLUMN_HU) & ~outside)
     barred, seed = outside.copy(order="F"), _given_seed(ct, seed_lps)
     barred[:, :, max(throat_level(air, seed, ct.spacing_mm[2]), int(seed[2]) + 1) :] = True
     return barred
@@ -192,8 +194,7 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
     middle = float((body * np.arange(len(body))).sum() / body.sum())
     for k in range(ct.hu.shape[2]):
         plane = ct.hu[:, :, k]
-        # The inside of a trachea is below this on coarse voxels, its middle below `COLUMN_MEDIAN_HU`.
-        pieces, count = ndimage.label((plane < -850.0) & ~outside[:, :, k])
+        pieces, count = ndimage.label((plane < COLUMN_HU) & ~outside[:, :, k])
         sizes = np.bincount(pieces.ravel(), minlength=count + 1)
         for piece, box in enumerate(ndimage.find_objects(pieces), start=1):
             width, depth = (s.stop - s.start for s in box)
@@ -337,7 +338,7 @@ def throat_level(air: Mask, seed_ijk: Int, slice_mm: float) -> int:
 def narrowest_level(lumen: Mask, seed_ijk: Int) -> int:
     """Return the axial level above a seed where the airway is narrowest, but for its first two."""
     upper = _areas(lumen, seed_ijk, range(int(seed_ijk[2]), lumen.shape[2]))[2:]
-    return int(seed_ijk[2]) + 2 + int(np.argmin(upper)) if upper else lumen.shape[2]
+    return int(seed_ijk[2]) + 2 + int(np.argmin(upper)) if upper else int(lumen.shape[2])
 
 
 def _areas(air: Mask, seed_ijk: Int, levels: Iterable[int]) -> list[int]:

@@ -59,9 +59,7 @@ def largest_piece(mask: Mask) -> Mask:
     pieces, count = ndimage.label(mask.T)
     if count < 2:
         return mask
-    sizes = np.bincount(pieces.ravel())
-    sizes[0] = 0
-    largest: Mask = (pieces == int(np.argmax(sizes))).T
+    largest: Mask = (pieces == int(np.argmax(np.bincount(pieces[mask.T])))).T
     return largest
 
 

@@ -47,8 +47,8 @@ def scan_warnings(ct: Volume, near: Mask) -> tuple[str, ...]:
     metal = np.count_nonzero(ct.array[window(*bounds(near))] > METAL_HU) * ct.grid.voxel_volume_mm3 / 1000.0
     if metal >= LEAST_METAL_ML:
         warnings.append(
-            f"{metal:.1f} ml of metal lie between or beside the lungs: its streaks hide airways and "
-            "vessels in the slices around it, so a path that looks free there may not be."
+            f"{metal:.1f} ml of metal or undiluted contrast medium lie between or beside the lungs: streaks "
+            "hide airways and vessels in the slices around, so a path that looks free there may not be."
         )
     noise = noise_hu(ct, near)
     # Diagnostic CT of the chest has 10 to 30 HU.

@@ -102,6 +102,7 @@ def segment_vessels(
     solid = space.hu >= towards_blood(lung_hu, SOLID_SHARE)
     best, response, at_scale = _responses(space, solid & ~airway, progress)
     large = _large(space, solid, airway, response, at_scale, large_radius_mm)
+    del response, at_scale
     warnings = () if large.any() else ("No large vessel was found: is the CT one of the chest?",)
     large |= _hilum(space, solid, airways)
     best[airway] = 0.0
@@ -218,7 +219,8 @@ def _without_small(mask: Mask, least_voxels: float) -> Mask:
     from scipy.ndimage import label
 
     pieces, _ = label(mask, structure=np.ones((3, 3, 3), dtype=np.bool_))
-    keep = np.bincount(pieces.ravel()) >= least_voxels
+    # The voxels of the pieces are few beside those of the image, whose numbers bincount would copy.
+    keep = np.bincount(pieces[mask], minlength=1) >= least_voxels
     keep[0] = False
     return np.asarray(keep[pieces])
 

@@ -324,7 +324,7 @@ def throat_level(air: Mask, seed_ijk: Int, slice_mm: float) -> int:
     it does neither, it is only narrow, as at mucus or a stenosis, and goes on.
     """
     reach = max(1, round(USUAL_REACH_MM / slice_mm))
-    first, count = int(seed_ijk[2]), air.shape[2]
+    first, count = int(seed_ijk[2]), int(air.shape[2])
     lower = _areas(air, seed_ijk, range(first, max(first - reach, -1), -1))
     upper = _areas(air, seed_ijk, range(first, count))
     usual = float(np.median([*lower, *upper[1:reach]])) if lower else 0.0

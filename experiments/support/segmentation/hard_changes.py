@@ -83,7 +83,7 @@ def throat(image: HardImage, glottis: float, *, lean_mm: float = 0.0) -> HardIma
         (28.0, 42.0, 1.15, 1.15),
         (42.0, 95.0, 1.7, 1.0),
     ):
-        tube = (x / (wide * radius)) ** 2 + (y / (deep * radius)) ** 2 < 1.0
+        tube = (x / (max(wide, 1e-6) * radius)) ** 2 + (y / (deep * radius)) ** 2 < 1.0
         made = made.filled(tube & (up > first) & (up <= last), AIR_HU)
     mouth = (x / 24.0) ** 2 + ((y + 32.0) / 32.0) ** 2 + ((up - 75.0) / 13.0) ** 2 < 1.0
     made = made.filled(mouth, AIR_HU)

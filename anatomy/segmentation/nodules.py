@@ -11,7 +11,7 @@ from anatomy.base.errors import FileError, GridMismatchError
 from anatomy.base.files import DAMAGE, read_json, reading
 from anatomy.base.typed import Float, Int16, Mask
 from anatomy.grid import Grid
-from anatomy.morphology import bounds, window
+from anatomy.morphology import bounds, components, window
 from anatomy.segmentation.closing import distance_mm, largest_piece
 
 _CONTOURS = '{"annotations": [{"contours": [{"z_mm": ..., "ij": [[column, row], ...]}]}]}'
@@ -20,6 +20,8 @@ RIM_MM = 2.0
 """A nodule blurs this far into the lung around it, and may be taken for a vessel there."""
 ATTACHED_MM = 1.5
 """Within the rim, what is this close to a vessel beyond it stays vessel."""
+LEAST_STOUT_ML, MOST_SLENDER = 0.35, 2.0
+"""Volume of the smallest large vessel, and how many times as long as wide what is no vessel is at most."""
 
 
 def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
@@ -188,3 +190,26 @@ def without_nodule(vessels: Mask, nodule: Mask, grid: Grid) -> Mask:
         gone &= (distance_mm(~beyond, grid.spacing_mm) > ATTACHED_MM) | nodule[box]
     cleared[box] &= ~gone
     return cleared
+
+
+def stout_warnings(vessels: Mask, lungs: Mask, grid: Grid) -> list[str]:
+    """Warn of pieces of the large vessels that lie in the lungs alone and are hardly longer than wide.
+
+    A vessel of this width runs to the hilum, outside of the lungs, or is cut off from it and long.
+    """
+    voxels, part = components(vessels)
+    ml = np.bincount(part) * grid.voxel_volume_mm3 / 1000.0
+    ml[part[~lungs[tuple(voxels.T)]]] = 0.0
+    found = []
+    for piece in np.flatnonzero(ml >= LEAST_STOUT_ML):
+        lps = grid.lps(voxels[part == piece])
+        _, across, along = np.sqrt(np.linalg.eigvalsh(np.cov(lps.T)))
+        if along <= MOST_SLENDER * across:
+            middle = lps[np.argmin(np.linalg.norm(lps - lps.mean(axis=0), axis=1))]
+            place = ",".join(f"{x:.0f}" for x in middle)
+            found.append(
+                f"{ml[piece]:.1f} ml of solid tissue at LPS ({place}) mm were taken for a large vessel, but "
+                "have no way to the hilum and are hardly longer than wide: a nodule, a scar, or tissue at the "
+                f"pleura. They are an obstacle; if they are a nodule, add --nodule lps:{place}."
+            )
+    return found

@@ -20,34 +20,33 @@ from anatomy.morphology import window
 from anatomy.segmentation.closing import distance_mm
 
 CUBES = ((0.75, 24.0, 8.0), (1.25, 44.0, 22.0))
-"""Edge of the voxels, half the side of the cube around the point, and the greatest radius of a nodule that is
-measured so, all mm: the second is tried where the first is too small."""
+"""The cubes around the point that are tried in turn, all mm: edge of a voxel, half the side of the cube, and
+the greatest radius of a nodule in it."""
 LUNG_BELOW_HU = -600.0
 """Lung that holds air is below this."""
 SNAP_MM = 2.0
 """Nobody clicks more exactly: the densest place within this distance is meant."""
 GREATEST_HU = 100.0
-"""Denser nodules, calcified or enhanced, count as this, because half-way to them lies inside of their edge."""
+"""Denser nodules, calcified or enhanced, count as this: half-way to them lies within their edge."""
 SOLID_HU = -300.0
 """Ground glass is below this."""
 LEAST_CONTRAST_HU, LEAST_HALO_HU = 120.0, 80.0
-"""What differs less from the lung around it is no nodule, and no halo of ground glass around a solid core."""
+"""What differs less from the lung around it is no nodule, or no ground glass around a denser core."""
 HALO_VOXELS, HALO_SHARE = (1.6, 3.2), 0.25
-"""Distances from a core between which its halo is looked for, and the quantile of the values there that must be
-dense: spikes and vessels around a core leave air between them."""
+"""Ground glass is looked for between these distances from a core, and this quantile of the values there must
+be dense: spikes and vessels around a core leave air between them."""
 SMOOTHING_MM = 0.6
 """Standard deviation of the Gaussian that takes the noise from ground glass."""
 OPENINGS = (0.35, 0.45, 0.55, 0.65, 0.75)
-"""Widths of the opening as shares of the radius of the largest ball in the nodule: the first that cuts it off."""
+"""Radii of the opening as shares of that of the largest ball in the nodule; the first that cuts it off is used."""
 MOST_EXTENT = 2.2
 """A nodule reaches this many of its radii from its middle; a vessel runs on farther."""
 LEAST_RADIUS_MM = 1.2
 """Radius of the largest ball in the smallest nodule that can be told from a vessel."""
 CELL_MM = 1.5
 """Spacing of the points of the pleura."""
-POW=0.5
 PLEURA_SHARE = 0.55
-"""Share of the reach within which the pleura counts most."""
+"""Share of half the cube's side within which the pleura counts most."""
 SURFACE_STEPS, BELOW_WEIGHT = 30, 0.15
 """Steps of the fit, and the weight of points below the surface, which are nodules and vessels at the pleura."""
 
@@ -97,6 +96,8 @@ class _Cube:
     def __init__(self, ct: Volume, lungs: Mask, point: Float, voxel_mm: float, reach_mm: float) -> None:
         n = 2 * int(reach_mm / voxel_mm) + 1
         self.point, self.voxel_mm, self.reach_mm = point, voxel_mm, reach_mm
+        if not ct.grid.contains(point):
+            raise _no_nodule(point, "in the image")
         self.grid = Grid.from_spacing((n,) * 3, (voxel_mm,) * 3, point - 0.5 * (n - 1) * voxel_mm)
         side = voxel_mm * (np.arange(n) - 0.5 * (n - 1)).astype(np.float32)
         self.places = np.asfortranarray(np.stack(np.meshgrid(side, side, side, indexing="ij")))
@@ -135,29 +136,27 @@ class _Cube:
         found = self._cut_off((image > 0.5 * (lung_hu + nodule_hu)) & allowed, seed, most_mm)
         if found is None:
             return None
+        # Ground glass around a solid core, or more of it around the densest place in it, lowers the threshold.
         beyond = distance_mm(~found, self.grid.spacing_mm) / self.voxel_mm
         shell = (beyond > HALO_VOXELS[0]) & (beyond <= HALO_VOXELS[1]) & allowed
         halo_hu = float(np.quantile(self.smooth[shell], HALO_SHARE)) if shell.any() else lung_hu
-        self.halo = halo_hu - lung_hu
         if halo_hu < lung_hu + LEAST_HALO_HU:
             return found
         return self._cut_off((self.smooth > 0.5 * (lung_hu + halo_hu)) & allowed, seed, most_mm)
 
     def _cut_off(self, dense: Mask, seed: Int, most_mm: float) -> Mask | None:
-        """Return the part of the dense voxels around a seed that the least opening cuts off from the rest."""
+        """Return the dense voxels around a seed that the least opening cuts off from the rest, if one does."""
         from scipy.ndimage import label
 
         depth = distance_mm(dense, self.grid.spacing_mm)
         middle = self._deepest(depth, seed)
         radius = float(depth[tuple(middle)])
-        self.radius=radius
         if not LEAST_RADIUS_MM <= radius <= most_mm:
             return None
         from_middle = np.linalg.norm(self.places - self.places[:, *middle][:, None, None, None], axis=0)
         for share in OPENINGS:
             pieces = label(depth > share * radius)[0]
             core = pieces == pieces[tuple(middle)]
-            self.share=share
             if from_middle[core].max() + share * radius <= MOST_EXTENT * radius:
                 grown = distance_mm(~core, self.grid.spacing_mm) <= share * radius + 0.5 * self.voxel_mm
                 return np.asarray(grown & dense)
@@ -197,7 +196,7 @@ class _Cube:
         for _ in range(SURFACE_STEPS):
             factors = np.linalg.lstsq(terms * weight[:, None], w * weight, rcond=None)[0]
             above = w - terms @ factors
-            weight = near * np.where(above > 0.0, 1.0, BELOW_WEIGHT) / (1.0 + above**2) ** POW
+            weight = near * np.where(above > 0.0, 1.0, BELOW_WEIGHT) / np.sqrt(1.0 + above**2)
         u, v, w = np.tensordot(axes.astype(np.float32), self.places, axes=1)
         level = sum(f * t for f, t in zip(factors.astype(np.float32), _second_order(u, v).T, strict=True)).T
         return np.asarray((w <= level + 0.5 * self.voxel_mm) & ball)

@@ -260,6 +260,8 @@ class Given:
         Contours of radiologists, see `anatomy.segmentation.nodules.nodule_from_contours`.
     nodule_mask : Path
         Mask of one or more nodules.
+    nodules : tuple of str
+        Points in nodules, which are outlined by `anatomy.segmentation.outlining.outline_nodule`.
     target : str
         A point with its frame, `ras:x,y,z` or `lps:x,y,z`.
     """
@@ -274,6 +276,7 @@ class Given:
     totalsegmentator: Path | None = None
     nodule_contours: Path | None = None
     nodule_mask: Path | None = None
+    nodules: tuple[str, ...] = ()
     target: str | None = None
 
     def files(self) -> dict[str, Path]:

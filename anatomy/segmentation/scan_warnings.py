@@ -4,6 +4,7 @@ Whether such masks lie on what they show in the CT is told by moving them a litt
 """
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import bounds, window
+from anatomy.morphology import bounds, components, window
+from anatomy.nodule_size import NoduleSize, nodule_size
 from anatomy.plausibility import LIMITS, Finding
 from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.input import FINE_SLICE_MM, slice_mm
@@ -178,11 +180,15 @@ def cut_off(central_airway: Mask, lumen: Mask, grid: Grid) -> tuple[str, ...]:
 
 @frozen_record
 class Quality:
-    """Figures and warnings about one segmentation; the tree is None if none could be made of the airway."""
+    """Figures and warnings about one segmentation; the tree is None if none could be made of the airway.
+
+    The nodules are in the order of their first voxels.
+    """
 
     volumes_l: dict[str, float]
     tree: AirwayTree | None
     ends: int
+    nodules: tuple[NoduleSize, ...]
     warnings: tuple[str, ...]
 
     def to_mapping(self) -> dict[str, Any]:
@@ -198,6 +204,7 @@ class Quality:
                 "gaps_bridged": 0 if tree is None else len(tree.report.gaps_bridged),
                 "loops_opened": 0 if tree is None else len(tree.report.loops_opened),
             },
+            "nodules": [asdict(each) for each in self.nodules],
             "warnings": list(self.warnings),
         }
 
@@ -216,13 +223,15 @@ def quality_of(parts: Parts) -> Quality:
     }
     volumes = {name: float(np.count_nonzero(mask)) * litre for name, mask in counted.items()}
     warnings = _volume_warnings(volumes)
+    voxels, part = components(parts.nodule)
+    nodules = tuple(nodule_size(voxels[part == n], parts.ct.grid) for n in range(part.max(initial=-1) + 1))
     tree = parts.tree
     if isinstance(tree, AnatomyError):
         failed = f"No airway tree could be made: {tree}"
-        return Quality(volumes_l=volumes, tree=None, ends=0, warnings=(*warnings, failed))
+        return Quality(volumes_l=volumes, tree=None, ends=0, nodules=nodules, warnings=(*warnings, failed))
     ends = sum(len(tree.children(branch)) == 0 for branch in range(tree.n_branches))
     warnings += [*tree.report.warnings, *_leaks(tree)]
-    return Quality(volumes_l=volumes, tree=tree, ends=ends, warnings=tuple(warnings))
+    return Quality(volumes_l=volumes, tree=tree, ends=ends, nodules=nodules, warnings=tuple(warnings))
 
 
 def _volume_warnings(volumes: dict[str, float]) -> list[str]:

@@ -10,6 +10,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.files import sha256
 from anatomy.base.typed import Array, Float32, Mask
 from anatomy.grid import Grid, Volume
+from anatomy.io.frames import parse_point
 from anatomy.io.images import read_mask, read_volume
 from anatomy.io.mask_values import require_label_values
 from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
@@ -29,7 +30,8 @@ from anatomy.segmentation.gate import plausibility
 from anatomy.segmentation.input import Scale, slice_mm
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
 from anatomy.segmentation.lungs import Lungs, lungs_given, segment_lungs
-from anatomy.segmentation.nodules import nodule_from_contours, without_nodule
+from anatomy.segmentation.nodules import nodule_from_contours, stout_warnings, without_nodule
+from anatomy.segmentation.outlining import outline_nodule
 from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import SegmentationRequest
 from anatomy.segmentation.scan_warnings import misplaced, scan_warnings
@@ -96,7 +98,7 @@ class Steps:
         airway = self._airway(lungs)
         tree = self._tree_of(airway["airway"])
         self._require_plausible(lungs, airway, tree)
-        nodule = self._nodule()
+        nodule = self._nodule(lungs)
         if nodule.any():
             volume_ml = float(np.count_nonzero(nodule)) * self.grid.voxel_volume_mm3 / 1000.0
             found = findings_of({"nodules_ml": volume_ml})
@@ -245,11 +247,13 @@ class Steps:
             shown = Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree)
             raise RefusedError(error, shown) from None
 
-    def _nodule(self) -> Mask:
+    def _nodule(self, lungs: Lungs) -> Mask:
         given, grid = self._request.given, self._folder.grid
         stated = {"contours": given.nodule_contours, "mask": given.nodule_mask}
         files = {name: sha256(path) for name, path in stated.items() if path is not None}
-        key = self._key("nodule", sources=("nodule",), grid=grid_digest(grid), files=files)
+        points = [parse_point(point).tolist() for point in given.nodules]
+        made_of = {"points": points, "ct": self._ct_digest, "of": ("lungs",)} if points else {}
+        key = self._key("nodule", sources=("nodule",), grid=grid_digest(grid), files=files, **made_of)
 
         def compute() -> tuple[Images, dict[str, Any]]:
             corrected = self._source_mask("nodule")
@@ -264,6 +268,9 @@ class Steps:
             if given.nodule_mask is not None:
                 mask = read_mask(given.nodule_mask, role="nodules", say=warnings.append)
                 nodule |= self._box.placed(mask, given.nodule_mask.name)
+            for point in points:
+                self._tell("nodules: outline")
+                nodule |= outline_nodule(self._ct, lungs.mask, point)
             return {"nodule": nodule}, {"warnings": warnings}
 
         return self._bring_up_to_date("nodule", ("nodule",), key, compute)[0]["nodule"]
@@ -291,7 +298,8 @@ class Steps:
             masks["all_vessels"] |= masks["vessels"]
             response = np.where(found.mask & ~masks["all_vessels"], np.float32(0.0), found.vesselness)
             images = {"vesselness": response, **masks}
-            return images, {"threshold": float(found.threshold), "warnings": list(found.warnings)}
+            warnings = [*found.warnings, *stout_warnings(masks["vessels"], lungs.mask, self._folder.grid)]
+            return images, {"threshold": float(found.threshold), "warnings": warnings}
 
         return self._bring_up_to_date("vessels", names, key, compute)[0]
 

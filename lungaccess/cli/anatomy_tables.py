@@ -71,7 +71,7 @@ def organ_record(lung: Organ) -> dict[str, Any]:
             {
                 "number": each.number,
                 "is_label": each.is_label,
-                "volume_ml": each.volume_ml,
+                **asdict(each.size),
                 "diameter_mm": each.diameter_mm,
                 "centre_lps": each.centre_lps.tolist(),
                 **(
@@ -201,14 +201,16 @@ def _nodule_table(lung: Organ) -> Table:
         (
             f"{each.number}",
             f"{each.diameter_mm:.1f}",
-            f"{each.volume_ml:.2f}",
+            f"{each.size.long_axis_mm:.1f} x {each.size.perpendicular_mm:.1f}",
+            f"{each.size.volume_ml:.2f}",
             ", ".join(f"{c:.1f}" for c in each.centre_lps),
             lung.region_at(each.centre_lps) if isinstance(lung, Lung) else "",
         )
         for each in found
     ]
     number = "label in the mask" if labelled else "number, by size"
-    headings = (number, "diameter of a ball as large, mm", "volume, ml", "centre, LPS mm", "place")
+    headings = (number, "diameter of a ball as large, mm", "long axis x across, mm", "volume, ml")
+    headings += ("centre, LPS mm", "place")
     return terminal.table("Nodules, for --nodule", headings, rows)
 
 

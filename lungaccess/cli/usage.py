@@ -97,10 +97,10 @@ def asks_json(words: Sequence[str]) -> bool:
 
 
 def with_nodule_number(words: Sequence[str]) -> list[str]:
-    """Let `--nodule` stand alone for `--nodule 0`, the largest: its value alone may be left out."""
+    """Let `--nodule` stand alone for `--nodule 0`, the largest; a point may follow it, as in `segment`."""
     completed: list[str] = []
     for word, following in zip(words, [*words[1:], ""], strict=False):
         completed.append(word)
-        if word == "--nodule" and not following.lstrip("+-").isdigit():
+        if word == "--nodule" and not (following.lstrip("+-").isdigit() or ":" in following):
             completed.append("0")
     return completed

@@ -7,6 +7,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from anatomy.morphology import components, voxels_of
+from anatomy.nodule_size import NoduleSize, nodule_size
 from anatomy.organ import Organ
 
 
@@ -22,7 +23,7 @@ class Nodule:
         Whether the number is a label of the files.
     voxels : (N, 3) int64
         On the grid of the organ.
-    volume_ml : float
+    size : NoduleSize
     diameter_mm : float
         Of the ball with its volume.
     centre_lps : (3,) float64
@@ -32,7 +33,7 @@ class Nodule:
     number: int
     is_label: bool
     voxels: Int
-    volume_ml: float
+    size: NoduleSize
     diameter_mm: float
     centre_lps: Float
 
@@ -96,12 +97,12 @@ def target_words(lung: Lung, point_lps: Float) -> str:
 
 
 def _nodule(organ: Organ, number: int, is_label: bool, voxels: Int) -> Nodule:
-    volume = len(voxels) * organ.grid.voxel_volume_mm3
+    size = nodule_size(voxels, organ.grid)
     return Nodule(
         number=number,
         is_label=is_label,
         voxels=voxels,
-        volume_ml=volume / 1000.0,
-        diameter_mm=float(np.cbrt(6.0 * volume / np.pi)),
+        size=size,
+        diameter_mm=float(np.cbrt(6000.0 * size.volume_ml / np.pi)),
         centre_lps=np.asarray(organ.grid.lps(voxels).mean(axis=0)),
     )

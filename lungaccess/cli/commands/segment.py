@@ -42,6 +42,7 @@ def segment(
     out: Path,
     nodule_contours: Path | None = None,
     nodule_mask: Path | None = None,
+    nodule: tuple[str, ...] = (),
     target: str | None = None,
     series: str | None = None,
     ex_vivo: bool = False,
@@ -78,6 +79,9 @@ def segment(
         Contours of radiologists (JSON, see docs/explanation/segmentation.md); the nodule becomes the target.
     nodule_mask : Path
         Mask of the nodule, which becomes the target.
+    nodule : tuple[str, ...]
+        A point in a nodule, ras:x,y,z or lps:x,y,z, which is outlined and becomes the target; repeated for
+        more nodules.
     target : str
         Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
     series : str
@@ -129,7 +133,7 @@ def segment(
     from anatomy.segmentation.request import Given, SegmentationRequest
     from anatomy.segmentation.scan_warnings import quality_of
 
-    for point in (target, seed):
+    for point in (target, seed, *nodule):
         if point is not None:
             parse_point(point)
     case = ct_case(ct)
@@ -167,6 +171,7 @@ def segment(
                 totalsegmentator=totalsegmentator,
                 nodule_contours=nodule_contours,
                 nodule_mask=nodule_mask,
+                nodules=nodule,
                 target=target,
             ),
         )
@@ -215,16 +220,22 @@ def _tables(result: Segmentation, quality: Quality) -> list[Table]:
             ("length of the centreline, mm", f"{float(tree.branch_length_mm.sum()):.0f}"),
             ("gaps bridged", f"{len(tree.report.gaps_bridged)}"),
         ]
+    nodules = [
+        (f"{each.volume_ml:.2f}", f"{each.long_axis_mm:.1f} x {each.perpendicular_mm:.1f}")
+        for each in quality.nodules
+    ]
     done = [
         ("done now", ", ".join(result.recomputed) or "nothing: all was up to date"),
         ("corrected by hand", ", ".join(result.corrected) or "nothing"),
         ("from elsewhere", "; ".join(f"{k}: {v}" for k, v in result.from_elsewhere.items()) or "nothing"),
     ]
-    return [
+    made = [
         terminal.table("Volumes", ("structure", "litres"), volumes),
         terminal.table("Airway", ("", ""), airway),
+        terminal.table("Nodules", ("volume, ml", "long axis x across, mm"), nodules),
         terminal.table("Steps", ("", ""), done),
     ]
+    return [each for each in made if each.row_count]
 
 
 def _written(result: Segmentation) -> str:

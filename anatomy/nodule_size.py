@@ -32,7 +32,10 @@ def nodule_size(voxels: Int, grid: Grid) -> NoduleSize:
         widths = np.ptp(along[voxels[:, through] == k], axis=0)
         longest = int(np.argmax(widths))
         if widths[longest] >= long_mm:
-            long_mm, across_mm = float(widths[longest]), float(widths[(longest + DIRECTIONS // 2) % DIRECTIONS])
+            long_mm, across_mm = (
+                float(widths[longest]),
+                float(widths[(longest + DIRECTIONS // 2) % DIRECTIONS]),
+            )
     side_mm = float(np.delete(grid.spacing_mm, through).mean())
     return NoduleSize(
         volume_ml=len(voxels) * grid.voxel_volume_mm3 / 1000.0,

@@ -209,7 +209,7 @@ def stout_warnings(vessels: Mask, lungs: Mask, grid: Grid) -> list[str]:
             place = ",".join(f"{x:.0f}" for x in middle)
             found.append(
                 f"{ml[piece]:.1f} ml of solid tissue at LPS ({place}) mm were taken for a large vessel, but "
-                "have no way to the hilum and are hardly longer than wide: a nodule, a scar, or tissue at the "
-                f"pleura. They are an obstacle; if they are a nodule, add --nodule lps:{place}."
+                "have no way to the hilum and are hardly longer than wide: a nodule, a scar, or tissue at "
+                f"the pleura. They are an obstacle; if they are a nodule, add --nodule lps:{place}."
             )
     return found

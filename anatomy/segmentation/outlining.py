@@ -1,9 +1,9 @@
-"""A nodule outlined from one point in it: grown by density, then cut off from vessels and from the chest wall.
+"""A nodule outlined from one point in it: grown by density, then cut off from vessels and chest wall.
 
 A threshold half-way between lung and nodule, and an opening as wide as it takes to cut the nodule off, are
-those of [Kuhnigk2006]; [Kostis2003] opens by the width of vessels.  At the chest wall a smooth surface through
-the pleura around the nodule takes the place of their plane and convex hull, because it also fits the diaphragm,
-which bulges into the lung.
+those of [Kuhnigk2006]; [Kostis2003] opens by the width of vessels.  At the chest wall a smooth surface
+through the pleura around the nodule takes the place of their convex hull and plane, because it also fits
+the diaphragm, which bulges into the lung.
 """
 
 from functools import cached_property
@@ -16,10 +16,10 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Float32, Int, Mask
 from anatomy.base.words import point_in_words
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import window
+from anatomy.morphology import grown_by_one, window
 from anatomy.segmentation.closing import distance_mm
 
-CUBES = ((0.75, 24.0, 8.0), (1.25, 44.0, 22.0))
+CUBES = ((0.75, 24.0, 8.0), (1.25, 40.0, 18.0))
 """The cubes around the point that are tried in turn, all mm: edge of a voxel, half the side of the cube, and
 the greatest radius of a nodule in it."""
 LUNG_BELOW_HU = -600.0
@@ -30,17 +30,21 @@ GREATEST_HU = 100.0
 """Denser nodules, calcified or enhanced, count as this: half-way to them lies within their edge."""
 SOLID_HU = -300.0
 """Ground glass is below this."""
-LEAST_CONTRAST_HU, LEAST_HALO_HU = 120.0, 80.0
-"""What differs less from the lung around it is no nodule, or no ground glass around a denser core."""
-HALO_VOXELS, HALO_SHARE = (1.6, 3.2), 0.25
-"""Ground glass is looked for between these distances from a core, and this quantile of the values there must
-be dense: spikes and vessels around a core leave air between them."""
+LEAST_CONTRAST_HU, LEAST_HALO_HU = 120.0, 170.0
+"""What differs less from the lung around it is no nodule; most of what is around a core must differ by the
+second to be ground glass, since the spikes of real nodules raise it by up to 150 HU."""
+HALO_VOXELS = (1.6, 3.2)
+"""Ground glass around a core is looked for between these distances from it, beyond the core's own blur."""
 SMOOTHING_MM = 0.6
 """Standard deviation of the Gaussian that takes the noise from ground glass."""
 OPENINGS = (0.35, 0.45, 0.55, 0.65, 0.75)
-"""Radii of the opening as shares of that of the largest ball in the nodule; the first that cuts it off is used."""
+"""Radii of the opening as shares of that of the largest ball in the nodule: the first that cuts it off is
+used."""
 MOST_EXTENT = 2.2
 """A nodule reaches this many of its radii from its middle; a vessel runs on farther."""
+LEAST_AIR_AROUND = 0.45
+"""Least share of the surface that borders on lung: half a ball on the pleura has more, a leak into the chest
+wall or the diaphragm less."""
 LEAST_RADIUS_MM = 1.2
 """Radius of the largest ball in the smallest nodule that can be told from a vessel."""
 CELL_MM = 1.5
@@ -48,7 +52,7 @@ CELL_MM = 1.5
 PLEURA_SHARE = 0.55
 """Share of half the cube's side within which the pleura counts most."""
 SURFACE_STEPS, BELOW_WEIGHT = 30, 0.15
-"""Steps of the fit, and the weight of points below the surface, which are nodules and vessels at the pleura."""
+"""Steps of the fit, and the weight of points below the surface: nodules and vessels at the pleura."""
 
 
 def outline_nodule(ct: Volume, lungs: Mask, point_lps: ArrayLike) -> Mask:
@@ -136,16 +140,16 @@ class _Cube:
         found = self._cut_off((image > 0.5 * (lung_hu + nodule_hu)) & allowed, seed, most_mm)
         if found is None:
             return None
-        # Ground glass around a solid core, or more of it around the densest place in it, lowers the threshold.
+        # Ground glass around a core lowers the threshold.
         beyond = distance_mm(~found, self.grid.spacing_mm) / self.voxel_mm
         shell = (beyond > HALO_VOXELS[0]) & (beyond <= HALO_VOXELS[1]) & allowed
-        halo_hu = float(np.quantile(self.smooth[shell], HALO_SHARE)) if shell.any() else lung_hu
+        halo_hu = float(np.median(self.smooth[shell])) if shell.any() else lung_hu
         if halo_hu < lung_hu + LEAST_HALO_HU:
             return found
         return self._cut_off((self.smooth > 0.5 * (lung_hu + halo_hu)) & allowed, seed, most_mm)
 
     def _cut_off(self, dense: Mask, seed: Int, most_mm: float) -> Mask | None:
-        """Return the dense voxels around a seed that the least opening cuts off from the rest, if one does."""
+        """Return the dense voxels around a seed that the least opening cuts off, if one does."""
         from scipy.ndimage import label
 
         depth = distance_mm(dense, self.grid.spacing_mm)
@@ -157,9 +161,12 @@ class _Cube:
         for share in OPENINGS:
             pieces = label(depth > share * radius)[0]
             core = pieces == pieces[tuple(middle)]
-            if from_middle[core].max() + share * radius <= MOST_EXTENT * radius:
-                grown = distance_mm(~core, self.grid.spacing_mm) <= share * radius + 0.5 * self.voxel_mm
-                return np.asarray(grown & dense)
+            if from_middle[core].max() + share * radius > MOST_EXTENT * radius:
+                continue
+            found = (distance_mm(~core, self.grid.spacing_mm) <= share * radius + 0.5 * self.voxel_mm) & dense
+            ring = grown_by_one(found) & ~found
+            if np.count_nonzero(ring & self.lung & ~dense) >= LEAST_AIR_AROUND * np.count_nonzero(ring):
+                return np.asfortranarray(found)
         return None
 
     def _deepest(self, depth: Float32, start: Int) -> Int:
@@ -227,9 +234,7 @@ def _interpolated(array: Mask | Float32, grid: Grid, at: Grid) -> Float32:
     part = grid.crop([each.start for each in box], [each.stop for each in box])
     matrix = part.ijk_from_lps @ at.lps_from_ijk
     values = array[box].astype(np.float32)
-    found = affine_transform(
-        values, matrix[:3, :3], matrix[:3, 3], at.shape, order=1, mode="nearest"
-    )
+    found = affine_transform(values, matrix[:3, :3], matrix[:3, 3], at.shape, order=1, mode="nearest")
     return np.asfortranarray(found)
 
 

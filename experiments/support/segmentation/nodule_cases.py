@@ -1,8 +1,6 @@
-"""Nodules of known shape drawn into the CT of a phantom: solid, part-solid, non-solid, at the pleura, at a vessel."""
+"""Nodules of known shape drawn into the CT of a phantom: solid, part-solid, at the pleura, at a vessel."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import numpy as np
 from scipy import ndimage
@@ -27,7 +25,7 @@ AROUND_MM = 36.0
 
 @frozen_record
 class NoduleCase:
-    """A part of a CT with one nodule, its truth, the lungs without the nodule, and the clicked point, LPS mm."""
+    """A part of a CT with one nodule, its truth, the lungs without it, and the clicked point, LPS mm."""
 
     ct: Volume
     truth: Mask

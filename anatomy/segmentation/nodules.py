@@ -53,7 +53,7 @@ def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
     annotations = _annotations(Path(path))
     _require_axial(grid)
     with reading(path):
-        masks = [_annotation_mask(annotation, grid, Path(path)) for annotation in annotations]
+        masks = [annotation_mask(annotation, grid, Path(path)) for annotation in annotations]
     votes = np.zeros(grid.shape, dtype=np.int16, order="F")
     for mask in masks:
         votes += mask
@@ -103,7 +103,7 @@ def _require_axial(grid: Grid) -> None:
         )
 
 
-def _annotation_mask(annotation: Mapping[str, Any], grid: Grid, path: Path) -> Mask:
+def annotation_mask(annotation: Mapping[str, Any], grid: Grid, path: Path) -> Mask:
     """Return the inside of the contours of one annotation."""
     mask = np.zeros(grid.shape, dtype=np.bool_, order="F")
     for included in (True, False):

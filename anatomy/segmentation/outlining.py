@@ -90,7 +90,7 @@ def _no_nodule(point: Float, what: str) -> AnatomyError:
     return AnatomyError(
         f"At {point_in_words(point)} there is no nodule {what}",
         expected="a point in a nodule of 3 to 40 mm with lung around it",
-        remedy="Point at its middle, or give it with --nodule-mask or --nodule-contours",
+        remedy="Point at its middle with --nodule, or give it with --nodule-mask or --nodule-contours",
     )
 
 

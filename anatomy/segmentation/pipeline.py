@@ -146,9 +146,9 @@ def target_warnings(target_lps: Float | None, parts: Parts, ct_grid: Grid) -> li
     if parts.nodule[i, j, k]:
         return []
     if not (parts.left[i, j, k] or parts.right[i, j, k]):
-        return [f"{place} lies outside the lungs; give the nodule as a mask or contours if it is one."]
+        return [f"{place} lies outside the lungs; if it is in a nodule, outline that with --nodule."]
     if parts.large_vessels[i, j, k]:
-        return [f"{place} lies in what was taken for a large vessel; give the nodule as a mask or contours."]
+        return [f"{place} lies in what was taken for a large vessel; outline a nodule with --nodule."]
     return []
 
 

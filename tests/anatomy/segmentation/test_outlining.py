@@ -1,4 +1,4 @@
-"""Nodules outlined from a point: solid, ground glass, part-solid, at a vessel, at the pleura; and what is none."""
+"""Nodules outlined from a point: solid, ground glass, at a vessel, at the pleura; and what is none."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _ct(*parts: tuple[Mask, float]) -> Volume:
 
 
 EVERYWHERE = np.ones(GRID.shape, dtype=np.bool_, order="F")
-VESSEL = np.asarray((np.hypot(MM[..., 0] - 7.0, MM[..., 1]) <= 2.5))
+VESSEL = np.asarray(np.hypot(MM[..., 0] - 7.0, MM[..., 1]) <= 2.5)
 WALL = np.asarray(MM[..., 0] - 0.004 * (MM[..., 1] ** 2 + MM[..., 2] ** 2) <= -12.0)
 """A chest wall that bulges into the lung, like a diaphragm."""
 

@@ -100,6 +100,22 @@ def test_the_folder_is_a_patient(patient: Phantom, made: Segmentation) -> None:
     assert made.corrected == ()
 
 
+def test_a_nodule_is_outlined_at_a_point_and_freed_of_vessel(
+    patient: Phantom, made: Segmentation, copy: Path
+) -> None:
+    nodule = max(patient.nodules, key=lambda each: each.radius_mm)
+    point = "lps:" + ",".join(f"{x:.2f}" for x in nodule.centre_lps)
+    again = segment(_request(patient, copy, nodules=(point,)))
+    assert again.recomputed == ("nodule", "vessels", "lobes", "cost map")
+    centres = again.grid.lps(np.argwhere(again.parts.nodule))
+    apart = np.linalg.norm(centres - nodule.centre_lps, axis=1)
+    assert apart.max() < nodule.radius_mm + 2.0 * VOXEL_MM
+    (size,) = quality_of(again.parts).nodules
+    assert size.long_axis_mm == pytest.approx(2.0 * nodule.radius_mm, abs=2.0 * VOXEL_MM)
+    assert not (again.parts.all_vessels & again.parts.nodule).any()
+    assert np.isfinite(again.parts.cost[again.parts.nodule]).all()
+
+
 def test_lobes_and_fissures_are_those_of_the_patient(patient: Phantom, made: Segmentation) -> None:
     images = load_patient(made.folder)
     assert images.lobes is not None and images.fissures is not None

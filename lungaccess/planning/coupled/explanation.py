@@ -58,7 +58,7 @@ def _explain_tubes(
         if stopped:
             main_reason += f"; nearer it is refused, mostly because {max(stopped, key=stopped.__getitem__)}"
     reasons = {
-        **_scope_reasons(atlas),
+        **_scope_reasons(aimed.task, atlas),
         **{f"tube: {why}": count for why, count in atlas.deployments.refused.items()},
         "tube: scope tips with a deployment that ends near the target": near,
         **{f"tube, aimed at the target: {why}": count for why, count in sorted(blocked.items())},
@@ -93,8 +93,7 @@ def _before_the_needle(task: Task, atlas: Atlas) -> str:
         generation, excess = atlas.motions.passages.narrowest
         if generation < 0:
             return f"{scope}; no airway lies in lung tissue"
-        narrow = f"too narrow at generation {generation}, typically by {2 * excess:.1f} mm"
-        return f"{scope}; the airway is {narrow}"
+        return f"{scope}; the airway is too narrow at generation {generation}, {_typically(task, excess)}"
     if atlas.deployments.count == 0:
         return "the tubes cannot leave the airway safely from any scope tip"
     return ""
@@ -112,7 +111,7 @@ def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
 def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
     """Count, stage by stage, what was ruled out and why."""
     atlas = arcs.atlas
-    reasons = _scope_reasons(atlas)
+    reasons = _scope_reasons(arcs.task, atlas)
     reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
     outside = atlas.deployments.count - len(arcs.in_workspace)
     reasons["needle: deployments whose workspace does not hold the target"] = outside
@@ -122,7 +121,14 @@ def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
     return reasons
 
 
-def _scope_reasons(atlas: Atlas) -> dict[str, int]:
+def _typically(task: Task, excess_mm: float) -> str:
+    """Say how much an airway lacks in diameter, and whether its mask can tell so little."""
+    voxel_mm = float(task.lung.grid.spacing_mm.max())
+    unsure = f", less than a voxel of the masks, {voxel_mm:.2f} mm" if 2 * excess_mm < voxel_mm else ""
+    return f"typically by {2 * excess_mm:.1f} mm{unsure}"
+
+
+def _scope_reasons(task: Task, atlas: Atlas) -> dict[str, int]:
     """Count scope tips, airways that are too narrow, and the deployments looked at."""
     reasons = {"scope: tips with a proved motion": atlas.motions.count}
     generation, excess = atlas.motions.passages.narrowest
@@ -130,7 +136,7 @@ def _scope_reasons(atlas: Atlas) -> dict[str, int]:
     if closed:
         reasons[
             f"scope: tree points beyond airways too narrow (mostly at generation {generation}, "
-            f"typically by {2 * excess:.1f} mm)"
+            f"{_typically(task, excess)})"
         ] = closed
     return reasons | {"tube: deployments looked at": atlas.deployments.candidates}
 

@@ -252,7 +252,9 @@ class Steps:
         stated = {"contours": given.nodule_contours, "mask": given.nodule_mask}
         files = {name: sha256(path) for name, path in stated.items() if path is not None}
         points = [parse_point(point).tolist() for point in given.nodules]
-        made_of = {"points": points, "ct": self._ct_digest, "of": ("lungs",)} if points else {}
+        made_of: dict[str, Any] = (
+            {"points": points, "ct": self._ct_digest, "of": ("lungs",)} if points else {}
+        )
         key = self._key("nodule", sources=("nodule",), grid=grid_digest(grid), files=files, **made_of)
 
         def compute() -> tuple[Images, dict[str, Any]]:

@@ -209,8 +209,8 @@ def _nodule_table(lung: Organ) -> Table:
         for each in found
     ]
     number = "label in the mask" if labelled else "number, by size"
-    headings = (number, "diameter of a ball as large, mm", "long axis x across, mm", "volume, ml")
-    headings += ("centre, LPS mm", "place")
+    diameters = ("diameter of a ball as large, mm", "long axis x across, mm")
+    headings = (number, *diameters, "volume, ml", "centre, LPS mm", "place")
     return terminal.table("Nodules, for --nodule", headings, rows)
 
 

@@ -39,8 +39,10 @@ SUMMARY_FILE = "summary.json"
 """What `--json` prints: headline, limits, costs.  The plan's own file states only the plan."""
 PICTURES = ("overview.png", "tree.png", "cost_over_time.png")
 """Pictures of a found plan, unless the user wants none."""
-RESULTS = (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *PICTURES, "no_plan.*", "plan-*.json", "report.html")
-"""All files that `plan` may write, and the page that `report` writes beside them."""
+PAGE_FILE = "report.html"
+"""The page that `demo` and `report` write beside the plan."""
+RESULTS = (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *PICTURES, "no_plan.*", "plan-*.json", PAGE_FILE)
+"""All files that `plan` may write, and the page beside them."""
 
 
 class Display(AbstractContextManager[Any], Protocol):
@@ -94,7 +96,7 @@ class PlanJob:
     asked : Asked
         Everything of the request but the patient and the target in it.
     guide : Panel, optional
-        What a newcomer is told of the pictures, before the plan and its headline are shown.
+        What a newcomer is told of the pictures, before the plan and its headline are shown; the page is made, too.
     """
 
     asked: Asked
@@ -107,7 +109,8 @@ class PlanJob:
     @property
     def files(self) -> tuple[str, ...]:
         """Names of the files that a found plan leaves in the folder."""
-        return (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *(PICTURES if self.pictures else ()))
+        page = () if self.guide is None else (PAGE_FILE,)
+        return (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *(PICTURES if self.pictures else ()), *page)
 
 
 def run_search(request: Request, job: PlanJob, display: Display) -> tuple[Plan, list[CostPoint]]:
@@ -193,6 +196,12 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
             terminal.console.print(job.guide)
         show_plan(found, lung, appraisal, advice)
     write_history(found, history, lung, appraisal, job, goal)
+    if job.guide is not None:
+        from lungaccess.showing.report.html import PageOptions, plan_page
+
+        with progress("making the page"):
+            options = PageOptions(cost_over_time=job.out / HISTORY_FILE, advice=advice)
+            plan_page(found, lung, job.out / PAGE_FILE, options)
     if job.output.json:
         terminal.show_json(record)
     else:

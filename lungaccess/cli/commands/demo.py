@@ -15,7 +15,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Seconds, Seed
 from lungaccess.cli.options import CacheOptions, SearchOptions, SystemOptions
-from lungaccess.cli.plan_search import HISTORY_FILE, PLAN_FILE, RESULTS, PlanJob, plan_and_report
+from lungaccess.cli.plan_search import RESULTS, PlanJob, plan_and_report
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
 
@@ -48,11 +48,7 @@ def demo(
         terminal.show(anatomy_tables(lung)[1:3])
     guide = what_to_look_at(out)
     job = PlanJob(asked=search.asked(systems), target=target, out=out, output=output, guide=guide)
-    code = _first_reachable_nodule(lung, job)
-    if code == ExitCode.OK:
-        with progress("making the page"):
-            _write_page(lung, out)
-    return code
+    return _first_reachable_nodule(lung, job)
 
 
 def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> Lung:
@@ -66,15 +62,6 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
     # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
     images = make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
     return open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
-
-
-def _write_page(lung: Lung, out: Path) -> None:
-    """Write report.html about the plan in `out`."""
-    from lungaccess.plans.plan import Plan
-    from lungaccess.showing.report.html import PageOptions, plan_page
-
-    options = PageOptions(cost_over_time=out / HISTORY_FILE)
-    plan_page(Plan.load(out / PLAN_FILE), lung, out / "report.html", options)
 
 
 def _first_reachable_nodule(lung: Lung, job: PlanJob) -> ExitCode:

@@ -256,7 +256,7 @@ class Answers:
     def _appraise(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         from lungaccess.judging.advice import advise
         from lungaccess.judging.appraisal import Appraiser
-        from lungaccess.showing.explorer.exports import appraisal_words
+        from lungaccess.showing.explorer.exports import ADVICE_S, appraisal_words
 
         found = self._plan_asked(asked)
         if self._appraiser is None:
@@ -270,8 +270,7 @@ class Answers:
                 **appraisal_words(appraisal), "window": window or motion,
                 "breathing_known": window is not None,
                 "findings": len(appraisal.check.findings), "refusals": len(appraisal.check.refusals),
-                # Seconds for what would lift the chance of success.
-                "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=3.0)],
+                "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=ADVICE_S)],
             }
         )  # fmt: skip
 

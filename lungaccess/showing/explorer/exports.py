@@ -19,6 +19,7 @@ from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Int
 from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
+from lungaccess.judging.advice import advise
 from lungaccess.judging.appraisal import Appraisal, appraise, plan_record
 from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan, sections
 from lungaccess.planning import run
@@ -40,6 +41,9 @@ Reached = MutableMapping[tuple[Any, ...], Int]
 """The deployment that reached each voxel, by scope, tubes, margins and rule for fissures."""
 
 ITERATIONS = 100
+
+ADVICE_S = 3.0
+"""Seconds for what would lift the chance of success: a reader of the page waits for it."""
 
 Curve = Sequence[tuple[float, float, float]]
 """Seconds, iterations and value of the goal of better and better plans."""
@@ -72,7 +76,10 @@ def export_file(
         report.cost_over_time_csv(points, history)
         image = None if ct is None else ct.read()
         name = "" if ct is None else ct.path.name
-        plan_page(plan, lung, file, PageOptions(ct=image, ct_name=name, cost_over_time=history))
+        advice = advise(plan, lung, appraise(plan, lung), time_s=ADVICE_S)
+        plan_page(
+            plan, lung, file, PageOptions(ct=image, ct_name=name, cost_over_time=history, advice=advice)
+        )
     elif what == "overview.png":
         report.overview_png(plan, lung, file, appraise(plan, lung))
     elif what == "tree.png":

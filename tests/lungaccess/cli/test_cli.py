@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -297,6 +298,8 @@ def test_the_demonstration_ends_with_an_accepted_plan(
     words = ["demo", "--budget", "1", "--out", str(out), "--cache", str(tmp_path / "cache")]
     assert cli.main(words) == ExitCode.OK, capsys.readouterr().out
     assert {file.name for file in out.iterdir() if file.is_file()} == WRITTEN | {"report.html"}
+    page, advice = (out / "report.html").read_text(), json.loads((out / "summary.json").read_text())["advice"]
+    assert advice and all(shlex.join(each["options"]) in page for each in advice)
 
 
 # Bad input ---------------------------------------------------------------------------------------

@@ -2,8 +2,9 @@
 import { byId } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
 import { Motion } from "../report/motion.js";
+import { made } from "../report/structures.js";
 import { MOST_COMPARED, planKey, planQuestion } from "./state.js";
-import { button, errorWords, fillRows, made, mm } from "./widgets.js";
+import { button, errorWords, fillRows, mm } from "./widgets.js";
 
 export class Compared {
   constructor(page) {

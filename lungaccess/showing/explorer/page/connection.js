@@ -1,6 +1,6 @@
 // The socket to the server: questions with numbers, and answers part by part; lungaccess.showing.explorer.messages says how.
+import { TYPES } from "../report/decode.js";
 
-const TYPES = { u1: Uint8Array, u2: Uint16Array, i4: Int32Array, f4: Float32Array };
 const LAST = ["end", "error", "superseded"];
 const LOST = { kind: "Connection", found: "The explorer has ended", expected: "a running lungaccess view", remedy: "Start it again" };
 

@@ -1,17 +1,13 @@
 // The feasible exits of the target: painted in 3-D and in the slices, listed, chosen.
-import { mix, point, rgb } from "../report/vectors.js";
-import { button, made, mm } from "./widgets.js";
+import { VIRIDIS } from "../report/colours.js";
+import { made } from "../report/structures.js";
+import { point, ramp, rgb } from "../report/vectors.js";
+import { button, mm } from "./widgets.js";
 
-// Viridis without its darkest end: even in lightness, for every colour vision.
-const RAMP = ["#3B528B", "#21918C", "#5EC962", "#FDE725"].map(rgb);
+// Without its darkest end.
+const RAMP = VIRIDIS.slice(1);
 const RADIUS_MM = 1.1, CHOSEN_MM = 1.8, MOST_LISTED = 12;
 const CHOSEN = rgb("#FFFFFF");
-
-export function ramp(share) {
-  const at = Math.min(Math.max(share, 0), 1) * (RAMP.length - 1);
-  const n = Math.min(Math.floor(at), RAMP.length - 2);
-  return mix(RAMP[n], RAMP[n + 1], at - n);
-}
 
 export class Exits {
   constructor(answer) {
@@ -34,7 +30,7 @@ export class Exits {
   // Return the points of the 3-D view; the chosen one is white and larger.
   points(by, chosen) {
     const shares = this.shares(by);
-    const colours = shares.map((share, n) => (n === chosen ? CHOSEN : ramp(share)));
+    const colours = shares.map((share, n) => (n === chosen ? CHOSEN : ramp(RAMP, share)));
     const radii = shares.map((_, n) => (n === chosen ? CHOSEN_MM : RADIUS_MM));
     return { places: this.places.flat(), colours: colours.flat(), radii };
   }

@@ -3,10 +3,11 @@ import { byId, openPage } from "../report/anatomy_page.js";
 import { Bronchoscopy } from "../report/bronchoscopy.js";
 import { planStyle } from "../report/colours.js";
 import { DevicePage } from "../report/device_page.js";
+import { deviceLines, otherLines, showBall, showDevices, showOther } from "../report/devices.js";
 import { Motion } from "../report/motion.js";
 import { STANDARD } from "../report/slices.js";
 import { Player } from "../report/player.js";
-import { oncePerFrame } from "../report/structures.js";
+import { made, oncePerFrame } from "../report/structures.js";
 import { minus, norm, rgb } from "../report/vectors.js";
 import { VoxelImage } from "../report/voxel_image.js";
 import { placedVolume } from "../report/voxels.js";
@@ -14,7 +15,6 @@ import { Asker } from "./asker.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
 import { ctSource } from "./ct_source.js";
-import { COMPARED, comparedLines, deviceLines, showCompared, showDevices, showTarget } from "./devices.js";
 import { connectHelp, connectKeys } from "./keys.js";
 import { Panes } from "./panes.js";
 import { PlanPanel } from "./plan_panel.js";
@@ -22,9 +22,9 @@ import { connectPointer } from "./pointer.js";
 import { Search } from "./search.js";
 import { MOST_COMPARED, planKey, State } from "./state.js";
 import { WhatIfPanel } from "./what_if.js";
-import { errorWords, lpsText, made, mm } from "./widgets.js";
+import { errorWords, lpsText, mm } from "./widgets.js";
 
-const KEPT_PLANS = 30, REST_MS = 250, DARK_AIRWAY = "#A6D8F8";
+const KEPT_PLANS = 30, REST_MS = 250, DARK_AIRWAY = "#A6D8F8", COMPARED = "compared ";
 
 class ExplorerPage extends DevicePage {
   constructor() {
@@ -117,7 +117,7 @@ class ExplorerPage extends DevicePage {
 
   async takeStructures(structures) {
     this.structures = structures;
-    const isOpen = await this.openScene((size) => (1.05 * Math.max(...size)) / Math.tan((15 * Math.PI) / 180) / 2 + size[1] / 2);
+    const isOpen = await this.openScene();
     this.panes = new Panes(this.redraw);
     this.linkSlices({ placed: () => this.describe(), picked: (place) => this.chooseTarget(lpsText(place)) });
     this.views.lookAt(this.start);
@@ -258,7 +258,7 @@ class ExplorerPage extends DevicePage {
     if (this.targetLps && norm(minus(this.targetLps, lps)) < 1e-6) return;
     this.targetLps = [...lps];
     this.moveTo(lps);
-    if (this.scene) showTarget(this.scene, lps);
+    if (this.scene) showBall(this.scene, "target", lps);
     this.fitImage(lps);
   }
 
@@ -311,7 +311,7 @@ class ExplorerPage extends DevicePage {
   showPlan() {
     byId("player").hidden = !this.motion;
     this.drawn = null;
-    if (this.scene && !this.targetLps) showTarget(this.scene, null);
+    if (this.scene && !this.targetLps) showBall(this.scene, "target", null);
     if (this.orbit) this.fitToPlan();
     this.redraw();
   }
@@ -376,15 +376,20 @@ class ExplorerPage extends DevicePage {
     const key = JSON.stringify([state && this.plan.digest, this.player.position, Math.round(8 * Math.log(this.orbit.distance)), this.compared.key]);
     if (this.drawn === key) return;
     this.drawn = key;
-    showDevices(this.scene, this.motion, state, this.orbit.distance);
-    showCompared(this.scene, this.compared.shown, MOST_COMPARED, this.orbit.distance);
+    showDevices(this.scene, this.motion && this.motion.plan, state, this.orbit.distance);
+    const { shown } = this.compared;
+    for (let n = 1; n <= MOST_COMPARED; n++) {
+      const { motion } = shown.find(({ number }) => number === n) || {};
+      showOther(this.scene, `${COMPARED}${n}`, n, motion && motion.plan, motion && motion.end, this.orbit.distance);
+    }
   }
 
   drawSlices(isCoarse = this.hurriesSlices()) {
     this.image.overlay = byId("reach-slices").checked && this.reach ? this.reach.painter() : null;
-    const of = this.motion ? deviceLines(this.motion, this.motion.at(this.player.position)) : [];
+    const of = this.motion ? deviceLines(this.motion.plan, this.motion.at(this.player.position)) : [];
+    const others = this.compared.shown.flatMap(({ motion, number }) => otherLines(motion.plan, motion.end, number));
     const planes = Object.fromEntries(Object.entries(STANDARD).filter(([name]) => this.panes.isShown(name)));
-    this.views.draw(planes, { lines: [...comparedLines(this.compared.shown), ...of], target: this.targetLps }, isCoarse);
+    this.views.draw(planes, { lines: [...others, ...of], target: this.targetLps }, isCoarse);
   }
 
   // What a test may read.

@@ -1,5 +1,5 @@
 // The views: which four are where, the bars between them, and canvases with the pixels of their places.
-import { made } from "./widgets.js";
+import { made } from "../report/structures.js";
 
 const AREAS = ["a", "b", "c", "d"], NAMES = { scene: "3-D", axial: "Axial", coronal: "Coronal", sagittal: "Sagittal", bronchoscopy: "Bronchoscopy" };
 const MOST_PIXELS = 320_000, LEAST = 12, MOST = 88, STEP = 2;

@@ -1,7 +1,8 @@
 // What is said of the plan: headline, numbers, advice, why there is none, files, and the command.
 import { byId } from "../report/anatomy_page.js";
+import { made } from "../report/structures.js";
 import { planKey, whatIf } from "./state.js";
-import { errorWords, fillRows, made } from "./widgets.js";
+import { errorWords, fillRows } from "./widgets.js";
 
 const MOST_LIMITS = 6;
 

@@ -1,5 +1,5 @@
 // What the system reaches of the lung: voxels that take their colour as they become known.
-import { made, nearest, VoxelGrid } from "../report/voxels.js";
+import { nearest, volumeOf, VoxelGrid } from "../report/voxels.js";
 
 // How densely a voxel is painted over the picture: known, and as it was before the system was changed, which has codes of its own.
 const SHOWN = 0.25, PALE = 0.1, BEFORE = 128;
@@ -10,7 +10,7 @@ export class ReachLayer {
     const { shape: [ni, nj, nk], lps_from_ijk: rows, kinds } = grid;
     Object.assign(this, { grid, shades, share: 0, reached: [kinds["direct arc"], kinds.search] });
     // The last index is the fastest, as in the arrays of the answers.
-    this.volume = made(new VoxelGrid([nk, nj, ni], rows.map(([i, j, k, first]) => [k, j, i, first])), new Uint8Array(ni * nj * nk));
+    this.volume = volumeOf(new VoxelGrid([nk, nj, ni], rows.map(([i, j, k, first]) => [k, j, i, first])), new Uint8Array(ni * nj * nk));
     if (before && before.kinds.length === this.kinds.length) this.kinds.set(before.kinds.map((kind) => kind && kind | BEFORE));
     // What is only not reached by a single arc keeps the colours of its tissue.
     this.colours = [];

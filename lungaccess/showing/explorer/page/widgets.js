@@ -1,15 +1,5 @@
-// Small parts of the page: elements with text, tables, and words.  Text is never markup.
-
-export function made(name, attributes = {}, ...content) {
-  const element = document.createElement(name);
-  for (const [key, value] of Object.entries(attributes)) {
-    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
-    else if (key in element && key !== "list") element[key] = value;
-    else element.setAttribute(key, value);
-  }
-  element.append(...content);
-  return element;
-}
+// Small parts of the page: buttons, tables, and words.
+import { made } from "../report/structures.js";
 
 export const button = (text, name, press, attributes = {}) =>
   made("button", { type: "button", ariaLabel: name, onclick: press, ...attributes }, text);

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lungaccess.judging.explanation import Explanation
     from lungaccess.plans.plan import Plan
 
-MODULES = ("no_plan.js",)
+MODULES = ("devices.js", "no_plan.js")
 PLACES = '<label>Through <select id="place"></select></label>'
 """Places to which the cross of the slices can be put."""
 

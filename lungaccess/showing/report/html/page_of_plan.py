@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 
 MODULES = (
-    "motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "player.js", "device_page.js",
-    "plan.js",
+    "motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "player.js", "devices.js",
+    "device_page.js", "plan.js",
 )  # fmt: skip
 NO_REGION = "No safe start region"
 THICKER = "; seen from afar, devices are drawn thicker than they are"

@@ -1,11 +1,12 @@
 // What the pages have in common: the 3-D view of the structures, their switches, and the slices.
 import { publishColours } from "./colours.js";
 import { Orbit } from "./orbit.js";
-import { Scene } from "./scene.js";
+import { Scene, VIEW_HALF_ANGLE } from "./scene.js";
 import { SlicePanel } from "./slice_panel.js";
 import { SliceViews } from "./slice_views.js";
 import { Slice, STANDARD } from "./slices.js";
-import { addSwitch, connectViews, isOnScreen, oncePerFrame, sceneBackground, showEdges } from "./structures.js";
+import { addSwitch, made, oncePerFrame } from "./structures.js";
+import { rgb } from "./vectors.js";
 import { ViewTools } from "./view_tools.js";
 
 // A slow machine draws coarsely while something moves, well when it has rested for a moment, and finely after another
@@ -54,7 +55,8 @@ export class AnatomyPage {
 
   // Return whether a picture is left out for now: it cannot be seen, and a slow machine is in a hurry.
   leavesOut(canvas) {
-    return Boolean(this.scene && this.scene.slow && this.scene.quality === "moving" && !isOnScreen(canvas));
+    const { top, bottom } = canvas.getBoundingClientRect();
+    return Boolean(this.scene && this.scene.slow && this.scene.quality === "moving" && (bottom <= 0 || top >= window.innerHeight));
   }
 
   // Return whether slices are painted coarsely for now: something moves, and the machine is slow; they are then painted
@@ -67,13 +69,18 @@ export class AnatomyPage {
     return true;
   }
 
-  // Draw the 3-D view, where that is not all that there is.
-  drawView() {
-    this.draw();
+  draw() {
+    if (this.scene) this.drawView();
+    if (this.views) this.drawSlices();
   }
 
-  // Open the 3-D view, and return whether there is one; distanceOf takes the size of the lung in mm.
-  async openScene(distanceOf) {
+  drawView() {
+    this.scene.fit();
+    this.drawScene();
+  }
+
+  // Open the 3-D view, so far away that the whole lung is seen at once, and return whether there is one.
+  async openScene() {
     const canvas = byId("scene");
     try {
       this.scene = new Scene(canvas);
@@ -85,9 +92,13 @@ export class AnatomyPage {
     // One after the other: the order in which surfaces are added is that in which they are drawn.
     for (const packed of this.structures) await this.scene.addSurface(packed, this.breath);
     const box = this.structures.find(({ key }) => key === "lung") || this.structures[0];
-    const centre = box.low_lps.map((low, axis) => low + box.size_mm[axis] / 2);
-    this.orbit = new Orbit(canvas, centre, distanceOf(box.size_mm), this.redrawView);
-    connectViews(byId("scene-figure"), this.orbit);
+    const size = box.size_mm, centre = box.low_lps.map((low, axis) => low + size[axis] / 2);
+    const distance = (1.05 * Math.max(...size)) / Math.tan(VIEW_HALF_ANGLE) / 2 + size[1] / 2;
+    this.orbit = new Orbit(canvas, centre, distance, this.redrawView);
+    byId("scene-figure").addEventListener("click", ({ target: { dataset: { view, fit } } }) => {
+      if (view) this.orbit.look(view);
+      if (fit) this.orbit.fit(fit);
+    });
     new ResizeObserver(() => {
       const [width, height] = this.scene.fitted || [];
       if (canvas.clientWidth !== width || canvas.clientHeight !== height) this.redraw.now();
@@ -155,9 +166,7 @@ export class AnatomyPage {
     this.panel = new SlicePanel(document, this.views, (place) => this.distancesOf(place));
     if (!this.scene) return;
     const { canvas } = this.scene;
-    this.crossMark = document.createElement("span");
-    this.crossMark.className = "scene-cross";
-    this.crossMark.setAttribute("aria-hidden", "true");
+    this.crossMark = made("span", { className: "scene-cross", ariaHidden: "true" });
     canvas.parentNode.append(this.crossMark);
     const take = (x, y) => {
       const hit = this.scene.pick(x, y);
@@ -187,8 +196,10 @@ export class AnatomyPage {
   drawScene() {
     const camera = this.orbit.camera();
     if (this.tools) this.tools.beforeDrawing(camera);
-    this.scene.draw(camera, sceneBackground());
-    showEdges(byId("scene-figure"), this.orbit);
+    this.scene.draw(camera, rgb(getComputedStyle(document.documentElement).getPropertyValue("--scene").trim()));
+    const edges = this.orbit.edges();
+    document.querySelectorAll("#scene-figure .edge").forEach((element, n) => (element.textContent = edges[n]));
+    for (const button of document.querySelectorAll("#scene-figure [data-fit]")) button.hidden = !this.orbit.homes[button.dataset.fit];
     if (this.tools) this.tools.afterDrawing();
     this.showCross();
   }

@@ -1,4 +1,5 @@
 // Line charts as SVG, with a cursor.
+import { made } from "./structures.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const SIZE = { width: 520, height: 270, left: 50, right: 14, top: 12, bottom: 44 };
@@ -95,14 +96,9 @@ function described(figure, series) {
 }
 
 function legend(series) {
-  const list = document.createElement("ul");
-  list.className = "legend";
-  for (const { name, colour, dash } of series) {
-    const item = document.createElement("li");
+  return made("ul", { className: "legend" }, ...series.map(({ name, colour, dash }) => {
     const sample = element("svg", { viewBox: "0 0 34 8", class: "sample", "aria-hidden": "true" });
     element("line", { x1: 0, x2: 34, y1: 4, y2: 4, stroke: colour, "stroke-width": 3, "stroke-dasharray": dash || "" }, sample);
-    item.append(sample, document.createTextNode(name));
-    list.append(item);
-  }
-  return list;
+    return made("li", {}, sample, name);
+  }));
 }

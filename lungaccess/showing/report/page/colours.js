@@ -12,6 +12,9 @@ export const DEVICE_COLOURS = {
   "others": ["#56B4E9", "#F0E442", "#5B3A8E", "#4F7F2A", "#6B6B6B"]
 };
 
+// Even in lightness, for every colour vision.
+export const VIRIDIS = ["#440154", "#3B528B", "#21918C", "#5EC962", "#FDE725"];
+
 // Lengths in mm of the bands of plans beside the first, so that they differ without their colours, too.
 const BANDS_MM = [null, [6, 2], [2, 2], [9, 3], [1, 3], [4, 1]];
 

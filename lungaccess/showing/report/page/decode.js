@@ -1,6 +1,6 @@
 // Arrays and volumes as lungaccess.showing.report.html.pack stores them.
 
-const TYPES = { u1: Uint8Array, u2: Uint16Array, i4: Int32Array, f4: Float32Array };
+export const TYPES = { u1: Uint8Array, u2: Uint16Array, i4: Int32Array, f4: Float32Array };
 
 // Read the data of the page.
 export function reportData() {

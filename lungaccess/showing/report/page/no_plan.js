@@ -1,41 +1,32 @@
 // The page of a search that found no plan.
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
-import { DEVICE_COLOURS } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
+import { showBall } from "./devices.js";
 import { STANDARD } from "./slices.js";
 import { Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
-import { minus, norm, rgb } from "./vectors.js";
+import { minus, norm, point, rgb } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
 
-const START_MM = 1.1;
-const FAINT_START_MM = 0.6;
-const TARGET_MM = 2.2;
-const PATH_MM = 1.2;
-const AROUND_TARGET_MM = 44;
+const START_MM = 1.1, FAINT_START_MM = 0.6, BALL_MM = 2.2, PATH_MM = 1.2, AROUND_TARGET_MM = 44;
 
 // Return points as lists of three numbers.
 async function pointsOf(packed) {
   const flat = await unpack(packed);
-  return Array.from({ length: flat.length / 3 }, (_, n) => [flat[3 * n], flat[3 * n + 1], flat[3 * n + 2]]);
+  return Array.from({ length: flat.length / 3 }, (_, n) => point(flat, n));
 }
 
 class NoPlanPage extends AnatomyPage {
   constructor(data) {
     super(data, ["airway", "lung"]);
     this.place = [...data.target_lps];
-    this.solids = new Map();
     this.shown = {};
-    this.drawn = {};
   }
 
   async open() {
     for (const path of this.data.paths) path.lines = await Promise.all(path.curves.map(pointsOf));
     for (const group of this.data.starts) group.places = await pointsOf(group.points);
-    if (await this.openScene((size) => 2.1 * Math.max(...size))) {
-      this.orbit.setHome("target", this.data.target_lps, AROUND_TARGET_MM);
-      this.makeSolids();
-    }
+    if (await this.openScene()) this.orbit.setHome("target", this.data.target_lps, AROUND_TARGET_MM);
     this.image = await VoxelImage.of(this.data);
     this.listControls();
     this.openSlices();
@@ -59,28 +50,29 @@ class NoPlanPage extends AnatomyPage {
     return [`${norm(minus(point, this.data.target_lps)).toFixed(1)} mm to the target`];
   }
 
-  makeSolids() {
-    const target = new Solids();
-    target.ball(this.data.target_lps, TARGET_MM, rgb(DEVICE_COLOURS.target));
-    this.solids.set("target", target);
-    this.data.paths.forEach(({ lines, colour, radius_mm: radius }, n) => {
-      const tubes = new Solids();
-      for (const line of lines) tubes.tube(line, Math.max(radius, PATH_MM), rgb(colour));
-      this.solids.set(`path ${n}`, tubes);
-    });
+  // Add a switch with a name that puts something into the scene, or takes it away.
+  list(id, key, { name, colour, shown = true }, put) {
+    const change = (on) => {
+      this.shown[key] = on;
+      if (this.scene) put(on);
+      this.redraw();
+    };
+    addSwitch(byId(id), { key, name, colour, shown }, change);
+    change(shown);
   }
 
   listControls() {
-    this.shown.target = true;
-    const list = (id, key, name, colour, shown) => {
-      this.shown[key] = shown;
-      addSwitch(byId(id), { key, name, colour, shown }, (on) => {
-        this.shown[key] = on;
-        this.redraw();
-      });
-    };
-    for (const { key, name, colour } of this.data.starts) list("starts", `start ${key}`, name, colour, true);
-    this.data.paths.forEach(({ name, colour, shown }, n) => list("paths", `path ${n}`, name, colour, shown));
+    if (this.scene) showBall(this.scene, "target", this.data.target_lps, BALL_MM);
+    for (const group of this.data.starts) {
+      const { key, colour, places } = group, radii = key === "out of reach" ? FAINT_START_MM : START_MM;
+      const points = { places: places.flat(), colours: places.flatMap(() => rgb(colour)), radii };
+      this.list("starts", `start ${key}`, group, (on) => this.scene.setPoints(`start ${key}`, on ? points : null));
+    }
+    this.data.paths.forEach((path, n) => {
+      const tubes = new Solids();
+      for (const line of path.lines) tubes.tube(line, Math.max(path.radius_mm, PATH_MM), rgb(path.colour));
+      this.list("paths", `path ${n}`, path, (on) => this.scene.setSolids(`path ${n}`, on ? tubes : null));
+    });
     this.listStructures();
     const places = [{ name: "the target", lps: this.data.target_lps }, ...this.data.places];
     places.forEach(({ name }, n) => byId("place").append(new Option(name, n)));
@@ -92,39 +84,11 @@ class NoPlanPage extends AnatomyPage {
     this.views.lookAt(place);
   }
 
-  // Hand over only what was switched since the last picture.
-  switchSolids() {
-    for (const [key, solids] of this.solids) {
-      if (this.drawn[key] === this.shown[key]) continue;
-      this.scene.setSolids(key, this.shown[key] ? solids : null);
-      this.drawn[key] = this.shown[key];
-    }
-    for (const { key, colour, places } of this.data.starts) {
-      const name = `start ${key}`;
-      if (this.drawn[name] === this.shown[name]) continue;
-      const radii = key === "out of reach" ? FAINT_START_MM : START_MM, colours = places.flatMap(() => rgb(colour));
-      this.scene.setPoints(name, this.shown[name] ? { places: places.flat(), colours, radii } : null);
-      this.drawn[name] = this.shown[name];
-    }
-  }
-
-  drawView() {
-    this.switchSolids();
-    this.scene.fit();
-    this.drawScene();
-  }
-
-  draw() {
-    if (this.scene) this.drawView();
-    if (this.views) this.drawSlices();
-  }
-
   drawSlices(isCoarse = this.hurriesSlices()) {
     const lines = this.data.paths.flatMap(({ lines: curves, colour, radius_mm: radius }, n) =>
       (this.shown[`path ${n}`] ? curves.map((points) => ({ points, radius, colour })) : []));
     this.views.draw(STANDARD, { lines, target: this.data.target_lps }, isCoarse);
-    this.panel.showField();
-    this.panel.describe();
+    this.panel.show();
     byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(1)).join(", ")} mm.`;
   }
 

@@ -6,14 +6,14 @@ import { lineChart } from "./charts.js";
 import { DEVICE_COLOURS, planStyle } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { DevicePage } from "./device_page.js";
+import { deviceLines, showBall, showDevices, showOther } from "./devices.js";
 import { Motion, STAGES } from "./motion.js";
 import { bendOf, planeAcross, planeAlong, STANDARD } from "./slices.js";
 import { paced, Player } from "./player.js";
-import { banded, Solids } from "./solids.js";
 import { addSwitch } from "./structures.js";
 import { alongLine } from "./surfaces.js";
 import { TipSection } from "./tip_section.js";
-import { cross, dot, minus, mix, norm, rgb, unit } from "./vectors.js";
+import { cross, dot, minus, mix, norm } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
 
 const { scope: SCOPE, outer: OUTER, middle: MIDDLE, inner: INNER, needle: NEEDLE, target: TARGET, aim: AIM } = DEVICE_COLOURS;
@@ -24,16 +24,14 @@ const DEVICES = [
   { key: "target", name: "Target", colour: TARGET, shown: true },
   { key: "aim", name: "Aim of the devices, beside the moving target", colour: AIM, shown: true },
 ];
-const WHITE = [1, 1, 1];
 const CHART = {
   airway: ["airway wall", "#3A9BD5", ""], vessel: ["vessel", "#D81B60", "9 4"],
   pleura: ["pleura", "#B8860B", "3 4"], fissure: ["fissure", "#785EF0", "12 4 3 4"],
 };
 const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
 const BREATH_S = 5;
-const LEAST_WIDTH = 0.0016;
 const MOST_ACROSS_MM = 60;
-const TARGET_MM = 1.6, AIM_MM = 1.1, ABOVE_CARINA_MM = 30;
+const AIM_MM = 1.1, ABOVE_CARINA_MM = 30;
 // The chart of distances reaches to so many times what is required, or what is nearest.
 const CHART_ROOM = 3;
 
@@ -58,7 +56,7 @@ class PlanPage extends DevicePage {
     this.followed = 0;
     this.listSwitches();
     this.connectControls();
-    if (await this.openScene(distanceOfAll)) {
+    if (await this.openScene()) {
       this.bronchoscopy = new Bronchoscopy(this.scene, byId("inside"), byId("inside-place"), byId("inside-prompt"));
       this.fitToPlan();
       this.lookAtPlan();
@@ -274,52 +272,24 @@ class PlanPage extends DevicePage {
   }
 
   putDevices(state) {
-    const { scene, shown } = this;
-    const radius = thickened(this.motion.plan.radius_mm, this.orbit.distance);
-    const followed = this.shownPlans[this.followed];
-    const put = (name, on, fill) => {
-      const solids = new Solids();
-      if (on) fill(solids);
-      scene.setSolids(name, solids);
-    };
-    put("scope", followed && shown.scope, (s) => s.tube(state.scope, radius.scope, rgb(SCOPE)));
-    put("outer", followed && shown.tubes, (s) => s.tube(state.outer, radius.outer, rgb(OUTER)));
-    put("middle", followed && shown.tubes, (s) => s.tube(state.middle, radius.middle, rgb(MIDDLE)));
-    put("inner", followed && shown.tubes, (s) => s.tube(state.inner, radius.inner, rgb(INNER)));
-    put("needle", followed && shown.needle, (s) => s.tube(state.needle, radius.needle, state.needleColours));
-    this.motions.forEach((_, n) => put(`plan ${n}`, n !== this.followed && this.shownPlans[n], (s) => this.otherPlan(n, s)));
-    put("aim", shown.aim && this.aim, (s) => s.ball(this.aim, AIM_MM, rgb(AIM)));
-    put("target", shown.target, (s) => s.ball(this.target, TARGET_MM, rgb(TARGET)));
+    const { scene, shown, motion, target, aim, orbit: { distance } } = this;
+    showDevices(scene, motion.plan, this.shownPlans[this.followed] ? state : null, distance, shown);
+    this.motions.forEach(({ plan }, n) => {
+      const isShown = n !== this.followed && this.shownPlans[n];
+      showOther(scene, `plan ${n}`, n, plan, isShown ? this.stateOf(n, 1) : null, distance, shown);
+    });
+    showBall(scene, "aim", shown.aim && aim, AIM_MM);
+    showBall(scene, "target", shown.target && target);
     scene.fit();
   }
 
-  // The plans beside the one followed, each in a colour and in bands of its own.
-  otherPlan(n, solids) {
-    const end = this.stateOf(n, 1), radius = thickened(this.motions[n].plan.radius_mm, this.orbit.distance);
-    const { colour, bands } = planStyle(n);
-    const put = (points, mm) => {
-      const line = banded(points, rgb(colour), WHITE, bands);
-      solids.tube(line.points, mm, line.colours);
-    };
-    if (this.shown.scope) put(end.scope, 0.6 * radius.scope);
-    if (this.shown.tubes) put([...end.outer, ...end.middle, ...end.inner], 0.8 * radius.inner);
-    if (this.shown.needle) put(end.needle, 0.8 * radius.needle);
-  }
-
   drawSlices(isCoarse = this.hurriesSlices()) {
-    const { target, state, views } = this, { radius_mm: radius } = this.motion.plan, following = byId("follow").checked;
+    const { target, state, views } = this, following = byId("follow").checked;
     if (following) [views.place, views.centre] = [[...state.tip], [...state.tip]];
-    const lines = [
-      this.shown.scope && { points: state.scope, radius: radius.scope, colour: SCOPE },
-      this.shown.tubes && { points: state.outer, radius: radius.outer, colour: OUTER },
-      this.shown.tubes && { points: state.middle, radius: radius.middle, colour: MIDDLE },
-      this.shown.tubes && { points: state.inner, radius: radius.inner, colour: INNER },
-      this.shown.needle && { points: state.needle, radius: radius.needle, colour: NEEDLE },
-    ].filter((line) => line && line.points.length > 1);
+    const lines = deviceLines(this.motion.plan, state, this.shown);
     const marks = { lines, target: this.shown.target ? target : null };
     views.draw({ ...STANDARD, across: this.across(state, following), along: this.along(state, following) }, marks, isCoarse);
-    this.panel.showField();
-    this.panel.describe();
+    this.panel.show();
     this.drawTipSection(state);
     byId("slice-place").textContent = `Through ${following ? "the foremost tip, at" : "the cross, at"} LPS ${views.place.map((v) => v.toFixed(1)).join(", ")} mm.`;
     if (!following) for (const move of this.cursors) move(alongLine(this.devices, views.place).alongMm);
@@ -448,20 +418,9 @@ function swatchOf({ colour, bands }) {
 // Return the least of distances; below 0 there is none.
 const leastOf = (values) => values.reduce((least, value) => (value >= 0 ? Math.min(least, value) : least), Infinity);
 
-// Return how far away the whole lung is seen at once, by its size in mm.
-function distanceOfAll(size) {
-  return 1.05 * Math.max(...size) / Math.tan((15 * Math.PI) / 180) / 2 + size[1] / 2;
-}
-
 // Return the line of everything that is out, from the scope on.
 function wholeLine({ scope, outer, middle, inner, needle }) {
   return [...scope, ...outer, ...middle, ...inner, ...needle];
-}
-
-// Return radii that can be seen from a distance.
-function thickened(radius, distance) {
-  const least = LEAST_WIDTH * distance;
-  return Object.fromEntries(Object.entries(radius).map(([key, mm]) => [key, Math.max(mm, least)]));
 }
 
 openPage(new PlanPage(reportData()));

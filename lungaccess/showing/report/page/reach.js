@@ -1,23 +1,18 @@
 // The page of a reachability map.
 import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
+import { VIRIDIS } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { STANDARD } from "./slices.js";
-import { addSwitch, swatch } from "./structures.js";
-import { minus, mix, norm, rgb } from "./vectors.js";
+import { addSwitch, made, swatch } from "./structures.js";
+import { minus, norm, ramp, rgb } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
 
-// Viridis in five steps: even in lightness, for every colour vision.
-const RAMP = ["#440154", "#3B528B", "#21918C", "#5EC962", "#FDE725"].map(rgb);
 const NO_PATH = [150, 150, 150];
 const OVER_SHARE = 0.85;
 
 const bytes = (colour) => colour.map((value) => Math.round(255 * value));
 
-function ramp(share) {
-  const at = Math.min(Math.max(share, 0), 1) * (RAMP.length - 1);
-  const n = Math.min(Math.floor(at), RAMP.length - 2);
-  return bytes(mix(RAMP[n], RAMP[n + 1], at - n));
-}
+const shade = (share) => bytes(ramp(VIRIDIS, share));
 
 class ReachPage extends AnatomyPage {
   constructor(data) {
@@ -30,7 +25,7 @@ class ReachPage extends AnatomyPage {
     this.maps = await Promise.all(this.data.maps.map(async (map) => ({
       ...map, kindOf: await unpack(map.kind), clearanceOf: await unpack(map.clearance),
     })));
-    if (await this.openScene((size) => 2.1 * Math.max(...size))) await this.addMaps();
+    if (await this.openScene()) await this.addMaps();
     this.image = await VoxelImage.of(this.data);
     this.listControls();
     this.openSlices();
@@ -124,7 +119,7 @@ class ReachPage extends AnatomyPage {
     const reached = [map.kinds["direct arc"], map.kinds.search];
     const byClearance = byId("quantity").value === "clearance";
     const [low, high] = this.data.clearance_range_mm;
-    const shades = Array.from({ length: 256 }, (_, n) => ramp((n / map.steps_per_mm - low) / (high - low)));
+    const shades = Array.from({ length: 256 }, (_, n) => shade((n / map.steps_per_mm - low) / (high - low)));
     return (x, y, z) => {
       const at = this.voxel(x, y, z);
       const kind = at < 0 ? 0 : map.kindOf[at];
@@ -134,21 +129,10 @@ class ReachPage extends AnatomyPage {
     };
   }
 
-  drawView() {
-    this.scene.fit();
-    this.drawScene();
-  }
-
-  draw() {
-    if (this.scene) this.drawView();
-    if (this.views) this.drawSlices();
-  }
-
   drawSlices(isCoarse = this.hurriesSlices()) {
     this.image.overlay = this.painter();
     this.views.draw(STANDARD, {}, isCoarse);
-    this.panel.showField();
-    this.panel.describe();
+    this.panel.show();
     byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(0)).join(", ")} mm: ${this.words()}.`;
     this.showKey();
   }
@@ -168,14 +152,10 @@ class ReachPage extends AnatomyPage {
     const entries = clearance
       ? [0, 0.25, 0.5, 0.75, 1].map((share) => {
         const mm = this.data.clearance_range_mm[1] * share;
-        return [`${mm} mm${share === 1 ? " and more" : ""}`, `rgb(${ramp(share).join(",")})`];
+        return [`${mm} mm${share === 1 ? " and more" : ""}`, `rgb(${shade(share).join(",")})`];
       }).concat([["no path", `rgb(${NO_PATH.join(",")})`]])
       : Object.entries(this.data.colours);
-    byId("key").replaceChildren(...entries.map(([name, colour]) => {
-      const item = document.createElement("li");
-      item.append(swatch(colour), ` ${name}`);
-      return item;
-    }));
+    byId("key").replaceChildren(...entries.map(([name, colour]) => made("li", {}, swatch(colour), ` ${name}`)));
   }
 
   // What a test may read; docs/how_to/report.md names the fields.

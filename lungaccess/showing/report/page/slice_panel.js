@@ -1,5 +1,5 @@
 // The controls of slices (slices.html): field, window, what a drag does, opacities, and what is under the pointer.
-import { swatch } from "./structures.js";
+import { made, swatch } from "./structures.js";
 import { minus, norm } from "./vectors.js";
 
 // Connects the controls with slices.
@@ -54,29 +54,25 @@ export class SlicePanel {
     this.find("window-width").value = Math.round(width);
   }
 
-  // Write the width of the pictures into its field.
-  showField() {
+  // Write the width of the pictures into its field, and say what is at the pointer or the cross.
+  show() {
     const field = this.find("field"), { widthMm } = this.views, known = [...field.options].find((option) => Number(option.value) === widthMm);
     const free = field.querySelector("option[value='']");
     free.textContent = known ? "other" : `${widthMm.toFixed(0)} mm`;
     field.value = known ? known.value : "";
+    this.describe();
   }
 
   addOpacity({ name, colour, opacity }) {
-    const item = document.createElement("li"), label = document.createElement("label"), slider = document.createElement("input");
-    Object.assign(slider, { type: "range", min: 0, max: 100, step: 5 });
-    slider.value = Math.round(100 * opacity);
-    slider.dataset.structure = name;
-    const say = () => slider.setAttribute("aria-valuetext", `${slider.value} %`);
+    const slider = made("input", { type: "range", min: 0, max: 100, step: 5, value: Math.round(100 * opacity), "data-structure": name });
+    const say = () => (slider.ariaValueText = `${slider.value} %`);
     say();
     slider.addEventListener("input", () => {
       say();
       this.views.image.setOpacity(name, Number(slider.value) / 100);
       this.views.changed();
     });
-    label.append(swatch(colour), document.createTextNode(name), slider);
-    item.append(label);
-    this.find("opacities").append(item);
+    this.find("opacities").append(made("li", {}, made("label", {}, swatch(colour), name, slider)));
   }
 
   // Say what is at a place: of the pointer, or of the cross when there is none.

@@ -1,33 +1,25 @@
-// The switches: one labelled box for each thing that can be shown.
+// Elements of the page, and its switches: one labelled box for each thing that can be shown.
+
+// Return an element with properties or attributes, listeners ("on" and a name) and content; text is never markup.
+export function made(name, attributes = {}, ...content) {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (key in element && key !== "list") element[key] = value;
+    else element.setAttribute(key, value);
+  }
+  element.append(...content);
+  return element;
+}
 
 // Return a patch of a colour.
-export function swatch(colour) {
-  const made = document.createElement("span");
-  made.className = "swatch";
-  made.style.background = colour;
-  made.setAttribute("aria-hidden", "true");
-  return made;
-}
+export const swatch = (colour) => made("span", { className: "swatch", ariaHidden: "true", style: `background: ${colour}` });
 
 // Add a switch to a list; changed receives whether it is on.
 export function addSwitch(list, { key, name, colour, shown }, changed) {
-  const item = document.createElement("li");
-  const label = document.createElement("label");
-  const box = document.createElement("input");
-  box.type = "checkbox";
-  box.checked = shown;
-  box.dataset.key = key;
-  label.append(box, swatch(colour), document.createTextNode(name));
-  item.append(label);
-  list.append(item);
-  box.addEventListener("change", () => changed(box.checked));
+  const box = made("input", { type: "checkbox", checked: shown, "data-key": key, onchange: () => changed(box.checked) });
+  list.append(made("li", {}, made("label", {}, box, swatch(colour), name)));
   return box;
-}
-
-// Return the colour behind the scene, 0 to 1, as the page's style states it.
-export function sceneBackground() {
-  const value = getComputedStyle(document.documentElement).getPropertyValue("--scene").trim();
-  return [1, 3, 5].map((n) => parseInt(value.slice(n, n + 2), 16) / 255);
 }
 
 // Call a function at most once for each picture of the screen; `now` calls it at once, with true, and no call waits then.
@@ -45,29 +37,4 @@ export function oncePerFrame(task) {
     task(true);
   };
   return later;
-}
-
-// Connect the buttons of the views, the canvas and the letters at its edges with a camera.
-export function connectViews(figure, orbit) {
-  for (const button of figure.querySelectorAll("button[data-view]")) {
-    button.addEventListener("click", () => orbit.look(button.dataset.view));
-  }
-  for (const button of figure.querySelectorAll("button[data-fit]")) {
-    button.addEventListener("click", () => orbit.fit(button.dataset.fit));
-  }
-}
-
-// Return whether any of an element can be seen.
-export function isOnScreen(element) {
-  const { top, bottom } = element.getBoundingClientRect();
-  return bottom > 0 && top < window.innerHeight;
-}
-
-// Write the patient's sides at the edges of the scene.
-export function showEdges(figure, orbit) {
-  const names = orbit.edges();
-  figure.querySelectorAll(".edge").forEach((element, n) => {
-    element.textContent = names[n];
-  });
-  for (const button of figure.querySelectorAll("button[data-fit]")) button.hidden = !orbit.homes[button.dataset.fit];
 }

@@ -41,5 +41,11 @@ export function letters(direction) {
     .join("");
 }
 
+// Return the colour at a share, 0 to 1, of a ramp of colours "#rrggbb".
+export function ramp(colours, share) {
+  const at = Math.min(Math.max(share, 0), 1) * (colours.length - 1), n = Math.min(Math.floor(at), colours.length - 2);
+  return mix(rgb(colours[n]), rgb(colours[n + 1]), at - n);
+}
+
 // Return red, green and blue of "#rrggbb", 0 to 1.
 export const rgb = (hex) => [1, 3, 5].map((n) => parseInt(hex.slice(n, n + 2), 16) / 255);

@@ -44,11 +44,11 @@ export async function placedVolume(packed, table = null) {
   const volume = await unpackVolume(packed);
   const { width, height, depth, first, spacing } = volume;
   const rows = [0, 1, 2].map((row) => [0, 1, 2].map((column) => (row === column ? spacing : 0)).concat(first[row]));
-  return made(new VoxelGrid([width, height, depth], rows), table ? decoded(volume.voxels, table) : volume.voxels);
+  return volumeOf(new VoxelGrid([width, height, depth], rows), table ? decoded(volume.voxels, table) : volume.voxels);
 }
 
 // Return a volume of voxels, i fastest, on a grid.
-export function made(grid, voxels) {
+export function volumeOf(grid, voxels) {
   const [width, height, depth] = grid.shape;
   const m = Float64Array.from(grid.inverse.flatMap((row, n) => [...row, grid.shift[n]]));
   return { grid, voxels, width, height, depth, m, first: grid.first, spacing: grid.spacing[0] };

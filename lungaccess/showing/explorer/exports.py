@@ -17,7 +17,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.files import write_json, write_text
 from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Int
-from anatomy.base.words import of_hundred
+from anatomy.base.words import of_hundred, percent
 from anatomy.lung import Lung
 from lungaccess.judging.advice import advise
 from lungaccess.judging.appraisal import Appraisal, appraise, plan_record
@@ -181,21 +181,25 @@ def reach_parts(
         {
             "answer": "reach grid", "shape": list(grid.shape), "spacing_mm": float(grid.spacing_mm[0]),
             "ijk_from_lps": grid.ijk_from_lps.tolist(), "lps_from_ijk": grid.lps_from_ijk.tolist(),
-            "kinds": dict(KINDS), "counted": len(stream.counted),
-            "voxel_ml": float(grid.voxel_volume_mm3) / 1000.0, "system": system.name,
+            "kinds": dict(KINDS), "counted": len(stream.counted), "system": system.name,
         }
     )  # fmt: skip
     key = (system.scope, system.tubes, system.margins, atlas.with_fissures)
     known = None if system.needle is None else reached.get(key)
     reached.clear()  # Of one atlas only: a page changes the needle far more often than the scope.
-    kept = reached[key] = (
-        np.full(int(np.prod(grid.shape)), -1, dtype=np.int64) if known is None else known.copy()
-    )
+    count, by = int(np.prod(grid.shape)), "the tubes" if system.needle is None else "a single arc"
+    kept = reached[key] = np.full(count, -1, dtype=np.int64) if known is None else known.copy()
+    kinds = np.zeros(count, dtype=np.uint8)
     for part in stream.parts(around_lps, known):
         found = part.entries >= 0
         kept[part.voxels[found]] = part.entries[found]
+        kinds[part.voxels] = part.kinds
+        told, hit = np.count_nonzero(kinds), np.isin(kinds, (KINDS["direct arc"], KINDS["search"])).sum()
+        ml = float(grid.voxel_volume_mm3) / 1000.0
+        words = f"Reached by {by}: {hit * ml:.0f} of {told * ml:.0f} mL ({percent(hit / max(told, 1))})"
+        so_far = "" if part.share >= 1.0 else f"; {percent(part.share)} of the lung known so far"
         yield Part(
-            {"answer": "reach", "share": part.share},
+            {"answer": "reach", "share": part.share, "words": words + so_far},
             {"voxels": part.voxels.astype(np.int32), "kinds": part.kinds.astype(np.uint8)},
         )
         turn.check()

@@ -235,7 +235,7 @@ class ExplorerPage extends DevicePage {
 
   showReach(words = null) {
     if (!this.views) return;
-    byId("reach-words").textContent = words ?? (this.reach ? this.reach.words(this.hasNeedle ? "a single arc" : "the tubes") : "");
+    byId("reach-words").textContent = words ?? (this.reach ? this.reach.words() : "");
     const shown = byId("reach-scene").checked && this.reach;
     if (this.scene && (shown || this.scene.points.has("reach"))) {
       this.scene.setPoints("reach", shown ? this.reach.points() : null);

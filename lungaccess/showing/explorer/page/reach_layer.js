@@ -8,7 +8,7 @@ export class ReachLayer {
   // before: the layer of the system before the change, whose voxels are pale until they are known anew.
   constructor(grid, shades, before = null) {
     const { shape: [ni, nj, nk], lps_from_ijk: rows, kinds } = grid;
-    Object.assign(this, { grid, shades, share: 0, reached: [kinds["direct arc"], kinds.search] });
+    Object.assign(this, { grid, shades, share: 0, said: "" });
     // The last index is the fastest, as in the arrays of the answers.
     this.volume = volumeOf(new VoxelGrid([nk, nj, ni], rows.map(([i, j, k, first]) => [k, j, i, first])), new Uint8Array(ni * nj * nk));
     if (before && before.kinds.length === this.kinds.length) this.kinds.set(before.kinds.map((kind) => kind && kind | BEFORE));
@@ -32,12 +32,11 @@ export class ReachLayer {
     return layer;
   }
 
-  take({ share, arrays: { voxels, kinds } }) {
-    this.paint = null;
+  take({ share, words, arrays: { voxels, kinds } }) {
+    Object.assign(this, { share, said: words, paint: null });
     voxels.forEach((voxel, n) => {
       this.kinds[voxel] = kinds[n];
     });
-    this.share = share;
   }
 
   // Return what paints the map over a slice: the same function as long as the map is the same.
@@ -59,12 +58,9 @@ export class ReachLayer {
     return { places, colours: shades, radii: 0.16 * spacing };
   }
 
-  // Say in words how much is reached of what is known; by: "a single arc" or "the tubes".
-  words(by) {
+  // Say in words how much is reached of what is known.
+  words() {
     if (this.isOutdated) return `Pale: what ${this.grid.system} reaches. What the changed system reaches is not known yet.`;
-    const known = this.kinds.filter((kind) => kind && kind < BEFORE), reached = known.filter((kind) => this.reached.includes(kind)).length;
-    const ml = (count) => `${Math.round(count * this.grid.voxel_ml)} mL`, isPale = this.kinds.some((kind) => kind > BEFORE);
-    const whole = this.share >= 1 ? "" : `; ${Math.round(100 * this.share)} % of the lung known so far${isPale ? ", the pale rest is that of the system before" : ""}`;
-    return known.length ? `Reached by ${by}: ${ml(reached)} of ${ml(known.length)} (${((100 * reached) / known.length).toFixed(0)} %)${whole}` : "";
+    return `${this.said}${this.kinds.some((kind) => kind > BEFORE) ? ", the pale rest is that of the system before" : ""}`;
   }
 }

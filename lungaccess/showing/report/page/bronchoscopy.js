@@ -1,5 +1,6 @@
 // What the camera at the tip of the scope sees: the airway's surface from inside, the devices ahead, and which way to go.
 import { DEVICE_COLOURS } from "./colours.js";
+import { inscribe } from "./slices.js";
 import { banded, Solids } from "./solids.js";
 import { add, cross, dot, minus, norm, rgb, times } from "./vectors.js";
 
@@ -50,16 +51,12 @@ export class Bronchoscopy {
     pen.beginPath();
     pen.arc(...at, 13, 0, 2 * Math.PI);
     pen.stroke();
-    pen.font = `${taken ? "bold " : ""}19px system-ui, sans-serif`;
-    pen.textBaseline = "middle";
-    const words = `${taken ? "→ " : ""}${label}`, width = pen.measureText(words).width;
+    const words = `${taken ? "→ " : ""}${label}`, font = taken ? "bold 19px" : "19px";
+    pen.font = `${font} system-ui, sans-serif`;
+    const { width } = pen.measureText(words);
     const [low, high] = [half - Math.sqrt(half ** 2 - (at[1] - half) ** 2), half + Math.sqrt(half ** 2 - (at[1] - half) ** 2)];
     const below = at[1] + (at[1] > 1.6 * half ? -26 : 26), left = Math.min(Math.max(at[0] - width / 2, low + 12), Math.max(high - width - 12, low + 12));
-    pen.textAlign = "left";
-    pen.lineWidth = 4;
-    pen.strokeStyle = "#000000";
-    pen.strokeText(words, left, below);
-    pen.fillText(words, left, below);
+    inscribe(pen, words, left, below, "left", font, pen.fillStyle);
     return true;
   }
 }

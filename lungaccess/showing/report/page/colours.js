@@ -12,6 +12,13 @@ export const DEVICE_COLOURS = {
   "others": ["#56B4E9", "#F0E442", "#5B3A8E", "#4F7F2A", "#6B6B6B"]
 };
 
+// Of slices.  Each is at least 1.5 times as light as the one before, so that all are told apart on a dark ground, also
+// without their hues.
+export const TISSUE_COLOURS = {
+  outside: "#000000", lung: "#2E3133", lumen: "#19507E", fissure: "#7B5FA5", vessel: "#CF777D", "airway wall": "#85BFE4",
+  nodule: "#80FBC4",
+};
+
 // Even in lightness, for every colour vision.
 export const VIRIDIS = ["#440154", "#3B528B", "#21918C", "#5EC962", "#FDE725"];
 
@@ -25,9 +32,10 @@ export function planStyle(n) {
   return { colour: others[(n - 1) % others.length], bands: BANDS_MM[1 + ((n - 1) % (BANDS_MM.length - 1))] };
 }
 
-// Let the style sheet have the colours: --device-scope and so on.
+// Let the style sheet have the colours: --device-scope, --tissue-vessel and so on.
 export function publishColours() {
-  for (const [name, colour] of Object.entries(DEVICE_COLOURS)) {
-    if (typeof colour === "string") document.documentElement.style.setProperty(`--device-${name.replaceAll("_", "-")}`, colour);
-  }
+  const put = (kind) => ([name, colour]) =>
+    document.documentElement.style.setProperty(`--${kind}-${name.replace(/[_ ]/g, "-")}`, colour);
+  Object.entries(DEVICE_COLOURS).forEach(put("device"));
+  Object.entries(TISSUE_COLOURS).forEach(put("tissue"));
 }

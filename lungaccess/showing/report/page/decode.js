@@ -34,6 +34,11 @@ export async function unpack(packed) {
   return new Kind(joined.buffer);
 }
 
+// Return an object of packed arrays with the arrays.
+export async function unpackAll(packed) {
+  return Object.fromEntries(await Promise.all(Object.entries(packed).map(async ([key, each]) => [key, await unpack(each)])));
+}
+
 // Return a volume with its voxels, i fastest.
 export async function unpackVolume(packed) {
   const voxels = await unpack(packed.voxels);

@@ -1,6 +1,6 @@
 // A plan in motion: what is where at a position of the slider.
 import { DEVICE_COLOURS } from "./colours.js";
-import { unpack } from "./decode.js";
+import { unpackAll } from "./decode.js";
 import { minus, mix, point, rgb, unit } from "./vectors.js";
 
 export const STAGES = ["scope", "both tubes", "inner tube", "needle"];
@@ -19,15 +19,11 @@ export class Motion {
     const motion = new Motion();
     motion.plan = packed;
     const { scope, tubes, needle, profile } = packed;
-    [
-      motion.route, motion.routeMm, motion.forward, motion.up, motion.tubes, motion.innerMm, motion.outerMm,
-      motion.needle, motion.needleMm, motion.margin, motion.insertedMm, motion.sections, motion.shaft, motion.shaftMm,
-      motion.middleMm,
-    ] = await Promise.all([
-      scope.points, scope.arc_length_mm, scope.forward, scope.up, tubes.points, tubes.inner_mm, tubes.outer_mm,
-      needle.points, needle.arc_length_mm, profile.margin_mm,
-      scope.inserted_mm, scope.sections, scope.shaft, scope.shaft_mm, tubes.middle_mm,
-    ].map(unpack));
+    Object.assign(motion, await unpackAll({
+      route: scope.points, routeMm: scope.arc_length_mm, forward: scope.forward, up: scope.up, insertedMm: scope.inserted_mm,
+      sections: scope.sections, shaft: scope.shaft, shaftMm: scope.shaft_mm, tubes: tubes.points, innerMm: tubes.inner_mm,
+      outerMm: tubes.outer_mm, middleMm: tubes.middle_mm, needle: needle.points, needleMm: needle.arc_length_mm, margin: profile.margin_mm,
+    }));
     motion.tubePoints = tubes.points.shape[1];
     motion.sectionPoints = scope.sections.shape[1];
     const last = (array) => array[array.length - 1];

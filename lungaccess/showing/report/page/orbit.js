@@ -29,9 +29,7 @@ export class Orbit {
       this.pressed = null;
     });
     canvas.addEventListener("pointermove", (event) => this.drag(event));
-    for (const kind of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(kind, (event) => this.fingers.delete(event.pointerId));
-    }
+    canvas.addEventListener("lostpointercapture", (event) => this.fingers.delete(event.pointerId));
     canvas.addEventListener("wheel", (event) => {
       if (document.activeElement !== canvas && !event.ctrlKey) return;
       event.preventDefault();

@@ -9,7 +9,7 @@ import { DevicePage } from "./device_page.js";
 import { deviceLines, showBall, showDevices, showOther } from "./devices.js";
 import { Motion, STAGES } from "./motion.js";
 import { bendOf, planeAcross, planeAlong, STANDARD } from "./slices.js";
-import { paced, Player } from "./player.js";
+import { Animated, Player } from "./player.js";
 import { addSwitch } from "./structures.js";
 import { alongLine } from "./surfaces.js";
 import { TipSection } from "./tip_section.js";
@@ -41,7 +41,6 @@ class PlanPage extends DevicePage {
     this.player = new Player(this, () => (byId("pause").checked ? pausesOf(this.motion) : []));
     this.shown = Object.fromEntries(DEVICES.map(({ key, shown }) => [key, shown]));
     this.cursors = [];
-    this.breathing = null;
     this.phase = 0;
     this.exhaling = false;
   }
@@ -164,12 +163,12 @@ class PlanPage extends DevicePage {
   }
 
   connectBreath() {
+    const breathing = new Animated(byId("breathe"), ["Breathe", "Hold"], () => this.beginBreath());
     byId("phase").addEventListener("input", () => {
-      this.holdBreath();
+      breathing.stop();
       this.breathe(Number(byId("phase").value) / 1000);
       this.redraw();
     });
-    byId("breathe").addEventListener("click", () => (this.breathing === null ? this.breatheOn() : this.holdBreath()));
   }
 
   // Show a phase of the breath.
@@ -179,23 +178,14 @@ class PlanPage extends DevicePage {
     byId("phase").value = Math.round(1000 * phase);
   }
 
-  breatheOn() {
+  beginBreath() {
     let angle = this.exhaling ? 2 * Math.PI - Math.acos(1 - 2 * this.phase) : Math.acos(1 - 2 * this.phase);
-    const step = paced((seconds) => {
-      if (this.breathing === null) return;
+    return (seconds) => {
       angle += (2 * Math.PI * seconds) / BREATH_S;
       this.breathe((1 - Math.cos(angle)) / 2, Math.sin(angle) < 0);
       this.show("moving");
-      this.breathing = requestAnimationFrame(step);
-    });
-    byId("breathe").textContent = "Hold";
-    this.breathing = requestAnimationFrame(step);
-  }
-
-  holdBreath() {
-    if (this.breathing !== null) cancelAnimationFrame(this.breathing);
-    this.breathing = null;
-    byId("breathe").textContent = "Breathe";
+      return true;
+    };
   }
 
   moveTo(position) {

@@ -7,12 +7,12 @@ export class Player {
   // page: its `redraw` is called when the slider was moved, and its `show` while it plays; `pauses` returns where playing
   // stops, in thousandths of the slider.
   constructor(page, pauses = () => []) {
-    Object.assign(this, { page, pauses, slider: byId("position"), button: byId("play"), playing: null });
+    Object.assign(this, { page, pauses, slider: byId("position") });
+    this.animated = new Animated(byId("play"), ["Play", "Pause"], () => this.begin());
     this.slider.addEventListener("input", () => {
       this.stop();
       page.redraw();
     });
-    this.button.addEventListener("click", () => (this.playing === null ? this.play() : this.stop()));
   }
 
   // Where the deployment is, 0 to 1.
@@ -30,38 +30,49 @@ export class Player {
     byId("position-words").textContent = words;
   }
 
-  play() {
+  begin() {
     let share = this.position >= 1 ? 0 : this.position;
     const first = share;
-    const step = paced((seconds) => {
-      if (this.playing === null) return;
+    return (seconds) => {
       const before = share;
       share = Math.min(share + seconds / PLAY_S, 1);
       const pause = this.pauses().find((tick) => tick > 1000 * Math.max(before, first) + 1e-6 && tick <= 1000 * share);
       if (pause) share = pause / 1000;
       this.position = share;
       this.page.show("moving");
-      if (share >= 1 || pause) this.stop();
-      else this.playing = requestAnimationFrame(step);
-    });
-    this.button.textContent = "Pause";
-    this.playing = requestAnimationFrame(step);
+      return share < 1 && !pause;
+    };
   }
 
   stop() {
-    if (this.playing !== null) cancelAnimationFrame(this.playing);
-    this.playing = null;
-    this.button.textContent = "Play";
+    this.animated.stop();
   }
 }
 
-// Return a step of an animation that is told the seconds since the one before: on a slow machine it is slower,
-// and does not jump.
-export function paced(step) {
-  let last = performance.now();
-  return (now) => {
-    const seconds = Math.min(Math.max(now - last, 0) / 1000, MOST_STEP_S);
-    last = now;
-    step(seconds);
-  };
+// An animation that a button begins and ends: begin returns a step, which is told the seconds since the one before and
+// returns whether it goes on; on a slow machine it is slower, and does not jump.
+export class Animated {
+  constructor(button, words, begin) {
+    Object.assign(this, { button, words, begin, frame: null });
+    button.addEventListener("click", () => (this.frame === null ? this.play() : this.stop()));
+  }
+
+  play() {
+    const step = this.begin();
+    let last = performance.now();
+    const next = (now) => {
+      const seconds = Math.min(Math.max(now - last, 0) / 1000, MOST_STEP_S);
+      last = now;
+      if (step(seconds) && this.frame !== null) this.frame = requestAnimationFrame(next);
+      else this.stop();
+    };
+    this.button.textContent = this.words[1];
+    this.frame = requestAnimationFrame(next);
+  }
+
+  stop() {
+    cancelAnimationFrame(this.frame);
+    this.frame = null;
+    [this.button.textContent] = this.words;
+  }
 }

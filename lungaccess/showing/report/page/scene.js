@@ -134,14 +134,12 @@ export class Scene {
     gl.bindVertexArray(null);
   }
 
-  // Let the depth reach over points; a little more than needed, so that it seldom changes.
-  enclose(points) {
-    const empty = this.low.every((low, axis) => low === this.high[axis]);
-    const low = (axis) => Math.min(...points.map((point) => point[axis]));
-    const high = (axis) => Math.max(...points.map((point) => point[axis]));
+  // Let the depth reach over a box, a little more than needed, so that it seldom changes.
+  enclose([low, high]) {
+    const empty = this.low.every((each, axis) => each === this.high[axis]);
     for (let axis = 0; axis < 3; axis++) {
-      if (empty || low(axis) < this.low[axis]) this.low[axis] = low(axis) - SLACK_MM;
-      if (empty || high(axis) > this.high[axis]) this.high[axis] = high(axis) + SLACK_MM;
+      if (empty || low[axis] < this.low[axis]) this.low[axis] = low[axis] - SLACK_MM;
+      if (empty || high[axis] > this.high[axis]) this.high[axis] = high[axis] + SLACK_MM;
     }
   }
 

@@ -1,13 +1,13 @@
 // Planes through the image: standard ones by radiological convention, and any other.
 import { add, cross, dot, letters, minus, norm, times, unit } from "./vectors.js";
 
-const INK = { label: "#F2F2F2", cross: "#FFFFFF" };
+const INK = "#F2F2F2", CROSS_INK = "#FFFFFF";
 const NEAR_MM = 2;
 const FAINT = 0.5;
 const LATTICE_PIXELS = 8;
 const NOWHERE = [0, 0, 0];
 const KEY_DIGITS = 6, COARSE_PIXELS = 3;
-const BARS_MM = [1, 2, 5, 10, 20, 50, 100];
+const BARS_MM = [0.5, 1, 2, 5, 10, 20, 50, 100];
 const CROSS_GAP = 9;
 // A line that is bent less lies in every plane through its ends.
 const STRAIGHT_MM = 0.05;
@@ -128,7 +128,7 @@ export class Slice {
     this.paintPixels(values);
     pen.putImageData(this.pixels, 0, 0);
     this.letters();
-    this.bar(width / this.plane.scale);
+    scaleBar(pen, this.plane.scale);
     this.ground = pen.getImageData(0, 0, width, height);
   }
 
@@ -236,7 +236,7 @@ export class Slice {
   // The cross: where the other planes cut this one.
   cross(place) {
     const [x, y, away] = this.project(place), { width, height } = this.canvas, pen = this.pen;
-    pen.strokeStyle = INK.cross;
+    pen.strokeStyle = CROSS_INK;
     pen.globalAlpha = away <= NEAR_MM ? 0.6 : 0.3;
     pen.lineWidth = 1;
     pen.beginPath();
@@ -260,31 +260,21 @@ export class Slice {
       [letters(up), width / 2, 16, "center"], [letters(times(up, -1)), width / 2, height - 16, "center"],
     ];
     this.edges = edges.map(([name]) => name);
-    for (const [name, x, y, align] of edges) this.write(name, x, y, align, "bold 19px system-ui, sans-serif");
+    for (const [name, x, y, align] of edges) inscribe(this.pen, name, x, y, align, "bold 19px");
   }
+}
 
-  bar(widthMm) {
-    const mm = Math.max(BARS_MM[0], ...BARS_MM.filter((each) => each <= 0.3 * widthMm));
-    const pen = this.pen;
-    const y = this.canvas.height - 9;
-    pen.strokeStyle = INK.label;
-    pen.lineWidth = 3;
-    pen.beginPath();
-    pen.moveTo(9, y);
-    pen.lineTo(9 + mm * this.plane.scale, y);
-    pen.stroke();
-    this.write(`${mm} mm`, 9, y - 13, "left", "15px system-ui, sans-serif");
-  }
+// Draw a bar of a round length at the lower left of a picture of so many pixels for a mm.
+export function scaleBar(pen, scale) {
+  const { width, height } = pen.canvas, mm = Math.max(BARS_MM[0], ...BARS_MM.filter((each) => each * scale <= 0.3 * width));
+  pen.fillStyle = INK;
+  pen.fillRect(9, height - 10.5, mm * scale, 3);
+  inscribe(pen, `${mm} mm`, 9, height - 22, "left", "15px");
+}
 
-  write(text, x, y, align, font) {
-    const pen = this.pen;
-    pen.font = font;
-    pen.textAlign = align;
-    pen.textBaseline = "middle";
-    pen.lineWidth = 4;
-    pen.strokeStyle = "#000000";
-    pen.strokeText(text, x, y);
-    pen.fillStyle = INK.label;
-    pen.fillText(text, x, y);
-  }
+// Write a text in light letters with a dark rim, which are read on any ground.
+export function inscribe(pen, text, x, y, align, font, ink = INK, rim = "#000000", rimPx = 4) {
+  Object.assign(pen, { font: `${font} system-ui, sans-serif`, textAlign: align, textBaseline: "middle", lineWidth: rimPx, strokeStyle: rim, fillStyle: ink });
+  pen.strokeText(text, x, y);
+  pen.fillText(text, x, y);
 }

@@ -1,19 +1,15 @@
 // The cross-section of the airway at the tip of the scope: the border of the lumen around the scope of its true width.
-import { DEVICE_COLOURS } from "./colours.js";
-import { unpack } from "./decode.js";
+import { DEVICE_COLOURS, TISSUE_COLOURS } from "./colours.js";
+import { unpackAll } from "./decode.js";
+import { scaleBar } from "./slices.js";
 
-const SECTION_WALL = "#6FA8CC", SECTION_LUMEN = "#0E3A57", FREE_INK = "#FFD23F", CROSSED = "#FF8F8A", SECTION_INK = "#F2F2F2";
-const SECTION_BARS_MM = [0.5, 1, 2, 5];
+const FREE_INK = "#FFD23F", CROSSED = "#FF8F8A", SECTION_INK = "#F2F2F2";
 const SECTION_ROOM = 1.15;
 
 export class TipSection {
   static async of(scope) {
-    const section = new TipSection();
-    section.step = scope.border_step_mm;
-    section.count = scope.border.shape[1];
-    [section.border, section.gap, section.nearest, section.depthGap, section.along] = await Promise.all(
-      [scope.border, scope.gap_mm, scope.nearest, scope.depth_gap_mm, scope.arc_length_mm].map(unpack));
-    return section;
+    const { border, gap_mm: gap, nearest, depth_gap_mm: depthGap, arc_length_mm: along, border_step_mm: step } = scope;
+    return Object.assign(new TipSection(), await unpackAll({ border, gap, nearest, depthGap, along }), { step, count: border.shape[1] });
   }
 
   // Return the section of the stored state that is nearest after so much motion.
@@ -33,12 +29,12 @@ export class TipSection {
       const angle = (2 * Math.PI * n) / this.count;
       return [middle + scale * mm * Math.sin(angle), middle - scale * mm * Math.cos(angle)];
     };
-    pen.fillStyle = SECTION_WALL;
+    pen.fillStyle = TISSUE_COLOURS["airway wall"];
     pen.fillRect(0, 0, side, side);
     pen.beginPath();
     border.forEach((mm, n) => pen.lineTo(...place(n, mm)));
     pen.closePath();
-    pen.fillStyle = SECTION_LUMEN;
+    pen.fillStyle = TISSUE_COLOURS.lumen;
     pen.fill();
     pen.strokeStyle = SECTION_INK;
     pen.lineWidth = 2;
@@ -54,22 +50,11 @@ export class TipSection {
     pen.strokeStyle = gap > 0 ? FREE_INK : CROSSED;
     pen.lineWidth = 5;
     pen.stroke();
-    this.bar(pen, side, scale);
+    scaleBar(pen, scale);
     const hour = Math.round((12 * nearest) / this.count) % 12 || 12;
     const free = gap > 0 ? `${gap.toFixed(1)} mm free at ${hour} o'clock` : `the border of the lumen crosses the scope at ${hour} o'clock`;
     const proved = depthGap > 0 ? `at least ${depthGap.toFixed(1)} mm` : "not proved";
     caption.textContent = `Across the scope's tip (${(2 * radius).toFixed(1)} mm wide), seen along it, as in the bronchoscopy: ${free} in this plane; all around: ${proved}`;
     canvas.setAttribute("aria-label", caption.textContent);
-  }
-
-  bar(pen, side, scale) {
-    const mm = Math.max(...SECTION_BARS_MM.filter((each) => each * scale <= 0.3 * side), SECTION_BARS_MM[0]);
-    pen.fillStyle = SECTION_INK;
-    pen.fillRect(9, side - 12, mm * scale, 3);
-    pen.font = "15px system-ui, sans-serif";
-    pen.strokeStyle = "#000000";
-    pen.lineWidth = 4;
-    pen.strokeText(`${mm} mm`, 9, side - 19);
-    pen.fillText(`${mm} mm`, 9, side - 19);
   }
 }

@@ -1,5 +1,7 @@
 // What one does in the 3-D view besides turning it: point, measure, cut, and save a picture or a film.
+import { inscribe } from "./slices.js";
 import { Solids } from "./solids.js";
+import { made } from "./structures.js";
 import { add, dot, minus, norm, rgb, times, unit } from "./vectors.js";
 
 const MEASURE_INK = "#FFD23F";
@@ -50,17 +52,10 @@ export class ViewTools {
 
   afterDrawing() {
     const labels = [...this.page.labels(), ...this.measureLabel()];
-    const list = this.find("scene-labels");
-    while (list.children.length > labels.length) list.lastChild.remove();
-    while (list.children.length < labels.length) list.append(document.createElement("span"));
-    labels.forEach(({ text, point, colour }, n) => {
-      const label = list.children[n], at = this.page.scene.project(point);
-      label.hidden = !at;
-      if (!at) return;
-      label.textContent = text;
-      label.style.borderColor = colour || "currentColor";
-      label.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px)`;
-    });
+    this.find("scene-labels").replaceChildren(...labels.flatMap(({ text, point, colour }) => {
+      const at = this.page.scene.project(point);
+      return at ? made("span", { style: `border-color: ${colour}; transform: translate(${at.map((px) => `${px.toFixed(1)}px`)})` }, text) : [];
+    }));
   }
 
   // Pointing ----------------------------------------------------------------------------------------------------------
@@ -198,18 +193,11 @@ export class ViewTools {
     const { canvas } = this, pen = sheet.getContext("2d");
     const scale = sheet.width / canvas.clientWidth, frame = canvas.getBoundingClientRect();
     pen.drawImage(canvas, 0, 0, sheet.width, sheet.height);
-    const style = getComputedStyle(document.documentElement), ink = style.getPropertyValue("--ink").trim();
-    pen.textAlign = "center";
-    pen.textBaseline = "middle";
-    pen.lineWidth = 3 * scale;
-    pen.strokeStyle = style.getPropertyValue("--paper").trim();
-    pen.fillStyle = ink;
-    for (const element of this.figure.querySelectorAll(".edge, #scene-labels > span:not([hidden])")) {
+    const style = getComputedStyle(document.documentElement), [ink, paper] = ["--ink", "--paper"].map((name) => style.getPropertyValue(name).trim());
+    for (const element of this.figure.querySelectorAll(".edge, #scene-labels > span")) {
       const box = element.getBoundingClientRect();
       const at = [(box.x + box.width / 2 - frame.x) * scale, (box.y + box.height / 2 - frame.y) * scale];
-      pen.font = `700 ${15 * scale}px system-ui, sans-serif`;
-      pen.strokeText(element.textContent, ...at);
-      pen.fillText(element.textContent, ...at);
+      inscribe(pen, element.textContent, ...at, "center", `700 ${15 * scale}px`, ink, paper, 3 * scale);
     }
   }
 

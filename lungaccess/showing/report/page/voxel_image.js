@@ -1,12 +1,8 @@
 // The voxels of a page and how they are painted: structures, a CT, and a further layer over them.
+import { TISSUE_COLOURS } from "./colours.js";
 import { rgb } from "./vectors.js";
 import { linear, nearest, PackedSource, placedVolume, VoxelGrid } from "./voxels.js";
 
-// Each is at least 1.5 times as light as the one before, so that all are told apart on a dark ground, also without their hues.
-const STRUCTURE_COLOURS = {
-  outside: "#000000", lung: "#2E3133", lumen: "#19507E", fissure: "#7B5FA5", vessel: "#CF777D", "airway wall": "#85BFE4",
-  nodule: "#80FBC4",
-};
 // What is painted over a CT at first, and how densely.
 const TINTED = ["airway wall", "vessel", "fissure", "nodule"];
 const TINT = 0.45;
@@ -31,7 +27,7 @@ export class VoxelImage {
     image.tinted = new Uint8Array(256);
     image.opacity = new Float32Array(256);
     for (const [name, code] of Object.entries(data.codes)) {
-      image.table.set(rgb(STRUCTURE_COLOURS[name]).map((value) => 255 * value), 3 * code);
+      image.table.set(rgb(TISSUE_COLOURS[name]).map((value) => 255 * value), 3 * code);
       image.ground[code] = GROUND.includes(name) ? 1 : 0;
       image.tinted[code] = TINTED.includes(name) ? 1 : 0;
       image.opacity[code] = image.hasCt ? TINT * image.tinted[code] : 1;
@@ -72,7 +68,7 @@ export class VoxelImage {
   // Return name, colour and opacity of the structures that can be painted over others.
   structures() {
     return Object.entries(this.codes).filter(([, code]) => !this.ground[code])
-      .map(([name, code]) => ({ name, colour: STRUCTURE_COLOURS[name], opacity: this.opacity[code] }));
+      .map(([name, code]) => ({ name, colour: TISSUE_COLOURS[name], opacity: this.opacity[code] }));
   }
 
   setOpacity(name, share) {

@@ -14,7 +14,6 @@ import { placedVolume } from "../report/voxels.js";
 import { Asker } from "./asker.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
-import { ctSource } from "./ct_source.js";
 import { connectHelp, connectKeys } from "./keys.js";
 import { Panes } from "./panes.js";
 import { PlanPanel } from "./plan_panel.js";
@@ -34,6 +33,7 @@ class ExplorerPage extends DevicePage {
     this.search = new Search(this);
     this.exits = this.tips = this.reach = this.motion = null;
     this.targetLps = this.failure = null;
+    this.sharp = 0;
     this.stale = { scene: true, slices: true };
     const later = oncePerFrame((atOnce) => (this.stale.scene ? this.show(atOnce ? "rest" : "moving") : this.draw()));
     const mark = (changes) => Object.assign(this.stale, changes);
@@ -109,10 +109,18 @@ class ExplorerPage extends DevicePage {
 
   takeImage(image) {
     this.image = image;
-    if (this.facts.has_ct) image.finer = ctSource(this.connection);
+    if (this.facts.has_ct) image.finer = { slice: (raster) => this.sharpSlice(raster) };
     byId("ct-controls").hidden = !image.hasCt;
     this.openSlices();
     byId("reach-slices").checked = !image.hasCt;
+  }
+
+  // Return the values of the CT, as the server has it, at the pixels of a plane; voxels.js says what a source is.
+  async sharpSlice(raster) {
+    let values = null;
+    // A slot of its own: each slice asks one at a time, and none takes the place of another.
+    await this.connection.ask("slice", { ...raster, slot: `${++this.sharp}` }, ({ arrays: { hu } }) => (values = hu)).done;
+    return values;
   }
 
   async takeStructures(structures) {

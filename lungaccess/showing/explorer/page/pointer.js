@@ -1,4 +1,5 @@
 // What a click in the 3-D view chooses, and how exit and scope tip are dragged.
+import { rayThrough } from "../report/picking.js";
 import { add, dot, minus, norm, times } from "../report/vectors.js";
 import { leastOf, lpsText } from "./widgets.js";
 
@@ -93,7 +94,7 @@ export function connectPointer(page) {
     }
     const { eye, forward } = orbit.camera();
     const [x, y] = [(2 * at[0]) / canvas.clientWidth - 1, 1 - (2 * at[1]) / canvas.clientHeight];
-    const ray = scene.picker.ray(x, y);
+    const ray = rayThrough(scene, x, y);
     const depth = dot(minus(page.place, eye), forward) / dot(ray, forward);
     page.moveTo(add(eye, times(ray, depth)));
     return page.chooseTarget(lpsText(page.place));

@@ -6,77 +6,69 @@ export const FAINTEST = 0.2;
 const STEEPEST = 8;
 const HIT = { surface: "surface", solid: "solid", points: "points" };
 
-export class Picker {
-  constructor(scene) {
-    this.scene = scene;
-  }
+// Return the first hit along the ray through a pixel that can be picked, null for none:
+//   { kind: "surface", "solid" or "points", key, point: LPS mm, depth_mm, index: of a point, hits }
+// By rule: the nearest of solid bodies, points and surfaces of the structures that can be picked (opacity 0.2 and more,
+// or those listed in `pickable`); if there is none, the nearest surface of all.  `hits` are all of them, nearest first.
+export function pick(scene, x, y, { pickable = null } = {}) {
+  const { view, layers } = scene;
+  if (!view || !layers.width) return null;
+  const { clientWidth, clientHeight } = scene.canvas;
+  if (x < 0 || y < 0 || x >= clientWidth || y >= clientHeight) return null;
+  const across = (x * layers.width) / clientWidth, up = layers.height - (y * layers.height) / clientHeight;
+  const hits = hitsAt(scene, across, up, rayThrough(scene, (2 * across) / layers.width - 1, (2 * up) / layers.height - 1));
+  if (!hits.length) return null;
+  const can = ({ kind, key }) => kind !== HIT.surface
+    || (pickable ? pickable.includes(key) : scene.surfaces.get(key).opacity >= FAINTEST);
+  return { ...(hits.find(can) || hits[0]), hits };
+}
 
-  // Return the first hit along the ray through a pixel that can be picked, null for none:
-  //   { kind: "surface", "solid" or "points", key, point: LPS mm, depth_mm, index: of a point, hits }
-  // By rule: the nearest of solid bodies, points and surfaces of the structures that can be picked (opacity 0.2 and more,
-  // or those listed in `pickable`); if there is none, the nearest surface of all.  `hits` are all of them, nearest first.
-  pick(x, y, { pickable = null } = {}) {
-    const { scene } = this, { view, layers } = scene;
-    if (!view || !layers.width) return null;
-    const { clientWidth, clientHeight } = scene.canvas;
-    if (x < 0 || y < 0 || x >= clientWidth || y >= clientHeight) return null;
-    const across = (x * layers.width) / clientWidth, up = layers.height - (y * layers.height) / clientHeight;
-    const hits = this.hitsAt(across, up, this.ray((2 * across) / layers.width - 1, (2 * up) / layers.height - 1));
-    if (!hits.length) return null;
-    const can = ({ kind, key }) => kind !== HIT.surface
-      || (pickable ? pickable.includes(key) : scene.surfaces.get(key).opacity >= FAINTEST);
-    return { ...(hits.find(can) || hits[0]), hits };
-  }
-
-  hitsAt(across, up, ray) {
-    const { scene } = this, { view, layers } = scene;
-    const hits = [], step = (view.span[1] - view.span[0]) / 65534;
-    // Four pixels are of one surface if it is not steeper than so.
-    const most = (STEEPEST * 2 * view.camera.distance) / (view.clip[5] * layers.height * step);
-    const put = (kind, key, depth, more) => {
-      const mm = view.span[0] + depth * step;
-      hits.push({ kind, key, depth_mm: mm, point: add(view.camera.eye, times(ray, mm)), ...more });
-    };
-    const { number, depth: solid } = layers.read(layers.reading, across, up, most);
-    if (solid < 65535) {
-      const names = [...scene.solids.keys()];
-      if (number < names.length) put(HIT.solid, names[number], solid);
-      else {
-        const key = [...scene.points.keys()][number - names.length];
-        put(HIT.points, key, solid, {});
-        hits[0].index = this.nearestPoint(scene.points.get(key), hits[0].point);
-      }
+function hitsAt(scene, across, up, ray) {
+  const { view, layers } = scene;
+  const hits = [], step = (view.span[1] - view.span[0]) / 65534;
+  // Four pixels are of one surface if it is not steeper than so.
+  const most = (STEEPEST * 2 * view.camera.distance) / (view.clip[5] * layers.height * step);
+  const put = (kind, key, depth, more) => {
+    const mm = view.span[0] + depth * step;
+    hits.push({ kind, key, depth_mm: mm, point: add(view.camera.eye, times(ray, mm)), ...more });
+  };
+  const { number, depth: solid } = layers.read(layers.reading, across, up, most);
+  if (solid < 65535) {
+    const names = [...scene.solids.keys()];
+    if (number < names.length) put(HIT.solid, names[number], solid);
+    else {
+      const key = [...scene.points.keys()][number - names.length];
+      put(HIT.points, key, solid, {});
+      hits[0].index = nearestPoint(scene.points.get(key), hits[0].point);
     }
-    view.counts.forEach((count, k) => view.shown.slice(0, count).forEach(([key], n) => {
-      const { depth } = layers.read(layers.peeled[k][n], across, up, most);
-      if (depth < 65535 && depth < solid) put(HIT.surface, key, depth);
-    }));
-    return hits.sort((a, b) => a.depth_mm - b.depth_mm);
   }
+  view.counts.forEach((count, k) => view.shown.slice(0, count).forEach(([key], n) => {
+    const { depth } = layers.read(layers.peeled[k][n], across, up, most);
+    if (depth < 65535 && depth < solid) put(HIT.surface, key, depth);
+  }));
+  return hits.sort((a, b) => a.depth_mm - b.depth_mm);
+}
 
-  // Return the direction through a place of the picture, -1 to 1, so long that it advances 1 mm along the view.
-  ray(across, up) {
-    const { camera, clip, eye } = this.scene.view;
-    const right = [eye[0], eye[4], eye[8]], above = [eye[1], eye[5], eye[9]];
-    return add(camera.forward, add(times(right, across / clip[0]), times(above, up / clip[5])));
-  }
+// Return the direction through a place of the picture, -1 to 1, so long that it advances 1 mm along the view.
+export function rayThrough({ view: { camera, clip, eye } }, across, up) {
+  const right = [eye[0], eye[4], eye[8]], above = [eye[1], eye[5], eye[9]];
+  return add(camera.forward, add(times(right, across / clip[0]), times(above, up / clip[5])));
+}
 
-  nearestPoint({ places }, point) {
-    let least = Infinity, found = -1;
-    for (let n = 0; n < places.length / 3; n++) {
-      const away = minus([places[3 * n], places[3 * n + 1], places[3 * n + 2]], point);
-      const square = dot(away, away);
-      if (square < least) [least, found] = [square, n];
-    }
-    return found;
+function nearestPoint({ places }, point) {
+  let least = Infinity, found = -1;
+  for (let n = 0; n < places.length / 3; n++) {
+    const away = minus([places[3 * n], places[3 * n + 1], places[3 * n + 2]], point);
+    const square = dot(away, away);
+    if (square < least) [least, found] = [square, n];
   }
+  return found;
+}
 
-  // Return where a point is in the picture, in pixels of the page from its upper left; null behind the camera.
-  project(point) {
-    const { canvas, view: { eye, clip } } = this.scene;
-    const at = (row) => eye[row] * point[0] + eye[4 + row] * point[1] + eye[8 + row] * point[2] + eye[12 + row];
-    const z = -at(2);
-    if (z <= 0) return null;
-    return [(0.5 + (0.5 * clip[0] * at(0)) / z) * canvas.clientWidth, (0.5 - (0.5 * clip[5] * at(1)) / z) * canvas.clientHeight];
-  }
+// Return where a point is in the picture, in pixels of the page from its upper left; null behind the camera.
+export function project({ canvas, view: { eye, clip } }, point) {
+  const at = (row) => eye[row] * point[0] + eye[4 + row] * point[1] + eye[8 + row] * point[2] + eye[12 + row];
+  const z = -at(2);
+  if (z <= 0) return null;
+  return [(0.5 + (0.5 * clip[0] * at(0)) / z) * canvas.clientWidth, (0.5 - (0.5 * clip[5] * at(1)) / z) * canvas.clientHeight];
 }

@@ -1,7 +1,7 @@
 // The 3-D scene: see-through surfaces in layers, sorted by depth in each pixel, and solid bodies and points among them.
 import { unpack } from "./decode.js";
 import { Layers } from "./layers.js";
-import { FAINTEST, Picker } from "./picking.js";
+import { FAINTEST, pick, project } from "./picking.js";
 import { MOST_SLICES, programs } from "./shaders.js";
 import { coarser, facesFrom, nearnessOf, normalsOf } from "./surfaces.js";
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
@@ -28,7 +28,6 @@ export class Scene {
     if (!this.gl) throw new Error("WebGL 2 is not available");
     this.programs = programs(this.gl);
     this.layers = new Layers(this.gl);
-    this.picker = new Picker(this);
     this.surfaces = new Map();
     this.solids = new Map();
     this.points = new Map();
@@ -285,12 +284,12 @@ export class Scene {
 
   // Return what is under a place of the canvas, in pixels of the page from its upper left; picking.js says what.
   pick(x, y, options) {
-    return this.picker.pick(x, y, options);
+    return pick(this, x, y, options);
   }
 
   // Return where a point is in the picture, in pixels of the page from its upper left; null behind the camera.
   project(point) {
-    return this.picker.project(point);
+    return project(this, point);
   }
 
   // Draw the airway from inside into a square of the canvas, and copy it to another one.

@@ -14,6 +14,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+CONTAINER = (ROOT / "packaging/Containerfile").read_text()
 CONDA_NAMES = {"matplotlib": "matplotlib-base"}
 RUN_EXTRAS = ("learned", "live", "study", "view")
 
@@ -87,19 +88,28 @@ def test_the_recipe_has_the_requirements_of_the_project() -> None:
     assert command == [f"{name} = {place}" for name, place in PROJECT["scripts"].items()]
 
 
-def test_the_container_copies_what_is_there_and_installs_extras_that_exist() -> None:
-    text = (ROOT / "packaging/Containerfile").read_text()
+def test_the_container_installs_the_tested_versions_by_their_digests() -> None:
+    text = (ROOT / "packaging/requirements.txt").read_text()
+    digests = re.findall(
+        r"^([\w.-]+)==(\S+).*?((?:\\\n    --hash=sha256:[0-9a-f]{64} ?)+)$", text, re.MULTILINE
+    )
+    assert len(digests) == len(re.findall(r"^\w", text, re.MULTILINE)) and "--require-hashes" in CONTAINER
+    tested = {name.replace("_", "-"): version for name, version in pins("constraints.txt").items()}
+    held = {name: version for name, version, _files in digests}
+    assert held == {name: tested.get(name) for name in held}
+    assert set(bounds("live", "study", "view")) <= set(held)
+
+
+def test_the_container_copies_what_is_there() -> None:
     copied = [
         words
-        for line in re.findall(r"^COPY (?!--from)(.+) \S+$", text, re.MULTILINE)
+        for line in re.findall(r"^COPY (?!--from)(.+) \S+$", CONTAINER, re.MULTILINE)
         for words in line.split()
     ]
     assert copied and all((ROOT / name).exists() for name in copied)
     for package in release.PACKAGES:
         assert package in copied
-    (extras,) = re.findall(r"\[([\w,]+)\]", text)
-    assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
-    versions = set(re.findall(r"^FROM python:(3\.\d+)", text, re.MULTILINE))
+    versions = set(re.findall(r"^FROM python:(3\.\d+)", CONTAINER, re.MULTILINE))
     tested = {each["python"] for each in release.MATRIX["environment"] if each["dependencies"] == "tested"}
     assert versions == tested
 

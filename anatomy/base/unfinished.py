@@ -10,6 +10,7 @@ from pathlib import Path
 from filelock import FileLock, SoftFileLock, Timeout
 
 from anatomy.base.cache import BUILDING
+from anatomy.base.errors import FileError
 
 SECONDS_PER_DAY = 24 * 3600.0
 LOCK, CONTENT = "lock", "content"
@@ -48,8 +49,29 @@ def _is_taken(folder: Path, stack: contextlib.ExitStack) -> bool:
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[bool]:
-    """Hold the lock of a folder; yield whether there is one: some file systems have none.
+def sole_writer(results: Path, folder: Path, name: str = LOCK) -> Iterator[None]:
+    """Hold a lock in a folder as the one command that writes results.
+
+    Raises
+    ------
+    FileError
+        If another process holds it.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder, name))
+        except BlockingIOError as error:
+            raise FileError(
+                f"Another command writes its results into {results}",
+                expected="one command at a time for each folder or file of results",
+                remedy="Wait until it has ended, or choose another place with --out",
+            ) from error
+        yield
+
+
+@contextlib.contextmanager
+def locked(folder: Path, name: str = LOCK) -> Iterator[bool]:
+    """Hold a lock of a folder; yield whether there is one: some file systems have none.
 
     Raises
     ------
@@ -58,7 +80,7 @@ def locked(folder: Path) -> Iterator[bool]:
     FileNotFoundError
         If there is no such folder.
     """
-    lock, there = FileLock(folder / LOCK), True
+    lock, there = FileLock(folder / name), True
     try:
         lock.acquire(blocking=False)
     except FileNotFoundError:

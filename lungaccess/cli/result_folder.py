@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from anatomy.base.errors import FileError
 from anatomy.base.files import require_writable_folder
-from anatomy.base.unfinished import locked
+from anatomy.base.unfinished import sole_writer
 from lungaccess.cli import terminal
 
 MARK = ".lungaccess"
@@ -61,14 +61,7 @@ def claim_folder(out: Path, results: Sequence[str], *, force: bool = False) -> P
     if there and not is_ours and not force:
         raise _occupied(folder, there)
     mark.mkdir(exist_ok=True)
-    try:
-        held.enter_context(locked(mark))
-    except BlockingIOError as error:
-        raise FileError(
-            f"Another command writes its results into {folder}",
-            expected="one command at a time for each folder",
-            remedy="Wait until it has ended, or choose another folder with --out",
-        ) from error
+    held.enter_context(sole_writer(folder, mark))
     # The results of earlier runs are moved into a folder inside.
     aside = next(
         place

@@ -146,7 +146,7 @@ def plan_needle(
         If there is no such planner or objective, no limit, or a cost map is missing; if OMPL has been used
         in this process.
     TargetError
-        If the start lies outside the images.
+        If the start lies outside the images, or the target is its point.
     """
     weighed = Objective.of(objective)
     require_planner(planner)
@@ -197,7 +197,19 @@ def needle_question(lung: Organ, system: System, lps_from_start: Float, target_l
     ----------
     lps_from_start : (4, 4) float64
     target_lps : (3,) float64, LPS mm
+
+    Raises
+    ------
+    TargetError
+        If the target is the point of the start.
     """
+    # The searches take no shorter arc.
+    if np.linalg.norm(lps_from_start[:3, 3] - target_lps) < 1e-6:
+        raise TargetError(
+            "The needle starts at its target, so there is nothing to insert",
+            expected="a target away from the start",
+            remedy="Check that start and target are those of the question",
+        )
     if not isinstance(lung, Lung):
         lung = _opened(lung, system, lps_from_start[:3, 3])
     needle = system.require_needle("A path of the needle")

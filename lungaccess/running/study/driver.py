@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
+from anatomy.base.unfinished import sole_writer
 from lungaccess.plans.version import software_kernels
 from lungaccess.running.study.answers import CRASH, UNKNOWN, Answer
 from lungaccess.running.study.cluster import connect, each_done, interruptions_noted, require_dask
@@ -29,8 +30,7 @@ Progress = Callable[[str, float | None], None]
 class StudyDone:
     """What a start of a study did.
 
-    The study has `runs`, of which the file had `stored_before`.  The start `added` some: fewer than the rest
-    if another process stored some meanwhile.  Those that `failed` could not be made; the next start makes
+    The study has `runs`, of which the file had `stored_before`.  The start `added` some.  Those that `failed` could not be made; the next start makes
     them again.  Of what was stored before, `other_kernels` runs were made with other kernels than those here,
     or do not say with which: their figures may differ from what would be found now.
     """
@@ -74,7 +74,8 @@ def run_study(
     StudyError
         If dask is not installed, or the scheduler does not answer.
     FileError
-        If the results file cannot be read or written; what is stored by then stays.
+        If the results file cannot be read or written, or another process adds to it; what is stored by then
+        stays.
     LungaccessError
         If a patient, a system or a target of the study cannot be read.
     """
@@ -96,6 +97,7 @@ def open_results(
         )
     require_dask()
     with ResultsFile(path, create=True) as results, contextlib.ExitStack() as stack:
+        stack.enter_context(sole_writer(path, path.parent, f".{path.name}.lock"))
         yield RunMaker(results, cache, lambda: stack.enter_context(connect(scheduler, workers)))
 
 

@@ -76,6 +76,9 @@ def test_bad_questions_are_refused(small_lung: Lung, system: System) -> None:
     outside[:3, 3] += 1e4
     with pytest.raises(TargetError, match="outside the images"):
         plan_needle(small_lung, system, outside, target, iterations=1)
+    start[:3, 3] = target.lps_mm
+    with pytest.raises(TargetError, match="nothing to insert"):
+        plan_needle(small_lung, system, start, target, iterations=1)
 
 
 def test_the_pierced_branch(small_lung: Lung) -> None:

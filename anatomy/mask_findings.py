@@ -93,6 +93,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     if images.nodules is not None:
         nodules = images.nodules.array
         yield "nodules_ml", _count(nodules) * ml
+        yield "nodules_beyond_lungs", float(np.count_nonzero(nodules & ~lung)) / _count(nodules)
         yield "nodules_in_others", _count(nodules & (vessels | lumen)) / _count(nodules)
         if images.targets_lps:
             there = images.grid.values_at(nodules, np.array(images.targets_lps), False)

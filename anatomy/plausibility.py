@@ -262,6 +262,12 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             possible=(0.5, 1), reason="a nodule that a mask of the lungs leaves out still touches it",
             remedy="Check the header of the mask of the nodules, and that it shows nothing else",
         ),
+        "nodules_beyond_lungs": Limit(
+            check="nodules", words="{} of the nodules lie beyond the lungs, and count as lung",
+            usual=(0, 0.05), possible=(0, 1),
+            reason="a mask of the lungs may leave out a nodule at the pleura, and one of nodules may be wide",
+            remedy="Look whether a nodule reaches into the chest wall or the mediastinum",
+        ),
         "nodule_filled": Limit(
             check="nodules", words="The largest nodule fills {} of the box around it",
             usual=(0.15, 1), possible=(0.02, 1), reason="a ball fills 52 %; sheets and trees fill little",

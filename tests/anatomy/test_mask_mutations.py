@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -40,7 +41,9 @@ class Checked:
         points = (nowhere, nowhere) if sides is None else points_of_sides(*sides, images.grid)
         self.images, self.tree, self.folder = images, tree, folder
         self.findings = mask_findings(images, tree, points)
-        self.words = {*images.warnings, *(each.found for each in self.findings if each.verdict != FITS)}
+        told = [*images.warnings, *(each.found for each in self.findings if each.verdict != FITS)]
+        # The same warning with other numbers is no new one.
+        self.words = {re.sub(r"-?\d+(?:\.\d+)?", "#", each) for each in told}
         self.masks = masks_of(images)
 
 
@@ -76,11 +79,13 @@ def _middles(nodules: Volume) -> Array:
     return np.array(sorted(middles, key=tuple)).reshape(-1, 3)
 
 
-def _are_in_place(one: Volume | None, other: Volume | None) -> bool:
-    """Tell whether nodules have the same middles, which are the targets."""
-    if one is None or other is None:
-        return one is other
-    middles = _middles(one), _middles(other)
+def _are_in_place(one: PatientImages, other: PatientImages) -> bool:
+    """Tell whether nodules have the same middles, which are the targets, and make the same the lung."""
+    if one.nodules is None or other.nodules is None:
+        return one.nodules is other.nodules
+    if not np.array_equal(*(each.nodules.array & ~each.lung.array for each in (one, other))):
+        return False
+    middles = _middles(one.nodules), _middles(other.nodules)
     return middles[0].shape == middles[1].shape and bool(
         (np.linalg.norm(middles[0] - middles[1], axis=1) < SAME_PLACE_MM).all()
     )
@@ -102,7 +107,7 @@ def outcome(whole: Checked, mutation: Mutation) -> str:
         return "same"
     if found.words - whole.words:
         return "warned"
-    is_in_place = changed == ["nodules"] and _are_in_place(images.nodules, whole.images.nodules)
+    is_in_place = changed == ["nodules"] and _are_in_place(images, whole.images)
     return "in place" if is_in_place else "silent"
 
 

@@ -30,9 +30,10 @@ Progress = Callable[[str, float | None], None]
 class StudyDone:
     """What a start of a study did.
 
-    The study has `runs`, of which the file had `stored_before`.  The start `added` some.  Those that `failed` could not be made; the next start makes
-    them again.  Of what was stored before, `other_kernels` runs were made with other kernels than those here,
-    or do not say with which: their figures may differ from what would be found now.
+    The study has `runs`, of which the file had `stored_before`.  The start `added` some.  Those that `failed`
+    could not be made; the next start makes them again.  Of what was stored before, `other_kernels` runs were
+    made with other kernels than those here, or do not say with which: their figures may differ from what
+    would be found now.
     """
 
     runs: int

@@ -29,7 +29,7 @@ BAD_POINTS = (
 )  # fmt: skip
 FAR_POINTS = ("lps:1e9,0,0", "ras:0,0,-5000", "lps:-9e307,1e308,0")
 """Points in no patient."""
-NO_NUMBERS = ("x", "", "nan", "1,5", "--", "1e", "0x", "\N{INFINITY}", "one", "1 2")
+NO_NUMBERS = ("x", "", "nan", "1,5", "--", "1e", "0x", "\N{INFINITY}", "one", "1 2", "5mm", "30 deg", "10%")
 ODD_WORDS = (
     "",
     "no such thing",
@@ -95,8 +95,8 @@ def ranges_of(argument: Any) -> list[Within]:
 
 
 def outside(limits: Within) -> Iterator[str]:
-    """Return finite numbers outside a range, and infinity."""
-    yield "inf"
+    """Return finite numbers outside a range, infinity, and one that is too small for anything."""
+    yield from ("inf", "5e-324")
     if limits.above is not None:
         yield from (f"{limits.above:.10g}", f"{limits.above - 1:.10g}")
     if limits.at_least is not None:

@@ -21,7 +21,7 @@ from anatomy.base.errors import FileError
 from lungaccess.running.study import cluster as cluster_of_study
 from lungaccess.running.study import driver, one_run
 from lungaccess.running.study.answers import Answer
-from lungaccess.running.study.driver import StudyDone, run_study
+from lungaccess.running.study.driver import StudyDone, open_results, run_study
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.runs import Run
 from lungaccess.running.study.settings import Study, StudyError, study_of
@@ -88,6 +88,15 @@ def test_a_study_goes_on_from_what_is_stored(
         connection.execute("DROP TABLE made_with")
     earlier = start(study_of(content()))
     assert (earlier.stored_before, earlier.other_kernels) == (4, 4), "an earlier version did not state them"
+
+
+def test_a_second_study_does_not_add_to_the_same_file(tmp_path: Path, study: Study, cache: Path) -> None:
+    path = tmp_path / "r.db"
+    with open_results(path, scheduler=None, workers=1, cache=cache):
+        with pytest.raises(FileError, match="Another command writes its results into"):
+            run_study(study, path, workers=1, cache=cache)
+        with ResultsFile(path) as results:
+            assert not results.finished_keys()
 
 
 def test_a_run_that_cannot_be_made_is_stored_and_made_again(

@@ -29,7 +29,9 @@ BAD_POINTS = (
 )  # fmt: skip
 FAR_POINTS = ("lps:1e9,0,0", "ras:0,0,-5000", "lps:-9e307,1e308,0")
 """Points in no patient."""
-NO_NUMBERS = ("x", "", "nan", "1,5", "--", "1e", "0x", "\N{INFINITY}", "one", "1 2", "5mm", "30 deg", "10%")
+NO_NUMBERS = (
+    "x", "", "nan", "1,5", "--", "1e", "0x", "\N{INFINITY}", "one", "1 2", "5mm", "30 deg", "10%",
+)  # fmt: skip
 ODD_WORDS = (
     "",
     "no such thing",

@@ -21,7 +21,7 @@ from anatomy.mask_findings import mask_findings
 from anatomy.morphology import components
 from anatomy.patient import PatientImages
 from anatomy.phantom import Phantom, make_phantom
-from anatomy.plausibility import FITS, REFUSED, require_plausible, with_accepted
+from anatomy.plausibility import DOUBTFUL, FITS, REFUSED, require_plausible, with_accepted
 from anatomy.sides import coarse_sides, points_of_sides
 from anatomy.tree import tree_from_mask
 from tests.anatomy.mask_mutations import KINDS, ROLES, Masks, Mutation, drawn, write
@@ -114,6 +114,15 @@ def outcome(whole: Checked, mutation: Mutation) -> str:
 def test_masks_of_a_phantom_are_usual_in_every_figure(whole: Checked) -> None:
     assert {each.verdict for each in whole.findings} == {FITS}
     assert len(whole.findings) >= 20
+
+
+def test_nodules_beyond_the_lungs_are_told(whole: Checked) -> None:
+    """They count as lung, so that a mask of nodules which is too wide would open the chest wall."""
+    lung, nodules = whole.images.lung, whole.images.nodules
+    assert nodules is not None
+    images = replace(whole.images, lung=replace(lung, array=lung.array & ~nodules.array))
+    findings = mask_findings(images, whole.tree, (np.zeros((0, 3)),) * 2)
+    assert [each.verdict for each in findings if "beyond the lungs" in each.found] == [DOUBTFUL]
 
 
 def _require_none_silent(whole: Checked, mutations: Iterable[Mutation]) -> None:

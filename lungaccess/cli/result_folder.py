@@ -4,6 +4,7 @@ import contextlib
 import filecmp
 import itertools
 import os
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -60,6 +61,8 @@ def claim_folder(out: Path, results: Sequence[str], *, force: bool = False) -> P
     there = sorted(path for path in found if path.name[0] != ".")
     if there and not is_ours and not force:
         raise _occupied(folder, there)
+    if not is_ours and not there:
+        held.callback(_unmark, mark, set(os.listdir(folder)))
     mark.mkdir(exist_ok=True)
     held.enter_context(sole_writer(folder, mark))
     # The results of earlier runs are moved into a folder inside.
@@ -75,6 +78,12 @@ def claim_folder(out: Path, results: Sequence[str], *, force: bool = False) -> P
         aside.mkdir(exist_ok=True)
         path.rename(aside / path.name)
     return folder
+
+
+def _unmark(mark: Path, before: set[str]) -> None:
+    """Take the mark from a folder in which a command that was refused has written nothing."""
+    if set(os.listdir(mark.parent)) - {MARK} == before:
+        shutil.rmtree(mark, ignore_errors=True)
 
 
 def require_empty_folder(out: Path, *, force: bool) -> None:

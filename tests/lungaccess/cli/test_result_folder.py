@@ -23,10 +23,10 @@ def released():
 def test_results_of_an_earlier_question_are_moved_aside(tmp_path):
     for n in range(3):
         claim_folder(tmp_path, ("plan.json", "plan-*.json"))
-        held.close()
         assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == (["notes.txt"] if n else [])
         for name in ("plan.json", "plan-1.json", "notes.txt"):
             (tmp_path / name).write_text(f"{n}")
+        held.close()
     assert (tmp_path / "earlier-1" / "plan.json").read_text() == "0"
     assert (tmp_path / "earlier-2" / "plan-1.json").read_text() == "1"
     claim_folder(tmp_path, ("plan.json",), force=True)
@@ -45,6 +45,7 @@ def test_two_commands_do_not_share_a_folder(tmp_path):
     claim_folder(tmp_path, ())
     with pytest.raises(FileError, match="Another command"):
         claim_folder(tmp_path, ())
+    (tmp_path / "notes.txt").touch()
     held.close()
     with locked(tmp_path / MARK):
         assert main(["plan", str(tmp_path), "--nodule", "--out", str(tmp_path)]) == ExitCode.BAD_INPUT
@@ -114,4 +115,4 @@ def test_a_segmentation_leaves_its_inputs_and_masks_of_others_alone(tmp_path, pa
     assert "are inputs" in " ".join(capsys.readouterr().err.split())
     assert main(words) == ExitCode.BAD_INPUT
     assert "vessels.nii.gz, patient.toml" in " ".join(capsys.readouterr().err.split())
-    assert {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -96,7 +96,7 @@ class PlanJob:
     asked : Asked
         Everything of the request but the patient and the target in it.
     guide : Panel, optional
-        What a newcomer is told of the pictures, before the plan and its headline are shown; the page is made, too.
+        What a newcomer is told of the pictures, before plan and headline are shown; the page is made, too.
     """
 
     asked: Asked

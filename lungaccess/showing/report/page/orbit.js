@@ -29,7 +29,9 @@ export class Orbit {
       this.pressed = null;
     });
     canvas.addEventListener("pointermove", (event) => this.drag(event));
-    canvas.addEventListener("lostpointercapture", (event) => this.fingers.delete(event.pointerId));
+    for (const kind of ["pointerup", "pointercancel"]) {
+      canvas.addEventListener(kind, (event) => this.fingers.delete(event.pointerId));
+    }
     canvas.addEventListener("wheel", (event) => {
       if (document.activeElement !== canvas && !event.ctrlKey) return;
       event.preventDefault();

@@ -87,25 +87,25 @@ def roll_towards(frame: Float, direction: ArrayLike) -> float:
     return math.atan2(float(d @ frame[:3, 1]), float(d @ frame[:3, 0]))
 
 
-def poses_on_arc(frame: Float, roll_rad: float, curvature_per_mm: float, lengths_mm: ArrayLike) -> Float:
-    """Return the frames `(N, 4, 4)` at lengths `(N,)` along an arc, exact where the curvature goes to zero.
+def poses_on_arc(frame: Float, roll_rad: float, curvature_per_mm: ArrayLike, lengths_mm: ArrayLike) -> Float:
+    """Return frames `(..., N, 4, 4)` at lengths `(N,)` along arcs, exact where the curvature goes to zero.
 
-    The arc starts at a frame, along its +z, and bends towards the +x of the frame rolled about its +z by
-    `roll_rad`; the frames on it are rolled so.
+    An arc starts at a frame `(..., 4, 4)`, along its +z, and bends by its curvature `(...)` towards the +x of
+    the frame rolled about its +z by `roll_rad`; the frames on it are rolled so.
     """
     s = np.asarray(lengths_mm, dtype=np.float64)
-    half = 0.5 * curvature_per_mm * s
+    half = 0.5 * np.asarray(curvature_per_mm)[..., None] * s
+    x, y, forward, origin = (frame[..., None, :3, axis] for axis in range(4))
     ahead = s * np.sinc(2.0 * half / np.pi)
     aside = s * np.sin(half) * np.sinc(half / np.pi)
-    cosine, sine = np.cos(2.0 * half)[:, None], np.sin(2.0 * half)[:, None]
-    forward = frame[:3, 2]
-    bend = math.cos(roll_rad) * frame[:3, 0] + math.sin(roll_rad) * frame[:3, 1]
-    poses = np.zeros((len(s), 4, 4))
-    poses[:, :3, 0] = cosine * bend - sine * forward
-    poses[:, :3, 1] = math.cos(roll_rad) * frame[:3, 1] - math.sin(roll_rad) * frame[:3, 0]
-    poses[:, :3, 2] = sine * bend + cosine * forward
-    poses[:, :3, 3] = frame[:3, 3] + ahead[:, None] * forward + aside[:, None] * bend
-    poses[:, 3, 3] = 1.0
+    cosine, sine = np.cos(2.0 * half)[..., None], np.sin(2.0 * half)[..., None]
+    bend = math.cos(roll_rad) * x + math.sin(roll_rad) * y
+    poses = np.zeros((*half.shape, 4, 4))
+    poses[..., :3, 0] = cosine * bend - sine * forward
+    poses[..., :3, 1] = math.cos(roll_rad) * y - math.sin(roll_rad) * x
+    poses[..., :3, 2] = sine * bend + cosine * forward
+    poses[..., :3, 3] = origin + ahead[..., None] * forward + aside[..., None] * bend
+    poses[..., 3, 3] = 1.0
     return poses
 
 

@@ -135,14 +135,13 @@ class Picture:
 
 def branches_beyond(tree: AirwayTree, point: int) -> Bool:
     """Return which branches `(B,)` go on from a point of the tree, that of the point among them."""
-    own = int(tree.branch_of_point[point])
-    beyond: Bool = np.arange(tree.n_branches) == own
+    own, parents = int(tree.branch_of_point[point]), tree.branch_parent.tolist()
+    forks = tree.parent_point[tree.branch_start[:-1]].tolist()
+    beyond = [branch == own for branch in range(tree.n_branches)]
     for branch in range(own + 1, tree.n_branches):
-        parent = tree.branch_parent[branch]
-        beyond[branch] = beyond[parent] and (
-            parent != own or tree.parent_point[tree.branch_start[branch]] >= point
-        )
-    return beyond
+        parent = parents[branch]
+        beyond[branch] = beyond[parent] and (parent != own or forks[branch] >= point)
+    return np.array(beyond)
 
 
 @cache

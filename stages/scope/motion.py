@@ -9,6 +9,7 @@ its own arc, or twists and bends in place, both at a steady rate.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -79,7 +80,7 @@ class ScopeMotion:
         """Largest curvature of the body in the last state, which tubes in the channel pass."""
         return float(np.abs(self.pieces[:, 2]).max())
 
-    @property
+    @cached_property
     def tips(self) -> Float:
         """Frames of the tip in every state, `(M, 4, 4)`, +x as in `body`."""
         curvature = self.states[:, BEND] / self.bending_length_mm
@@ -89,7 +90,7 @@ class ScopeMotion:
         for roll, bent, step in zip(turned, curvature, advanced, strict=True):
             base, tip = poses_on_arc(base, roll, bent, [step, self.bending_length_mm])
             tips.append(tip)
-        return np.array(tips)
+        return read_only(np.array(tips))
 
     def between(self, advance_mm: float, turn_rad: float) -> ScopeMotion:
         """Return the same motion with states put between, so that none differs more from the one before it.

@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from anatomy.base.errors import FrameError
-from anatomy.poses import ANTERIOR, SUPERIOR, bending_directions, pose, roll_towards
+from anatomy.poses import ANTERIOR, SUPERIOR, bending_directions, pose, poses_on_arc, roll_towards
 
 vectors = st.tuples(*[st.floats(-10.0, 10.0)] * 3).map(np.array)
 
@@ -74,3 +74,10 @@ def test_bending_directions_count_from_x_towards_y() -> None:
     frame = pose((0.0, 0.0, 0.0), (1.0, 1.0, 0.0))
     x, y, _z = frame[:3, :3].T
     np.testing.assert_allclose(bending_directions(frame, [0.0, math.pi / 2, math.pi]), [x, y, -x], atol=1e-12)
+
+
+def test_arcs_from_many_frames_are_those_from_each() -> None:
+    frames = np.array([pose((1.0, 2.0, n), (0.1 * n, 1.0, -1.0)) for n in range(5)])
+    bends, at = np.linspace(-0.02, 0.05, 5), [0.0, 3.0, 7.5]
+    each = [poses_on_arc(frame, 0.3, bend, at) for frame, bend in zip(frames, bends, strict=True)]
+    np.testing.assert_allclose(poses_on_arc(frames, 0.3, bends, at), each, rtol=0.0, atol=1e-12)

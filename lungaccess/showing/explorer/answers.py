@@ -242,7 +242,7 @@ class Answers:
             ),
         }  # fmt: skip
         if not known:
-            message["packed"] = packed_plan(found, self.lung, "", cross_sections=False)
+            message["packed"] = packed_plan(found, self.lung, "", charts=False)
         kept = KeptPlan(digest=found.digest, text=found.to_json(), curve=tuple(curve))
         return Part(message, plan=kept)
 

@@ -37,6 +37,8 @@ MM_PER_STEP = 0.01
 """A distance across the lumen is stored in steps of this."""
 CAP_MM = 15.0
 """Clearances are measured up to this distance: farther than any margin, and where the plot ends."""
+COLOURED_MM = 5.0
+"""The needle's colour on a page tells clearances to spare up to this distance."""
 NOT_MEASURED = -1.0
 """Stands where no clearance to the airway is asked for; no distance is negative."""
 DIRECTIONS = 90
@@ -45,10 +47,11 @@ FARTHEST_MM = 20.0
 """The border of the lumen is looked for along each ray as far as the radius of a wide trachea."""
 
 
-def packed_plan(plan: Plan, lung: Lung, name: str, *, cross_sections: bool = True) -> Packed:
+def packed_plan(plan: Plan, lung: Lung, name: str, *, charts: bool = True) -> Packed:
     """Return everything by which a page shows one plan in motion and along its path.
 
-    The cross-sections of the airway around the tip of the scope take longer than all others.
+    Charts along the path, and cross-sections of the airway around the tip of the scope, take longer than all
+    others.
     """
     return {
         "name": name,
@@ -62,10 +65,10 @@ def packed_plan(plan: Plan, lung: Lung, name: str, *, cross_sections: bool = Tru
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.track_radius_mm,
         },
-        "scope": {**_scope(plan, lung), **(_around_tip(plan, lung) if cross_sections else {})},
+        "scope": {**_scope(plan, lung), **(_around_tip(plan, lung) if charts else {})},
         "tubes": _tubes(plan),
         "needle": _needle(plan),
-        "profile": profile(plan, lung),
+        "profile": profile(plan, lung) if charts else _margin(plan, lung),
         "costs": known_costs(plan.costs, has_map=lung.cost is not None),
         "objective": plan.objective,
         "objective_words": Objective.of(plan.objective).words,
@@ -90,7 +93,7 @@ def _scope(plan: Plan, lung: Lung) -> Packed:
     # Points of a stored bending section: 1 to 2 mm apart.
     back = np.linspace(-length, 0.0, 12)
     bends = moving.states[:, 2] / length
-    sections = [poses_on_arc(tip, 0.0, bend, back)[:, :3, 3] for tip, bend in zip(tips, bends, strict=True)]
+    sections = poses_on_arc(tips, 0.0, bends, back)[..., :3, 3]
     shaft, shaft_mm = poses_on_pieces(moving.lps_from_entry, moving.pieces[:-1], SHOWN_STEP_MM)
     moved = moved_mm(moving)
     return {
@@ -99,7 +102,7 @@ def _scope(plan: Plan, lung: Lung) -> Packed:
         "forward": pack(tips[:, :3, 2], "f4"),
         "up": pack(tips[:, :3, 0], "f4"),
         "inserted_mm": pack(moving.states[:, 0] + length, "f4"),
-        "sections": pack(np.array(sections), "f4"),
+        "sections": pack(sections, "f4"),
         "shaft": pack(shaft[:, :3, 3], "f4"),
         "shaft_mm": pack(shaft_mm, "f4"),
         "from_carina_mm": float(plan.scope.length_from_carina_mm),
@@ -208,6 +211,17 @@ def profile(plan: Plan, lung: Lung) -> Packed:
     }
 
 
+def _margin(plan: Plan, lung: Lung) -> Packed:
+    """Return what `profile` has of the needle alone, exact up to where its colour on the page ends."""
+    points, along, start = profile_points(plan)
+    needle = slice(len(along) - len(plan.curves().needle.arc_length_mm), None)
+    required = required_mm(plan, along, start)[needle]
+    exempt = along[needle] <= start + plan.exemption.needle_length_mm
+    found = _clearances(plan, lung, points[needle], exempt, float(required.max(initial=0.0)) + COLOURED_MM)
+    limited = [v for k, v in found.items() if k != "fissure" or plan.fissures_are_obstacles]
+    return {"margin_mm": pack(np.min(limited, axis=0) - required, "f4")}
+
+
 def profile_points(plan: Plan) -> tuple[Float, Float, float]:
     """Return points `(N, 3)`, LPS mm, of tubes and needle, their lengths, and where the needle begins.
 
@@ -227,14 +241,16 @@ def required_mm(plan: Plan, along: Float, start: float) -> Float:
     return np.where(along <= start, of_tube, plan.required_clearance_mm.get("needle", 0.0))
 
 
-def _clearances(plan: Plan, lung: Lung, points: Float, exempt: Bool) -> dict[str, Float]:
+def _clearances(
+    plan: Plan, lung: Lung, points: Float, exempt: Bool, cap_mm: float = CAP_MM
+) -> dict[str, Float]:
     found = {}
     for name, bits in (("airway", AIRWAY), ("vessel", VESSEL), ("pleura", OUTSIDE), ("fissure", FISSURE)):
         if name == "fissure" and not lung.has_fissures:
             continue
-        found[name] = lung.exact_clearance_mm(points, bits, cap_mm=CAP_MM)
+        found[name] = lung.exact_clearance_mm(points, bits, cap_mm=cap_mm)
     found["airway"][exempt] = lung.exact_clearance_mm(
-        points[exempt], AIRWAY, cap_mm=CAP_MM, exempt_branch=plan.exemption.branch
+        points[exempt], AIRWAY, cap_mm=cap_mm, exempt_branch=plan.exemption.branch
     )
     return found
 

@@ -344,3 +344,16 @@ def test_a_notebook_shows_the_page_in_a_frame(
     written = la.plan_page(plans[0], small_lung, tmp_path / "plan.html").read_text(encoding="utf-8")
     assert len(html.unescape(page)) == pytest.approx(len(written), rel=0.01)
     assert 'sandbox="allow-scripts"' in shown and 'height="500"' in shown
+
+
+def test_a_plan_without_charts_has_the_colours_of_the_needle(
+    plans: tuple[Plan, ...], small_lung: Lung
+) -> None:
+    whole, short = (
+        deployment.packed_plan(plans[0], small_lung, "", charts=charts) for charts in (True, False)
+    )
+    margins = [pack.unpack(each["profile"].pop("margin_mm")) for each in (whole, short)]
+    most = deployment.COLOURED_MM
+    np.testing.assert_array_equal(*(np.minimum(each, most) for each in margins))
+    assert margins[0].min() < most and f"WIDE_MM = {most:g};" in document.asset("motion.js")
+    assert not short["profile"] and short["scope"].items() <= whole["scope"].items()

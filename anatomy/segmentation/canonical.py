@@ -15,16 +15,21 @@ def canonical(volume: Volume) -> Volume:
     Only the order of the voxels changes: every voxel keeps its place in the patient, to `LAST_DIGIT`.
     An image in this order is returned as it is.
     """
-    # Adding 0 makes -0 to 0, which are different bytes.
-    matrix = np.round(volume.grid.lps_from_ijk, LAST_DIGIT) + 0.0
-    if not np.array_equal(matrix, volume.grid.lps_from_ijk):
-        volume = Volume(grid=Grid(shape=volume.grid.shape, lps_from_ijk=matrix), array=volume.array)
+    volume = _rounded(volume)
     order, flipped = towards_lps(volume.grid.lps_from_ijk[:3, :3])
     if order == (0, 1, 2) and not any(flipped):
         return volume
     reversed_axes = tuple(axis for axis in range(3) if flipped[axis])
     array = np.flip(np.transpose(volume.array, order), axis=reversed_axes)
-    return Volume(grid=turned_grid(volume.grid, order, flipped), array=np.asfortranarray(array))
+    return _rounded(Volume(grid=turned_grid(volume.grid, order, flipped), array=np.asfortranarray(array)))
+
+
+def _rounded(volume: Volume) -> Volume:
+    # Adding 0 makes -0 to 0, which are different bytes.
+    matrix = np.round(volume.grid.lps_from_ijk, LAST_DIGIT) + 0.0
+    if matrix.tobytes() == volume.grid.lps_from_ijk.tobytes():
+        return volume
+    return Volume(grid=Grid(shape=volume.grid.shape, lps_from_ijk=matrix), array=volume.array)
 
 
 def towards_lps(axes: Float) -> tuple[tuple[int, int, int], tuple[bool, bool, bool]]:

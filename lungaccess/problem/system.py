@@ -17,6 +17,7 @@ from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, parse, settings, switch, text, to_mapping
 from anatomy.margins import Margins
 from lungaccess.problem.preset_files import PresetFiles
+from lungaccess.problem.tools import Tool
 from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes, Tube
@@ -54,6 +55,9 @@ class System:
         with them, and `tubes` know its shaft; else its stiffness is neglected.
     fissures_allowed : bool, optional
         Whether tubes and needle may cross a fissure, which pierces the pleura twice.
+    tool : Tool, optional
+        What is done at the target.  With one a procedure succeeds if enough of the nodule is in it, and without
+        one if the last tip ends near the target.
 
     Raises
     ------
@@ -76,6 +80,7 @@ class System:
         ),
     ] = field(default=False, metadata={LEFT_OUT_IF_EMPTY: True})
     fissures_allowed: Annotated[bool, switch("whether a fissure may be crossed")] = False
+    tool: Tool | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def __post_init__(self) -> None:
         outer, channel = self.tubes.outermost.outer_diameter_mm, self.scope.channel_diameter_mm

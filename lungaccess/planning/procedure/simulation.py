@@ -60,11 +60,12 @@ class _Decided(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What came of N procedures: flags touched, distance from the target, no path left, placements of the
-    scope; and what was decided, by stage, which is not in the order of the procedures."""
+    """What came of N procedures: flags touched, distance from the target, tissue taken, no path left, placements
+    of the scope; and what was decided, by stage, which is not in the order of the procedures."""
 
     touched: Int
     miss_mm: Float
+    taken: Float
     stopped: Bool
     placements: Int
     decided: dict[str, list[_Decided]]
@@ -154,13 +155,15 @@ class _Run:
         """Carry out the plan as it stands, as `assess` does."""
         outcomes = self.assessor.outcomes(fitted_to(self.assessor.n_arcs, self._attempts[0]))
         ones = np.ones(self.samples, dtype=np.int64)
-        return _Found(outcomes.touched, outcomes.miss_mm, np.zeros(self.samples, dtype=bool), ones, {})
+        return _Found(
+            outcomes.touched, outcomes.miss_mm, outcomes.taken, np.zeros(self.samples, dtype=bool), ones, {}
+        )
 
     def _part(self, numbers: Int) -> _Found:
         """Go through some procedures: the scope is placed again where the policy says so."""
         count = len(numbers)
         found = _Found(
-            np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.ones(count, dtype=bool),
+            np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.zeros(count), np.ones(count, dtype=bool),
             np.zeros(count, dtype=np.int64), {stage: [] for stage in STAGES},
         )  # fmt: skip
         active = np.arange(count)
@@ -232,15 +235,17 @@ class _Run:
             pieces = as_pieces(arcs, plan.system.track_radius_mm)
             pieces[:, 0, kernel.ROLL] -= rolled
             pieces = np.concatenate([tubes, pieces], axis=1)
-        touched, ends = self.assessor.follow(went.starts, pieces, n_tube)
+        touched, ends, taken = self.assessor.follow(went.starts, pieces, n_tube, errors.target_mm)
         back = np.flatnonzero(~done)
         if len(back):
             # Tubes that were drawn back again may have stayed in the airway: nothing came of it.
-            alone = self.assessor.follow(went.starts[back], np.ascontiguousarray(tubes[back]), n_tube)[0]
+            alone = self.assessor.follow(
+                went.starts[back], np.ascontiguousarray(tubes[back]), n_tube, errors.target_mm[back]
+            )[0]
             touched[back] = alone & ~kernel.STAYS_INSIDE
         found.touched[at] |= touched
         miss = np.linalg.norm(ends - plan.target_lps - errors.target_mm, axis=1)
-        found.miss_mm[at[done]] = miss[done]
+        found.miss_mm[at[done]], found.taken[at[done]] = miss[done], taken[done]
         found.stopped[at[done]] &= went.stopped[done]
         return done
 
@@ -289,14 +294,14 @@ class _Went:
 
 def _joined(parts: Iterable[_Found]) -> _Found:
     found = list(parts)
-    touched, miss_mm, stopped, placements = (np.concatenate([each[n] for each in found]) for n in range(4))
+    arrays = (np.concatenate([each[n] for each in found]) for n in range(5))
     decided = {stage: [one for each in found for one in each.decided.get(stage, [])] for stage in STAGES}
-    return _Found(touched, miss_mm, stopped, placements, decided)
+    return _Found(*arrays, decided)
 
 
 def _report(policy: Policy, found: _Found, samples: int, seed: int) -> ProcedureReport:
     assessor, procedure = policy.assessor, policy.procedure
-    reaches = found.miss_mm <= assessor.radius_mm
+    reaches = found.taken >= assessor.wanted.least
     touched = {name: (found.touched & flag) != 0 for name, flag in assessor.structures.items()}
     inserted = found.miss_mm[np.isfinite(found.miss_mm)]
     quantiles = {q: float(np.quantile(inserted, q)) for q in MISS_QUANTILES} if len(inserted) else {}

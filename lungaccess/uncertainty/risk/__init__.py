@@ -6,7 +6,7 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from lungaccess.uncertainty.risk.assessment import MISSES, DrawnReport, RiskReport, assess, rare_touch
-    from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor, goal_radius
+    from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor
     from lungaccess.uncertainty.risk.deviations import Deviations
     from lungaccess.uncertainty.risk.draws import Draws
     from lungaccess.uncertainty.risk.rare import RareShare, rare_share
@@ -15,5 +15,6 @@ if TYPE_CHECKING:
     from lungaccess.uncertainty.risk.start_region import proved_body, safe_start_region, tried_body
     from lungaccess.uncertainty.risk.statistics import Share
     from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances
+    from lungaccess.uncertainty.risk.wanted import goal_radius
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

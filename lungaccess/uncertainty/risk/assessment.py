@@ -139,7 +139,7 @@ def assess(
         radius_mm=assessor.radius_mm,
         radius_origin=assessor.radius_origin,
         succeeds=share_of(assessor.succeeded(outcomes)),
-        reaches=share_of(outcomes.miss_mm <= assessor.radius_mm),
+        reaches=share_of(outcomes.taken >= assessor.wanted.least),
         touches=MappingProxyType(touched),
         forbidden=assessor.forbidden,
         miss_mm=MappingProxyType({q: float(np.quantile(outcomes.miss_mm, q)) for q in MISS_QUANTILES}),

@@ -11,7 +11,6 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
-from anatomy.morphology import components
 from anatomy.motion.population import share_of_motion
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.plans.plan import Plan
@@ -23,6 +22,7 @@ from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_successes, follow_chains
 from lungaccess.uncertainty.risk.statistics import Share, share_of
+from lungaccess.uncertainty.risk.wanted import goal_radius, own_nodule, wanted_of
 from stages.needle import Obstacles
 
 STRUCTURES: dict[str, int] = {
@@ -42,11 +42,13 @@ THREADS = 2
 class Outcomes:
     """What became of N deviated plans, `(N,)` each.
 
-    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the last tip is from the deviated target.
+    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the last tip is from the deviated target, `taken`
+    how much of the nodule is in the tool, see `wanted_of`.
     """
 
     touched: Int
     miss_mm: Float
+    taken: Float
 
 
 class RiskAssessor:
@@ -63,7 +65,8 @@ class RiskAssessor:
     ----------
     radius_mm : float, optional
         Radius of the goal; by default that of a ball of the volume of the target's nodule, or 5 mm if the
-        target lies in no nodule of the mask.
+        target lies in no nodule of the mask.  A tool of the system takes tissue of that ball if a radius is
+        given or there is no mask, else of the nodule.
 
     Raises
     ------
@@ -87,6 +90,9 @@ class RiskAssessor:
         known = lung.motion if lung.motion is not None and not lung.motion.warning_only else None
         self._motion = None if known is None else PatientMotion(plan, known)
         self.radius_mm, self.radius_origin = goal_radius(lung, plan.target_lps, radius_mm)
+        tool = plan.system.tool
+        own = own_nodule(lung, plan.target_lps) if tool is not None and radius_mm is None else None
+        self.wanted = wanted_of(tool, self.radius_mm, own, lung.grid)
         self._deviated, self._judging = DeviatedPlan(plan), judging(plan, lung)
         self.structures = {
             name: flag for name, flag in STRUCTURES.items() if flag != FISSURE or lung.has_fissures
@@ -116,29 +122,50 @@ class RiskAssessor:
 
     def outcomes(self, deviations: Deviations) -> Outcomes:
         """Follow deviated plans through all three stages."""
-        touched, miss_mm = np.zeros(deviations.count, dtype=np.int64), np.zeros(deviations.count)
+        touched, (miss_mm, taken) = (
+            np.zeros(deviations.count, dtype=np.int64),
+            np.zeros((2, deviations.count)),
+        )
         inputs = self._inputs(deviations)
 
         def find(part: slice) -> None:
-            find_outcomes(*inputs, part.start, touched[part], miss_mm[part])
+            find_outcomes(*inputs, self.wanted, part.start, touched[part], miss_mm[part], taken[part])
 
         _in_threads(find, deviations.count)
-        return Outcomes(touched=touched, miss_mm=miss_mm)
+        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken)
 
-    def follow(self, starts: Float, pieces: Float, n_tube: int) -> tuple[Int, Float]:
-        """Return what chains touch `(N,)` and where they end `(N, 3)`; see `kernels.deviation`."""
-        touched, ends = np.zeros(len(starts), dtype=np.int64), np.zeros((len(starts), 3))
-        follow_chains(starts, pieces, n_tube, self._obstacles, self._judging, touched, ends)
-        return touched, ends
+    def follow(self, starts: Float, pieces: Float, n_tube: int, target_mm: Float) -> tuple[Int, Float, Float]:
+        """Return what chains touch `(N,)`, where they end `(N, 3)`, and how much they take `(N,)`.
+
+        `target_mm` `(N, 3)` is how far the target has moved; see `kernels.deviation`.
+        """
+        touched, ends, taken = (
+            np.zeros(len(starts), dtype=np.int64),
+            np.zeros((len(starts), 3)),
+            np.zeros(len(starts)),
+        )
+        follow_chains(
+            starts,
+            pieces,
+            n_tube,
+            self._obstacles,
+            self._judging,
+            self.wanted,
+            target_mm,
+            touched,
+            ends,
+            taken,
+        )
+        return touched, ends, taken
 
     def _inputs(self, deviations: Deviations) -> tuple[Any, ...]:
         """Return what both kernels take first; see `find_successes`."""
         return (*self._deviated.kernel_inputs(deviations), self._obstacles, self._judging)
 
     def succeeded(self, outcomes: Outcomes) -> Bool:
-        """Tell which `(N,)` end within the radius, leave the airway and touch nothing forbidden."""
+        """Tell which `(N,)` take enough, leave the airway and touch nothing forbidden."""
         return np.asarray(
-            (outcomes.miss_mm <= self.radius_mm) & ((outcomes.touched & self._forbidden_flags) == 0)
+            (outcomes.taken >= self.wanted.least) & ((outcomes.touched & self._forbidden_flags) == 0)
         )
 
     def successes(self, deviations: Deviations) -> Bool:
@@ -150,7 +177,7 @@ class RiskAssessor:
         inputs = self._inputs(deviations)
 
         def find(part: slice) -> None:
-            find_successes(*inputs, self.radius_mm, self._forbidden_flags, part.start, done[part])
+            find_successes(*inputs, self.wanted, self._forbidden_flags, part.start, done[part])
 
         _in_threads(find, deviations.count)
         return done
@@ -169,8 +196,9 @@ class RiskAssessor:
         """
         done, which = np.zeros(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
         judged = self._judging._replace(least_depth_mm=least_depth_mm)
+        anywhere = wanted_of(None, math.inf)
         find_successes(
-            devices, errors, which, self._obstacles, judged, math.inf, self._forbidden_flags, 0, done
+            devices, errors, which, self._obstacles, judged, anywhere, self._forbidden_flags, 0, done
         )
         return done
 
@@ -184,26 +212,3 @@ def _in_threads(find: Callable[[slice], None], count: int) -> None:
     bounds = np.linspace(0, count, THREADS + 1).astype(int).tolist()
     with ThreadPoolExecutor(THREADS) as pool:
         list(pool.map(find, map(slice, bounds[:-1], bounds[1:])))
-
-
-def goal_radius(lung: Lung, target_lps: Float, radius_mm: float | None = None) -> tuple[float, str]:
-    """Return the radius of the goal about a target in mm, and its origin in words.
-
-    It is the given one, or that of the ball as large as the target's nodule; see `RiskAssessor`.
-    """
-    if radius_mm is not None:
-        if not 0.0 < radius_mm < math.inf:
-            raise SettingsError(
-                f"The radius of the goal is {radius_mm} mm",
-                expected="a finite length above 0",
-                remedy="Choose a radius in mm, such as 5",
-            )
-        return float(radius_mm), "given"
-    nodules = lung.nodules
-    if nodules is not None and nodules.at(target_lps, False):
-        voxels, part = components(nodules.array)
-        own = part[(voxels == nodules.grid.voxels(target_lps)).all(axis=1)]
-        volume = float(np.count_nonzero(part == own)) * nodules.grid.voxel_volume_mm3
-        return (0.75 * volume / math.pi) ** (1.0 / 3.0), "ball of the nodule's volume"
-    # Radius of the goal where the target is no nodule of the nodule mask: one of 10 mm.
-    return 5.0, "assumed: the target lies in no nodule of a mask"

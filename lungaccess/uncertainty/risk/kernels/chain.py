@@ -153,7 +153,7 @@ def set_needle(needle, max_needle_mm, n_tube, rolled_rad, errors, n, pieces):
 
 @borrowing_kernel
 def find_end(start, pieces):
-    """Return the point where a chain ends."""
+    """Return the pose in which a chain ends: point, direction ahead, and the normal across it."""
     x, y, z = start[0], start[1], start[2]
     tx, ty, tz = start[3], start[4], start[5]
     nx, ny, nz = start[6], start[7], start[8]
@@ -178,4 +178,4 @@ def find_end(start, pieces):
         nx, ny, nz = c * nx - s * tx, c * ny - s * ty, c * nz - s * tz
         norm = math.sqrt(ux * ux + uy * uy + uz * uz)
         tx, ty, tz = ux / norm, uy / norm, uz / norm
-    return x, y, z
+    return x, y, z, tx, ty, tz, nx, ny, nz

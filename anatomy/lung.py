@@ -6,11 +6,11 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float
+from anatomy.base.typed import Float, Int
 from anatomy.fields import DistanceField
 from anatomy.grid import Volume
 from anatomy.lobes import LOBES
-from anatomy.morphology import voxels_in
+from anatomy.morphology import components, voxels_in
 from anatomy.motion.motion import Motion
 from anatomy.organ import Organ
 from anatomy.plausibility import FITS
@@ -75,6 +75,13 @@ class Lung(Organ):
         doubts = dict.fromkeys(each.name for each in self.findings if each.verdict != FITS)
         look = f"; their checks of {', '.join(doubts)} are not as usual" if doubts else ""
         return f"the masks of {self.name}, with an airway of {self.tree.n_branches} branches{left_out}{look}"
+
+    @cached_property
+    def nodule_parts(self) -> tuple[Int, Int]:
+        """The voxels `(V, 3)` of all nodules of the mask, and of which part each is; see `components`."""
+        if self.nodules is None:
+            return np.zeros((0, 3), dtype=np.int64), np.zeros(0, dtype=np.int64)
+        return components(self.nodules.array)
 
     @cached_property
     def _apex_and_base(self) -> tuple[tuple[float, float], ...]:

@@ -10,7 +10,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import BITS
-from lungaccess.plans.candidate import Candidate, parts_in_tissue, wall_in_path_mm
+from lungaccess.plans.candidate import Candidate, parts_in_tissue, wall_in_path_mm, with_tool_in_place
 from lungaccess.plans.costs import path_costs
 from lungaccess.plans.insertion import scope_insertion
 from lungaccess.plans.parts import (
@@ -24,6 +24,7 @@ from lungaccess.plans.parts import (
 )
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_kernels, software_version
+from lungaccess.plans.window import BreathingAim
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, InTissue
@@ -46,9 +47,9 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
     """
     system, lung = task.system, task.lung
     frame, deployment, needle = candidate.tip.lps_from_scope_tip, candidate.deployment, system.needle
-    of_needle = {}
+    path, of_needle = with_tool_in_place(system, candidate.path), {}
     if needle is not None:
-        of_needle = {"needle": needle_clearance_mm(task, candidate.path, deployment.branch)}
+        of_needle = {"needle": needle_clearance_mm(task, path, deployment.branch)}
     return Plan(
         software_version=software_version(),
         kernels=software_kernels(),
@@ -64,7 +65,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         objective=str(task.objective),
         scope=_scope(task, candidate.tip),
         tube=tube_part(task, frame, deployment),
-        needle=None if needle is None else needle_part(candidate.path),
+        needle=None if needle is None else needle_part(path),
         exemption=Exemption(
             branch=deployment.branch,
             exit_point_lps=deployment.exit_point(frame),
@@ -72,13 +73,21 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         ),
         required_clearance_mm=required_clearance_mm(system),
         clearance_mm={"tube": tube_clearance_mm(task, frame, deployment)} | of_needle,
-        costs=stated_costs(task, frame, deployment, candidate.path),
+        costs=stated_costs(task, frame, deployment, path),
         method=task.method,
         needle_planner=task.needle_planner,
         seed=task.seed,
         iterations=iteration,
         timing=timing,
+        aim=aim_of_tool(system, path),
     )
+
+
+def aim_of_tool(system: System, path: ArcPath) -> BreathingAim | None:
+    """Return where a path ends whose tool is at the target as the aim of a plan; None without a tool."""
+    if system.tool is None:
+        return None
+    return BreathingAim(point_lps=path.frames()[-1][:3, 3], phases=np.zeros((0, 2)))
 
 
 def with_devices(task: Task, candidate: Candidate, model: Plan) -> Plan:
@@ -88,10 +97,12 @@ def with_devices(task: Task, candidate: Candidate, model: Plan) -> Plan:
     """
     frame, deployment = candidate.tip.lps_from_scope_tip, candidate.deployment
     tube = tube_part(task, frame, deployment)
-    needle = None if task.system.needle is None else needle_part(candidate.path)
+    path = with_tool_in_place(task.system, candidate.path)
+    needle = None if task.system.needle is None else needle_part(path)
     exemption = replace(model.exemption, branch=deployment.branch, exit_point_lps=tube.exit.point_lps)
     scope = replace(model.scope, lps_from_scope_tip=frame)
-    return replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption)
+    aim = aim_of_tool(task.system, path)
+    return replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption, aim=aim)
 
 
 def required_clearance_mm(system: System) -> dict[str, float]:

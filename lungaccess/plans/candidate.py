@@ -64,6 +64,18 @@ def _tubes_beyond(lps_from_scope_tip: Float, deployment: Deployment, begin_mm: f
     return ArcPath(lps_from_start=start, arcs=arcs)
 
 
+def with_tool_in_place(system: System, path: ArcPath) -> ArcPath:
+    """Return a path to the target that goes on until the middle of the system's tool is there.
+
+    The last arc goes on as it bends: the tool then lies about the place where the path met the target.
+    """
+    if system.tool is None:
+        return path
+    arcs = path.arcs.copy()
+    arcs[-1:, LENGTH] += system.tool.beyond_mm
+    return ArcPath(lps_from_start=path.lps_from_start, arcs=arcs)
+
+
 def wall_in_path_mm(system: System, deployment: Deployment) -> float:
     """Return how much of a candidate's path lies in the wall that is pierced: a needle begins beyond it."""
     return deployment.wall_run_mm if system.needle is None else 0.0

@@ -1,9 +1,10 @@
 """The chance of success of a plan as it is stated: counts of simulated procedures, and what they rest on."""
 
 from collections.abc import Mapping
+from dataclasses import field
 
 from anatomy.base.errors import PlanFileError
-from anatomy.base.records import frozen_record
+from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
 from lungaccess.plans.record import Record
 
 
@@ -22,7 +23,10 @@ class Chance(Record):
     assumed : tuple of str
         Kinds of error whose size nobody has published.
     radius_mm, radius_origin : float, str
-        Radius of the goal about the target, and where it came from.
+        Radius of the goal about the target, and where it came from; of a tool, which nodule counts.
+    tissue : str
+        What has to be in the tool in words, such as "at least 5 mm of the nodule in the core needle"; empty
+        without a tool.
     with_needle : bool
         Whether it is the needle that ends at the target; the tubes do so without one.
     samples, seed : int
@@ -49,6 +53,14 @@ class Chance(Record):
     seed: int
     successes: int
     failures: Mapping[str, int]
+    tissue: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
+
+    @property
+    def success_words(self) -> str:
+        """What counts as success beside touching nothing forbidden, in words."""
+        last = "needle ends" if self.with_needle else "tubes end"
+        aim = self.tissue or f"the {last} within {self.radius_mm:.1f} mm of the target"
+        return f"{aim} ({self.radius_origin})"
 
     @property
     def share(self) -> float:

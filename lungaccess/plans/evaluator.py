@@ -9,9 +9,17 @@ import numpy as np
 
 from anatomy.base.typed import Float, Float32, Int
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from lungaccess.plans.candidate import Candidate, parts_in_tissue, tubes_in_tissue, wall_in_path_mm
+from lungaccess.plans.candidate import (
+    Candidate,
+    parts_in_tissue,
+    tubes_in_tissue,
+    wall_in_path_mm,
+    with_tool_in_place,
+)
 from lungaccess.plans.costs import path_beyond, path_cost
+from lungaccess.plans.kernels.tissue import Wanted, taken_at
 from lungaccess.plans.tip_rows import TipRows
+from lungaccess.plans.tissue import wanted_of
 from lungaccess.problem.task import Task
 from stages.needle import (
     CURVATURE,
@@ -57,6 +65,8 @@ class NeedleArrays(NamedTuple):
 BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"), (AIRWAY, "an airway"))
 """Names of obstacles; the first one of a voxel counts."""
 
+TOO_LITTLE = "too little of the nodule in the tool"
+"""What stops a path whose tool is at the target, and holds less of the nodule than it has to."""
 TIP_OFF_MM = 1e-6
 """So far from the target may the tip of the tubes be by rounding where there is no needle."""
 
@@ -94,8 +104,11 @@ class CandidateEvaluator:
         return self.cost_from(candidate.tip.lps_from_scope_tip, candidate.deployment, candidate.path)
 
     def cost_from(self, lps_from_scope_tip: Float, deployment: Deployment, path: ArcPath) -> float:
-        """Return the cost of tubes from a scope tip, and a path beyond them, under the task's objective."""
-        task = self.task
+        """Return the cost of tubes from a scope tip, and a path beyond them, under the task's objective.
+
+        The path is one to the target, as that of a candidate, and goes on as far as a tool needs it.
+        """
+        task, path = self.task, with_tool_in_place(self.task.system, path)
         return path_cost(
             task.lung,
             path,
@@ -131,10 +144,19 @@ class CandidateEvaluator:
     def proves(self, deployment: Deployment, path: ArcPath) -> bool:
         """Tell whether a path ends at the target, keeps all limits, is clear, and enters no infinite cost.
 
-        Without a needle the deployment is proved clear by its own validation.  A voxel of infinite cost may
-        not be entered, whatever the objective is, but in the wall that the tubes pierce.
+        With a tool the path goes on until the tool is at the target: all of it is proved, and enough of the
+        nodule has to be in the tool.  Without a needle the deployment is proved clear by its own validation.
+        A voxel of infinite cost may not be entered, whatever the objective is, but in the wall that the tubes
+        pierce.
         """
-        needle, end = self.task.system.needle, self.end_of(path)
+        needle, end, wanted = self.task.system.needle, self.end_of(path), self.wanted
+        if wanted is not None:
+            path = with_tool_in_place(self.task.system, path)
+            last = path.frames()[-1]
+            end = last[:3, 3]
+            if taken_at(wanted, last) < wanted.least:
+                self.blocked[TOO_LITTLE] += 1
+                return False
         if needle is None:
             kept = np.abs(deployment.lps_from_tip[:3, 3] - end).max() <= TIP_OFF_MM
         else:
@@ -187,6 +209,12 @@ class CandidateEvaluator:
     def count_blockers(self, blockers: Int) -> None:
         """Add to `blocked` what stopped direct arcs, by their labels `(N,)`."""
         self.blocked.update(blocker_counts(blockers))
+
+    @cached_property
+    def wanted(self) -> Wanted | None:
+        """What has to be in the system's tool as planned; None without one."""
+        task, tool = self.task, self.task.system.tool
+        return None if tool is None else wanted_of(task.lung, task.target.lps_mm, tool)
 
     @cached_property
     def tip_rows(self) -> TipRows:

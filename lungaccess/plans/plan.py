@@ -83,7 +83,8 @@ class Plan(Record):
     window : BreathingWindow or None
         The phases of the breath in which it is proved clear and on target; None where no motion was known.
     aim : BreathingAim or None
-        Where the devices end, of a plan made for its window; None for any other, which ends at the target.
+        Where the devices end, of a plan made for its window, or of one whose tool is behind the tip; None for
+        any other, which ends at the target.
     cost_bound : float
         Proved lower bound of the cost of every plan from a scope tip of the atlas, where the search was told
         to find one; 0 for any other.
@@ -134,6 +135,11 @@ class Plan(Record):
     def end_lps(self) -> Float:
         """Where the devices are to end in the masks' phase, `(3,)` LPS mm: at the target, or at the aim."""
         return self.target_lps if self.aim is None else self.aim.point_lps
+
+    @property
+    def goal_lps(self) -> Float:
+        """Where the devices have to end so that the tip, or its tool, is at the target, `(3,)` LPS mm."""
+        return self.target_lps if self.system.tool is None else self.end_lps
 
     @property
     def insertions(self) -> str:

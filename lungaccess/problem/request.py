@@ -200,6 +200,13 @@ class Request:
                 expected="a patient with a motion: [motion] in its patient.toml",
                 remedy="Leave phases and window out, or state a motion; see docs/how_to/breathing.md",
             )
+        tools = [system.tool.name for system in self.systems if system.tool is not None]
+        if self.is_for_window and tools:
+            raise SettingsError(
+                f"A window of the breath is asked for with the {tools[0]}",
+                expected="no tool: a window promises where the tip is in moving tissue, not what is in a tool",
+                remedy="Leave out the tool, or plan for success, which counts breathing",
+            )
         self._require_bound()
         self._require_systems()
 

@@ -56,8 +56,8 @@ class System:
     fissures_allowed : bool, optional
         Whether tubes and needle may cross a fissure, which pierces the pleura twice.
     tool : Tool, optional
-        What is done at the target.  With one a procedure succeeds if enough of the nodule is in it, and without
-        one if the last tip ends near the target.
+        What is done at the target, on the needle.  With one a procedure succeeds if enough of the nodule is
+        in it, and without one if the last tip ends near the target.
 
     Raises
     ------
@@ -93,6 +93,8 @@ class System:
             self._check_aim()
         else:
             self._check_needle(self.needle)
+        if self.tool is not None and self.needle is None:
+            raise impossible("tool", self.tool.name, "no table [tool] where there is no [needle] to lead it")
         if self.needle_preloaded:
             self._check_shaft()
         # The shaft bends with the tubes while they are deployed, if it is in them then.

@@ -1,21 +1,33 @@
-"""What is done at the target: the tool, and how much tissue it has to take or treat."""
+"""What is done at the target: the tool, and how much of the nodule has to be in it."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+import os
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from anatomy.base.settings import impossible, quantity, settings, text
+from anatomy.base.settings import impossible, parse, quantity, settings, text
 from anatomy.base.typed import Float
+from lungaccess.problem.preset_files import PresetFiles
+
+if TYPE_CHECKING:
+    from lungaccess.problem.system import System
 
 FINEST_MM = 0.25
-"""Spacing of the points on the axis of a tool: what is left of a core differs by less than half of it."""
+"""Points on the axis of a thin tool are so far apart: what is in a core is then known to half of it."""
 ACROSS = 9
-"""Points of a tool that is wide, across it: a volume is then known to some percent."""
+"""So many points lie across a wide tool: its volume in the nodule is then known to some percent."""
 WIDE_MM = 2.0
-"""A tool that is no wider takes along its axis what it takes beside it."""
+"""A tool that is no wider takes beside its axis what it takes along it."""
+_FILES = PresetFiles(
+    what="tool",
+    folders=("presets/tools",),
+    remedy="docs/explanation/tissue.md prints a complete file to start from",
+    expected="lines such as from_tip_mm = -15.0",
+)
 
 
 @settings
@@ -25,51 +37,59 @@ class Tool:
     Parameters
     ----------
     name, description, source : str
+        What it is, for people, and where its sizes come from.
     shape : str
-        "cylinder", or "ellipsoid" of what is frozen or heated.
+        "cylinder" of what a device cuts or holds, or "ellipsoid" of what is frozen or heated.
     from_tip_mm, to_tip_mm : float
-        Where that body begins and ends along the needle's direction, from its tip; what lies behind it is
-        negative.
+        Where the body begins and ends along the needle's direction, from the tip; behind it is negative.
+        What goes on mechanically is part of the needle, whose tip is at its end: a cylinder does not reach
+        ahead of the tip, and no tool has its middle ahead of it.
     diameter_mm : float
     least : float
-        Tissue of the nodule with which a pass or several are enough, in `unit`.
+        Tissue of the nodule in the tool that counts as success, in `unit`.
     unit : str
-        "mm" of the tool's length, "mm3", or "share" of the nodule.
+        "mm" of the tool's length, "mm3" of its volume, or "share" of the nodule.
     margin_mm : float
-        Tissue about the nodule that counts as nodule: what an ablation has to cover.
+        Tissue about the nodule counts as nodule up to this distance: what an ablation has to cover.
     rim_mm : float
-        Only so thick a rim of the nodule counts, 0 for all of it: the core may be necrotic.
+        Only tissue so near to the nodule's surface counts, 0 for all of it: the inside may be necrotic.
 
     Raises
     ------
     SettingsError
-        If the body has no length, or less tissue fits into it than there has to be.
+        If the body has no length, reaches ahead, or has less room than the tissue that has to be in it.
     """
 
     name: Annotated[str, text("what the tool is called")] = "stated"
     description: Annotated[str, text("one sentence for people", may_be_empty=True)] = ""
     source: Annotated[str, text("where its sizes come from, or 'assumption'")] = "assumption"
     shape: Literal["cylinder", "ellipsoid"] = "cylinder"
-    from_tip_mm: Annotated[
-        float, quantity("where it begins, from the needle's tip", at_least=-60, at_most=60)
-    ]
-    to_tip_mm: Annotated[float, quantity("where it ends, from the needle's tip", at_least=-60, at_most=60)]
-    diameter_mm: Annotated[float, quantity("diameter of what it takes or treats", above=0.0, at_most=80.0)]
-    least: Annotated[float, quantity("tissue that is enough, in `unit`", above=0.0, at_most=1e6)]
+    from_tip_mm: Annotated[float, quantity("begin of the body, from the tip", at_least=-80.0, at_most=80.0)]
+    to_tip_mm: Annotated[float, quantity("end of the body, from the tip", at_least=-80.0, at_most=80.0)]
+    diameter_mm: Annotated[float, quantity("diameter of the body", above=0.0, at_most=80.0)]
+    least: Annotated[float, quantity("tissue in the tool that is enough, in `unit`", above=0.0, at_most=1e6)]
     unit: Literal["mm", "mm3", "share"] = "mm"
-    margin_mm: Annotated[float, quantity("tissue about the nodule that counts", at_least=0, at_most=20)] = 0.0
-    rim_mm: Annotated[float, quantity("thickness of the rim that counts, 0: all", at_least=0, at_most=50)] = (
-        0.0
-    )
+    margin_mm: Annotated[
+        float, quantity("tissue about the nodule that counts as nodule", at_least=0.0, at_most=20.0)
+    ] = 0.0
+    rim_mm: Annotated[
+        float, quantity("thickness of the rim that counts, 0 for all", at_least=0.0, at_most=50.0)
+    ] = 0.0
 
     def __post_init__(self) -> None:
         if self.to_tip_mm <= self.from_tip_mm:
             raise impossible("to_tip_mm", self.to_tip_mm, f"more than from_tip_mm = {self.from_tip_mm:g}")
-        most = {"mm": self.length_mm, "mm3": self.volume_mm3, "share": 1.0}[self.unit]
-        if self.least > most:
+        most = 0.0 if self.shape == "cylinder" else -self.from_tip_mm
+        if self.to_tip_mm > most:
             raise impossible(
-                "least", self.least, f"at most {most:.3g} {self.unit}: no more fits into the tool"
+                "to_tip_mm",
+                self.to_tip_mm,
+                f"at most {most:g}: what goes on mechanically is part of the needle's way, whose tip is at "
+                "the end of it, and nothing lies mostly ahead of the tip",
             )
+        room = {"mm": self.length_mm, "mm3": self.volume_mm3, "share": 1.0}[self.unit]
+        if self.least > room:
+            raise impossible("least", self.least, f"at most {room:.4g} {self.unit}, which fits into the tool")
 
     @property
     def length_mm(self) -> float:
@@ -77,28 +97,77 @@ class Tool:
         return self.to_tip_mm - self.from_tip_mm
 
     @property
+    def beyond_mm(self) -> float:
+        """How far the tip lies beyond the middle of the body, mm."""
+        return -0.5 * (self.from_tip_mm + self.to_tip_mm)
+
+    @property
     def volume_mm3(self) -> float:
         """Volume of the body, mm^3."""
-        shape = 1.0 if self.shape == "cylinder" else 2.0 / 3.0
-        return shape * 0.25 * math.pi * self.diameter_mm**2 * self.length_mm
+        share = 1.0 if self.shape == "cylinder" else 2.0 / 3.0
+        return share * 0.25 * math.pi * self.diameter_mm**2 * self.length_mm
 
     @property
     def words(self) -> str:
-        """What is enough: "at least 5 mm of the nodule in the tool"."""
-        if self.unit == "share":
-            return f"at least {self.least:.0%} of the nodule in the {self.name}"
-        return f"at least {self.least:g} {self.unit.replace('3', '³')} of the nodule in the {self.name}"
+        """What counts as success in words, such as "at least 5 mm of the nodule in the core needle"."""
+        about = f" with {self.margin_mm:g} mm about it" if self.margin_mm else ""
+        rim = f"'s rim of {self.rim_mm:g} mm" if self.rim_mm else ""
+        amount = {"mm": f"{self.least:g} mm", "mm3": f"{self.least:g} mm³", "share": f"{self.least:.0%}"}
+        return f"at least {amount[self.unit]} of the nodule{rim}{about} in the {self.name}"
 
     def points(self) -> Float:
-        """Return points `(K, 3)` of the body, in the frame of the needle's tip, +z ahead; each stands for as much."""
-        count = max(round(self.length_mm / FINEST_MM), 1) if self.diameter_mm <= WIDE_MM else ACROSS
-        along = (np.arange(count) + 0.5) / count
-        z = self.from_tip_mm + self.length_mm * along
+        """Return points `(K, 3)` of the body in the frame of the tip, +z ahead; each stands for as much."""
         if self.diameter_mm <= WIDE_MM:
+            count = max(math.ceil(self.length_mm / FINEST_MM), 1)
+            z = self.from_tip_mm + self.length_mm * (np.arange(count) + 0.5) / count
             return np.column_stack([np.zeros((count, 2)), z])
         side = (2.0 * np.arange(ACROSS) + 1.0) / ACROSS - 1.0
-        x, y, n = np.meshgrid(side, side, np.arange(count), indexing="ij")
-        widest = np.ones(count) if self.shape == "cylinder" else 1.0 - (2.0 * along - 1.0) ** 2
-        inside = x**2 + y**2 <= widest[n]
-        radius = 0.5 * self.diameter_mm
-        return np.column_stack([radius * x[inside], radius * y[inside], z[n[inside]]])
+        x, y, z = (each.ravel() for each in np.meshgrid(side, side, side, indexing="ij"))
+        inside = x**2 + y**2 + (z**2 if self.shape == "ellipsoid" else 0.0) <= 1.0
+        scale = 0.5 * np.array([self.diameter_mm, self.diameter_mm, self.length_mm])
+        found = np.column_stack([x, y, z])[inside] * scale
+        return np.asarray(found - [0.0, 0.0, self.beyond_mm])
+
+
+def tool_names() -> tuple[str, ...]:
+    """Return the names of the tools that ship with the package, sorted."""
+    return _FILES.names
+
+
+def load_tool(name_or_path: str | os.PathLike[str]) -> Tool:
+    """Read a tool from a preset or from a TOML file.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        Name of a preset (see `tool_names`), or path of a file that ends in ``.toml``.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such preset, the file is not TOML, or a value in it is wrong.
+    FileError
+        If the file cannot be read.
+
+    Examples
+    --------
+    >>> load_tool("core").words
+    'at least 5 mm of the nodule in the core needle'
+    """
+    return parse(Tool, _FILES.read(name_or_path), os.fspath(name_or_path), remedy=_FILES.remedy)
+
+
+def with_tool(system: System, tool: Tool | None) -> System:
+    """Return a system with a tool, and with a name that says so; itself for None."""
+    if tool is None or tool == system.tool:
+        return system
+    before = "" if system.tool is None else f" ({system.tool.name})"
+    return replace(system, tool=tool, name=f"{system.name.removesuffix(before)} ({tool.name})")
+
+
+def systems_with_tool(systems: tuple[System, ...], name_or_path: str | None) -> tuple[System, ...]:
+    """Return systems with a tool of a name or file, of several those with a needle; themselves for None."""
+    if name_or_path is None:
+        return systems
+    able = [system for system in systems if system.needle is not None or len(systems) == 1]
+    return tuple(with_tool(system, load_tool(name_or_path)) for system in able)

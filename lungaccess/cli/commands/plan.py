@@ -19,6 +19,7 @@ from lungaccess.cli.options import (
     SearchOptions,
     SystemOptions,
     TargetOptions,
+    ToolText,
 )
 from lungaccess.cli.plan_search import RESULTS, PlanJob, plan_and_report
 from lungaccess.cli.progress import progress
@@ -45,6 +46,7 @@ def plan(
     search: SearchOptions = SearchOptions(),
     through: PlaceOptions = PlaceOptions(),
     errors: ErrorOptions = ErrorOptions(),
+    tool: ToolText = None,
     thick_slices: Annotated[
         bool,
         Parameter(help="Plan on masks from slices of more than 3 mm, which lack small airways and vessels."),
@@ -69,9 +71,10 @@ def plan(
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
+    from lungaccess.problem.tools import systems_with_tool
 
     stated = target.stated()
-    systems = system.candidates()
+    systems = systems_with_tool(system.candidates(), tool)
     asked = search.asked(systems, errors.given(), errors.given_procedure(), through.stated())
     claim_folder(out, RESULTS, force=force)
     lung = output.load(patient, thick_slices=thick_slices)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -12,7 +13,7 @@ from anatomy.base.words import of_hundred, percent, range_of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Probability, Processes, Samples, Seed
-from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
+from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile, ToolText
 from lungaccess.cli.progress import progress
 from lungaccess.uncertainty.risk.statistics import Share
 
@@ -41,6 +42,7 @@ def risk(
     probability: Annotated[
         Probability, Parameter(help="Probability of success that the tolerances keep.")
     ] = 0.95,
+    tool: ToolText = None,
     seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
     processes: Annotated[
         Processes, Parameter(help="How many processes share procedures that measure; one on Windows.")
@@ -53,12 +55,14 @@ def risk(
     from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.procedures import Procedure
+    from lungaccess.problem.tools import load_tool, with_tool
     from lungaccess.uncertainty.risk import assess, find_tolerances, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.assessment import DEFAULT_SAMPLES
     from stages.scope import WallContact
 
     model, followed = errors.load(), errors.given_procedure() or Procedure()
     stored = Plan.load(plan)
+    stored = replace(stored, system=with_tool(stored.system, None if tool is None else load_tool(tool)))
     lung = output.load(patient)
     with progress("bringing the scope to rest on the wall"):
         wall = model.wall or WallContact()
@@ -162,7 +166,7 @@ def _resting_table(rows: Sequence[RestingRow]) -> Table:
 def _outcome_table(report: RiskReport) -> Table:
     rows = [
         share_row("succeeds", report.succeeds),
-        share_row(f"ends within {report.radius_mm:.2f} mm", report.reaches),
+        share_row(report.tissue or f"ends within {report.radius_mm:.2f} mm", report.reaches),
     ]
     for name, share in report.touches.items():
         words = name if name.startswith("stays") else f"touches {name}"
@@ -173,10 +177,14 @@ def _outcome_table(report: RiskReport) -> Table:
             else share_row(words, share, fails=True)
         )
     rows += [(f"{percent(share)} end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()]
-    title = (
-        f"{report.samples} deviated plans, errors of '{report.model.label}'; radius: {report.radius_origin}"
-    )
+    title = f"{report.samples} deviated plans, errors of '{report.model.label}'; {_goal_words(report)}"
     return terminal.table(title, ("", "%", "95 % interval"), rows)
+
+
+def _goal_words(report: RiskReport | ProcedureReport) -> str:
+    """Return what the goal is, and where it came from."""
+    goal = report.tissue or f"goal {report.radius_mm:.2f} mm"
+    return f"{goal}: {report.radius_origin}"
 
 
 def _rare_row(name: str, rare: RareShare) -> terminal.Row:
@@ -238,11 +246,13 @@ def share_row(name: str, share: Share, *, fails: bool = False) -> terminal.Row:
 def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
     """Return what estimates of single plans and of procedures have in common."""
     from anatomy.base.settings import to_mapping
+    from lungaccess.planning.success.estimate import chance_of
 
     return {
         "errors": {**to_mapping(report.model), "name": report.model.label},
         "samples": report.samples,
         "seed": report.seed,
+        "counts_as_success": chance_of(report).success_words,
         "radius_mm": report.radius_mm,
         "radius_origin": report.radius_origin,
         "succeeds": report.succeeds.to_mapping(),
@@ -280,8 +290,8 @@ def procedure_tables(report: ProcedureReport) -> list[Table]:
         for share, miss in report.miss_mm.items()
     ]
     title = (
-        f"{report.samples} procedures '{report.procedure.name}', errors of '{report.model.label}'; goal "
-        f"{report.radius_mm:.2f} mm: {report.radius_origin}"
+        f"{report.samples} procedures '{report.procedure.name}', errors of '{report.model.label}'; "
+        f"{_goal_words(report)}"
     )
     found = [terminal.table(title, ("ends with", "%", "95 % interval"), rows)]
     if report.stages:

@@ -79,7 +79,7 @@ class Headline:
             return cls(geometry=Geometry.UNCHECKED, estimate=estimate)
         geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
         unchecked = {each.name: each.detail for each in report.unchecked}
-        has_aim = any(each.name == "target.aim" for each in report.findings)
+        has_aim = any(each.name == "window.of_aim" for each in report.findings)
         return cls(
             geometry=geometry,
             refusals=len(report.refusals),
@@ -153,7 +153,8 @@ class Headline:
     def _failure(self, name: str) -> str:
         chance = self.chance
         if name == MISSES and chance is not None:
-            return f"ends more than {chance.radius_mm:.1f} mm from the target"
+            far = f"ends more than {chance.radius_mm:.1f} mm from the target"
+            return f"ends without {chance.tissue}" if chance.tissue else far
         return FAILURES[name]
 
     @property
@@ -196,10 +197,11 @@ class Headline:
         if chance is None or success is None:
             return "Chance of success not computed."
         open_loop = self.without_measuring
+        means = f", that is to have {chance.tissue}" if chance.tissue else ""
         left = "" if open_loop is None else f" Without measuring: {of_hundred(open_loop.value)} of 100."
         return (
             f"Estimated to succeed in {of_hundred(success.value)} of 100 procedures (95 % interval "
-            f"{range_of_hundred(success.interval)}); {self._why}. "
+            f"{range_of_hundred(success.interval)}){means}; {self._why}. "
             f"Procedure '{chance.procedure}', errors of '{chance.errors}'.{left}"
         )
 
@@ -219,12 +221,10 @@ class Headline:
         drawn = f"{plural(chance.samples, 'draw')}, seed {chance.seed}"
         if self.is_stated:
             drawn += ", which its search never saw; as the plan states, not computed again"
-        last = "needle ends" if chance.with_needle else "tubes end"
         assumed = ", ".join(kind.replace("_", " ") for kind in chance.assumed)
         return (
             f"{drawn}. {chance.corrections}",
-            f"Success: the {last} within {chance.radius_mm:.1f} mm of the target "
-            f"({chance.radius_origin}) and nothing forbidden is touched.",
+            f"Success: {chance.success_words} and nothing forbidden is touched.",
             *((BESIDE_TARGET,) if self.has_aim else ()),
             f"Errors of '{chance.errors}': {chance.sizes}. Assumed, with no published source: "
             f"{assumed or 'none'}.",
@@ -254,6 +254,7 @@ class Headline:
             "failures": None if chance is None else counted,
             "draws": None if chance is None else chance.samples,
             "seed": None if chance is None else chance.seed,
+            "counts_as_success": None if chance is None else chance.success_words,
             "goal_radius_mm": None if chance is None else chance.radius_mm,
             "goal_radius_origin": None if chance is None else chance.radius_origin,
             "procedure": None if chance is None else chance.procedure,

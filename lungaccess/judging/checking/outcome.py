@@ -84,7 +84,8 @@ def recomputed_costs(
 def check_target(plan: Plan, lung: Lung, end: Float, found: Findings) -> None:
     """The needle, or the tubes, end at the target, which lies in the lung and in no obstacle.
 
-    Devices with an aim end there instead: how near that is to the target, its window says.
+    Devices with an aim end there instead: how near that is to the target, its window says, or for a tool
+    `check_tool`.
     """
     miss = float(np.linalg.norm(end - plan.end_lps))
     if plan.aim is not None:

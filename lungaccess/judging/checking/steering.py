@@ -28,6 +28,7 @@ from lungaccess.judging.checking.poses import (
 )
 from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.judging.checking.space import Select, airway_except, branch_of, has, labels_at
+from lungaccess.judging.checking.tool import check_tool
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.needle.device import Needle
@@ -65,6 +66,7 @@ def check_needle(
         return
     found.agrees("needle.end", needle.end_lps, curve.points[-1], POSITION_TOLERANCE_MM, "mm")
     check_target(plan, lung, curve.points[-1], found)
+    check_tool(plan, lung, curve.end, found)
     _check_exemption(plan, device, found)
     _check_containment(plan, lung, curve, found)
     _check_clearance(plan, device, environment, curve, found)

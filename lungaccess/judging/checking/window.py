@@ -59,7 +59,7 @@ class Part:
 def check_window(plan: Plan, environment: Environment, found: Findings) -> None:
     """Record whether the stated window holds; a patient without motion has none, and needs none."""
     window, motion = plan.window, environment.lung.motion
-    if plan.aim is not None:
+    if plan.aim is not None and plan.system.tool is None:
         _check_aim(plan, found)
     if window is None and motion is None:
         return
@@ -71,7 +71,7 @@ def check_window(plan: Plan, environment: Environment, found: Findings) -> None:
             found.unchecked("window", f"the plan states {what}")
         return
     found.true("window.motion", window.motion_key == motion.key, "the motion is that of the patient")
-    beside = float(np.linalg.norm(np.asarray(plan.end_lps) - np.asarray(plan.target_lps)))
+    beside = float(np.linalg.norm(np.asarray(plan.end_lps) - np.asarray(plan.goal_lps)))
     found.agrees("window.beside_target", window.beside_target_mm, beside, ROUNDING, "mm")
     names = ("masks_phase", "amplitude", "warning_only", "hysteresis")
     same = (window.motion_source, *(getattr(window, name) for name in names))
@@ -209,7 +209,7 @@ def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings
 
 def _miss(plan: Plan, breath: Breath, devices: _Devices, phase: float) -> float:
     end = breath.carried(devices.end[None], phase)
-    return float(np.linalg.norm(end - breath.moved(np.asarray(plan.target_lps)[None], phase)))
+    return float(np.linalg.norm(end - breath.moved(np.asarray(plan.goal_lps)[None], phase)))
 
 
 def _check_clear(

@@ -1,6 +1,7 @@
 """Plan the rest from a measured pose: tubes and needle from a scope's tip, or a needle from a tube's tip."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,6 +123,8 @@ def replan_from_tube(
 
 
 def _task(lung: Lung, system: System, target: Target, objective: str | Objective, seed: int) -> Task:
+    # The rest of a plan ends where it is told to, which for a tool is the aim of the plan.
+    system = replace(system, tool=None)
     weighed = objective_of(lung, objective)
     return Task(lung=lung, system=system, target=target, objective=weighed, method="replan", seed=seed)
 

@@ -125,7 +125,7 @@ def offered(
 
     `system` is that of the plan with the margins that are kept after a measurement.
     """
-    fissures, target = plan.fissures_are_obstacles, np.asarray(plan.target_lps)
+    fissures, target = plan.fissures_are_obstacles, np.asarray(plan.goal_lps)
     planned = planned_choice(plan, left)
     needle = system.require_needle("A choice of deployments")
     environment = needle_environment(lung, needle, system.margins, with_fissures=fissures)

@@ -302,7 +302,7 @@ class _Inserter:
         start = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
         chain = np.concatenate([tubes, needle])
         moved = (attempt.target_lps - self.query.target)[None]
-        flags = int(self._assessor.follow(start[None], chain[None], len(tubes), moved)[0][0])
+        flags = int(self._assessor.follow(start[None], chain[None], len(tubes), moved).touched[0])
         structures = self._assessor.structures
         touched = tuple(name for name in self._assessor.forbidden if flags & structures[name])
         frames, lengths = poses.poses_on_pieces(end, needle[:, :3], SHOWN_STEP_MM)

@@ -203,9 +203,10 @@ class Policy:
         self.errors = model_for(errors or load_errors(), plan, lung)
         self.procedure = procedure or load_procedure()
         self._left = Residuals.of(self.errors, self.procedure, self.assessor.stretch)
-        self._target = np.asarray(plan.target_lps)
+        self._target = np.asarray(plan.goal_lps)
         # Fissures are obstacles of what follows exactly where they are of the plan.
-        whole = replace(plan.system, fissures_allowed=not plan.fissures_are_obstacles)
+        # The way is planned again to where the tip has to end, so that nothing has to go on from there.
+        whole = replace(plan.system, fissures_allowed=not plan.fissures_are_obstacles, tool=None)
         self.system = _with_margins(whole, self.procedure.least_margin_share)
         arcs = [] if plan.needle is None else plan.needle.arcs
         self._planned = np.array([(a.length_mm, a.roll_rad, a.curvature_per_mm) for a in arcs]).reshape(-1, 3)
@@ -495,7 +496,7 @@ class Policy:
             return self._decision(chosen, left, tubes_out=False)
         target = self._target[None]
         if measured.target_lps is not None and procedure.imaging.measured:
-            target = self.targets_measured(np.asarray(measured.target_lps)[None])
+            target = self.targets_measured((measured.target_lps + self._target - self.plan.target_lps)[None])
         if len(poses.tubes) and self.plan.needle is not None:
             tips = self.tips_measured(chosen, mean_pose(poses.tubes)[None], len(poses.tubes))
             chosen = self.from_tubes(chosen, tips, target)

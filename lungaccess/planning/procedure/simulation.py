@@ -60,8 +60,8 @@ class _Decided(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What came of N procedures: flags touched, distance from the target, tissue taken, no path left, placements
-    of the scope; and what was decided, by stage, which is not in the order of the procedures."""
+    """What came of N procedures: flags touched, distance from the target, tissue in the tool, no path left,
+    placements of the scope; and what was decided, by stage, which is not in the order of the procedures."""
 
     touched: Int
     miss_mm: Float
@@ -163,8 +163,8 @@ class _Run:
         """Go through some procedures: the scope is placed again where the policy says so."""
         count = len(numbers)
         found = _Found(
-            np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.zeros(count), np.ones(count, dtype=bool),
-            np.zeros(count, dtype=np.int64), {stage: [] for stage in STAGES},
+            np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.zeros(count),
+            np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64), {stage: [] for stage in STAGES},
         )  # fmt: skip
         active = np.arange(count)
         for attempt in range(len(self._attempts)):
@@ -203,7 +203,7 @@ class _Run:
         """Return how far from the target the plan would end without further errors from scope tips."""
         plan = self._policy.plan
         planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip)) @ np.append(plan.end_lps, 1.0)
-        return np.asarray(np.linalg.norm((likely @ planned)[:, :3] - plan.target_lps, axis=1))
+        return np.asarray(np.linalg.norm((likely @ planned)[:, :3] - plan.goal_lps, axis=1))
 
     def _devices_out(self, went: _Went, left: int, at: Int, found: _Found) -> Bool:
         """Let tubes and needles out, and note what came of it; tell which needles were inserted."""
@@ -214,7 +214,7 @@ class _Run:
         pieces, n_tube = tubes, tubes.shape[1]
         if plan.needle is not None:
             true_tips = turned_about(ends_of(scope_frames(went.starts), tubes), -rolled)
-            targets = np.tile(np.asarray(plan.target_lps), (len(at), 1))
+            targets = np.tile(np.asarray(plan.goal_lps), (len(at), 1))
             if procedure.imaging.measured:
                 shown = targets + errors.target_mm + procedure.imaging.position_mm * went.noise[:, 1, :3]
                 targets = policy.targets_measured(shown)
@@ -235,17 +235,17 @@ class _Run:
             pieces = as_pieces(arcs, plan.system.track_radius_mm)
             pieces[:, 0, kernel.ROLL] -= rolled
             pieces = np.concatenate([tubes, pieces], axis=1)
-        touched, ends, taken = self.assessor.follow(went.starts, pieces, n_tube, errors.target_mm)
+        outcomes = self.assessor.follow(went.starts, pieces, n_tube, errors.target_mm)
+        touched = outcomes.touched.copy()
         back = np.flatnonzero(~done)
         if len(back):
             # Tubes that were drawn back again may have stayed in the airway: nothing came of it.
             alone = self.assessor.follow(
                 went.starts[back], np.ascontiguousarray(tubes[back]), n_tube, errors.target_mm[back]
-            )[0]
+            ).touched
             touched[back] = alone & ~kernel.STAYS_INSIDE
         found.touched[at] |= touched
-        miss = np.linalg.norm(ends - plan.target_lps - errors.target_mm, axis=1)
-        found.miss_mm[at[done]], found.taken[at[done]] = miss[done], taken[done]
+        found.miss_mm[at[done]], found.taken[at[done]] = outcomes.miss_mm[done], outcomes.taken[done]
         found.stopped[at[done]] &= went.stopped[done]
         return done
 
@@ -268,7 +268,7 @@ class _Run:
             path = ArcPath(lps_from_start=chosen.tips[n], arcs=chosen.arcs[n, : chosen.found[n, 1]])
             key = (_MEASURING, int(went.rows[n]))
             errors = rows_of(went.errors, np.array([n]))
-            attempt = Attempt(errors=errors, target_lps=self._policy.plan.target_lps + errors.target_mm[0])
+            attempt = Attempt(errors=errors, target_lps=self._policy.plan.goal_lps + errors.target_mm[0])
             one = steered(
                 self._policy, path, int(chosen.found[n, 2]), true_tips[n], targets[n], attempt,
                 self._policy.doubt_of(chosen.frames[n], chosen.tips[n]),
@@ -294,9 +294,11 @@ class _Went:
 
 def _joined(parts: Iterable[_Found]) -> _Found:
     found = list(parts)
-    arrays = (np.concatenate([each[n] for each in found]) for n in range(5))
+    touched, miss_mm, taken, stopped, placements = (
+        np.concatenate([each[n] for each in found]) for n in range(5)
+    )
     decided = {stage: [one for each in found for one in each.decided.get(stage, [])] for stage in STAGES}
-    return _Found(*arrays, decided)
+    return _Found(touched, miss_mm, taken, stopped, placements, decided)
 
 
 def _report(policy: Policy, found: _Found, samples: int, seed: int) -> ProcedureReport:
@@ -326,6 +328,7 @@ def _report(policy: Policy, found: _Found, samples: int, seed: int) -> Procedure
         stages=tuple(
             _stage(stage, found.decided.get(stage, [])) for stage in STAGES if _used(procedure, stage)
         ),
+        tissue=assessor.tissue,
         with_needle=assessor.plan.needle is not None,
     )
 

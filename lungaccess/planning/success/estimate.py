@@ -73,4 +73,5 @@ def chance_of(found: Estimate) -> Chance:
         seed=found.seed,
         successes=found.succeeds.count,
         failures={name: share.count for name, share in found.failures},
+        tissue=found.tissue,
     )

@@ -14,12 +14,13 @@ from lungaccess.planning.procedure import Policy, simulated
 from lungaccess.planning.procedure.spread import Spread
 from lungaccess.planning.success.estimate import FRESH_SEED, MEASURED_PROCEDURE, chance_of, estimate_success
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.tissue import goal_radius
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.goals import SUCCESS, Goal
 from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.request import Request
-from lungaccess.uncertainty.risk import RiskAssessor, goal_radius
+from lungaccess.uncertainty.risk import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
 
 BATCH_SEED = 1 << 24
@@ -126,7 +127,7 @@ class ChanceRating:
     def scorer(self, plan: Plan) -> Scorer:
         """Return what counts the successes of a plan in a batch of draws that all plans have in common."""
         if self.procedure.is_open_loop:
-            assessor = RiskAssessor(plan, self._lung, radius_mm=self._radius_mm)
+            assessor = RiskAssessor(plan, self._lung, radius_mm=self._given_mm)
             model = model_for(self.errors, plan, self._lung)
 
             def deviated(batch: int, draws: int, factor: float) -> float:
@@ -134,7 +135,7 @@ class ChanceRating:
                 return assessor.success(assessor.draws(draws, self._batch_seed(batch)), errors).count
 
             return deviated
-        policy = Policy(plan, self._lung, self.errors, self.procedure, radius_mm=self._radius_mm)
+        policy = Policy(plan, self._lung, self.errors, self.procedure, radius_mm=self._given_mm)
 
         def counted(batch: int, draws: int, _factor: float) -> float:
             # Procedures that several processes share: fewer take less time than to begin processes.

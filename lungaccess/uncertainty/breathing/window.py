@@ -57,7 +57,7 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
         )
     leaves, devices = _leaves(plan, lung, float(tolerance_mm), WHOLE_BREATH, all_of_it=True)
     found = _window(motion, float(tolerance_mm), leaves, devices)
-    beside = float(np.linalg.norm(plan.end_lps - plan.target_lps))
+    beside = float(np.linalg.norm(plan.end_lps - plan.goal_lps))
     return replace(found, beside_target_mm=beside)
 
 
@@ -86,7 +86,7 @@ def _leaves(
         devices.points,
         devices.arc_mm,
         devices.sections,
-        np.array(plan.target_lps),
+        np.array(plan.goal_lps),
         miss_allowed(motion, tolerance_mm, distance_mm(devices.points[-1], tip)),
         devices.hole_lps,
         miss_allowed(motion, devices.hole_mm, distance_mm(devices.hole_lps, tip)),

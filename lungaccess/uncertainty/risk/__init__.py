@@ -15,6 +15,5 @@ if TYPE_CHECKING:
     from lungaccess.uncertainty.risk.start_region import proved_body, safe_start_region, tried_body
     from lungaccess.uncertainty.risk.statistics import Share
     from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances
-    from lungaccess.uncertainty.risk.wanted import goal_radius
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -24,7 +24,8 @@ MISS_QUANTILES = (0.5, 0.9, 0.95)
 
 
 MISSES = "misses the goal"
-"""A draw whose needle, or without one whose tubes, end outside the goal: farther than its radius."""
+"""A draw whose needle, or without one whose tubes, end farther than the radius of the goal from the target,
+or with too little of the nodule in the tool."""
 
 
 @frozen_value
@@ -34,13 +35,17 @@ class DrawnReport:
     Parameters
     ----------
     radius_mm, radius_origin : float, str
-        Radius of the goal about the target, and where the radius came from.
+        Radius of the goal about the target, and where the radius came from; of a tool, which nodule counts.
     succeeds : Share
-        Ends within the radius, leaves the airway, and touches nothing that is forbidden.
+        Ends within the radius, or with enough of the nodule in the tool, leaves the airway, and touches
+        nothing that is forbidden.
     touches : mapping of str to Share
         By the names of `STRUCTURES`; a fissure only where there is a mask of them.
     miss_mm : mapping of float to float
-        Distance of the tip from the target that a share of the needles does not exceed, by the share.
+        Distance of the tip, or of the middle of its tool, from the target that a share of the needles does
+        not exceed, by the share.
+    tissue : str
+        What has to be in the tool in words; empty without a tool: then the tip ends within the radius.
     with_needle : bool
         Whether the plan has a needle; its tubes end at the target where it has none.
     """
@@ -53,6 +58,7 @@ class DrawnReport:
     succeeds: Share
     touches: Mapping[str, Share]
     miss_mm: Mapping[float, float]
+    tissue: str = ""
     with_needle: bool = True
 
 
@@ -63,7 +69,7 @@ class RiskReport(DrawnReport):
     Parameters
     ----------
     reaches : Share
-        Ends within the radius, whatever it touches.
+        Ends within the radius, or with enough of the nodule in the tool, whatever it touches.
     forbidden : tuple of str
         The names of `touches` that a success must not have.
     alone : mapping of str to Share
@@ -144,6 +150,7 @@ def assess(
         forbidden=assessor.forbidden,
         miss_mm=MappingProxyType({q: float(np.quantile(outcomes.miss_mm, q)) for q in MISS_QUANTILES}),
         alone=MappingProxyType(alone),
+        tissue=assessor.tissue,
         with_needle=plan.needle is not None,
         sensitivity=sensitivities(assessor, stated, samples, seed) if each_kind else (),
         rare=MappingProxyType({name: each for name, each in weighted.items() if each.is_exact}),

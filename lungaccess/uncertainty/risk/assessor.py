@@ -14,6 +14,7 @@ from anatomy.lung import Lung
 from anatomy.motion.population import share_of_motion
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.tissue import goal_radius, wanted_in, wanted_of
 from lungaccess.problem.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.breathing import PatientMotion
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations
@@ -22,7 +23,6 @@ from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_successes, follow_chains
 from lungaccess.uncertainty.risk.statistics import Share, share_of
-from lungaccess.uncertainty.risk.wanted import goal_radius, own_nodule, wanted_of
 from stages.needle import Obstacles
 
 STRUCTURES: dict[str, int] = {
@@ -42,8 +42,8 @@ THREADS = 2
 class Outcomes:
     """What became of N deviated plans, `(N,)` each.
 
-    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the last tip is from the deviated target, `taken`
-    how much of the nodule is in the tool, see `wanted_of`.
+    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the middle of the tool, or the last tip without
+    one, is from the deviated target, `taken` how much of the nodule is in the tool, see `wanted_of`.
     """
 
     touched: Int
@@ -60,6 +60,8 @@ class RiskAssessor:
         The kinds of error that the devices of the plan can have, and that of the target.
     stretch : float
         See `Draws`.
+    radius_mm, radius_origin, tissue : float, str, str
+        See `DrawnReport`.
 
     Parameters
     ----------
@@ -91,8 +93,12 @@ class RiskAssessor:
         self._motion = None if known is None else PatientMotion(plan, known)
         self.radius_mm, self.radius_origin = goal_radius(lung, plan.target_lps, radius_mm)
         tool = plan.system.tool
-        own = own_nodule(lung, plan.target_lps) if tool is not None and radius_mm is None else None
-        self.wanted = wanted_of(tool, self.radius_mm, own, lung.grid)
+        self.wanted = wanted_of(lung, plan.target_lps, tool, radius_mm)
+        self.tissue = "" if tool is None else tool.words
+        if tool is not None:
+            own = self.wanted.tissue.size > 0
+            ball = f"a ball of {self.radius_mm:.1f} mm: {self.radius_origin}"
+            self.radius_origin = "the nodule as it is in the mask" if own else ball
         self._deviated, self._judging = DeviatedPlan(plan), judging(plan, lung)
         self.structures = {
             name: flag for name, flag in STRUCTURES.items() if flag != FISSURE or lung.has_fissures
@@ -122,41 +128,25 @@ class RiskAssessor:
 
     def outcomes(self, deviations: Deviations) -> Outcomes:
         """Follow deviated plans through all three stages."""
-        touched, (miss_mm, taken) = (
-            np.zeros(deviations.count, dtype=np.int64),
-            np.zeros((2, deviations.count)),
-        )
+        count = deviations.count
+        touched, miss_mm, taken = np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count)
         inputs = self._inputs(deviations)
 
         def find(part: slice) -> None:
             find_outcomes(*inputs, self.wanted, part.start, touched[part], miss_mm[part], taken[part])
 
-        _in_threads(find, deviations.count)
+        _in_threads(find, count)
         return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken)
 
-    def follow(self, starts: Float, pieces: Float, n_tube: int, target_mm: Float) -> tuple[Int, Float, Float]:
-        """Return what chains touch `(N,)`, where they end `(N, 3)`, and how much they take `(N,)`.
-
-        `target_mm` `(N, 3)` is how far the target has moved; see `kernels.deviation`.
-        """
-        touched, ends, taken = (
-            np.zeros(len(starts), dtype=np.int64),
-            np.zeros((len(starts), 3)),
-            np.zeros(len(starts)),
-        )
+    def follow(self, starts: Float, pieces: Float, n_tube: int, target_mm: Float) -> Outcomes:
+        """Return what becomes of chains whose target has moved by `target_mm` `(N, 3)`; see `Outcomes`."""
+        count = len(starts)
+        touched, miss_mm, taken = np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count)
         follow_chains(
-            starts,
-            pieces,
-            n_tube,
-            self._obstacles,
-            self._judging,
-            self.wanted,
-            target_mm,
-            touched,
-            ends,
+            starts, pieces, n_tube, self._obstacles, self._judging, self.wanted, target_mm, touched, miss_mm,
             taken,
-        )
-        return touched, ends, taken
+        )  # fmt: skip
+        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken)
 
     def _inputs(self, deviations: Deviations) -> tuple[Any, ...]:
         """Return what both kernels take first; see `find_successes`."""
@@ -164,9 +154,8 @@ class RiskAssessor:
 
     def succeeded(self, outcomes: Outcomes) -> Bool:
         """Tell which `(N,)` take enough, leave the airway and touch nothing forbidden."""
-        return np.asarray(
-            (outcomes.taken >= self.wanted.least) & ((outcomes.touched & self._forbidden_flags) == 0)
-        )
+        enough = outcomes.taken >= self.wanted.least
+        return np.asarray(enough & ((outcomes.touched & self._forbidden_flags) == 0))
 
     def successes(self, deviations: Deviations) -> Bool:
         """Tell which `(N,)` of deviated plans succeed, as `succeeded` does of their outcomes.
@@ -196,7 +185,7 @@ class RiskAssessor:
         """
         done, which = np.zeros(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
         judged = self._judging._replace(least_depth_mm=least_depth_mm)
-        anywhere = wanted_of(None, math.inf)
+        anywhere = wanted_in(self.wanted.target, None, math.inf)
         find_successes(
             devices, errors, which, self._obstacles, judged, anywhere, self._forbidden_flags, 0, done
         )

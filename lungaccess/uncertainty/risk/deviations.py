@@ -139,7 +139,6 @@ def judging(plan: Plan, lung: Lung) -> Judging:
         min(plan.system.scope.radius_mm, planned) - ROUNDING_MM,
         lung.tree.mediastinal,
         float(plan.exemption.needle_length_mm),
-        np.array(plan.target_lps),
     )
 
 

@@ -9,7 +9,7 @@ from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh
 from lungaccess.plans.curves import needle_pieces
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk.wanted import goal_radius
+from lungaccess.plans.tissue import goal_radius
 from stages.needle import ArcPath, Query, StartRegion, needle_environment, prove_starts, try_starts
 
 OFFSET_MM, TILT_DEG = 5.0, 15.0

@@ -255,11 +255,13 @@ def summary(plan: Plan, lung: Lung) -> str:
 
 
 def _aim_words(plan: Plan) -> str:
-    """Say where the devices end that were planned for a window; "" if they end at the target."""
+    """Say where the devices end that were planned for a window or a tool; "" if they end at the target."""
     if plan.aim is None:
         return ""
     x, y, z = (float(c) for c in plan.aim.point_lps)
     beside = float(np.linalg.norm(plan.aim.point_lps - plan.target_lps))
+    if plan.system.tool is not None:
+        return f"; the tip ends {beside:.1f} mm beyond it, so that the {plan.system.tool.name} lies there"
     return (
         f", which moves: in the phase of the masks the devices end {beside:.1f} mm beside it, at their aim, "
         f"LPS {x:.1f}, {y:.1f}, {z:.1f} mm"

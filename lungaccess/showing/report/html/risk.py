@@ -88,8 +88,9 @@ def _of_procedures(report: ProcedureReport) -> str:
 
 def _of_deviations(report: RiskReport) -> str:
     """Return what came of plans that are carried out as they stand."""
+    within = f"ends within {report.radius_mm:.1f} mm of the target"
     rows = [("reaches the goal and touches nothing forbidden", _share(report.succeeds))]
-    rows.append((f"ends within {report.radius_mm:.1f} mm of the target", _share(report.reaches)))
+    rows.append((report.tissue or within, _share(report.reaches)))
     rows += [
         (f"touches: {name}" if name != "stays in the airway" else name, _share(share, fails=True))
         for name, share in report.touches.items()
@@ -103,8 +104,9 @@ def _of_deviations(report: RiskReport) -> str:
     sizes = report.model.words(with_needle=report.with_needle)
     note = (
         f"{report.samples} deviated plans, seed {report.seed}, open loop, errors of '{report.model.label}': "
-        f"{sizes}; of which assumed: {assumed}. Radius of the "
-        f"goal: {report.radius_origin}. The range is the 95 % interval."
+        f"{sizes}; of which assumed: {assumed}. "
+        f"{'Nodule' if report.tissue else 'Radius of the goal'}: {report.radius_origin}. The range is the "
+        "95 % interval."
     )
     return (
         f"<p class='note'>{words.text(note)}</p>"

@@ -18,7 +18,8 @@ from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose
 from lungaccess.cli.app import main
 from lungaccess.plans.plan import Plan
-from lungaccess.uncertainty.risk import goal_radius, proved_body, tried_body
+from lungaccess.plans.tissue import goal_radius
+from lungaccess.uncertainty.risk import proved_body, tried_body
 from stages.needle import Query, StartRegion, needle_environment, violation
 
 

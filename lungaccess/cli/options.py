@@ -257,8 +257,9 @@ class SystemOptions:
 ToolText = Annotated[
     str | None,
     Parameter(
-        help="What is done at the target: a preset (ablation, aspiration, brush, core, cryoprobe, forceps) or "
-        "a TOML file. Success then counts the tissue of the nodule in the tool; as the system says if not given."
+        help="What is done at the target: a preset (ablation, aspiration, brush, core, cryoprobe, forceps) "
+        "or a TOML file. Success then counts the tissue of the nodule in the tool. As the system says if not "
+        "given."
     ),
 ]
 ErrorsText = Annotated[

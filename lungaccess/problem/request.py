@@ -204,7 +204,7 @@ class Request:
         if self.is_for_window and tools:
             raise SettingsError(
                 f"A window of the breath is asked for with the {tools[0]}",
-                expected="no tool: a window promises where the tip is in moving tissue, not what is in a tool",
+                expected="no tool: a window promises where the tip is in moving tissue, not what it takes",
                 remedy="Leave out the tool, or plan for success, which counts breathing",
             )
         self._require_bound()

@@ -57,7 +57,7 @@ def _nodule(tool: Tool, lung: Lung, target: Float) -> tuple[Int, Float]:
     else:
         parts, _count = ndimage.label(nodules.array, np.ones((3, 3, 3)))
         own = parts[tuple(nodules.grid.voxels(target))]
-        window = ndimage.find_objects(parts == own)[0]
+        window = ndimage.find_objects(parts)[own - 1]
         spacing = nodules.grid.spacing_mm
         pad = np.ceil(tool.margin_mm / spacing).astype(int) + 1
         solid = np.pad(parts[window] == own, [(each, each) for each in pad])

@@ -43,6 +43,7 @@ KEYS = {
     "failures",
     "draws",
     "seed",
+    "counts_as_success",
     "goal_radius_mm",
     "goal_radius_origin",
     "procedure",

@@ -46,7 +46,7 @@ class Chances:
         self.assessor.success(self.assessor.draws(DEVIATED, 0), self.errors)
 
     def time_deviated_plans_with_a_core_needle(self) -> None:
-        """A million deviated plans, whose core needle is counted in the nodule; 4 s are half a million a second."""
+        """A million deviated plans whose core is counted in the nodule; 4 s are half a million a second."""
         self.tooled.success(self.tooled.draws(DEVIATED, 0), self.errors)
 
     def time_procedures(self) -> None:

@@ -57,14 +57,15 @@ class WindowLimit(Record):
 
 @frozen_record
 class BreathingAim(Record):
-    """Where devices end that were planned for a window: beside the target of the masks' phase.
+    """Where devices end that were planned for a window, beside the target of the masks' phase, or with a tool.
 
     Parameters
     ----------
     point_lps : (3,) float64, LPS mm
         Where tubes and needle end in the masks' phase.
     phases : (N, 2) float64
-        First and last of the phases that were asked for, all of which the window holds; N is 0 or 1.
+        First and last of the phases that were asked for, all of which the window holds; N is 0 or 1, and 0
+        with a tool.
 
     Raises
     ------

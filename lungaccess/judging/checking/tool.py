@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy import ndimage
 
 from anatomy.base.typed import Bool, Float, Int
-from anatomy.lung import Lung
 from lungaccess.judging.checking.findings import Findings
-from lungaccess.plans.plan import Plan
-from lungaccess.problem.tools import Tool
+
+if TYPE_CHECKING:
+    from anatomy.lung import Lung
+    from lungaccess.plans.plan import Plan
+    from lungaccess.problem.tools import Tool
 
 PARTS = 6
 """A voxel is cut into so many parts along each axis where a volume is counted."""

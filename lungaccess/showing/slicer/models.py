@@ -206,7 +206,7 @@ def points_of_interest(plan: Plan) -> dict[str, Any]:
 
 
 def aim_point(aim: BreathingAim) -> dict[str, Any]:
-    """Return the content of a `.mrk.json` file: where devices end that were planned for a window, LPS mm."""
+    """Return the content of a `.mrk.json` file: where devices end beside the target, LPS mm."""
     return _fiducials("aim", {"aim of the devices": aim.point_lps})
 
 

@@ -80,11 +80,11 @@ def safe_start_region(
         lung, needle, plan.system.margins, with_fissures=plan.fissures_are_obstacles, goal_tolerance_mm=radius
     )
     start = plan.needle.lps_from_start
-    query = Query(lps_from_start=start, target=plan.target_lps, branch=plan.exemption.branch)
+    query = Query(lps_from_start=start, target=plan.goal_lps, branch=plan.exemption.branch)
     path = ArcPath(lps_from_start=start, arcs=needle_pieces(plan.needle))
     return StartRegion(
         lps_from_start=start,
-        target=plan.target_lps,
+        target=plan.goal_lps,
         radius_mm=radius,
         max_curvature_per_mm=environment.limits.kappa,
         proved=prove_starts(environment, query, path),

@@ -56,9 +56,9 @@ from lungaccess.problem.procedures import load_procedure as load_procedure
 from lungaccess.problem.request import Request as Request
 from lungaccess.problem.request import StatedPlace as StatedPlace
 from lungaccess.problem.request import register_goal as register_goal
+from lungaccess.problem.system import with_tool as with_tool
 from lungaccess.problem.tools import Tool as Tool
 from lungaccess.problem.tools import load_tool as load_tool
-from lungaccess.problem.tools import with_tool as with_tool
 from lungaccess.running.design import read_design as read_design
 from lungaccess.running.design import run_design as run_design
 from lungaccess.running.study import read_study as read_study

@@ -24,6 +24,7 @@ CHECK_MAY_USE = (
     "lungaccess.plans.version",
     "lungaccess.problem.goals",
     "lungaccess.problem.system",
+    "lungaccess.problem.tools",
     "lungaccess.judging.checking*",
     "stages.tube.casadi_shape",
 )

@@ -57,7 +57,7 @@ class WindowLimit(Record):
 
 @frozen_record
 class BreathingAim(Record):
-    """Where devices end that were planned for a window, beside the target of the masks' phase, or with a tool.
+    """Where devices end beside the target of the masks' phase: planned for a window, or with a tool.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, parse, settings, switch, text, to_mapping
 from anatomy.margins import Margins
 from lungaccess.problem.preset_files import PresetFiles
-from lungaccess.problem.tools import Tool
+from lungaccess.problem.tools import Tool, load_tool
 from stages.needle.device import Needle
 from stages.scope.device import Bronchoscope
 from stages.tube.device import ConcentricTubes, Tube
@@ -283,6 +283,22 @@ def with_fissure_rule(system: System, fissures_allowed: bool | None) -> System:
         return system
     name = system.name + FISSURE_RULES[fissures_allowed]
     return replace(system, name=name, fissures_allowed=fissures_allowed)
+
+
+def with_tool(system: System, tool: Tool | None) -> System:
+    """Return a system with a tool, and with a name that says so; itself for None."""
+    if tool is None or tool == system.tool:
+        return system
+    before = "" if system.tool is None else f" ({system.tool.name})"
+    return replace(system, tool=tool, name=f"{system.name.removesuffix(before)} ({tool.name})")
+
+
+def systems_with_tool(systems: tuple[System, ...], name_or_path: str | None) -> tuple[System, ...]:
+    """Return systems with a tool of a name or file, of several those with a needle; themselves for None."""
+    if name_or_path is None:
+        return systems
+    able = [system for system in systems if system.needle is not None or len(systems) == 1]
+    return tuple(with_tool(system, load_tool(name_or_path)) for system in able)
 
 
 def preset_named(name: str) -> System | None:

@@ -71,7 +71,7 @@ def plan(
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
-    from lungaccess.problem.tools import systems_with_tool
+    from lungaccess.problem.system import systems_with_tool
 
     stated = target.stated()
     systems = systems_with_tool(system.candidates(), tool)

@@ -55,7 +55,8 @@ def risk(
     from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.procedures import Procedure
-    from lungaccess.problem.tools import load_tool, with_tool
+    from lungaccess.problem.system import with_tool
+    from lungaccess.problem.tools import load_tool
     from lungaccess.uncertainty.risk import assess, find_tolerances, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.assessment import DEFAULT_SAMPLES
     from stages.scope import WallContact

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 PARTS = 6
 """A voxel is cut into so many parts along each axis where a volume is counted."""
 LENGTH_TOLERANCE_MM = 0.3
-"""The planner knows where a core enters and leaves the nodule to half of 0.25 mm each."""
+"""The planner knows where a core enters and leaves the nodule, and voxels at the edge, to 0.1 mm each."""
 VOLUME_TOLERANCE = 0.1
 """Share of what is wanted by which volumes may differ: the planner counts few points of the tool."""
 BALL_RADIUS_MM = 5.0

@@ -20,8 +20,8 @@ from lungaccess.plans.plan import Plan
 from lungaccess.plans.tissue import wanted_of
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
-from lungaccess.problem.system import System, system_fingerprint
-from lungaccess.problem.tools import Tool, load_tool, systems_with_tool, tool_names, with_tool
+from lungaccess.problem.system import System, system_fingerprint, systems_with_tool, with_tool
+from lungaccess.problem.tools import Tool, load_tool, tool_names
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts
 from lungaccess.uncertainty.risk.statistics import share_of
@@ -29,7 +29,7 @@ from stages.needle.path import arc_transform
 
 SYSTEM = la.load_system("ultrathin")
 MODEL = load_errors("breath-hold")
-DRAWS = 400
+DRAWS = 150
 """So many ends are found by 4 x 4 matrices, one after the other."""
 
 
@@ -59,11 +59,11 @@ def ends(plan: Plan, lung: Lung, deviations: Deviations) -> np.ndarray:
 
 def brute(tool: Tool, lung: Lung, frame: np.ndarray, shift: np.ndarray) -> float:
     """Return how much of the nodules is in a tool: its body is looked at in fine steps, voxel by voxel."""
-    fine = 0.05 if tool.unit == "mm" else 0.25
+    fine = 0.05 if tool.unit == "mm" else 0.05 * tool.diameter_mm
     if tool.unit == "share":
         volume = lung.nodules.array.sum() * lung.grid.voxel_volume_mm3
         assert tool.margin_mm == 0.0
-        return brute(replace(tool, unit="mm3", least=1.0), lung, frame, shift) / volume
+        return brute(replace(tool, unit="mm3"), lung, frame, shift) / volume
     half = 0.5 * tool.diameter_mm
     sides = np.arange(-half + 0.5 * fine, half, fine) if tool.unit == "mm3" else np.zeros(1)
     z = np.arange(tool.from_tip_mm + 0.5 * fine, tool.to_tip_mm, fine)
@@ -81,7 +81,7 @@ def test_what_is_in_the_tool_is_what_its_voxels_say(
     plans: dict[str, Plan], small_lung: Lung, name: str
 ) -> None:
     plan = plans[name]
-    tool = plan.system.tool if name != "ablation" else replace(plan.system.tool, margin_mm=0.0)
+    tool = plan.system.tool if name != "ablation" else replace(plan.system.tool, margin_mm=0.0, least=0.5)
     there = RiskAssessor(replace(plan, system=replace(plan.system, tool=tool)), small_lung)
     deviations = there.draws(DRAWS, 3).deviations(MODEL)
     taken = there.outcomes(deviations).taken

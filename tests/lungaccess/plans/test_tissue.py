@@ -17,7 +17,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.judging.checking import check
 from lungaccess.planning.procedure import simulate_procedure
 from lungaccess.plans.plan import Plan
-from lungaccess.plans.tissue import own_nodule, wanted_of
+from lungaccess.plans.tissue import wanted_of
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.system import System, system_fingerprint, systems_with_tool, with_tool
@@ -60,11 +60,6 @@ def ends(plan: Plan, lung: Lung, deviations: Deviations) -> np.ndarray:
 def brute(tool: Tool, lung: Lung, frame: np.ndarray, shift: np.ndarray) -> float:
     """Return how much of the nodules is in a tool: its body is looked at in fine steps, voxel by voxel."""
     fine = 0.05 if tool.unit == "mm" else 0.05 * tool.diameter_mm
-    if tool.unit == "share":
-        own = own_nodule(lung, la.resolve_target(lung).lps_mm)
-        volume = len(own) * lung.grid.voxel_volume_mm3
-        assert tool.margin_mm == 0.0
-        return brute(replace(tool, unit="mm3"), lung, frame, shift) / volume
     half = 0.5 * tool.diameter_mm
     sides = np.arange(-half + 0.5 * fine, half, fine) if tool.unit == "mm3" else np.zeros(1)
     z = np.arange(tool.from_tip_mm + 0.5 * fine, tool.to_tip_mm, fine)
@@ -77,21 +72,19 @@ def brute(tool: Tool, lung: Lung, frame: np.ndarray, shift: np.ndarray) -> float
     return float(found * (fine if tool.unit == "mm" else fine**3))
 
 
-@pytest.mark.parametrize("name", ["core", "cryoprobe", "ablation"])
+@pytest.mark.parametrize("name", ["core", "cryoprobe"])
 def test_what_is_in_the_tool_is_what_its_voxels_say(
     plans: dict[str, Plan], small_lung: Lung, name: str
 ) -> None:
     plan = plans[name]
     tool = plan.system.tool
-    if name == "ablation":
-        tool = replace(tool, margin_mm=0.0, least=0.5, from_tip_mm=-14.0, to_tip_mm=-4.0, diameter_mm=9.0)
     there = RiskAssessor(replace(plan, system=replace(plan.system, tool=tool)), small_lung)
     deviations = there.draws(DRAWS, 3).deviations(MODEL)
     taken = there.outcomes(deviations).taken
     frames = ends(plan, small_lung, deviations)
     every = zip(frames, deviations.target_mm, strict=True)
     truth = np.array([brute(tool, small_lung, *each) for each in every])
-    off = {"mm": 0.3, "mm3": 0.12 * tool.volume_mm3, "share": 0.08}[tool.unit]
+    off = {"mm": 0.3, "mm3": 0.12 * tool.volume_mm3}[tool.unit]
     assert np.abs(taken - truth).max() <= off
     assert np.mean(truth > 0.0) > 0.0 and np.ptp(truth) > off, "the draws tell them apart"
     many = share_of(there.outcomes(there.draws(20_000, 4).deviations(MODEL)).taken >= there.wanted.least)

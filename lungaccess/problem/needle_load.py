@@ -61,8 +61,7 @@ def stiffness_ratio(system: System) -> float:
 def needle_load(system: System) -> NeedleLoad | None:
     """Return what a system's needle does to its tubes; None without one, or if its stiffness is neglected.
 
-    The section does not give way here, and no tissue holds: see `stages.tube.bending_section` and
-    `stages.tube.held_shape`.
+    The section does not give way here, and no tissue holds it; docs/explanation/tubes.md says what they do.
     """
     from stages.tube import TubeMechanics
 

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from stages.tube.exits import exit_points
     from stages.tube.following import DeployedSequence, SnapError, deploy
     from stages.tube.kernels import DesignArrays, ManyShapes, ShapeArrays, TubeEnvironment
-    from stages.tube.loading import NeedleArrivals, needle_arrivals
     from stages.tube.mechanics import Batch, TubeMechanics
     from stages.tube.nearby import NearbyShape, Neighbourhood
     from stages.tube.nesting import check_nesting
@@ -59,8 +58,7 @@ if TYPE_CHECKING:
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
-    from stages.tube.strain import bending_section, straightening
-    from stages.tube.tissue import LUNG_N_MM2, HeldShape, held_shape
+    from stages.tube.strain import straightening
     from stages.tube.validation import REASONS, Deployment, DeploymentValidator
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -80,7 +80,8 @@ def derive_loaded(
     needle_mm : float
         Arc length of the needle's tip from the front plate.
     tissue_n_mm2, tissue_from_mm : float
-        See `stages.tube.tissue.held_shape`; far stiffer tissue than lungs makes the problem too steep.
+        Force for each mm of tube and mm aside, beyond an arc length.  Far stiffer tissue than lungs makes the
+        problem too steep.
 
     Raises
     ------

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.shafts import second_moment_mm4
 from stages.tube.device import ConcentricTubes, Tube
 
 
@@ -41,32 +40,3 @@ def straightening(
         passing_mm = float(inserted[-1]) + needle_out_mm + bending_length_mm
         total += float(needle.parts.stiffness_n_mm2[needle.parts.begin_mm < passing_mm].max())
     return total / section_stiffness_n_mm2
-
-
-def bending_section(
-    outer_diameter_mm: float,
-    channel_diameter_mm: float,
-    length_mm: float,
-    stiffness_n_mm2: float,
-    curvature_per_mm: float,
-) -> Tube:
-    """Return a scope's bending section as the outermost of nested tubes, whose rear end is the front plate.
-
-    Its precurvature is what the handle gives it while it is empty.  So section, tubes and needle are one
-    equilibrium.  In torsion it is as soft as in bending: no measurement is known, and real ones are stiffer.
-
-    Raises
-    ------
-    SettingsError
-        If it is no tube.
-    """
-    area = second_moment_mm4(outer_diameter_mm, channel_diameter_mm)
-    return Tube(
-        outer_diameter_mm=outer_diameter_mm,
-        inner_diameter_mm=channel_diameter_mm,
-        length_mm=length_mm,
-        curved_length_mm=length_mm if curvature_per_mm > 0.0 else 0.0,
-        precurvature_per_mm=curvature_per_mm,
-        youngs_modulus_gpa=1e-3 * stiffness_n_mm2 / area,
-        poisson_ratio=0.0,
-    )

@@ -16,7 +16,6 @@ except ImportError as error:
         remedy="Choose a planner of our own, such as rrt or optimal, or install ompl where it exists",
     ) from error
 
-from stages.needle.ompl.benchmark import benchmark
 from stages.needle.ompl.planner import NeedleGoal, NeedlePlanner, Question, path_of, read_state, write_state
 from stages.needle.ompl.problem import Allocator, NeedleProblem, SearchFactory, seed_ompl
 
@@ -27,7 +26,6 @@ __all__ = [
     "NeedleProblem",
     "Question",
     "SearchFactory",
-    "benchmark",
     "path_of",
     "read_state",
     "seed_ompl",

@@ -2,13 +2,11 @@
 
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from ompl import base, control
 
-from anatomy.base.errors import FileError
 from anatomy.base.typed import Float
 from stages.needle.kernels import states
 from stages.needle.path import ArcPath, Query, arc_transform
@@ -160,11 +158,6 @@ class NeedlePlanner(base.Planner):
         state = self._si.allocState()
         put_numbers(state, states.rolled(states.state_of(frame), -roll))
         return state
-
-
-def not_written(file: str | Path) -> FileError:
-    """Return the error of a file that OMPL could not write."""
-    return FileError(f"{file} was not written by OMPL", expected="a folder that may be written to")
 
 
 def write_state(state: Any, frame: Float) -> None:

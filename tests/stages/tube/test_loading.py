@@ -11,17 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from anatomy.base.errors import SettingsError
 from anatomy.shafts import SlottedSegment
+from experiments.support.needle_load.arrivals import bending_section, needle_arrivals
 from stages.tube import (
     BEND_RAD,
     Neighbourhood,
     ShapeGrid,
     ShapeLimits,
     TubeMechanics,
-    bending_section,
     deploy,
     deployed,
     design_arrays,
-    needle_arrivals,
     together,
     tube_shapes,
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,3 +86,19 @@ class Given:
 
 def given(*paths: ArcPath) -> Callable[[NeedleEnvironment, Query, int], Search]:
     return lambda _environment, _query, _seed: Given(*paths)
+
+
+def ompls_benchmark(problem: NeedleProblem, log: Path | None = None) -> list[float]:
+    """Return the shares of solved runs of our default planner in OMPL's own benchmark."""
+    from ompl import tools
+
+    problem.pose(query())
+    bench = tools.Benchmark(problem.setup, "needle")
+    bench.addPlanner(problem.planners()["rrt"](problem.si))
+    bench.benchmark(
+        tools.Request(maxTime=LONG_S, maxMem=1e5, runCount=3, displayProgress=False, simplify=False)
+    )
+    if log is not None:
+        bench.saveResultsToFile(str(log))
+    (record,) = bench.getRecordedExperimentData().planners
+    return [float(run["solved BOOLEAN"]) for run in record.runs]

@@ -17,8 +17,17 @@ import pytest
 from anatomy.base.errors import SettingsError
 from stages.needle import ompl as ompl_planner
 from stages.needle.environment import NeedleEnvironment
-from stages.needle.ompl import NeedleProblem, benchmark, path_of, seed_ompl
-from tests.stages.needle.ompl.problems import LONG_S, NEAR, arcs_of, ask, given, query, require
+from stages.needle.ompl import NeedleProblem, path_of, seed_ompl
+from tests.stages.needle.ompl.problems import (
+    LONG_S,
+    NEAR,
+    arcs_of,
+    ask,
+    given,
+    ompls_benchmark,
+    query,
+    require,
+)
 
 
 def test_the_path_outlives_the_states_of_ompl(problem: NeedleProblem) -> None:
@@ -121,7 +130,7 @@ def test_a_problem_is_freed_when_it_is_dropped(environment: NeedleEnvironment) -
     problem.pose(query(NEAR), goal_tolerance_mm=4.0)
     problem.setup.solve(LONG_S)
     problem.setup.setPlanner(problem.planner)
-    benchmark(problem, query(), time_s=LONG_S, runs=1, planners=["rrt"])
+    ompls_benchmark(problem)
     alive = [weakref.ref(problem), weakref.ref(problem.own().search), weakref.ref(problem._question)]
     assert all(reference() is not None for reference in alive)
     del problem

@@ -9,8 +9,10 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import read_only
+from anatomy.shafts import second_moment_mm4
+from experiments.support.needle_load import kernels as kernel
+from stages.tube.device import Tube
 from stages.tube.equilibrium import matrices
-from stages.tube.kernels import loading as kernel
 from stages.tube.mechanics import TubeMechanics
 
 THREADS = 2
@@ -72,7 +74,7 @@ def needle_arrivals(
 ) -> NeedleArrivals:
     """Follow deployed tubes while the needle comes through them and goes on into tissue.
 
-    Tissue does not hold the tubes here; see `stages.tube.tissue` for what it does.
+    Tissue does not hold the tubes here; see `experiments.support.needle_load.tissue` for what it does.
 
     Parameters
     ----------
@@ -141,3 +143,32 @@ def needle_arrivals(
             )
         },
     )  # fmt: skip
+
+
+def bending_section(
+    outer_diameter_mm: float,
+    channel_diameter_mm: float,
+    length_mm: float,
+    stiffness_n_mm2: float,
+    curvature_per_mm: float,
+) -> Tube:
+    """Return a scope's bending section as the outermost of nested tubes, whose rear end is the front plate.
+
+    Its precurvature is what the handle gives it while it is empty.  So section, tubes and needle are one
+    equilibrium.  In torsion it is as soft as in bending: no measurement is known, and real ones are stiffer.
+
+    Raises
+    ------
+    SettingsError
+        If it is no tube.
+    """
+    area = second_moment_mm4(outer_diameter_mm, channel_diameter_mm)
+    return Tube(
+        outer_diameter_mm=outer_diameter_mm,
+        inner_diameter_mm=channel_diameter_mm,
+        length_mm=length_mm,
+        curved_length_mm=length_mm if curvature_per_mm > 0.0 else 0.0,
+        precurvature_per_mm=curvature_per_mm,
+        youngs_modulus_gpa=1e-3 * stiffness_n_mm2 / area,
+        poisson_ratio=0.0,
+    )

@@ -9,7 +9,8 @@ import pytest
 
 from anatomy.base.errors import SettingsError
 from anatomy.shafts import SlottedSegment
-from stages.tube import LUNG_N_MM2, derive_loaded, held_shape
+from experiments.support.needle_load.tissue import LUNG_N_MM2, held_shape
+from stages.tube import derive_loaded
 from stages.tube.device import Tube
 from stages.tube.mechanics import TubeMechanics
 from tests.stages.tube.test_loading import THIN, TWISTED, deployments

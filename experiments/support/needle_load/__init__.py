@@ -1,0 +1,1 @@
+"""What a needle does to tubes that stand when it comes, free and in tissue."""

@@ -7,7 +7,7 @@ it to the skeleton is added.
 
 import numpy as np
 
-from anatomy.base.typed import Bool, Float, Float32, Int
+from anatomy.base.typed import Bool, Int
 from anatomy.tree.lumen import CONNECT_26, PreparedLumen
 from anatomy.tree.noise import require_at_most
 
@@ -86,7 +86,10 @@ def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -
         high = np.minimum(open_voxels.max(axis=0) + margin + 1, prepared.solid.shape)
         window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         starts = skeleton[((skeleton >= low) & (skeleton < high)).all(axis=1)] - low
-        cost = _cost(prepared.solid_depth_mm[window], prepared.solid[window], spacing)
+        depth_mm = prepared.solid_depth_mm[window]
+        solid = prepared.solid[window]
+        floor = float(spacing.min()) / 4
+        cost = np.asarray(np.where(solid, 1.0 / np.maximum(depth_mm.astype(np.float64), floor) ** 2, -1.0))
         search = MCP_Geometric(cost, fully_connected=True, sampling=tuple(spacing))
         end = tuple((target - low).tolist())
         total, _ = search.find_costs([tuple(s) for s in starts.tolist()], [end])
@@ -94,8 +97,3 @@ def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -
             path: Int = np.array(search.traceback(end)[1:]) + low
             return path
         margin = margin * 2
-
-
-def _cost(depth_mm: Float32, solid: Bool, spacing_mm: Float) -> Float:
-    floor = float(spacing_mm.min()) / 4
-    return np.asarray(np.where(solid, 1.0 / np.maximum(depth_mm.astype(np.float64), floor) ** 2, -1.0))

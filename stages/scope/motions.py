@@ -173,7 +173,12 @@ def find_motions(
     """
     passages = find_passages(lung, scope, reach_mm=reach_mm)
     walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)
-    tried = _worth_a_try(lung.tree, device.radius)
+    # Tell which tree points are not too narrow on the way to them, nor would be a little beside the axis.
+    tree = lung.tree
+    # The lumen may be wider by so much, half a voxel or more, beside the axis than on it.
+    tried = tree.radius_mm >= device.radius - 0.5
+    for point in range(1, tree.n_points):
+        tried[point] &= tried[tree.parent_point[point]]
     states = Growth(walls, lung.tree, tried, passages.passable, device).grow()
     least, most = tip_bends_rad or scope.bends_rad
     tips, tree_point, ahead = find_tips(
@@ -207,15 +212,6 @@ def _entry(states: StateTree) -> Float:
     if len(states.states):
         entry[:3] = states.states[0, : kernel.U].reshape(4, 3).T
     return entry
-
-
-def _worth_a_try(tree: AirwayTree, radius_mm: float) -> Bool:
-    """Tell which tree points are not too narrow on the way to them, nor would be a little beside the axis."""
-    # The lumen may be wider by so much, half a voxel or more, beside the axis than on it.
-    wide = tree.radius_mm >= radius_mm - 0.5
-    for point in range(1, tree.n_points):
-        wide[point] &= wide[tree.parent_point[point]]
-    return wide
 
 
 TURNED_COARSER = 2.0

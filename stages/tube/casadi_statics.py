@@ -216,7 +216,12 @@ class _Shooting:
         ahead, ahead_before = _forward(loaded[ROTATION]), _forward(before[ROTATION])
         off = loaded[POSITION] - before[POSITION]
         across = off - ahead_before * casadi.dot(ahead_before, off)
-        local = _turned_back(loaded[ROTATION], loaded[MOMENT])
+        # A vector in the frame of a quaternion.
+        quaternion = loaded[ROTATION]
+        vector = loaded[MOMENT]
+        axis, w = -quaternion[1:], quaternion[0]
+        aside = 2 * casadi.cross(axis, vector)
+        local = vector + w * aside + casadi.cross(axis, aside)
         rates = []
         for part, moment, total in (
             (loaded[FIRST_ANGLE:], local, sum(bending) + share * stiff),
@@ -238,13 +243,6 @@ def _forward(quaternion: Any) -> Any:
     """Return the forward direction of a quaternion (w, x, y, z)."""
     w, x, y, z = casadi.vertsplit(quaternion)
     return casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
-
-
-def _turned_back(quaternion: Any, vector: Any) -> Any:
-    """Return a vector in the frame of a quaternion."""
-    axis, w = -quaternion[1:], quaternion[0]
-    aside = 2 * casadi.cross(axis, vector)
-    return vector + w * aside + casadi.cross(axis, aside)
 
 
 def _rotated(angle: Any, vector: Float) -> Any:

@@ -104,7 +104,10 @@ def completed_plan(
         follow_the_leader_error_mm=motions.follow_the_leader_error_mm,
         shape=motions.shape,
     )
-    pieces = _needle_pieces(motions.arcs)
+    pieces = [
+        shapes.Piece(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
+        for arc in motions.arcs
+    ]
     curve = shapes.integrate(motions.lps_from_tube_tip, shapes.cut_at(pieces, needle.exit_exemption_mm))
     draft = Plan(
         software_version=software_version(),
@@ -178,13 +181,6 @@ def _with_exit(plan: Plan, environment: Environment) -> Plan:
     whole = replace(tube, exit=stated)
     exemption = replace(plan.exemption, branch=way_out.branch, exit_point_lps=point)
     return replace(plan, tube=whole, exemption=exemption)
-
-
-def _needle_pieces(arcs: tuple[NeedleArc, ...]) -> list[shapes.Piece]:
-    return [
-        shapes.Piece(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
-        for arc in arcs
-    ]
 
 
 def _needle(motions: Motions, curve: shapes.Curve) -> NeedlePath:

@@ -83,7 +83,12 @@ def first_cells(motion: Motion) -> Cells:
 
     The shaft lies on what the section has slid along.
     """
-    slides, lengths = _slides(motion)
+    # From which states the section slides on, and the lengths of the arcs that it covers.
+    moves = motion.moves
+    begins = np.flatnonzero(moves & ~np.append(False, moves[:-1]))
+    ends = np.flatnonzero(moves & ~np.append(moves[1:], False)) + 1
+    advance = motion.states[:, 0]
+    slides, lengths = begins, advance[ends] - advance[begins] + motion.section_mm
     in_place = np.flatnonzero(motion.turns)
     last = len(motion.states) - 1
     states = np.concatenate([slides, in_place, [last]])
@@ -101,18 +106,6 @@ def first_cells(motion: Motion) -> Cells:
         time=np.repeat(half_time, counts),
         half_time=np.repeat(half_time, counts),
     )
-
-
-def _slides(motion: Motion) -> tuple[Int, Float]:
-    """Return from which states the section slides on, and the lengths of the arcs that it covers.
-
-    Advances with the same bend are one.
-    """
-    moves = motion.moves
-    begins = np.flatnonzero(moves & ~np.append(False, moves[:-1]))
-    ends = np.flatnonzero(moves & ~np.append(moves[1:], False)) + 1
-    advance = motion.states[:, 0]
-    return begins, advance[ends] - advance[begins] + motion.section_mm
 
 
 def places(motion: Motion, cells: Cells) -> Float:

@@ -50,7 +50,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import BREATHING, ErrorModel
 from lungaccess.problem.procedures import Procedure, load_procedure
-from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.uncertainty.risk import RiskAssessor
@@ -207,7 +206,10 @@ class Policy:
         # Fissures are obstacles of what follows exactly where they are of the plan.
         # The way is planned again to where the tip has to end, so that nothing has to go on from there.
         whole = replace(plan.system, fissures_allowed=not plan.fissures_are_obstacles, tool=None)
-        self.system = _with_margins(whole, self.procedure.least_margin_share)
+        # A system with a share of its margins.
+        share = self.procedure.least_margin_share
+        margins = {each.name: share * getattr(whole.margins, each.name) for each in fields(whole.margins)}
+        self.system = replace(whole, margins=replace(whole.margins, **margins))
         arcs = [] if plan.needle is None else plan.needle.arcs
         self._planned = np.array([(a.length_mm, a.roll_rad, a.curvature_per_mm) for a in arcs]).reshape(-1, 3)
         path = ArcPath(lps_from_start=np.eye(4), arcs=self._planned)
@@ -647,12 +649,6 @@ def rest_of(arcs: Float, behind_mm: float) -> tuple[Float, float]:
 def _same(arcs: Float, others: Float) -> Bool:
     """Tell which paths `(N, A, 3)` are the same but for rounding."""
     return np.asarray((np.abs(arcs - others) <= SAME).all(axis=(1, 2)))
-
-
-def _with_margins(system: System, share: float) -> System:
-    """Return a system with a share of its margins."""
-    margins = {each.name: share * getattr(system.margins, each.name) for each in fields(system.margins)}
-    return replace(system, margins=replace(system.margins, **margins))
 
 
 def _joined(parts: Sequence[Chosen]) -> Chosen:

@@ -139,7 +139,11 @@ class _Run:
     def all(self, processes: int) -> _Found:
         """Return what comes of all procedures."""
         if self._policy.procedure.is_open_loop:
-            return self._open_loop()
+            # Carry out the plan as it stands, as `assess` does.
+            outcomes = self.assessor.outcomes(fitted_to(self.assessor.n_arcs, self._attempts[0]))
+            ones = np.ones(self.samples, dtype=np.int64)
+            none = np.zeros(self.samples, dtype=bool)
+            return _Found(outcomes.touched, outcomes.miss_mm, outcomes.taken, none, ones, {})
         parts = np.array_split(np.arange(self.samples), processes)
         if processes == 1 or not can_fork():
             return _joined(map(self._part, parts))
@@ -150,14 +154,6 @@ class _Run:
         """Go through some procedures in a process of their own."""
         end_with_parent()
         end.send(self._part(numbers))
-
-    def _open_loop(self) -> _Found:
-        """Carry out the plan as it stands, as `assess` does."""
-        outcomes = self.assessor.outcomes(fitted_to(self.assessor.n_arcs, self._attempts[0]))
-        ones = np.ones(self.samples, dtype=np.int64)
-        return _Found(
-            outcomes.touched, outcomes.miss_mm, outcomes.taken, np.zeros(self.samples, dtype=bool), ones, {}
-        )
 
     def _part(self, numbers: Int) -> _Found:
         """Go through some procedures: the scope is placed again where the policy says so."""

@@ -16,7 +16,7 @@ from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.structures import obstacle_bits
 from lungaccess.planning.coupled import Scan
-from stages.needle import BLOCK_MM, Reached
+from stages.needle import BLOCK_MM
 
 SLAB_MM = BLOCK_MM
 """Thickness of the slabs of layers that are tried, and kept on disk, at a time."""
@@ -75,7 +75,10 @@ def scan_layers(
         kept = None if store is None else store.load(first, len(places))
         ijk = places + np.array([0, 0, first], dtype=np.int64)
         if kept is None and len(places):
-            kept = _as_rows(scan.reach(grid.lps(ijk), voxel_seeds(grid, ijk), _earlier_neighbours(slab)))
+            reached = scan.reach(grid.lps(ijk), voxel_seeds(grid, ijk), _earlier_neighbours(slab))
+            share = np.zeros_like(reached.cost) if reached.window_share is None else reached.window_share
+            rows = np.stack([reached.kinds, reached.cost, reached.clearance_mm, share]).astype(np.float32)
+            kept = rows, reached.entries.astype(np.int32)
             if store is not None:
                 store.save(first, kept)
         elif kept is not None:
@@ -108,12 +111,6 @@ def _earlier_neighbours(counted: Mask) -> Int:
 
 Rows = tuple[Float32, Int32]
 """What was found of N voxels: `(4, N)` and `(N,)`, see `scan_layers`."""
-
-
-def _as_rows(reached: Reached) -> Rows:
-    share = np.zeros_like(reached.cost) if reached.window_share is None else reached.window_share
-    rows = np.stack([reached.kinds, reached.cost, reached.clearance_mm, share]).astype(np.float32)
-    return rows, reached.entries.astype(np.int32)
 
 
 class LayerStore:

@@ -260,7 +260,13 @@ class UnreachableProof:
             )
         if self._free is None:
             return self._surroundings(np.zeros_like(self._masks[0]))
-        near = _near(lung, target, self._limits.goal_tolerance_mm + self._loss_mm)
+        # The window of voxels that may hold a point so near to the target.
+        distance_mm = self._limits.goal_tolerance_mm + self._loss_mm
+        at = lung.grid.ijk(target)
+        reach = distance_mm / lung.grid.spacing_mm + 1.0
+        low = np.maximum(np.floor(at - reach).astype(int), 0)
+        high = np.ceil(at + reach).astype(int) + 1
+        near = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
         regions = np.unique(self._free[near])
         regions = regions[regions > 0]
         if regions.tobytes() not in self._passable:
@@ -318,12 +324,3 @@ def _free_regions(lung: Lung, required_mm: float, loss_mm: float, with_fissures:
     free = (greatest / UNITS_PER_MM + loss_mm >= required_mm) & ((lung.labels & bits) == 0)
     labels, _ = ndimage.label(free, structure=np.ones((3, 3, 3)))
     return np.asarray(labels, dtype=np.int32)
-
-
-def _near(lung: Lung, target: Float, distance_mm: float) -> tuple[slice, ...]:
-    """Return the window of voxels that may hold a point so near to the target."""
-    at = lung.grid.ijk(target)
-    reach = distance_mm / lung.grid.spacing_mm + 1.0
-    low = np.maximum(np.floor(at - reach).astype(int), 0)
-    high = np.ceil(at + reach).astype(int) + 1
-    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))

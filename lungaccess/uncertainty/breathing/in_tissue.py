@@ -78,7 +78,9 @@ def carried_needle(plan: Plan, lung: Lung, window: BreathingWindow) -> CarriedNe
                 curve, pose = moving.moved(tissue, float(phase)), moving.pose(float(phase))
                 away = curve[0] - (pose[:3, :3] @ tubes + pose[:3, 3])
                 miss = curve[-1] - moving.moved(target, float(phase))[0]
-                bend = _angle_deg(curve[min(step, len(curve) - 1)] - curve[0], pose[:3, :3] @ ahead)
+                a = curve[min(step, len(curve) - 1)] - curve[0]
+                b = pose[:3, :3] @ ahead
+                bend = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
                 radius = _least_radius_mm(curve[::step])
                 seen = np.array([np.linalg.norm(miss), np.linalg.norm(away), bend])
                 worst[:3] = np.maximum(worst[:3], seen)
@@ -96,10 +98,6 @@ def carried_needle(plan: Plan, lung: Lung, window: BreathingWindow) -> CarriedNe
 
 def _length(curve: Float) -> float:
     return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
-
-
-def _angle_deg(a: Float, b: Float) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 def _least_radius_mm(points: Float) -> float:

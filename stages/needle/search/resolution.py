@@ -227,7 +227,12 @@ class ResolutionSearch:
         self._store = self._first_store()
         left = environment.limits.max_length_mm - query.inserted_mm
         pieces = max(int(left / self.resolution.fine_mm), 0) + 2
-        self._queue = _first_queue(pieces * len(self._words[4]) + resolution_nodes.LOOK_AHEAD + 1)
+        ranks = pieces * len(self._words[4]) + resolution_nodes.LOOK_AHEAD + 1
+        lists = np.zeros((ranks, 2), dtype=np.int32)
+        lists[:, resolution_nodes.HEAD] = -1
+        entries = np.zeros((FIRST_ENTRIES, resolution_nodes.ENTRY_COLUMNS), dtype=np.int32)
+        heap = np.zeros(FIRST_ENTRIES, dtype=np.int32)
+        self._queue = np.zeros(FIRST_ENTRIES), entries, np.zeros(FIRST_ENTRIES), heap, lists
         self._state = np.zeros(resolution_nodes.STATE_SIZE, dtype=np.int64)
         self._state[resolution_nodes.FREE] = -1
         self._counts = np.zeros(kernel.COUNTS, dtype=np.int64)
@@ -283,7 +288,11 @@ class ResolutionSearch:
             if reason == kernel.EXHAUSTED:
                 self._end(Outcome.NONE if self.path is None else Outcome.BEST)
             elif reason == kernel.FULL_OF_NODES:
-                self._more_nodes()
+                if self._may_double(self._store):
+                    nodes, links, proved, seen = self._store
+                    larger = np.zeros(2 * len(seen), dtype=np.int32)
+                    node_kernel.rehash(nodes, self._merge, seen, larger)
+                    self._store = _doubled(nodes), _doubled(links), _doubled(proved), larger
             elif reason == kernel.FULL_OF_ENTRIES:
                 f, entries, heap_f, heap, ranks = self._queue
                 if self._may_double((f, entries, heap_f, heap)):
@@ -300,13 +309,6 @@ class ResolutionSearch:
         if not fits:
             self._end(Outcome.OUT_OF_MEMORY)
         return fits
-
-    def _more_nodes(self) -> None:
-        if self._may_double(self._store):
-            nodes, links, proved, seen = self._store
-            larger = np.zeros(2 * len(seen), dtype=np.int32)
-            node_kernel.rehash(nodes, self._merge, seen, larger)
-            self._store = _doubled(nodes), _doubled(links), _doubled(proved), larger
 
     def _best_path(self) -> ArcPath:
         """Return the path to the best node and on to the goal."""
@@ -328,14 +330,6 @@ class ResolutionSearch:
                 rows.append(_row(length, bend))
         parents = np.arange(-1, len(rows) - 1)
         return path_from_tree(self.query.lps_from_start, np.stack(rows), parents, len(rows) - 1)
-
-
-def _first_queue(ranks: int) -> Queue:
-    lists = np.zeros((ranks, 2), dtype=np.int32)
-    lists[:, resolution_nodes.HEAD] = -1
-    entries = np.zeros((FIRST_ENTRIES, resolution_nodes.ENTRY_COLUMNS), dtype=np.int32)
-    heap = np.zeros(FIRST_ENTRIES, dtype=np.int32)
-    return np.zeros(FIRST_ENTRIES), entries, np.zeros(FIRST_ENTRIES), heap, lists
 
 
 def _megabytes(arrays: Iterable[Array]) -> float:

@@ -150,9 +150,6 @@ def _direction(tree: AirwayTree, fork: int, first: int) -> Float:
     points = np.arange(first, tree.branch_start[tree.branch_of_point[first] + 1])
     depth_mm = tree.distance_from_root_mm
     near = points[depth_mm[points] <= depth_mm[fork] + LOOK_MM]
-    return _unit(tree.points_lps[near[-1] if len(near) else first] - tree.points_lps[fork])
-
-
-def _unit(vector: Float) -> Float:
+    vector = tree.points_lps[near[-1] if len(near) else first] - tree.points_lps[fork]
     length = float(np.linalg.norm(vector))
     return vector / length if length > 0.0 else vector

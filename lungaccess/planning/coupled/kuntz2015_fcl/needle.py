@@ -141,15 +141,13 @@ class NeedleRRT:
         done = 0
         while done < (math.inf if iterations is None else iterations) and time.thread_time() < deadline:
             done += 1
-            self._extend(tree, sample_ahead(lps_from_start, goal_lps, self._needle, rng), branch)
+            # Extend the nearest state towards a sampled point, by at most RRT_STEP_MM.
+            point_lps = sample_ahead(lps_from_start, goal_lps, self._needle, rng)
+            controls = tree.controls_to(point_lps, self._needle.max_curvature_per_mm)
+            self._step(tree, int(np.argmin(controls.length_mm)), controls, branch)
             if self._towards_goal(tree, goal_lps, branch):
                 return tree.path_to(tree.count - 1, lps_from_start)
         return None
-
-    def _extend(self, tree: Tree, point_lps: Float, branch: int) -> None:
-        """Extend the nearest state towards a sampled point, by at most RRT_STEP_MM."""
-        controls = tree.controls_to(point_lps, self._needle.max_curvature_per_mm)
-        self._step(tree, int(np.argmin(controls.length_mm)), controls, branch)
 
     def _towards_goal(self, tree: Tree, goal_lps: Float, branch: int) -> bool:
         """Extend the state nearest to the goal towards it; tell whether it got there.

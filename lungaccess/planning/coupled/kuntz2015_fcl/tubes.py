@@ -40,7 +40,9 @@ class TubeValidator:
         refused = self._contained(labels[first:], at_mm[first:] - exit_mm, branch)
         if refused:
             return refused
-        angle = self._wall_angle_rad(shape, exit_mm)
+        lung, frame = self._obstacles.lung, frame_at(shape, exit_mm)
+        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+        angle = float(kernels.wall_angle(lung.labels, lung.geometry, pose))
         if angle < math.radians(self._system.tubes.min_wall_angle_deg):
             return REASONS[kernels.FLAT_EXIT]
         contact_mm = self._contact_mm(points[:first], at_mm[:first], made)
@@ -85,11 +87,6 @@ class TubeValidator:
         inside = (lung.grid.values_at(lung.labels, points, OUTSIDE) & LUMEN) != 0
         last = int(np.argmax(inside != inside[0])) - 1
         return float(at_mm[sample - 1] + share[last] * (at_mm[sample] - at_mm[sample - 1]))
-
-    def _wall_angle_rad(self, shape: ArcPath, exit_mm: float) -> float:
-        lung, frame = self._obstacles.lung, frame_at(shape, exit_mm)
-        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
-        return float(kernels.wall_angle(lung.labels, lung.geometry, pose))
 
     def _contained(self, labels: Labels, beyond_mm: Float, branch: int) -> str:
         """Return why the axis beyond the exit lies in something, or an empty text."""

@@ -56,7 +56,9 @@ class WindowReachScan:
             if found and found[-1].candidate is not None:
                 kinds[n], cost[n] = DIRECT, found[-1].cost
                 clearance[n] = self._clearance_mm(found[-1].candidate)
-                share[n] = self._share(task, found[-1].candidate)
+                candidate = found[-1].candidate
+                plan = assemble(task, candidate, iteration=0, timing={})
+                share[n] = breathing_window(plan, self._lung).share
         entries = np.full(len(places), -1, dtype=np.int64)
         return Reached(kinds=kinds, cost=cost, clearance_mm=clearance, entries=entries, window_share=share)
 
@@ -68,10 +70,6 @@ class WindowReachScan:
         points, lengths = candidate.path.sample(STEP_MM)
         beyond = self._field.lower_bound_mm(points[lengths >= needle.exit_exemption_mm])
         return max(float(beyond.min(initial=math.inf)) - 0.5 * STEP_MM, 0.0) if len(beyond) else 0.0
-
-    def _share(self, task: Task, candidate: Candidate) -> float:
-        plan = assemble(task, candidate, iteration=0, timing={})
-        return breathing_window(plan, self._lung).share
 
 
 class Scan(Protocol):

@@ -152,4 +152,4 @@ def _direction(tree: AirwayTree, fork: int, first: int) -> Float:
     near = points[depth_mm[points] <= depth_mm[fork] + LOOK_MM]
     vector = tree.points_lps[near[-1] if len(near) else first] - tree.points_lps[fork]
     length = float(np.linalg.norm(vector))
-    return vector / length if length > 0.0 else vector
+    return np.asarray(vector / length if length > 0.0 else vector)

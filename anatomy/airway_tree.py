@@ -28,31 +28,19 @@ class AirwayTree:
     The points of a branch are consecutive.  The first point of a branch hangs on `parent_point`, a
     point of its parent branch (its last one, or an earlier one where three or more branches part).
 
-    Parameters
-    ----------
-    points_lps : (N, 3) float64
-        LPS mm.
-    radius_mm : (N,) float64
-        Distance from the point to the border of the lumen; 0 in a bridged gap.
-    parent_point : (N,) int64
-        The next point towards the root; -1 at the root.
-    branch_of_point : (N,) int64
-    branch_start : (B + 1,) int64
-        The points of branch b are `branch_start[b]:branch_start[b + 1]`.
-    branch_parent : (B,) int64
-        -1 for the trachea, which is branch 0.
-    generation : (B,) int64
-        0 for the trachea, one more at each branching.
-    distance_from_root_mm : (N,) float64
-        Length along the tree.
-    tangents : (N, 3) float64
-        Unit vectors in LPS that point away from the root.
-    report : TreeReport
+    Args:
+        points_lps ((N, 3) float64): LPS mm.
+        radius_mm ((N,) float64): Distance from the point to the border of the lumen; 0 in a bridged gap.
+        parent_point ((N,) int64): The next point towards the root; -1 at the root.
+        branch_of_point: (N,) int64.
+        branch_start ((B + 1,) int64): The points of branch b are `branch_start[b]:branch_start[b + 1]`.
+        branch_parent ((B,) int64): -1 for the trachea, which is branch 0.
+        generation ((B,) int64): 0 for the trachea, one more at each branching.
+        distance_from_root_mm ((N,) float64): Length along the tree.
+        tangents ((N, 3) float64): Unit vectors in LPS that point away from the root.
 
-    Raises
-    ------
-    AnatomyError
-        If the arrays do not describe one tree.
+    Raises:
+        AnatomyError: If the arrays do not describe one tree.
     """
 
     points_lps: Float

@@ -71,21 +71,14 @@ def build_lung(
 ) -> Lung:
     """Make the `Lung` of a patient.
 
-    Parameters
-    ----------
-    images : PatientImages
-    key : str, optional
-        Key of the inputs; made from `images.sources` if None.
-    keep : callable, optional
-        Takes the name, as of `plain_values`, and values of each large array as soon as it is made and returns
-        the array to use, for instance the same values mapped from a file.
-    progress : callable, optional
-        Told each step as it begins.
+    Args:
+        key: Key of the inputs; made from `images.sources` if None.
+        keep: Takes the name, as of `plain_values`, and values of each large array as soon as it is made and
+            returns the array to use, for instance the same values mapped from a file.
+        progress: Told each step as it begins.
 
-    Raises
-    ------
-    AnatomyError
-        If lung or airway are empty, or the airway has no trachea.
+    Raises:
+        AnatomyError: If lung or airway are empty, or the airway has no trachea.
     """
     from anatomy.tree import tree_from_mask
 
@@ -231,14 +224,10 @@ def clearance_fields(
 ) -> dict[str, DistanceField]:
     """Return the fields of the clearance to each structure and to all of them, by name.
 
-    Parameters
-    ----------
-    labels : (ni, nj, nk) uint16
-        See `anatomy.structures`.
-    fissures : bool
-        Whether fissures are known, so that there are fields of them.
-    keep, tell
-        As `keep` and `progress` of `build_lung`.
+    Args:
+        labels ((ni, nj, nk) uint16): See `anatomy.structures`.
+        fissures: Whether fissures are known, so that there are fields of them.
+        keep, tell: As `keep` and `progress` of `build_lung`.
     """
     geometry = corner_geometry(grid)
     return {

@@ -31,11 +31,8 @@ ROUNDING_MM = 2e-5
 def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:
     """Return the `(3, 6)` array by which kernels find a point in `grid`, see `anatomy.kernels.field`.
 
-    Parameters
-    ----------
-    grid : Grid
-    half_voxels : float
-        Half side of an obstacle in voxels: `SOLID` boxes or `CENTRES`.
+    Args:
+        half_voxels: Half side of an obstacle in voxels: `SOLID` boxes or `CENTRES`.
     """
     geometry = np.zeros((3, 6))
     geometry[:, :4] = grid.ijk_from_lps[:3]
@@ -49,18 +46,13 @@ def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:
 class DistanceField:
     """The distance to a structure whose voxels are solid boxes, or count as their centres.
 
-    Parameters
-    ----------
-    name : str
-    corners : (ni + 1, nj + 1, nk + 1) uint16, Fortran-contiguous
-        Distance at each voxel corner in 1/256 mm, rounded down, at most 255.99 mm.
-    geometry : (3, 6) float64
-        See `corner_geometry`.
+    Args:
+        corners ((ni + 1, nj + 1, nk + 1) uint16, Fortran-contiguous): Distance at each voxel corner in 1/256
+            mm, rounded down, at most 255.99 mm.
+        geometry ((3, 6) float64): See `corner_geometry`.
 
-    Raises
-    ------
-    GridMismatchError
-        If the geometry has another shape: kernels would read beyond it.
+    Raises:
+        GridMismatchError: If the geometry has another shape: kernels would read beyond it.
     """
 
     name: str

@@ -42,17 +42,13 @@ def transform_points(target_from_source: ArrayLike, points: ArrayLike) -> Float:
 class Grid:
     """A rectilinear voxel grid; integer `ijk` are voxel CENTRES.
 
-    Parameters
-    ----------
-    shape : (3,) int
-        Number of voxels along i, j, k.
-    lps_from_ijk : (4, 4) float64
-        Maps voxel indices to LPS mm.  Its columns must be orthogonal, right-handed and non-zero.
+    Args:
+        shape ((3,) int): Number of voxels along i, j, k.
+        lps_from_ijk ((4, 4) float64): Maps voxel indices to LPS mm.  Its columns must be orthogonal,
+            right-handed and non-zero.
 
-    Raises
-    ------
-    FrameError
-        If the matrix is not finite, not affine, sheared, mirrored or of zero size.
+    Raises:
+        FrameError: If the matrix is not finite, not affine, sheared, mirrored or of zero size.
     """
 
     shape: tuple[int, int, int]

@@ -42,29 +42,19 @@ def kept_record(
 ) -> T:
     """Return the record from the cache, or make and keep it; what was used least recently makes room for it.
 
-    Parameters
-    ----------
-    kind : str
-        What it is, one of `anatomy.base.cache_entries`; the file is named after it.
-    version : str
-        Another one where `make` returns something else for the same `depends_on`, as other kernels may.
-    depends_on : mapping
-        Plain values.
-    cls : type
-        Class of the record, of arrays, plain values, and records of such.
-    cache : path, optional
-        Folder of the cache; `anatomy.base.cache.default_cache()` if None.
-    name : str
-        Whose it is; empty if it belongs to no patient.
-    in_use : tuple of Path
-        What has to stay in the cache as well.
+    Args:
+        kind: What it is, one of `anatomy.base.cache_entries`; the file is named after it.
+        version: Another one where `make` returns something else for the same `depends_on`, as other kernels
+            may.
+        depends_on: Plain values.
+        cls: Class of the record, of arrays, plain values, and records of such.
+        cache: Folder of the cache; `anatomy.base.cache.default_cache()` if None.
+        name: Whose it is; empty if it belongs to no patient.
+        in_use: What has to stay in the cache as well.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
-    SettingsError
-        If the limit of the cache is no size.
+    Raises:
+        FileError: If the file cannot be written.
+        SettingsError: If the limit of the cache is no size.
     """
     path = record_path(kind, version, depends_on, cache)
     stored = _stored(path, cls) if path.exists() else None
@@ -130,14 +120,10 @@ def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
     A lung that is not stored keeps nothing.  What is kept is made anew if it is missing, damaged or of
     another version, and goes when the lung goes.
 
-    Parameters
-    ----------
-    name : str
-        What they are; the file is named after it.
-    version : int
-        To be raised when `make` returns something else for the same lung.
-    make : callable
-        Returns the values; they should say the same after they were written as JSON and read again.
+    Args:
+        name: What they are; the file is named after it.
+        version: To be raised when `make` returns something else for the same lung.
+        make: Returns the values; they should say the same after they were written as JSON and read again.
     """
     if lung.folder is None:
         return make()

@@ -30,12 +30,10 @@ def landmarks(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) -> 
     Each direction is told by signs that do not depend on each other.  Only a header that is wrong, or organs
     that are mirrored, turn all signs of a direction around.
 
-    Parameters
-    ----------
-    left, right : (N, 3) float64, LPS mm
-        About one point in every cube of `SAMPLE_MM` of each lung.
-    lowest_mm : float
-        The height z of the lowest voxels of the image, LPS mm: a lung that reaches them may be cut off.
+    Args:
+        left, right ((N, 3) float64, LPS mm): About one point in every cube of `SAMPLE_MM` of each lung.
+        lowest_mm: The height z of the lowest voxels of the image, LPS mm: a lung that reaches them may be cut
+            off.
     """
     lungs = [left, right]
     top, carina = tree.points_lps[0], tree.carina_lps

@@ -21,14 +21,12 @@ ENTRY_BRANCH = 0
 class LiverImages:
     """What was read from disk for one liver, on one voxel grid.
 
-    Parameters
-    ----------
-    liver, nodules : Volume
-        Bool masks; the nodules are None if there is no mask of them.
-    lumens : mapping of str to Volume
-        The vessels by name, such as "portal-vein": obstacles of a needle, and what a catheter moves in.
-    starts, targets_lps, start_names, target_names, sources, warnings
-        As in `anatomy.patient.PatientImages`.
+    Args:
+        liver, nodules: Bool masks; the nodules are None if there is no mask of them.
+        lumens: The vessels by name, such as "portal-vein": obstacles of a needle, and what a catheter moves
+            in.
+        starts, targets_lps, start_names, target_names, sources, warnings: As in
+            `anatomy.patient.PatientImages`.
     """
 
     name: str

@@ -36,10 +36,9 @@ _WORDS = re.compile(r"left|right|upper|superior|middle|lower|inferior|lobe|lung"
 def lobe_named(name: str) -> int:
     """Return the number of the lobe that a file or label is named after; 0 if it is none.
 
-    Examples
-    --------
-    >>> [lobe_named(name) for name in ("RUL", "lung_upper_lobe_left", "RightLowerLobe", "lung")]
-    [1, 4, 3, 0]
+    Examples:
+        >>> [lobe_named(name) for name in ("RUL", "lung_upper_lobe_left", "RightLowerLobe", "lung")]
+        [1, 4, 3, 0]
     """
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
     if plain in _SHORT:
@@ -91,14 +90,11 @@ def fissures_between(lobes: UInt8) -> Mask:
 
     No chain of face neighbours passes from lobe to lobe without entering the fissure.
 
-    Parameters
-    ----------
-    lobes : (ni, nj, nk) uint8
-        Numbers of `LOBES`, 0 elsewhere.
+    Args:
+        lobes ((ni, nj, nk) uint8): Numbers of `LOBES`, 0 elsewhere.
 
-    Returns
-    -------
-    (ni, nj, nk) bool
+    Returns:
+        (ni, nj, nk) bool.
     """
     fissures = np.zeros(lobes.shape, dtype=np.bool_, order="F")
     box = window(*bounds(lobes))

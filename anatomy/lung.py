@@ -27,15 +27,10 @@ NEAREST_LOBE_MM = 10.0
 class Lung(Organ):
     """The lungs of one patient with their airways, in LPS mm, immutable.
 
-    Parameters
-    ----------
-    lumen_depth : DistanceField
-        Distance from a point in the lumen to the nearest voxel that is not lumen; 0 outside.
-    tree : AirwayTree
-    lobes : Volume or None
-        uint8 numbers of `anatomy.lobes.LOBES` on `grid`, if the patient came with lobes.
-    motion : Motion or None
-        How it breathes, if that is known.
+    Args:
+        lumen_depth: Distance from a point in the lumen to the nearest voxel that is not lumen; 0 outside.
+        lobes: uint8 numbers of `anatomy.lobes.LOBES` on `grid`, if the patient came with lobes.
+        motion: How it breathes, if that is known.
     """
 
     lumen_depth: DistanceField

@@ -59,14 +59,10 @@ class SurfaceMesh:
 def box_surface(mask: Mask, grid: Grid, *, beyond: bool = False) -> SurfaceMesh:
     """Return the exact boundary of the voxels of `mask` as solid boxes.
 
-    Parameters
-    ----------
-    mask : (ni, nj, nk) bool
-        A mask on `grid`.  An empty mask has an empty surface.
-    grid : Grid
-        Use `Grid.crop` for a region of interest.
-    beyond : bool
-        Whether all that lies beyond the grid belongs to the mask, too.
+    Args:
+        mask ((ni, nj, nk) bool): A mask on `grid`.  An empty mask has an empty surface.
+        grid: Use `Grid.crop` for a region of interest.
+        beyond: Whether all that lies beyond the grid belongs to the mask, too.
     """
     if beyond:
         rest = box_surface(~np.asarray(mask, dtype=bool), grid)
@@ -102,10 +98,8 @@ def _faces_of(padded: Mask, axis: int, side: int) -> Int:
 def smooth_surface(volume: Volume) -> SurfaceMesh:
     """Return a marching cubes surface of a bool volume, for pictures and prints.
 
-    Raises
-    ------
-    AnatomyError
-        If the mask is empty.
+    Raises:
+        AnatomyError: If the mask is empty.
     """
     from skimage.measure import marching_cubes
 

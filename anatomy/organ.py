@@ -28,42 +28,30 @@ if TYPE_CHECKING:
 class Organ:
     """A lung or a liver, in LPS mm, immutable; a lung with airways is a `anatomy.lung.Lung`.
 
-    Parameters
-    ----------
-    name, kind : str
-        The patient, and the kind of folder it was read from.
-    key : str
-        Hash of the content of the inputs and of the way they were processed.
-    grid : Grid
-        The working grid: the box of organ, airways and vessels, at least one voxel wider all around.
-    labels : (ni, nj, nk) uint16, Fortran-contiguous
-        Structures and airway branch of every voxel, see `anatomy.structures`.
-    fields : mapping of str to DistanceField
-        Clearance to "airway", "vessel", "pleura", "fissure" (if any), and to the nearest of them:
-        "obstacle" without fissures, "obstacle_fissure" with them.  The "pleura" of a liver is its capsule.
-    nodules, cost : Volume or None
-        Nodule mask; cost map in [0, 1] or infinite.  Both on `grid`.
-    nodule_labels : Volume or None
-        uint16 numbers of the nodules by the patient's files, on `grid`, if these tell more than one apart.
-    starts, targets_lps : tuple of arrays
-        Poses `lps_from_tip` (4, 4) and points (3,) that came with the patient.
-    start_names, target_names : tuple of str
-        How users name them.
-    breath_hold : str or None
-        In which breath-hold the image was taken, if stated.
-    sources : mapping of str to str
-        SHA-256 of every input file.
-    warnings : tuple of str
-        What was assumed or repaired on the way in.
-    findings : tuple of Finding
-        What the checks of the masks found, see `anatomy.plausibility`; none for masks that were not checked.
-    folder : Path or None
-        Where it is stored; None for one in memory alone, as a changed copy of a stored one is.
+    Args:
+        name, kind: The patient, and the kind of folder it was read from.
+        key: Hash of the content of the inputs and of the way they were processed.
+        grid: The working grid: the box of organ, airways and vessels, at least one voxel wider all around.
+        labels ((ni, nj, nk) uint16, Fortran-contiguous): Structures and airway branch of every voxel, see
+            `anatomy.structures`.
+        fields: Clearance to "airway", "vessel", "pleura", "fissure" (if any), and to the nearest of them:
+            "obstacle" without fissures, "obstacle_fissure" with them.  The "pleura" of a liver is its
+            capsule.
+        nodules, cost: Nodule mask; cost map in [0, 1] or infinite.  Both on `grid`.
+        nodule_labels: uint16 numbers of the nodules by the patient's files, on `grid`, if these tell more
+            than one apart.
+        starts, targets_lps (tuple of arrays): Poses `lps_from_tip` (4, 4) and points (3,) that came with the
+            patient.
+        start_names, target_names: How users name them.
+        breath_hold: In which breath-hold the image was taken, if stated.
+        sources: SHA-256 of every input file.
+        warnings: What was assumed or repaired on the way in.
+        findings: What the checks of the masks found, see `anatomy.plausibility`; none for masks that were not
+            checked.
+        folder: Where it is stored; None for one in memory alone, as a changed copy of a stored one is.
 
-    Raises
-    ------
-    GridMismatchError
-        If the labels or a field do not fit the grid.
+    Raises:
+        GridMismatchError: If the labels or a field do not fit the grid.
     """
 
     name: str
@@ -152,15 +140,11 @@ class Organ:
     ) -> Float:
         """Return exact distances in mm to the nearest voxel with any of `bits`, at most `cap_mm`.
 
-        Parameters
-        ----------
-        points_lps : (N, 3) float64, LPS mm
-        bits : int
-            Structures of `anatomy.structures` to measure to.
-        cap_mm : float
-            Search radius; the cost grows with its third power.
-        exempt_branch : int
-            Airway voxels of this branch are passed over; -1 for none.
+        Args:
+            points_lps: (N, 3) float64, LPS mm.
+            bits: Structures of `anatomy.structures` to measure to.
+            cap_mm: Search radius; the cost grows with its third power.
+            exempt_branch: Airway voxels of this branch are passed over; -1 for none.
         """
         points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
         out = np.zeros(len(points))
@@ -172,14 +156,10 @@ class Organ:
     ) -> float:
         """Return the least of the distances of points to structures: exact below a cap, else a lower bound.
 
-        Parameters
-        ----------
-        points_lps : (N, 3) float64, LPS mm
-            At least one.
-        field : str
-            The distance field of the structures.
-        bits, cap_mm, exempt_branch
-            As in `exact_clearance_mm`.
+        Args:
+            points_lps ((N, 3) float64, LPS mm): At least one.
+            field: The distance field of the structures.
+            bits, cap_mm, exempt_branch: As in `exact_clearance_mm`.
         """
         points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
         bounds = self.fields[field].lower_bound_mm(points)

@@ -19,45 +19,30 @@ MASKS = ("lumen", "wall", "vessels", "lung", "fissures", "nodules")
 class PatientImages:
     """Masks, poses and points of one patient.
 
-    Parameters
-    ----------
-    name, kind : str
-        What reports call it; where the images come from: "med-rad", "totalsegmentator", "masks" or "phantom".
-    grid : Grid
-        The voxel grid that all volumes share.
-    lumen, vessels, lung : Volume
-        Bool masks: the airway lumen, the union of arteries and veins, both lungs filled.
-    wall, fissures, nodules : Volume or None
-        Bool masks; None when the patient has none.
-    lobes : Volume or None
-        uint8 numbers of `anatomy.lobes.LOBES`; 0 is no lobe.
-    nodule_labels : Volume or None
-        uint16 numbers of the nodules by the patient's files, if these tell more than one apart; else 0.
-    cost : Volume or None
-        float32 cost of passing a voxel, in [0, 1], or infinity where passing is forbidden.
-    starts : tuple of (4, 4) float64
-        Poses `lps_from_tip` of needle starts, +z in the direction of insertion, LPS mm.
-    targets_lps : tuple of (3,) float64
-        Target points, LPS mm.
-    start_names, target_names : tuple of str
-        How users name them; "start1", "target1", ... if not given.
-    breath_hold : str or None
-        In which state of breathing the image was taken, if that is stated.
-    motion : MotionSource or None
-        What is known of the breathing.
-    sources : mapping of str to str
-        File name to the SHA-256 of its bytes.
-    warnings : tuple of str
-        What was unusual about the input but did not prevent reading it.
-    accepted : tuple of str
-        Checks of `anatomy.plausibility.CHECKS` whose failure a person has accepted.
+    Args:
+        name, kind: What reports call it; where the images come from: "med-rad", "totalsegmentator", "masks"
+            or "phantom".
+        grid: The voxel grid that all volumes share.
+        lumen, vessels, lung: Bool masks: the airway lumen, the union of arteries and veins, both lungs
+            filled.
+        wall, fissures, nodules: Bool masks; None when the patient has none.
+        lobes: uint8 numbers of `anatomy.lobes.LOBES`; 0 is no lobe.
+        nodule_labels: uint16 numbers of the nodules by the patient's files, if these tell more than one
+            apart; else 0.
+        cost: float32 cost of passing a voxel, in [0, 1], or infinity where passing is forbidden.
+        starts (tuple of (4, 4) float64): Poses `lps_from_tip` of needle starts, +z in the direction of
+            insertion, LPS mm.
+        targets_lps (tuple of (3,) float64): Target points, LPS mm.
+        start_names, target_names: How users name them; "start1", "target1", ... if not given.
+        breath_hold: In which state of breathing the image was taken, if that is stated.
+        motion: What is known of the breathing.
+        sources: File name to the SHA-256 of its bytes.
+        warnings: What was unusual about the input but did not prevent reading it.
+        accepted: Checks of `anatomy.plausibility.CHECKS` whose failure a person has accepted.
 
-    Raises
-    ------
-    AnatomyError
-        If a mask is not bool, or the cost is not in [0, 1] or infinite.
-    GridMismatchError
-        If a volume lies on another grid.
+    Raises:
+        AnatomyError: If a mask is not bool, or the cost is not in [0, 1] or infinite.
+        GridMismatchError: If a volume lies on another grid.
     """
 
     name: str

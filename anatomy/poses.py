@@ -18,23 +18,17 @@ SHORTEST = 1e-9
 def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = None) -> Float:
     """Return the frame at a point with +z along `forward`.
 
-    Parameters
-    ----------
-    point_lps : (3,) float64, LPS mm
-    forward : (3,) float64
-        Need not be of unit length.
-    sideways : (3,) float64, optional
-        +x is its part perpendicular to `forward`; by default anterior, or superior where the device
-        points along the anterior axis.
+    Args:
+        point_lps: (3,) float64, LPS mm.
+        forward ((3,) float64): Need not be of unit length.
+        sideways ((3,) float64): +x is its part perpendicular to `forward`; by default anterior, or superior
+            where the device points along the anterior axis.
 
-    Returns
-    -------
-    (4, 4) float64, read-only
+    Returns:
+        (4, 4) float64, read-only.
 
-    Raises
-    ------
-    FrameError
-        If a direction has no length or both are parallel.
+    Raises:
+        FrameError: If a direction has no length or both are parallel.
     """
     z = _unit(np.asarray(forward, dtype=np.float64), "forward")
     if sideways is None:
@@ -112,14 +106,11 @@ def poses_on_arc(frame: Float, roll_rad: float, curvature_per_mm: ArrayLike, len
 def poses_on_pieces(frame: Float, pieces: Float, step_mm: float) -> tuple[Float, Float]:
     """Return poses `(N, 4, 4)` at the ends of arcs and between them, and their arc lengths `(N,)`.
 
-    Parameters
-    ----------
-    frame : (4, 4) float64
-        Where the first arc starts.
-    pieces : (P, 3) float64
-        Length in mm, roll before it in rad, which is kept for the next, and curvature in 1/mm of each arc.
-    step_mm : float
-        Largest distance between two poses.
+    Args:
+        frame ((4, 4) float64): Where the first arc starts.
+        pieces ((P, 3) float64): Length in mm, roll before it in rad, which is kept for the next, and
+            curvature in 1/mm of each arc.
+        step_mm: Largest distance between two poses.
     """
     poses, lengths = [np.asarray(frame)[None]], [np.zeros(1)]
     for length, roll, curvature in pieces:

@@ -42,25 +42,17 @@ def open_lung(
 
     What its masks fail of `anatomy.plausibility.CHECKS` is among its warnings.
 
-    Parameters
-    ----------
-    sources : dict of str to str
-        SHA-256 of every input file.
-    read : callable
-        Reads the images; called only if the cache does not hold the lung.
-    cache : Path, optional
-        Folder of the cache; `anatomy.base.cache.default_cache()` if None.
-    progress : callable, optional
-        Told each step as it begins.
-    accept : collection of str, optional
-        Names of the checks whose failure is accepted; others are refused.  None refuses nothing.
+    Args:
+        sources: SHA-256 of every input file.
+        read: Reads the images; called only if the cache does not hold the lung.
+        cache: Folder of the cache; `anatomy.base.cache.default_cache()` if None.
+        progress: Told each step as it begins.
+        accept (collection of str): Names of the checks whose failure is accepted; others are refused.  None
+            refuses nothing.
 
-    Raises
-    ------
-    AnatomyError
-        If a check of the masks fails that is not accepted.
-    FileError
-        If the cache cannot be written.
+    Raises:
+        AnatomyError: If a check of the masks fails that is not accepted.
+        FileError: If the cache cannot be written.
     """
     lung = _stored_or_built(sources, read, cache, progress)
     findings = with_accepted(lung.findings, accept or ())

@@ -53,18 +53,13 @@ class LoopOpened(Repair):
 class TreeReport:
     """What was changed or left out while the tree was made.
 
-    Parameters
-    ----------
-    gaps_bridged, spurs_pruned, loops_opened, pieces_left_out : tuple of records
-        Each with `position_lps` and `length_mm`; pieces of a few voxels are counted alone.
-    components_dropped : int
-        Separate pieces of the mask that were left out.
-    voxels_dropped : int
-        Voxels in these pieces.
-    cavity_voxels : int
-        Voxels of holes enclosed in the lumen; the tree runs around them.
-    warnings : tuple of str
-        What a user should look at before trusting the tree.
+    Args:
+        gaps_bridged, spurs_pruned, loops_opened, pieces_left_out (tuple of records): Each with `position_lps`
+            and `length_mm`; pieces of a few voxels are counted alone.
+        components_dropped: Separate pieces of the mask that were left out.
+        voxels_dropped: Voxels in these pieces.
+        cavity_voxels: Voxels of holes enclosed in the lumen; the tree runs around them.
+        warnings: What a user should look at before trusting the tree.
     """
 
     gaps_bridged: tuple[GapBridged, ...] = ()

@@ -29,21 +29,13 @@ MOST_REPEATS = 20
 class Workload:
     """A piece of work of several sizes.
 
-    Parameters
-    ----------
-    title : str
-    grows : str
-        What grows: "voxels", "targets", "atlas entries", "tubes" or "lesions".
-    sizes : tuple of int
-        Each about a multiple of the one before.  For voxels, the edge of a cube.
-    promised : float or None
-        Exponent of time over work, where the algorithm has one.
-    prepare : callable
-        Takes a size and returns what is timed; it may be called again and again.
-    runs : int
-        How many equal pieces one call of the work does; times are divided by it.
-    fitted_from : int
-        Least amount that an exponent is fitted to.
+    Args:
+        grows: What grows: "voxels", "targets", "atlas entries", "tubes" or "lesions".
+        sizes: Each about a multiple of the one before.  For voxels, the edge of a cube.
+        promised: Exponent of time over work, where the algorithm has one.
+        prepare: Takes a size and returns what is timed; it may be called again and again.
+        runs: How many equal pieces one call of the work does; times are divided by it.
+        fitted_from: Least amount that an exponent is fitted to.
     """
 
     title: str

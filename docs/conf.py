@@ -36,10 +36,8 @@ html_sidebars = {
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 
-napoleon_google_docstring = False
 napoleon_use_ivar = True
 napoleon_use_rtype = False
-autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 nitpicky = False
 # Docstrings name their sources as [Kuntz2015]; the bibliography is one page for all of them.

@@ -71,13 +71,9 @@ def along_arc(headings: Float, side: Float, part: float) -> Float:
 class Table:
     """Chances and actions for each place, direction and side of the bevel.
 
-    Parameters
-    ----------
-    chances : (2, H, N, N) float64
-        By side (left, right), direction, x and y.
-    actions : (2, H, N, N) int64
-        INSERT or TURN.
-    spacing_mm : float
+    Args:
+        chances ((2, H, N, N) float64): By side (left, right), direction, x and y.
+        actions ((2, H, N, N) int64): INSERT or TURN.
     """
 
     chances: Float
@@ -100,14 +96,10 @@ class Table:
 def solve(insertion_deg: float, turn_deg: float, spacing_mm: float, directions: int) -> Table:
     """Return the actions of the greatest chance of success, by value iteration.
 
-    Parameters
-    ----------
-    insertion_deg, turn_deg : float
-        Standard deviations of the direction after each action.
-    spacing_mm : float
-        Of the grid of places.
-    directions : int
-        A multiple of STEPS_A_TURN.
+    Args:
+        insertion_deg, turn_deg: Standard deviations of the direction after each action.
+        spacing_mm: Of the grid of places.
+        directions: A multiple of STEPS_A_TURN.
     """
     headings = 2.0 * np.pi * np.arange(directions) / directions
     axis = np.arange(round(SIZE_MM / spacing_mm) + 1) * spacing_mm

@@ -49,10 +49,8 @@ class Decider:
     def record(self, point: Float, seed: int) -> dict[str, Any]:
         """Return the outcome of a target, with seconds, and the share of the deployments ruled out.
 
-        Raises
-        ------
-        AssertionError
-            If a target has a plan that the check accepts, and the proof rules it out.
+        Raises:
+            AssertionError: If a target has a plan that the check accepts, and the proof rules it out.
         """
         lung, system = self._atlas.lung, self._system
         began = time.perf_counter()

@@ -102,10 +102,8 @@ def times_by_case(file: Path) -> Times:
 def finished(found: Times, runs: dict[tuple[str, str], int]) -> tuple[Times, str]:
     """Return the cases whose runs are all there, and how far the study is; empty if it has ended.
 
-    Parameters
-    ----------
-    runs : dict
-        How many runs each case and planner has.
+    Args:
+        runs: How many runs each case and planner has.
     """
     done = {key: found[key] for key in runs if key in found and len(found[key][0]) >= runs[key]}
     made, of = sum(len(times) for times, _refused in found.values()), sum(runs.values())

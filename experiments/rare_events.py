@@ -30,15 +30,9 @@ WEIGHTED = 20_000
 class Case:
     """A plan and errors so small that it seldom touches a structure.
 
-    Parameters
-    ----------
-    phantom_seed : int
-    system : str
-        Name of a preset.
-    errors : str
-        Name of a preset, all of whose errors are multiplied by `scale`.
-    scale : float
-    structure : str
+    Args:
+        system: Name of a preset.
+        errors: Name of a preset, all of whose errors are multiplied by `scale`.
     """
 
     phantom_seed: int

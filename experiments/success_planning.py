@@ -61,12 +61,9 @@ def compare(
 ) -> Pair:
     """Plan for success to the target of a plan of least cost, with its seed, and count both.
 
-    Parameters
-    ----------
-    size : tuple of int
-        Variations of the search, and draws of the comparison.
-    seed : int
-        Of the comparison.
+    Args:
+        size: Variations of the search, and draws of the comparison.
+        seed: Of the comparison.
     """
     variations, draws = size
     target, began = la.point_target(lung, plan.target_lps), time.process_time()

@@ -37,17 +37,12 @@ def measured_entry(case: BenchmarkPhantom, folder: Path) -> Entry:
     The phantom goes through files, as it does for every planner and every score: a NIfTI file keeps the grid
     in single precision, and the targets are drawn from distances on the grid as it is read.
 
-    Parameters
-    ----------
-    folder : Path
-        Where its masks are written.
+    Args:
+        folder: Where its masks are written.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written to.
-    TargetError
-        If one of its lungs has no place for a target.
+    Raises:
+        FileError: If the folder cannot be written to.
+        TargetError: If one of its lungs has no place for a target.
     """
     write_phantom(unproved_phantom(case), folder, with_ct=False)
     images = load_patient(folder)

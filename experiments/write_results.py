@@ -69,10 +69,8 @@ Found = dict[str, dict[str, Any]]
 def read_all(folder: Path) -> dict[str, Found]:
     """Return the stored results by name and setting.
 
-    Raises
-    ------
-    FileError
-        If a file is damaged.
+    Raises:
+        FileError: If a file is damaged.
     """
     found: dict[str, Found] = {}
     for setting in SETTINGS:
@@ -98,12 +96,10 @@ def _read(file: Path) -> dict[str, Any]:
 def headlines(found: dict[str, Found], tables: str, docs: str) -> str:
     """Return the text of RESULTS.md.
 
-    Parameters
-    ----------
-    found : dict
-        Results by name and setting, see `read_all`.
-    tables, docs : str
-        The page of all rows and the folder of the documentation, as links from RESULTS.md name them.
+    Args:
+        found: Results by name and setting, see `read_all`.
+        tables, docs: The page of all rows and the folder of the documentation, as links from RESULTS.md name
+            them.
     """
     how = f"{docs}/measurements/results.md"
     lines = [HEADLINES_HEAD.format(tables=tables, how=how).rstrip("\n"), ""]
@@ -134,12 +130,9 @@ def _headlines(name: str, found: dict[str, Found], docs: str) -> list[list[str]]
 def page(found: dict[str, Found], headlines: str) -> str:
     """Return the text of the page of all rows, which lies in the folder of the results.
 
-    Parameters
-    ----------
-    found : dict
-        Results by name and setting, see `read_all`.
-    headlines : str
-        RESULTS.md, as a link from this page names it.
+    Args:
+        found: Results by name and setting, see `read_all`.
+        headlines: RESULTS.md, as a link from this page names it.
     """
     parts = [TABLES_HEAD.format(headlines=headlines), _overview(found)]
     for paper, names in PAPERS.items():
@@ -181,10 +174,9 @@ def section(name: str, found: Found) -> str:
 def ranges(seeds: list[int]) -> str:
     """Return whole numbers with runs of them written as ranges.
 
-    Examples
-    --------
-    >>> ranges([1, 2, 3, 7])
-    '1 to 3, 7'
+    Examples:
+        >>> ranges([1, 2, 3, 7])
+        '1 to 3, 7'
     """
     out = []
     for _, group in groupby(enumerate(sorted(seeds)), key=lambda pair: pair[1] - pair[0]):

@@ -33,10 +33,8 @@ class PublishError(Exception):
 def publish(site: Path, folder: Path) -> list[str]:
     """Copy the pages of a version and return all versions, newest first.
 
-    Raises
-    ------
-    PublishError
-        If `site` is not what `make docs` builds.
+    Raises:
+        PublishError: If `site` is not what `make docs` builds.
     """
     try:
         version = (site / "version.txt").read_text(encoding="utf-8").strip()

@@ -64,10 +64,9 @@ def copy_of(names: Iterable[str], tree: Path) -> None:
 def build(out: Path) -> tuple[Path, Path]:
     """Build wheel and sdist from the files of git, and the wheel once more from the sdist.
 
-    Raises
-    ------
-    ReleaseError
-        If the contents are not those of the packages, the two wheels differ, or the wheel is too large.
+    Raises:
+        ReleaseError: If the contents are not those of the packages, the two wheels differ, or the wheel is
+            too large.
     """
     names = tracked()
     with tempfile.TemporaryDirectory() as temporary:

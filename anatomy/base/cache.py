@@ -40,10 +40,8 @@ def user_cache() -> Path:
 def cache_limit_bytes() -> int:
     """Return how large the cache may grow: `$LUNGACCESS_CACHE_LIMIT`, such as 20GB, or `DEFAULT_LIMIT`.
 
-    Raises
-    ------
-    SettingsError
-        If the variable holds no size.
+    Raises:
+        SettingsError: If the variable holds no size.
     """
     return parse_size(os.environ.get("LUNGACCESS_CACHE_LIMIT") or DEFAULT_LIMIT, "LUNGACCESS_CACHE_LIMIT")
 
@@ -51,15 +49,12 @@ def cache_limit_bytes() -> int:
 def parse_size(text: str, name: str) -> int:
     """Return the bytes that a text such as ``2GB`` or ``500 MB`` stands for; `name` says where it stood.
 
-    Raises
-    ------
-    SettingsError
-        If it is no size.
+    Raises:
+        SettingsError: If it is no size.
 
-    Examples
-    --------
-    >>> parse_size("1.5GB", "--max-size")
-    1500000000
+    Examples:
+        >>> parse_size("1.5GB", "--max-size")
+        1500000000
     """
     match = re.fullmatch(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*([A-Za-z]*)\s*", text)
     if match is None or match[2].upper() not in UNITS:
@@ -74,10 +69,9 @@ def parse_size(text: str, name: str) -> int:
 def size_in_words(size_bytes: int) -> str:
     """Return a number of bytes for people.
 
-    Examples
-    --------
-    >>> size_in_words(1_234_567_890), size_in_words(500)
-    ('1.2 GB', '500 bytes')
+    Examples:
+        >>> size_in_words(1_234_567_890), size_in_words(500)
+        ('1.2 GB', '500 bytes')
     """
     for unit in ("TB", "GB", "MB", "KB"):
         if size_bytes >= UNITS[unit]:

@@ -33,22 +33,14 @@ UNFINISHED_PATTERN = re.compile(rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).
 class CacheEntry:
     """Something in a cache.
 
-    Parameters
-    ----------
-    path : Path
-        A folder, or the file of an atlas or of shapes.
-    kind : str
-        "anatomy", "atlas", "shapes", or "unfinished" for what is being written or was left behind.
-    patient : str
-        Whose it is; empty if it does not say so.
-    size_bytes : int
-        On disk, pictures included.
-    pictures_bytes : int
-        Of that, what pictures and pages keep with an anatomy.
-    last_used : float
-        Seconds since 1970.
-    current : bool
-        False if no command reads it any more, because its format is an old one.
+    Args:
+        path: A folder, or the file of an atlas or of shapes.
+        kind: "anatomy", "atlas", "shapes", or "unfinished" for what is being written or was left behind.
+        patient: Whose it is; empty if it does not say so.
+        size_bytes: On disk, pictures included.
+        pictures_bytes: Of that, what pictures and pages keep with an anatomy.
+        last_used: Seconds since 1970.
+        current: False if no command reads it any more, because its format is an old one.
     """
 
     path: Path
@@ -76,10 +68,8 @@ class CacheEntry:
 def cache_entries(cache: Path, formats: Mapping[str, str]) -> tuple[CacheEntry, ...]:
     """Return what a cache holds, the least recently used first.
 
-    Parameters
-    ----------
-    formats : mapping of str to str
-        The present format by kind; entries of a kind that is not named count as current.
+    Args:
+        formats: The present format by kind; entries of a kind that is not named count as current.
     """
     found = []
     for path in list(cache.iterdir()) if cache.is_dir() else []:
@@ -138,10 +128,8 @@ def note_use(path: Path) -> None:
 def remove_entry(entry: CacheEntry) -> None:
     """Remove an entry; one that another process has removed, or fills, is no error.
 
-    Raises
-    ------
-    FileError
-        If it may not be removed.
+    Raises:
+        FileError: If it may not be removed.
     """
     try:
         if entry.kind == "unfinished" and entry.path.is_dir():
@@ -166,14 +154,10 @@ def overdue(
 ) -> Iterator[CacheEntry]:
     """Yield what is to go: leftovers, old formats, what is too old, then the least recently used of the rest.
 
-    Parameters
-    ----------
-    entries : tuple of CacheEntry
-        The least recently used first.
-    most_bytes : int
-        What may stay.
-    older_than_days : float, optional
-        Time without use after which an entry goes.
+    Args:
+        entries: The least recently used first.
+        most_bytes: What may stay.
+        older_than_days: Time without use after which an entry goes.
     """
     stay = []
     for entry in entries:
@@ -196,14 +180,10 @@ def overdue(
 def make_room(cache: Path, most_bytes: int, formats: Mapping[str, str], *, keep: tuple[Path, ...]) -> None:
     """Remove what a cache may not hold any longer, after something was stored; what cannot go stays.
 
-    Parameters
-    ----------
-    most_bytes : int
-        How large the cache may be.
-    formats : mapping of str to str
-        See `cache_entries`.
-    keep : tuple of Path
-        What is in use and stays, even if it alone is larger.
+    Args:
+        most_bytes: How large the cache may be.
+        formats: See `cache_entries`.
+        keep: What is in use and stays, even if it alone is larger.
     """
     entries = cache_entries(cache, formats)
     if sum(entry.size_bytes for entry in entries) <= most_bytes:

@@ -6,14 +6,10 @@ class LungaccessError(Exception):
 
     The message states what was found, what was expected and what to do about it.
 
-    Parameters
-    ----------
-    found : str
-        What the input holds.
-    expected : str
-        What it should hold.
-    remedy : str
-        What the user can do.
+    Args:
+        found: What the input holds.
+        expected: What it should hold.
+        remedy: What the user can do.
     """
 
     def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:

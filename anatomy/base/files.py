@@ -31,10 +31,8 @@ REPLACE_TRIES = 20 if sys.platform == "win32" else 1
 def sha256(path: str | Path) -> str:
     """Return the SHA-256 of the bytes of a file as hex digits.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
+    Raises:
+        FileError: If the file cannot be read.
     """
     with reading(path), open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -53,10 +51,8 @@ def require_file(path: str | Path) -> Path:
 def read_text(path: str | Path) -> str:
     """Read a text file as any editor saves it: UTF-8, or UTF-16 with its mark, with any ends of lines.
 
-    Raises
-    ------
-    FileError
-        If it is none, or cannot be read.
+    Raises:
+        FileError: If it is none, or cannot be read.
     """
     path = require_file(path)
     with reading(path):
@@ -77,12 +73,9 @@ def read_text(path: str | Path) -> str:
 def read_toml(path: str | Path, *, remedy: str, expected: str = "text in TOML syntax") -> dict[str, Any]:
     """Read a TOML file; `expected` and `remedy` are for the message.
 
-    Raises
-    ------
-    SettingsError
-        If it is not TOML.
-    FileError
-        If it cannot be read, or is no text.
+    Raises:
+        SettingsError: If it is not TOML.
+        FileError: If it cannot be read, or is no text.
     """
     content = read_text(path)
     try:
@@ -96,10 +89,8 @@ def read_toml(path: str | Path, *, remedy: str, expected: str = "text in TOML sy
 def read_json(path: str | Path, *, expected: str, remedy: str) -> Any:
     """Read a JSON file; `expected` and `remedy` are for the message.
 
-    Raises
-    ------
-    FileError
-        If it cannot be read or is not JSON.
+    Raises:
+        FileError: If it cannot be read or is not JSON.
     """
     text = read_text(path)
     try:
@@ -119,10 +110,8 @@ def reason(error: Exception) -> str:
 def reading(path: str | Path) -> Iterator[None]:
     """Turn what reading a damaged file raises into a `FileError` that names the file.
 
-    Raises
-    ------
-    FileError
-        If the block raises one of `DAMAGE`; typed errors pass.
+    Raises:
+        FileError: If the block raises one of `DAMAGE`; typed errors pass.
     """
     try:
         yield
@@ -142,10 +131,8 @@ def unreadable(path: str | Path, error: Exception) -> FileError:
 def require_writable_folder(folder: str | Path) -> Path:
     """Make `folder` if needed and prove that files can be written into it.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be made or written to.
+    Raises:
+        FileError: If the folder cannot be made or written to.
     """
     folder = Path(folder)
     probe = folder / f".{secrets.token_hex(6)}.probe"
@@ -161,10 +148,8 @@ def require_writable_folder(folder: str | Path) -> Path:
 def require_suffix(path: str | Path, suffix: str) -> None:
     """Refuse a file to be written whose name does not end in `suffix`, in lower or upper case.
 
-    Raises
-    ------
-    FileError
-        If it ends differently.
+    Raises:
+        FileError: If it ends differently.
     """
     if Path(path).suffix.lower() != suffix:
         raise FileError(
@@ -179,19 +164,16 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     The temporary name ends like `path`, because writers choose the format by the ending.  When the
     block raises, `path` keeps its old contents and the temporary file is removed.
 
-    Raises
-    ------
-    FileError
-        If the folder is missing or not writable, or the disk is full.
+    Raises:
+        FileError: If the folder is missing or not writable, or the disk is full.
 
-    Examples
-    --------
-    >>> import tempfile
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> with atomic_write(folder / "plan.json") as temporary:
-    ...     _ = temporary.write_text("{}")
-    >>> (folder / "plan.json").read_text()
-    '{}'
+    Examples:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> with atomic_write(folder / "plan.json") as temporary:
+        ...     _ = temporary.write_text("{}")
+        >>> (folder / "plan.json").read_text()
+        '{}'
     """
     path = Path(path)
     # Short: Windows limits a whole path to 260 characters.
@@ -219,10 +201,8 @@ def _replace(source: Path, target: Path) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Write UTF-8 text, all of it or nothing.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -231,10 +211,8 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, value: object) -> None:
     """Write plain values as indented JSON, all of it or nothing.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     write_text(path, json.dumps(value, indent=2) + "\n")
 

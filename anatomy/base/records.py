@@ -27,13 +27,10 @@ def frozen_value(cls: type[T]) -> type[T]:
 def plain_values(value: Any, name: str, arrays: dict[str, Any]) -> Any:
     """Return a record as values that can be written as JSON; an array is its key in `arrays`.
 
-    Parameters
-    ----------
-    name : str
-        Begins the keys of the arrays, which are those of the fields joined by points, such as
-        `tree.points_lps`; it may be empty.
-    arrays : dict
-        The arrays of the record are added to it.
+    Args:
+        name: Begins the keys of the arrays, which are those of the fields joined by points, such as
+            `tree.points_lps`; it may be empty.
+        arrays: The arrays of the record are added to it.
     """
     if isinstance(value, np.ndarray):
         arrays[name] = value

@@ -35,15 +35,11 @@ def settings(cls: type[T]) -> type[T]:
     The class is a frozen, keyword-only dataclass. Whatever creates an instance (the constructor,
     `dataclasses.replace`, `parse`) checks it, and every fault becomes a `SettingsError`.
 
-    Parameters
-    ----------
-    cls : type
-        Class whose fields are annotated with `quantity` or `text` and whose `__post_init__`, if any, raises
-        what `impossible` returns when two fields contradict each other.
+    Args:
+        cls: Class whose fields are annotated with `quantity` or `text` and whose `__post_init__`, if any,
+            raises what `impossible` returns when two fields contradict each other.
 
-    Returns
-    -------
-    type
+    Returns:
         The settings class.
     """
     made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
@@ -69,16 +65,11 @@ def quantity(
 ) -> Any:
     """Annotate a finite number with its meaning and the range outside which it is absurd.
 
-    Parameters
-    ----------
-    description : str
-        Meaning and effect; the unit is in the name of the field.
-    above, at_least, below, at_most : float, optional
-        Ends of the allowed range; `MOST` either way where none is given.
+    Args:
+        description: Meaning and effect; the unit is in the name of the field.
+        above, at_least, below, at_most: Ends of the allowed range; `MOST` either way where none is given.
 
-    Returns
-    -------
-    pydantic.fields.FieldInfo
+    Returns:
         For use in `Annotated[float, quantity(...)]`. An integer is accepted, text and booleans are not.
     """
     at_least = -MOST if above is None and at_least is None else at_least
@@ -109,18 +100,12 @@ def switch(description: str) -> Any:
 def impossible(key: str, value: object, allowed: str) -> PydanticCustomError:
     """Return the error to raise from `__post_init__` when fields contradict each other.
 
-    Parameters
-    ----------
-    key : str
-        Dotted path of the offending field, from the class that raises.
-    value : object
-        What the field holds.
-    allowed : str
-        What it may hold, with the numbers that follow from the other fields.
+    Args:
+        key: Dotted path of the offending field, from the class that raises.
+        value: What the field holds.
+        allowed: What it may hold, with the numbers that follow from the other fields.
 
-    Returns
-    -------
-    pydantic_core.PydanticCustomError
+    Returns:
         Becomes a `SettingsError` with the whole key path.
     """
     return PydanticCustomError(
@@ -131,26 +116,19 @@ def impossible(key: str, value: object, allowed: str) -> PydanticCustomError:
 def parse(cls: type[T], mapping: Mapping[str, object], where: str, remedy: str = _REMEDY) -> T:
     """Build settings from plain values, as read from TOML or JSON.
 
-    Parameters
-    ----------
-    cls : type
-        A class made by `settings`.
-    mapping : mapping of str to object
-        Values by key; nested settings are nested mappings.
-    where : str
-        Where the values come from (a file name), for the message.
-    remedy : str, optional
-        What the user can do about a wrong value, for the message.
+    Args:
+        cls: A class made by `settings`.
+        mapping: Values by key; nested settings are nested mappings.
+        where: Where the values come from (a file name), for the message.
+        remedy: What the user can do about a wrong value, for the message.
 
-    Returns
-    -------
-    instance of `cls`
+    Returns:
+        instance of `cls`.
 
-    Raises
-    ------
-    SettingsError
-        For a missing or unknown key, a wrong type, a number that is not finite or outside its range, or
-        values that contradict each other. The message names the key path, the value and what is allowed.
+    Raises:
+        SettingsError: For a missing or unknown key, a wrong type, a number that is not finite or outside its
+            range, or values that contradict each other. The message names the key path, the value and what is
+            allowed.
     """
     try:
         return TypeAdapter(cls).validate_python(mapping)
@@ -177,24 +155,17 @@ def to_mapping(values: object) -> dict[str, Any]:
 def override(values: T, changes: Mapping[str, object], where: str = "overrides") -> T:
     """Return settings with some values replaced, all checked together.
 
-    Parameters
-    ----------
-    values : settings
-        What to start from.
-    changes : mapping of str to object
-        New values by dotted key path, e.g. ``{"needle.diameter_mm": 0.8}``; entries of arrays by their number
-        from 0.
-    where : str, optional
-        Where the changes come from, for the message.
+    Args:
+        values (settings): What to start from.
+        changes: New values by dotted key path, e.g. ``{"needle.diameter_mm": 0.8}``; entries of arrays by
+            their number from 0.
+        where: Where the changes come from, for the message.
 
-    Returns
-    -------
-    settings of the same class
+    Returns:
+        settings of the same class.
 
-    Raises
-    ------
-    SettingsError
-        As `parse`.
+    Raises:
+        SettingsError: As `parse`.
     """
     mapping = to_mapping(values)
     for path, value in changes.items():

@@ -23,10 +23,8 @@ def filled_folder(parent: Path) -> Iterator[Path]:
 
     What is left of the folder at the end of the block is removed.
 
-    Raises
-    ------
-    OSError
-        If the folder cannot be made.
+    Raises:
+        OSError: If the folder cannot be made.
     """
     while True:
         # The name is known before the folder is made: an interrupt between the two leaves nothing behind.
@@ -52,10 +50,8 @@ def _is_taken(folder: Path, stack: contextlib.ExitStack) -> bool:
 def sole_writer(results: Path, folder: Path, name: str = LOCK) -> Iterator[None]:
     """Hold a lock in a folder as the one command that writes results.
 
-    Raises
-    ------
-    FileError
-        If another process holds it.
+    Raises:
+        FileError: If another process holds it.
     """
     with contextlib.ExitStack() as stack:
         try:
@@ -73,12 +69,9 @@ def sole_writer(results: Path, folder: Path, name: str = LOCK) -> Iterator[None]
 def locked(folder: Path, name: str = LOCK) -> Iterator[bool]:
     """Hold a lock of a folder; yield whether there is one: some file systems have none.
 
-    Raises
-    ------
-    BlockingIOError
-        If another process holds it.
-    FileNotFoundError
-        If there is no such folder.
+    Raises:
+        BlockingIOError: If another process holds it.
+        FileNotFoundError: If there is no such folder.
     """
     lock, there = FileLock(folder / name), True
     try:

@@ -34,10 +34,8 @@ _choose_processor()
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function when it is first called, or finds its machine code on disk.
 
-    Parameters
-    ----------
-    **options
-        Options of `numba.njit`, such as ``nogil=True``.
+    Args:
+        **options: Options of `numba.njit`, such as ``nogil=True``.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:

@@ -24,12 +24,10 @@ FEWEST = 6
 class FirstCompilation:
     """What is done when a process first has to compile a kernel: all that its command will call is compiled.
 
-    Attributes
-    ----------
-    command : str
-        The command that runs; "" where none is known, as in a program of a user, and then nothing is done.
-    tell : callable
-        Receives how many kernels are compiled, and how many have to be, in words; None at the end.
+    Attributes:
+        command: The command that runs; "" where none is known, as in a program of a user, and then nothing is
+            done.
+        tell: Receives how many kernels are compiled, and how many have to be, in words; None at the end.
     """
 
     def __init__(self) -> None:
@@ -54,12 +52,9 @@ def compile_ahead(
 ) -> int:
     """Compile kernels that commands call and that are not on disk; return how many were compiled.
 
-    Parameters
-    ----------
-    commands : list of str
-        Such as "plan"; all that are known if empty.
-    fewest : int
-        Fewer missing kernels are left to be compiled when they are called.
+    Args:
+        commands: Such as "plan"; all that are known if empty.
+        fewest: Fewer missing kernels are left to be compiled when they are called.
     """
     missing = {n: call for n, call in _called(commands).items() if _code_file(call) is None}
     if len(missing) < fewest:
@@ -199,10 +194,8 @@ def _compiled_in_order(waits_for: dict[int, set[int]], processes: int) -> Iterat
 def encoded(kind: Any) -> Any:
     """Return one of numba's types as plain values.
 
-    Raises
-    ------
-    TypeError
-        If it is a type that no kernel is called with from Python.
+    Raises:
+        TypeError: If it is a type that no kernel is called with from Python.
     """
     from numba import types
 
@@ -228,10 +221,8 @@ def encoded(kind: Any) -> Any:
 def decoded(plain: Any) -> Any:
     """Return the type that `encoded` returned as these values.
 
-    Raises
-    ------
-    ImportError, AttributeError, LookupError, TypeError, ValueError
-        If there is none.
+    Raises:
+        ImportError, AttributeError, LookupError, TypeError, ValueError: If there is none.
     """
     from numba import types
 

@@ -30,10 +30,8 @@ _SEAL_BYTES = 32
 class KernelCache(caching._Cache):  # type: ignore[misc]
     """The machine code of one kernel on disk; numba's dispatcher asks it before it compiles.
 
-    Parameters
-    ----------
-    function : callable
-        The kernel before it was decorated, while its module is imported.
+    Args:
+        function: The kernel before it was decorated, while its module is imported.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -42,10 +42,8 @@ class Sources:
         were when they were imported.  What is edited afterwards keeps the stamp of the content that runs, so
         code compiled from it is never kept under the stamp of another content.
 
-        Parameters
-        ----------
-        module : str
-            Its dotted name, such as ``anatomy.kernels.field``.
+        Args:
+            module: Its dotted name, such as ``anatomy.kernels.field``.
         """
         if module not in self._stamps:
             for known in (self._texts, self._imports, self._digests):
@@ -103,10 +101,8 @@ running = Sources()
 def kernel_digest(*rooms: str) -> str:
     """Return 16 hexadecimal digits that tell kernels, and the numba that compiles them, from all others.
 
-    Parameters
-    ----------
-    *rooms : str
-        Packages whose kernels, and those that they call, count; all of the project if none is named.
+    Args:
+        *rooms: Packages whose kernels, and those that they call, count; all of the project if none is named.
     """
     sources = Sources()
     names = set().union(*(sources.closure(name) for name in kernel_modules(*rooms, sources=sources)))

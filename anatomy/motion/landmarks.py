@@ -30,19 +30,13 @@ class Fitted:
 def fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
     """Fit a thin-plate spline with the smoothness by which each half of the pairs predicts the other.
 
-    Parameters
-    ----------
-    points : (N, 3) float64, LPS mm
-        Places in the masks.
-    vectors : (N, 3) float64
-        Displacements, mm.
-    lung : str
-        Whose they are, for messages.
+    Args:
+        points ((N, 3) float64, LPS mm): Places in the masks.
+        vectors ((N, 3) float64): Displacements, mm.
+        lung: Whose they are, for messages.
 
-    Raises
-    ------
-    AnatomyError
-        If there are too few pairs, or they lie in a plane.
+    Raises:
+        AnatomyError: If there are too few pairs, or they lie in a plane.
     """
     if len(points) < LEAST_PAIRS:
         raise AnatomyError(

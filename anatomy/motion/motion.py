@@ -25,28 +25,18 @@ class Motion:
     A place X of the masks is at `X + amplitude (phase - masks_phase) d(X)`, up to the hysteresis; d is
     trilinear between nodes.
 
-    Parameters
-    ----------
-    grid : Grid
-        The nodes; axes along LPS, one spacing.
-    nodes : (2, ni, nj, nk, 3) float64
-        d as the right and as the left lung has it, mm, at places of the masks; continued beyond that lung.
-    middle_x_mm : float
-        x of the carina: what lies at larger x belongs to the left lung.
-    masks_phase : float
-        The phase that the masks show, 0 to 1.
-    amplitude : float
-        Share of the motion of the source.
-    source : str
-        Where the motion came from, in words.
-    warning_only : bool
-        Whether it is a model of other people's lungs, which may warn but not promise.
-    figures : mapping of str to float
-        What was measured of it, such as residuals; units are in the names.
-    warnings : tuple of str
-    hysteresis : float
-        How far two places may be, against each other, from where the motion puts them, as a share of their
-        distance: inhaling and exhaling take different ways.
+    Args:
+        grid: The nodes; axes along LPS, one spacing.
+        nodes ((2, ni, nj, nk, 3) float64): d as the right and as the left lung has it, mm, at places of the
+            masks; continued beyond that lung.
+        middle_x_mm: x of the carina: what lies at larger x belongs to the left lung.
+        masks_phase: The phase that the masks show, 0 to 1.
+        amplitude: Share of the motion of the source.
+        source: Where the motion came from, in words.
+        warning_only: Whether it is a model of other people's lungs, which may warn but not promise.
+        figures: What was measured of it, such as residuals; units are in the names.
+        hysteresis: How far two places may be, against each other, from where the motion puts them, as a share
+            of their distance: inhaling and exhaling take different ways.
     """
 
     grid: Grid
@@ -91,10 +81,8 @@ class Motion:
     def share(self, phase: float) -> float:
         """Return which share of d places of the masks are moved by in a phase, negative before the masks'.
 
-        Raises
-        ------
-        SettingsError
-            If the phase is not from 0 to 1.
+        Raises:
+            SettingsError: If the phase is not from 0 to 1.
         """
         return self.amplitude * (require_phase(phase) - self.masks_phase)
 
@@ -145,18 +133,13 @@ def cell_bounds(nodes: Float, spacing_mm: float) -> Float:
     that stays in cells is stretched by no less than `1 + share low` (share >= 0) or `1 + share high` (share
     < 0).
 
-    Parameters
-    ----------
-    nodes : (ni, nj, nk, 3) float64
-        Displacements at nodes, mm.
-    spacing_mm : float
-        Distance of nodes along all axes.
+    Args:
+        nodes ((ni, nj, nk, 3) float64): Displacements at nodes, mm.
+        spacing_mm: Distance of nodes along all axes.
 
-    Returns
-    -------
-    (ni - 1, nj - 1, nk - 1, 3) float64
-        For each cell: low, a lower bound of the eigenvalues of S; high, an upper one; an upper bound of the
-        norm of G.
+    Returns:
+        (ni - 1, nj - 1, nk - 1, 3) float64: For each cell: low, a lower bound of the eigenvalues of S; high,
+            an upper one; an upper bound of the norm of G.
     """
     ni, nj, nk, _ = nodes.shape
     out = np.zeros((ni - 1, nj - 1, nk - 1, 3))

@@ -130,16 +130,11 @@ LEAST_DICE = 0.8
 def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume) -> dict[str, float]:
     """Return how well the motion leads lungs onto lungs, or raise AnatomyError if it does not.
 
-    Parameters
-    ----------
-    labels : (ni, nj, nk) uint16
-        See `anatomy.structures`; on `grid`.
-    other : Volume of bool
-        The lungs at the end of the breath that is farther from the phase of the masks.
+    Args:
+        labels ((ni, nj, nk) uint16): See `anatomy.structures`; on `grid`.
+        other: The lungs at the end of the breath that is farther from the phase of the masks.
 
-    Returns
-    -------
-    dict of str to float
+    Returns:
         Dice of the moved lungs and of the lungs as they are with the others, and the mean distance of the
         borders, mm.
     """

@@ -33,21 +33,14 @@ At = Callable[[Float], Float]
 def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm: float) -> Motion:
     """Bring what was read to the masks, and test it.
 
-    Parameters
-    ----------
-    source : MotionSource
-    labels : (ni, nj, nk) uint16
-        See `anatomy.structures`; on `grid`.
-    middle_x_mm : float
-        x of the carina.
+    Args:
+        labels ((ni, nj, nk) uint16): See `anatomy.structures`; on `grid`.
+        middle_x_mm: x of the carina.
 
-    Raises
-    ------
-    AnatomyError
-        If the motion folds tissue, leads to the head on inhalation or the lungs away from the other lungs,
-        or too few landmarks lie in a lung.
-    FrameError
-        If a field does not cover the lungs.
+    Raises:
+        AnatomyError: If the motion folds tissue, leads to the head on inhalation or the lungs away from the
+            other lungs, or too few landmarks lie in a lung.
+        FrameError: If a field does not cover the lungs.
     """
     # Places `(N, 3)` LPS mm spread over the lungs.
     steps = np.maximum(np.rint(SAMPLE_MM / grid.spacing_mm).astype(int), 1)
@@ -264,14 +257,10 @@ def continued_unfolded(values: Float, inside: Mask, spacing_mm: float) -> tuple[
     A field of both lungs jumps from one to the other where they touch, and at the pleura; the nodes of cells
     in which it does are continued over, too.
 
-    Parameters
-    ----------
-    values : (ni, nj, nk, 3) float64
-        Displacements at nodes, mm.
-    inside : (ni, nj, nk) bool
-        The nodes in a lung.
-    spacing_mm : float
-        Distance of nodes.
+    Args:
+        values ((ni, nj, nk, 3) float64): Displacements at nodes, mm.
+        inside ((ni, nj, nk) bool): The nodes in a lung.
+        spacing_mm: Distance of nodes.
     """
     known = inside.copy()
     for _ in range(ROUNDS):

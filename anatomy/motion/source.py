@@ -14,26 +14,18 @@ class MotionSource:
     One of three kinds: a displacement field (`grid` and `vectors`), landmark pairs (`exhale_lps` and
     `inhale_lps`), or the model of a population (`population_motion_mm`).
 
-    Parameters
-    ----------
-    description : str
-        Where it came from, in words.
-    masks_phase : float
-        The phase that the patient's masks show.
-    amplitude : float
-        Motion from phase 0 to 1 as a share of that of the source.
-    maps_from : "end-exhale" or "end-inhale"
-        Where the points of a displacement field lie; the vectors lead to the other end.
-    vectors : (ni, nj, nk, 3) float64
-        Displacements at the voxel centres of `grid`.
-    exhale_lps, inhale_lps : (N, 3) float64
-        The same places of tissue at both ends.
-    population_motion_mm : float
-        95 % motion of the patient.
-    hysteresis : float
-        See `Motion`.
-    other_lungs : Volume of bool
-        The lungs at the end of the breath that is farther from the phase of the masks, to compare with.
+    Args:
+        description: Where it came from, in words.
+        masks_phase: The phase that the patient's masks show.
+        amplitude: Motion from phase 0 to 1 as a share of that of the source.
+        maps_from ("end-exhale" or "end-inhale"): Where the points of a displacement field lie; the vectors
+            lead to the other end.
+        vectors ((ni, nj, nk, 3) float64): Displacements at the voxel centres of `grid`.
+        exhale_lps, inhale_lps ((N, 3) float64): The same places of tissue at both ends.
+        population_motion_mm: 95 % motion of the patient.
+        hysteresis: See `Motion`.
+        other_lungs: The lungs at the end of the breath that is farther from the phase of the masks, to
+            compare with.
     """
 
     description: str

@@ -24,25 +24,18 @@ from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
 def tree_from_mask(lumen: Volume) -> AirwayTree:
     """Make the airway tree of a lumen mask.
 
-    Parameters
-    ----------
-    lumen : Volume
-        Mask of the airway lumen, trachea included; non-zero is lumen.
+    Args:
+        lumen: Mask of the airway lumen, trachea included; non-zero is lumen.
 
-    Returns
-    -------
-    AirwayTree
-        Every point and every step between neighbouring points lies in the lumen, except across the
-        gaps in `report.gaps_bridged`.
+    Returns:
+        Every point and every step between neighbouring points lies in the lumen, except across the gaps in
+        `report.gaps_bridged`.
 
-    Raises
-    ------
-    AnatomyError
-        If the mask is empty, has no trachea, or is noise.
+    Raises:
+        AnatomyError: If the mask is empty, has no trachea, or is noise.
 
-    References
-    ----------
-    [Lee1994] for the thinning; `docs/explanation/airway_tree.md` for the rest.
+    References:
+        [Lee1994] for the thinning; `docs/explanation/airway_tree.md` for the rest.
     """
     prepared = prepare_lumen(lumen, max_gap_mm=5.0)
     grid = prepared.grid
@@ -82,18 +75,13 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
     The points are kept as they are.  Points that coincide to 0.001 mm become one.  Of several
     separate pieces the one with most points is kept; a ring is opened where it is narrowest.
 
-    Parameters
-    ----------
-    points_lps : (N, 3) float64
-        LPS mm.
-    radius_mm : (N,) float64
-    edges : (E, 2) int64
-        Pairs of points that are neighbours along a branch.
+    Args:
+        points_lps ((N, 3) float64): LPS mm.
+        radius_mm: (N,) float64.
+        edges ((E, 2) int64): Pairs of points that are neighbours along a branch.
 
-    Raises
-    ------
-    AnatomyError
-        If the arrays are empty, do not fit together, hold no finite numbers or no trachea.
+    Raises:
+        AnatomyError: If the arrays are empty, do not fit together, hold no finite numbers or no trachea.
     """
     from anatomy.tree.graph import spanned_graph
 

@@ -18,10 +18,8 @@ MOST_PATHS = 500
 def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
     """Return the skeleton voxels `(M, 3)` with paths to all parts of the mask that they do not reach.
 
-    Raises
-    ------
-    AnatomyError
-        If more than `MOST_PATHS` parts are not reached.
+    Raises:
+        AnatomyError: If more than `MOST_PATHS` parts are not reached.
     """
     from scipy import ndimage
 

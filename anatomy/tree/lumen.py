@@ -20,20 +20,14 @@ each."""
 class PreparedLumen:
     """The lumen in its bounding box with an empty layer all around.
 
-    Parameters
-    ----------
-    grid : Grid
-        Grid of the box.
-    lumen : bool array
-        The largest piece and the pieces joined to it, as they are in the mask.
-    solid : bool array
-        `lumen` with bridges across gaps and with its cavities filled: what is thinned.
-    bridges : bool array
-        The voxels of the bridges.
-    depth_mm : float32 array
-        Distance from the voxel centre to the nearest one outside `lumen`.
-    solid_depth_mm : float32 array
-        The same for `solid`, so that a hole in the mask does not make the airway look narrow.
+    Args:
+        grid: Grid of the box.
+        lumen (bool array): The largest piece and the pieces joined to it, as they are in the mask.
+        solid (bool array): `lumen` with bridges across gaps and with its cavities filled: what is thinned.
+        bridges (bool array): The voxels of the bridges.
+        depth_mm (float32 array): Distance from the voxel centre to the nearest one outside `lumen`.
+        solid_depth_mm (float32 array): The same for `solid`, so that a hole in the mask does not make the
+            airway look narrow.
     """
 
     grid: Grid
@@ -52,10 +46,8 @@ class PreparedLumen:
 def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     """Crop a mask and keep its largest 26-connected piece with what belongs to it.
 
-    Raises
-    ------
-    AnatomyError
-        If the mask is empty, or falls into thousands of pieces.
+    Raises:
+        AnatomyError: If the mask is empty, or falls into thousands of pieces.
     """
     from scipy import ndimage
 

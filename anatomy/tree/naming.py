@@ -6,9 +6,8 @@ segment's bronchus, with all that lies beyond.  Every derivation has a probabili
 seen, and how well the directions of the branches fit those of the atlas.  The sum over all derivations gives
 the probability of every name, exactly and without drawing anything at random.
 
-References
-----------
-[Boyden1955], [Javed2024], [Javed2024a], [Huang2019], [Tschirren2005]
+References:
+    [Boyden1955], [Javed2024], [Javed2024a], [Huang2019], [Tschirren2005]
 """
 
 from __future__ import annotations
@@ -173,17 +172,14 @@ class BranchedTree(Protocol):
 class BronchialNames:
     """The names of the B branches of an airway tree.
 
-    Parameters
-    ----------
-    names : tuple of str
-        Of the bronchus that each branch is, such as "right upper lobe bronchus" or "RB6", or beyond a
-        segmental bronchus is a branch of; "" where none is sure enough.
-    starts : (B,) bool
-        Whether the named bronchus begins with this branch.
-    confidence : (B,) float64
-        Probability of the name under the atlas; of the likeliest name where a branch is unnamed.
-    lobes : (B,) int64
-        The lobe that the branch supplies alone, a number of `anatomy.lobes.LOBES`; 0 if none or not sure.
+    Args:
+        names: Of the bronchus that each branch is, such as "right upper lobe bronchus" or "RB6", or beyond a
+            segmental bronchus is a branch of; "" where none is sure enough.
+        starts ((B,) bool): Whether the named bronchus begins with this branch.
+        confidence ((B,) float64): Probability of the name under the atlas; of the likeliest name where a
+            branch is unnamed.
+        lobes ((B,) int64): The lobe that the branch supplies alone, a number of `anatomy.lobes.LOBES`; 0 if
+            none or not sure.
     """
 
     names: tuple[str, ...]

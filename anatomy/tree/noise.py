@@ -34,10 +34,8 @@ def tunnels(voxels: Int) -> int:
 
     One minus the Euler number of the union of the voxels as closed boxes.
 
-    Parameters
-    ----------
-    voxels : (N, 3) int64
-        Indices; voxels that share a corner are connected.
+    Args:
+        voxels ((N, 3) int64): Indices; voxels that share a corner are connected.
     """
     # Of the complex at doubled resolution a cell has as many dimensions as odd coordinates.
     middle = 2 * (voxels - voxels.min(axis=0)) + 1

@@ -107,20 +107,16 @@ def span(
 
     An edge costs its length over the squared depth, so that a ring is cut where it is thinnest.
 
-    Parameters
-    ----------
-    mm : (M, 3) float64
-    depth_mm : (M,) float64
-    pairs : (E, 2) int64
-        The edges, sorted, the smaller index first.
-    factor : (E,) float64
-        Multiplies the cost of each edge.
+    Args:
+        mm: (M, 3) float64.
+        depth_mm: (M,) float64.
+        pairs ((E, 2) int64): The edges, sorted, the smaller index first.
+        factor ((E,) float64): Multiplies the cost of each edge.
 
-    Returns
-    -------
-    tree : SkeletonTree
-    loops : list of (node, node, length_mm)
-        The cuts of rings of at least `LOOP_EDGES` edges, and the length once around.
+    Returns:
+        - tree
+        - loops (list of (node, node, length_mm)) - The cuts of rings of at least `LOOP_EDGES` edges, and the
+          length once around.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree

@@ -18,10 +18,8 @@ PATIENTS = ("Patient1", "Patient2")
 def data_folder() -> Path | None:
     """Return the folder of real anatomy that LUNGACCESS_DATA names, or None where it is not set.
 
-    Raises
-    ------
-    FileError
-        If it names something else than a folder.
+    Raises:
+        FileError: If it names something else than a folder.
     """
     stated = os.environ.get("LUNGACCESS_DATA")
     if not stated:
@@ -38,10 +36,8 @@ def data_folder() -> Path | None:
 def require_data(part: str) -> Path:
     """Return a folder or file below LUNGACCESS_DATA.
 
-    Raises
-    ------
-    FileError
-        If LUNGACCESS_DATA is not set or has no such part.
+    Raises:
+        FileError: If LUNGACCESS_DATA is not set or has no such part.
     """
     folder = data_folder()
     if folder is None or not (folder / part).exists():
@@ -61,15 +57,12 @@ def default_anatomies() -> tuple[str, ...]:
 def anatomy(name: str) -> Lung:
     """Return the lung of that name.
 
-    Parameters
-    ----------
-    name : str
-        "phantom" (a child's size, seed 3), the name of a folder below med-rad of LUNGACCESS_DATA, or a path.
+    Args:
+        name: "phantom" (a child's size, seed 3), the name of a folder below med-rad of LUNGACCESS_DATA, or a
+            path.
 
-    Raises
-    ------
-    FileError
-        If there is no such patient.
+    Raises:
+        FileError: If there is no such patient.
     """
     from anatomy.build import build_lung
     from anatomy.phantom import make_phantom

@@ -28,20 +28,16 @@ QUANTILES = (0.25, 0.5, 0.75)
 class Likeness:
     """The numbers of one lung.
 
-    Parameters
-    ----------
-    lung_l : float
-        Volume of the lungs, litres.
-    branches, deepest : int
-        Of the airway tree: how many branches, and the highest generation.
-    length_mm, diameter_mm, angle_deg : mapping of int to tuple of 3 float
-        By generation, quartiles and median of the branches that end in a fork (length) or of all (others):
-        arc length, inner diameter, and angle to the parent branch.
-    vessel_share, far_vessel_share : tuple of float
-        Share of the lung's volume that vessels take up, by the shells of `DEPTHS_MM`: in all of the lung, and
-        more than `FAR_MM` from the carina.
-    clearance_mm : tuple of 3 float
-        Quartiles of the distance of free tissue, 5 to 25 mm from the pleura, from vessels and airways.
+    Args:
+        lung_l: Volume of the lungs, litres.
+        branches, deepest: Of the airway tree: how many branches, and the highest generation.
+        length_mm, diameter_mm, angle_deg (mapping of int to tuple of 3 float): By generation, quartiles and
+            median of the branches that end in a fork (length) or of all (others): arc length, inner diameter,
+            and angle to the parent branch.
+        vessel_share, far_vessel_share: Share of the lung's volume that vessels take up, by the shells of
+            `DEPTHS_MM`: in all of the lung, and more than `FAR_MM` from the carina.
+        clearance_mm (tuple of 3 float): Quartiles of the distance of free tissue, 5 to 25 mm from the pleura,
+            from vessels and airways.
     """
 
     name: str

@@ -31,16 +31,12 @@ PNG_DPI = (130, 110, 90, 70, 55)
 class Row:
     """One line of a table "paper | ours".
 
-    Parameters
-    ----------
-    quantity : str
-        What was measured.
-    ours, paper : float, optional
-        The two values; None where there is none.  A share is a number of percent with the unit "%".
-    unit : str
-        The unit of both.
-    note : str
-        What differs, how often it was measured, where the paper says it.
+    Args:
+        quantity: What was measured.
+        ours, paper: The two values; None where there is none.  A share is a number of percent with the unit
+            "%".
+        unit: The unit of both.
+        note: What differs, how often it was measured, where the paper says it.
     """
 
     quantity: str
@@ -54,28 +50,17 @@ class Row:
 class Result:
     """What a study's run found; its clocks start when it is made, so make it first.
 
-    Parameters
-    ----------
-    name : str
-        The module's name, which is also the name of the files.
-    title : str
-        One line.
-    source : str
-        The paper with its table or figure; empty for a study of our own.
-    setting : str
-        "quick" or "full".
-    conditions : dict
-        What was measured on and how, words only.
-    seeds : list of int
-        All seeds.
-    rows : list of Row
-        The table.
-    not_reproduced : list of str
-        What of the paper was not reproduced, and why.
-    progress : str
-        How far a run is that is not finished, such as "400 of 1600 runs"; empty for one that is.
-    figure : matplotlib Figure, optional
-        Stored as a PNG of at most 150 kB.
+    Args:
+        name: The module's name, which is also the name of the files.
+        title: One line.
+        source: The paper with its table or figure; empty for a study of our own.
+        setting: "quick" or "full".
+        conditions: What was measured on and how, words only.
+        seeds: All seeds.
+        rows: The table.
+        not_reproduced: What of the paper was not reproduced, and why.
+        progress: How far a run is that is not finished, such as "400 of 1600 runs"; empty for one that is.
+        figure (matplotlib Figure): Stored as a PNG of at most 150 kB.
     """
 
     name: str
@@ -121,10 +106,8 @@ class Result:
 def study_parser(doc: str) -> argparse.ArgumentParser:
     """Return a parser of what all studies understand: --quick, --seed, --results FOLDER.
 
-    Parameters
-    ----------
-    doc : str
-        The docstring of the study's module.
+    Args:
+        doc: The docstring of the study's module.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="the small setting, minutes")
@@ -144,10 +127,8 @@ def setting_of(options: argparse.Namespace) -> str:
 def write_result(result: Result, folder: str | Path) -> Path:
     """Store a result as FOLDER/SETTING/NAME.json and NAME.png, each in one step; return the JSON file.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written, or the figure stays larger than 150 kB.
+    Raises:
+        FileError: If the folder cannot be written, or the figure stays larger than 150 kB.
     """
     home = require_writable_folder(Path(folder) / result.setting)
     if result.figure is not None:
@@ -179,10 +160,9 @@ def small_png(figure: Figure) -> bytes:
 def number(value: float | None) -> str:
     """Return a value with three digits that count, or all digits of a whole number; "" for None.
 
-    Examples
-    --------
-    >>> number(0.012345), number(1234.5), number(96.0), number(None)
-    ('0.0123', '1234', '96', '')
+    Examples:
+        >>> number(0.012345), number(1234.5), number(96.0), number(None)
+        ('0.0123', '1234', '96', '')
     """
     if value is None or not math.isfinite(value):
         return ""

@@ -34,21 +34,15 @@ def random_airway(seed: int, *, orders: int = ORDERS) -> AirwayTree:
     50 at order 15, and that the front branch leaves by the smaller one.  Lengths, radii and planes of
     branching are ours: planes turn by about 90 degrees from one order to the next.
 
-    Parameters
-    ----------
-    seed : int
-        Not negative.
-    orders : int
-        The trachea has order 1.
+    Args:
+        seed: Not negative.
+        orders: The trachea has order 1.
 
-    Raises
-    ------
-    SettingsError
-        If there are fewer than 2 orders, or more than 12.
+    Raises:
+        SettingsError: If there are fewer than 2 orders, or more than 12.
 
-    References
-    ----------
-    .. [Pan2025] docs/reference/bibliography.md
+    References:
+        .. [Pan2025] docs/reference/bibliography.md
     """
     if not 2 <= orders <= 12:
         raise SettingsError(f"A random airway of {orders} orders", expected="2 to 12 orders")
@@ -119,10 +113,8 @@ def random_lesions(tree: AirwayTree, count: int, seed: int, *, rule: ExitRule | 
     The hull of all points below the carina replaces the lungs; a place farther from the airway than the
     needle reaches is drawn again.
 
-    Raises
-    ------
-    SettingsError
-        If no such place is found.
+    Raises:
+        SettingsError: If no such place is found.
     """
     from scipy.spatial import ConvexHull
 

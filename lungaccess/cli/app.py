@@ -86,10 +86,8 @@ app = App(
 def completion(shell: Literal["bash", "zsh", "fish"], /) -> ExitCode:
     """Print a script that lets a shell complete commands, options and choices.
 
-    Parameters
-    ----------
-    shell : str
-        bash, zsh or fish; docs/reference/command_line.md says where the script goes.
+    Args:
+        shell: bash, zsh or fish; docs/reference/command_line.md says where the script goes.
     """
     terminal.console.file.write(app.generate_completion(prog_name="lungaccess", shell=shell))
     return ExitCode.OK
@@ -127,10 +125,8 @@ def _run(
 ) -> int | None:
     """Run a command.
 
-    Parameters
-    ----------
-    quiet : bool
-        Print neither results nor progress, only errors and what --json asks for.
+    Args:
+        quiet: Print neither results nor progress, only errors and what --json asks for.
     """
     terminal.set_quiet(quiet)
     code: int | None = app(words, exit_on_error=False, print_error=False)
@@ -140,10 +136,8 @@ def _run(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; no user error ever shows a traceback.
 
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The words after the name of the program; those of this process if None.
+    Args:
+        arguments: The words after the name of the program; those of this process if None.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     terminal.prepare_surroundings()

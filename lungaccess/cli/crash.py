@@ -16,14 +16,10 @@ class CrashError(LungaccessError):
 def write_report(error: Exception, words: Sequence[str], version: str) -> CrashError:
     """Write what is known of a crash into a file of its own, and return the error that names the file.
 
-    Parameters
-    ----------
-    error : Exception
-        Raised where no error of a user was expected.
-    words : sequence of str
-        The command line without the name of the program.
-    version : str
-        Of lungaccess.
+    Args:
+        error: Raised where no error of a user was expected.
+        words: The command line without the name of the program.
+        version: Of lungaccess.
     """
     system = f"Python {platform.python_version()} on {platform.platform()}"
     lines = [f"lungaccess {version}, {system}", f"command: {list(words)!r}", ""]

@@ -146,12 +146,9 @@ class TargetOptions:
     def stated(self) -> StatedTarget:
         """Return what the user states, before any patient is read.
 
-        Raises
-        ------
-        FrameError
-            If a point states no frame.
-        TargetError
-            If there is not exactly one of point and nodule.
+        Raises:
+            FrameError: If a point states no frame.
+            TargetError: If there is not exactly one of point and nodule.
         """
         from lungaccess.problem.target import stated_target
 
@@ -183,10 +180,8 @@ class PlaceOptions:
     def stated(self) -> StatedPlace | None:
         """Return the place that the user states, None for none; errors as `TargetOptions`.
 
-        Raises
-        ------
-        SettingsError
-            If both are stated.
+        Raises:
+            SettingsError: If both are stated.
         """
         if self.exit is not None and self.scope_tip is not None:
             raise SettingsError(
@@ -230,10 +225,8 @@ class SystemOptions:
     def load(self) -> System:
         """Return the system, with its rule about fissures replaced if the user states one.
 
-        Raises
-        ------
-        SettingsError
-            If it is to be chosen, or cannot be read.
+        Raises:
+            SettingsError: If it is to be chosen, or cannot be read.
         """
         from lungaccess.problem.system import load_system
 
@@ -416,10 +409,8 @@ class SearchOptions(BudgetOptions):
     ) -> Asked:
         """Return all of a request but patient and target, after what can be looked at without them.
 
-        Raises
-        ------
-        SettingsError
-            If there is no such goal or method, or a value is wrong.
+        Raises:
+            SettingsError: If there is no such goal or method, or a value is wrong.
         """
         from anatomy.machine_code.ahead import usable_cores
         from lungaccess.planning.searches import planners, unknown_method
@@ -455,10 +446,8 @@ class Asked:
 def stated_phases(text: str | None) -> tuple[float, float] | None:
     """Return first and last phase of a text such as 0.0:0.3; None without one.
 
-    Raises
-    ------
-    SettingsError
-        If it is not two phases from 0 to 1 in order.
+    Raises:
+        SettingsError: If it is not two phases from 0 to 1 in order.
     """
     if text is None:
         return None
@@ -514,12 +503,9 @@ def load_lung(
 ) -> Lung:
     """Return a patient's lung, and show what is being done meanwhile; None as `accept` refuses no masks.
 
-    Raises
-    ------
-    AnatomyError
-        If the masks fail a check that `accept` does not name.
-    SettingsError
-        If the masks were made from thick slices, unless `thick_slices` accepts them.
+    Raises:
+        AnatomyError: If the masks fail a check that `accept` does not name.
+        SettingsError: If the masks were made from thick slices, unless `thick_slices` accepts them.
     """
     from lungaccess.problem.patients import load_patient
 

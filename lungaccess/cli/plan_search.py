@@ -91,12 +91,10 @@ class CostHistory:
 class PlanJob:
     """What to plan and where to, and what to do with the plan.
 
-    Parameters
-    ----------
-    asked : Asked
-        Everything of the request but the patient and the target in it.
-    guide : Panel, optional
-        What a newcomer is told of the pictures, before plan and headline are shown; the page is made, too.
+    Args:
+        asked: Everything of the request but the patient and the target in it.
+        guide: What a newcomer is told of the pictures, before plan and headline are shown; the page is made,
+            too.
     """
 
     asked: Asked
@@ -119,10 +117,8 @@ def run_search(request: Request, job: PlanJob, display: Display) -> tuple[Plan, 
     The first plan is saved as soon as it is found, and the best one at the end, whatever happens after.  An
     interruption from the keyboard ends the search early; the best plan so far is kept.
 
-    Raises
-    ------
-    lungaccess.plans.no_plan.NoPlan
-        If no plan was found.
+    Raises:
+        lungaccess.plans.no_plan.NoPlan: If no plan was found.
     """
     from lungaccess.judging import answer
     from lungaccess.planning import atlas_event
@@ -162,10 +158,8 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     What is known is saved and shown before anything slower begins: the first plan, then the best one with its
     check and its chance of success, then the pictures.
 
-    Raises
-    ------
-    lungaccess.plans.no_plan.NoPlan
-        If no plan was found.
+    Raises:
+        lungaccess.plans.no_plan.NoPlan: If no plan was found.
     """
     request = job.asked.request(lung, job.target.resolve(lung))
     goal, limits = request.goal, request.limits

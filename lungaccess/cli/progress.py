@@ -30,12 +30,11 @@ class _Times(ProgressColumn):
 def remaining_s(passed_s: float, completed: float, total: float | None) -> float | None:
     """Return the time left if all goes on as before; None if too little is done for an estimate.
 
-    Examples
-    --------
-    >>> remaining_s(10.0, 0.25, 1.0)
-    30.0
-    >>> remaining_s(10.0, 0.0, 1.0) is None
-    True
+    Examples:
+        >>> remaining_s(10.0, 0.25, 1.0)
+        30.0
+        >>> remaining_s(10.0, 0.0, 1.0) is None
+        True
     """
     if not total or completed < LEAST_SHARE * total:
         return None

@@ -40,20 +40,14 @@ held = contextlib.ExitStack()
 def claim_folder(out: Path, results: Sequence[str], *, force: bool = False) -> Path:
     """Lock a folder for the results of one command, after moving those of an earlier one aside.
 
-    Parameters
-    ----------
-    out : path
-        Made if it is missing.
-    results : sequence of str
-        Patterns of the names of all files that the command, or what shows its results, may write.
-    force : bool
-        Remove such files instead.
+    Args:
+        out: Made if it is missing.
+        results: Patterns of the names of all files that the command, or what shows its results, may write.
+        force: Remove such files instead.
 
-    Raises
-    ------
-    FileError
-        If another command writes into the folder, the folder cannot be written, or such files lie in it
-        which no command is known to have left there.
+    Raises:
+        FileError: If another command writes into the folder, the folder cannot be written, or such files lie
+            in it which no command is known to have left there.
     """
     folder = require_writable_folder(out)
     mark, is_ours = folder / MARK, (folder / MARK).is_dir()
@@ -134,11 +128,9 @@ def _occupied(folder: Path, there: Sequence[Path]) -> FileError:
 def protect_files(words: Sequence[str]) -> None:
     """Keep results that a command line wants overwritten, see `keep_earlier`.
 
-    Raises
-    ------
-    FileError
-        If a file that is to be written is, or lies in, what is to be read: new files may be written beside
-        inputs; those that are there may not be overwritten.
+    Raises:
+        FileError: If a file that is to be written is, or lies in, what is to be read: new files may be
+            written beside inputs; those that are there may not be overwritten.
     """
     pairs = [word.partition("=")[::2] for word in words]
     written = [value for name, value in pairs if name in OUTPUTS and value]

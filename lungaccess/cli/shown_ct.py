@@ -24,10 +24,8 @@ CtOption = Annotated[
 def shown_ct(stated: Path | None, patient: Path) -> CtFile | None:
     """Return the CT that was stated, else the patient's; without one, a warning says where it was looked for.
 
-    Raises
-    ------
-    FileError
-        If the record of the patient's segmentation is damaged.
+    Raises:
+        FileError: If the record of the patient's segmentation is damaged.
     """
     from lungaccess.showing.report.html.volumes import CtFile, find_ct
 

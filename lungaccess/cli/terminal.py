@@ -163,10 +163,9 @@ def _is_number(text: str) -> bool:
 def safe(text: str) -> str:
     """Return text whose odd bytes, and what would command a terminal, are spelled out.
 
-    Examples
-    --------
-    >>> safe("lung\x1b[2J.nii")
-    'lung\\\\x1b[2J.nii'
+    Examples:
+        >>> safe("lung\x1b[2J.nii")
+        'lung\\\\x1b[2J.nii'
     """
     spelled = text.encode("utf-8", "backslashreplace").decode("utf-8")
     return _CONTROLS.sub(lambda found: ascii(found[0])[1:-1], spelled)

@@ -50,14 +50,10 @@ degrees or, of the curvature, its logarithm."""
 class Advice:
     """One thing that lifts the chance of success.
 
-    Parameters
-    ----------
-    words : str
-        What it is.
-    success : Share
-        How many procedures succeed with it, on the draws of the trial.
-    options : tuple of str
-        Words that the command `lungaccess plan` needs more for it.
+    Args:
+        words: What it is.
+        success: How many procedures succeed with it, on the draws of the trial.
+        options: Words that the command `lungaccess plan` needs more for it.
     """
 
     words: str
@@ -193,17 +189,11 @@ def advise(
     Errors that are known better, procedures, other points of the nodule and presets are tried one by one,
     under the same errors and procedure otherwise, until the time is up.
 
-    Parameters
-    ----------
-    appraisal : Appraisal
-        Of the plan: an accepted one whose chance of success is known.
-    errors, procedure
-        Under which it was estimated; as of `lungaccess.judging.appraisal.Appraiser`.
-    atlas_of : callable, optional
-        Returns the atlas of a system if it is at hand, else None: making one takes too long.
-    systems : tuple of System, optional
-        Other devices to try.
-    time_s : float
+    Args:
+        appraisal: Of the plan: an accepted one whose chance of success is known.
+        errors, procedure: Under which it was estimated; as of `lungaccess.judging.appraisal.Appraiser`.
+        atlas_of: Returns the atlas of a system if it is at hand, else None: making one takes too long.
+        systems: Other devices to try.
     """
     success = appraisal.headline.success
     if success is None or success.value >= GOOD:

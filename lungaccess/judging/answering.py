@@ -26,14 +26,10 @@ from lungaccess.problem.target import Target
 class Attempt:
     """What became of one system that was tried.
 
-    Parameters
-    ----------
-    plan : Plan or None
-        The first plan found, whether or not the check accepts it.
-    report : CheckReport or None
-        What the independent check says of that plan.
-    failure : NoPlan or None
-        Why there is none.
+    Args:
+        plan: The first plan found, whether or not the check accepts it.
+        report: What the independent check says of that plan.
+        failure: Why there is none.
     """
 
     system: System
@@ -71,21 +67,14 @@ def answer(
     Of several systems the first whose plan the independent check accepts is chosen, and the search goes on
     with it alone.  `Plan.system_choice` says which were tried and why each failed.
 
-    Parameters
-    ----------
-    atlas_of : callable, optional
-        Returns the deployment atlas of a system; made here if None.
-    counterfactuals, on_progress
-        See `lungaccess.planning.driver.run`.
-    on_attempt : callable, optional
-        Told each of several systems before it is tried.
+    Args:
+        atlas_of: Returns the deployment atlas of a system; made here if None.
+        counterfactuals, on_progress: See `lungaccess.planning.driver.run`.
+        on_attempt: Told each of several systems before it is tried.
 
-    Raises
-    ------
-    NoPlan
-        If no system reaches the target; `attempts` says why, system by system.
-    SettingsError, TargetError
-        See `lungaccess.planning.driver.run`.
+    Raises:
+        NoPlan: If no system reaches the target; `attempts` says why, system by system.
+        SettingsError, TargetError: See `lungaccess.planning.driver.run`.
     """
     require_method(request)
     if len(request.systems) == 1:
@@ -147,26 +136,18 @@ def plan(
     procedure that measures the tip of the tubes and plans again.  The first clear plan comes at once, without
     its chance.
 
-    Parameters
-    ----------
-    system : System, str, or sequence of them
-        Devices, the name of a preset, the path of a file, "auto" for all presets; of several the least
-        invasive that reaches the target is chosen.
-    atlas : Atlas, optional
-        Of one system, made with `build_atlas` beforehand; made here if None.
-    counterfactuals, on_progress
-        See `lungaccess.planning.driver.run`.
-    **asked
-        Goal, constraints, search and limits: see `lungaccess.problem.request.Request.of`.
+    Args:
+        system (System, str, or sequence of them): Devices, the name of a preset, the path of a file, "auto"
+            for all presets; of several the least invasive that reaches the target is chosen.
+        atlas: Of one system, made with `build_atlas` beforehand; made here if None.
+        counterfactuals, on_progress: See `lungaccess.planning.driver.run`.
+        **asked: Goal, constraints, search and limits: see `lungaccess.problem.request.Request.of`.
 
-    Raises
-    ------
-    NoPlan, SettingsError, TargetError
-        See `answer` and `lungaccess.problem.request.Request`.
+    Raises:
+        NoPlan, SettingsError, TargetError: See `answer` and `lungaccess.problem.request.Request`.
 
-    Examples
-    --------
-    >>> plans = la.plan(lung, "lung-default", target, goal="length", iterations=50)  # doctest: +SKIP
+    Examples:
+        >>> plans = la.plan(lung, "lung-default", target, goal="length", iterations=50)  # doctest: +SKIP
     """
     request = Request.of(lung, system, target, **asked)
     atlas_of = None if atlas is None else lambda _system: atlas
@@ -187,17 +168,12 @@ def alternatives(
 ) -> tuple[Alternative, ...]:
     """Return a diverse plan set, the best plan first, with its Pareto front.
 
-    Parameters
-    ----------
-    system, atlas, counterfactuals, on_progress, **asked
-        As of `plan`.
-    count, separation_mm
-        See `lungaccess.planning.diverse_plans.alternatives`.
+    Args:
+        system, atlas, counterfactuals, on_progress, **asked: As of `plan`.
+        count, separation_mm: See `lungaccess.planning.diverse_plans.alternatives`.
 
-    Raises
-    ------
-    NoPlan, SettingsError, TargetError
-        As `plan`.
+    Raises:
+        NoPlan, SettingsError, TargetError: As `plan`.
     """
     request = Request.of(lung, system, target, **asked)
     return answer_with_several(

@@ -50,19 +50,15 @@ TRADE_OFF = ("success", "length_in_tissue_mm", "clearance_mm")
 class Alternative:
     """One plan of a diverse plan set.
 
-    Parameters
-    ----------
-    criteria : dict of str to float
-        "clearance_mm" and "pleura_mm", least distance of tube and needle from any obstacle and from the
-        pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" as the plan states them; "success",
-        the share of procedures that succeed, and "window_share", that of the breath in which the plan is
-        proved, where they are known.
-    on_front : bool
-        Whether no other plan of the set is at least as good in all criteria of the front and better in one:
-        success, length and clearance where the chances of success are known, else all others; and the window
-        where every plan has one.
-    chance : Chance or None
-        The chance of success, where it is known.
+    Args:
+        criteria: "clearance_mm" and "pleura_mm", least distance of tube and needle from any obstacle and from
+            the pleura; "length_in_tissue_mm"; "inverse_clearance" and "cost_map" as the plan states them;
+            "success", the share of procedures that succeed, and "window_share", that of the breath in which
+            the plan is proved, where they are known.
+        on_front: Whether no other plan of the set is at least as good in all criteria of the front and better
+            in one: success, length and clearance where the chances of success are known, else all others; and
+            the window where every plan has one.
+        chance: The chance of success, where it is known.
     """
 
     plan: Plan
@@ -89,25 +85,16 @@ def alternatives(
     each airway branch comes first, then the others.  Each plan is proved and complete as any other, and
     states what the goal is of it.
 
-    Parameters
-    ----------
-    request : Request
-        For one system.
-    count : int
-        The most plans that are returned.
-    separation_mm : float
-        The least separation of the needles of two plans.
-    atlas, counterfactuals, on_progress
-        See `lungaccess.planning.driver.run`.
+    Args:
+        request: For one system.
+        count: The most plans that are returned.
+        separation_mm: The least separation of the needles of two plans.
+        atlas, counterfactuals, on_progress: See `lungaccess.planning.driver.run`.
 
-    Raises
-    ------
-    NoPlan
-        If no plan was found.
-    SettingsError
-        If a number is not above 0, or as `run`.
-    TargetError
-        If the target lies outside the lung or inside an obstacle.
+    Raises:
+        NoPlan: If no plan was found.
+        SettingsError: If a number is not above 0, or as `run`.
+        TargetError: If the target lies outside the lung or inside an obstacle.
     """
     if count < 1 or not separation_mm > 0.0:
         raise SettingsError(
@@ -189,10 +176,8 @@ def with_front(
 ) -> tuple[Alternative, ...]:
     """Return plans with their criteria, and which of them are on the Pareto front.
 
-    Parameters
-    ----------
-    chances : sequence of Chance or None, optional
-        The chance of success of each plan.  A plan of which none is known is on no front.
+    Args:
+        chances: The chance of success of each plan.  A plan of which none is known is on no front.
     """
     names = GEOMETRIC if chances is None else TRADE_OFF
     known = [None] * len(plans) if chances is None else list(chances)

@@ -22,14 +22,11 @@ PROGRESS_EVERY_S = 0.1
 class ProgressEvent:
     """The progress of a search.
 
-    Parameters
-    ----------
-    elapsed_s : float
-        Planning time, without that of the atlas.
-    best_cost : float or None
-        What is left to improve of the best plan, see `Goal.loss`; None as long as there is no plan.
-    phase, message : str
-        What the search does; the message replaces the phase where it is not empty.
+    Args:
+        elapsed_s: Planning time, without that of the atlas.
+        best_cost: What is left to improve of the best plan, see `Goal.loss`; None as long as there is no
+            plan.
+        phase, message: What the search does; the message replaces the phase where it is not empty.
     """
 
     iteration: int
@@ -43,14 +40,10 @@ class ProgressEvent:
 class Turn:
     """One step of a finder.
 
-    Parameters
-    ----------
-    iteration : int
-        0 for what comes before the iterations, then counted from 1.
-    phase, message : str
-        See `ProgressEvent`.
-    make : callable, optional
-        Returns a plan that is better than all before, of the planning time in seconds.
+    Args:
+        iteration: 0 for what comes before the iterations, then counted from 1.
+        phase, message: See `ProgressEvent`.
+        make: Returns a plan that is better than all before, of the planning time in seconds.
     """
 
     iteration: int

@@ -23,25 +23,18 @@ def run(
 
     At the end comes the best one again, with fewer motions of the scope to the same tip where they are found.
 
-    Parameters
-    ----------
-    atlas : Atlas, optional
-        Made with `build_atlas` beforehand; made here if None.
-    counterfactuals : bool
-        Whether a `NoPlan` looks for the change of device that would help, which takes up to some ten seconds.
-    on_progress : callable, optional
-        Gets a `ProgressEvent` about ten times a second.
+    Args:
+        atlas: Made with `build_atlas` beforehand; made here if None.
+        counterfactuals: Whether a `NoPlan` looks for the change of device that would help, which takes up to
+            some ten seconds.
+        on_progress: Gets a `ProgressEvent` about ten times a second.
 
-    Raises
-    ------
-    NoPlan
-        If the search ends without a plan; counts the reasons.
-    SettingsError
-        If there is no such method, it needs a needle that the system does not have, or the atlas belongs to
-        another lung or system.
-    TargetError
-        If the target lies outside the lung or inside an obstacle, or nothing of the atlas comes near the
-        stated place.
+    Raises:
+        NoPlan: If the search ends without a plan; counts the reasons.
+        SettingsError: If there is no such method, it needs a needle that the system does not have, or the
+            atlas belongs to another lung or system.
+        TargetError: If the target lies outside the lung or inside an obstacle, or nothing of the atlas comes
+            near the stated place.
     """
     require_method(request)
     task = request.task

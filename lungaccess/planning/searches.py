@@ -63,10 +63,8 @@ def planners() -> dict[str, SearchFactory]:
 def register_planner(name: str, search: SearchFactory) -> None:
     """Make a search known by its name in this process; a package does so by an entry point.
 
-    Raises
-    ------
-    SettingsError
-        If the name is that of a search of this package.
+    Raises:
+        SettingsError: If the name is that of a search of this package.
     """
     if name in (ATLAS, *NEED_A_NEEDLE):
         raise SettingsError(f"A planner cannot be called {name!r}", expected="a name of its own")

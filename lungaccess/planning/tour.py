@@ -48,23 +48,16 @@ ITERATIONS = 100
 class TourAnswer:
     """Tours to M lesions.
 
-    Parameters
-    ----------
-    lesions_lps : (M, 3) float64, LPS mm
-    numbers : tuple of int
-        Their numbers, from 1, in the order in which the user gave them.
-    left_out : mapping of int to str
-        Numbers of lesions without an exit, and why.
-    shortest : Itinerary
-        The shortest tour over all choices of exits.
-    least_resistance : Itinerary or None
-        The shortest tour over the exits of the circuit with the least resistance [Pan2025]; None if there
-        are too many combinations.
-    one_by_one_mm : float
-        Length of a tour in which the scope returns to the root between any two lesions, over the exits of
-        `shortest`.
-    plan_required : bool
-        Whether an exit counted only if a coupled plan from there exists.
+    Args:
+        lesions_lps: (M, 3) float64, LPS mm.
+        numbers: Their numbers, from 1, in the order in which the user gave them.
+        left_out: Numbers of lesions without an exit, and why.
+        shortest: The shortest tour over all choices of exits.
+        least_resistance: The shortest tour over the exits of the circuit with the least resistance [Pan2025];
+            None if there are too many combinations.
+        one_by_one_mm: Length of a tour in which the scope returns to the root between any two lesions, over
+            the exits of `shortest`.
+        plan_required: Whether an exit counted only if a coupled plan from there exists.
     """
 
     lesions_lps: Float
@@ -91,12 +84,9 @@ def read_lesions(path: str | Path) -> Float:
 
     Empty lines, and what follows a `#`, are passed over.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read or names no lesion, or more than 62.
-    FrameError
-        If a line states no frame.
+    Raises:
+        FileError: If the file cannot be read or names no lesion, or more than 62.
+        FrameError: If a line states no frame.
     """
     lines = [line.split("#")[0].strip() for line in read_text(path).splitlines()]
     points = [parse_point(line) for line in lines if line]
@@ -112,10 +102,8 @@ def read_lesions(path: str | Path) -> Float:
 def lesions_of(lung: Lung) -> Float:
     """Return the targets that came with a patient, `(M, 3)` LPS mm.
 
-    Raises
-    ------
-    TargetError
-        If none came with it, or more than 62.
+    Raises:
+        TargetError: If none came with it, or more than 62.
     """
     count = len(lung.targets_lps)
     if not 1 <= count <= MOST_LESIONS:
@@ -141,30 +129,22 @@ def plan_tour(
 ) -> TourAnswer:
     """Plan the shortest tour to all lesions, and the one by least resistance beside it.
 
-    Parameters
-    ----------
-    lesions_lps : (M, 3) float64, LPS mm
-    rule : ExitRule, optional
-        By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
-    reading : str
-        How resistances are merged: "printed" or "reduced", see `stages.scope.tour.circuit`.
-    closed : bool
-        Whether the tour returns to the root.
-    tissue_weight : float
-        How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the shortest tour.
-    atlas : Atlas, optional
-        If given, an exit counts only if a coupled plan from there was found: scope, tubes and needle, all
-        proved; see `coupled_plan_test`.
-    iterations : int
-        Of the coupled planner for a lesion that no direct arc reaches; 0 for direct arcs alone.
-
     A lesion without an exit is left out of the tour, and named in the answer.  That no plan was found does
     not prove that there is none.
 
-    Raises
-    ------
-    TargetError
-        If a lesion lies outside the image, or none has an exit.
+    Args:
+        lesions_lps: (M, 3) float64, LPS mm.
+        rule: By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
+        reading: How resistances are merged: "printed" or "reduced", see `stages.scope.tour.circuit`.
+        closed: Whether the tour returns to the root.
+        tissue_weight: How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the
+            shortest tour.
+        atlas: If given, an exit counts only if a coupled plan from there was found: scope, tubes and needle,
+            all proved; see `coupled_plan_test`.
+        iterations: Of the coupled planner for a lesion that no direct arc reaches; 0 for direct arcs alone.
+
+    Raises:
+        TargetError: If a lesion lies outside the image, or none has an exit.
     """
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
     for number, inside in enumerate(lung.grid.contains(lesions).tolist(), 1):
@@ -228,12 +208,9 @@ def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATI
     Where none is, the coupled planner searches, and the sites of its plans count.  So a refused exit may
     still be possible.
 
-    Raises
-    ------
-    NoPlan
-        If no plan was found at all.
-    TargetError
-        If the lesion lies outside the lung or inside an obstacle.
+    Raises:
+        NoPlan: If no plan was found at all.
+        TargetError: If the lesion lies outside the lung or inside an obstacle.
     """
     from lungaccess.problem.target import point_target
 

@@ -40,10 +40,8 @@ SAMPLE_MM = 0.05
 def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mapping[str, float]) -> Plan:
     """Return the plan of a candidate.
 
-    Raises
-    ------
-    AnatomyError
-        If the motion of the scope is not proved, which no candidate of a search may be.
+    Raises:
+        AnatomyError: If the motion of the scope is not proved, which no candidate of a search may be.
     """
     system, lung = task.system, task.lung
     frame, deployment, needle = candidate.tip.lps_from_scope_tip, candidate.deployment, system.needle

@@ -39,27 +39,18 @@ ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
 class Opening:
     """One way on at a bifurcation: the dark region of the picture through which the airway goes on.
 
-    Parameters
-    ----------
-    branch : int
-        Of the airway tree; that of the parent where it goes on itself.
-    label : str
-        Short name for a picture.
-    name : str
-        Number and generation, and what the tree and the lobes of the patient support beyond them.
-    place_lps : tuple of float
-        A place in the opening that is seen in the middle of its dark region, LPS mm; in the lumen of the
-        branch where the picture does not show it.
-    hour : int
-        Where it is in the picture on a clock, 1 to 12; 0 is straight ahead.
-    side : str
-        "on the left", "on the right", "at the top" or "at the bottom" of the picture, or "straight ahead".
-    order : int
-        Place among the openings of its side, the nearest to the camera first; 0 if it is alone there.
-    in_view : bool
-        Whether the picture shows it.
-    taken : bool
-        Whether the plan goes there.
+    Args:
+        branch: Of the airway tree; that of the parent where it goes on itself.
+        label: Short name for a picture.
+        name: Number and generation, and what the tree and the lobes of the patient support beyond them.
+        place_lps: A place in the opening that is seen in the middle of its dark region, LPS mm; in the lumen
+            of the branch where the picture does not show it.
+        hour: Where it is in the picture on a clock, 1 to 12; 0 is straight ahead.
+        side: "on the left", "on the right", "at the top" or "at the bottom" of the picture, or "straight
+            ahead".
+        order: Place among the openings of its side, the nearest to the camera first; 0 if it is alone there.
+        in_view: Whether the picture shows it.
+        taken: Whether the plan goes there.
     """
 
     branch: int
@@ -85,23 +76,15 @@ class Opening:
 class Bifurcation:
     """A bifurcation of the route, and the state of the scope before it.
 
-    Parameters
-    ----------
-    number, count : int
-        Of how many on the route it is which, from 1.
-    from_carina_mm : float
-        Where it is along the tree; 0 is the carina itself.
-    state : int
-        State of the motion in which the tip stands before it, and the picture shows all openings best.
-    entered_state : int
-        First state in which the tip is past it; the last one if it never is.
-    inserted_mm : float
-        Advance of the scope there.
-    held_bend_deg, bend_deg : float
-        Bend of the tip in that state, and in the picture of the openings: the tip is bent where only that, by
-        a proved motion, brings all of them into view.
-    openings : tuple of Opening
-        The one that is taken first.
+    Args:
+        number, count: Of how many on the route it is which, from 1.
+        from_carina_mm: Where it is along the tree; 0 is the carina itself.
+        state: State of the motion in which the tip stands before it, and the picture shows all openings best.
+        entered_state: First state in which the tip is past it; the last one if it never is.
+        inserted_mm: Advance of the scope there.
+        held_bend_deg, bend_deg: Bend of the tip in that state, and in the picture of the openings: the tip is
+            bent where only that, by a proved motion, brings all of them into view.
+        openings: The one that is taken first.
     """
 
     number: int
@@ -143,15 +126,10 @@ def route_bifurcations(
     Each is told in the picture that shows the smallest of its openings largest, from where the one before is
     told to where the tip is past it.  Where not even that one shows all of them, the tip is bent for a look.
 
-    Parameters
-    ----------
-    motion : ScopeMotion
-        With so many states that the tip moves little between them.
-    branches : (B,) int64
-        Of the airway tree, from the trachea to where the tip ends.
-    lung : Lung
-    system : System
-        The scope of the motion, and the tubes in its channel, beside which the camera is.
+    Args:
+        motion: With so many states that the tip moves little between them.
+        branches ((B,) int64): Of the airway tree, from the trachea to where the tip ends.
+        system: The scope of the motion, and the tubes in its channel, beside which the camera is.
     """
     tree, tips, state = lung.tree, motion.tips, 0
     depth = tree.distance_from_root_mm

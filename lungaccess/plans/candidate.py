@@ -15,15 +15,11 @@ from stages.tube import Deployment, pieces_of_arcs
 class Candidate:
     """The choices that make a plan.
 
-    Parameters
-    ----------
-    tip : ScopeTip
-        Where the scope's tip is.
-    deployment : Deployment
-        The tubes from there.
-    path : ArcPath
-        What the costs are of: the needle from the tip of the tubes to the target; without a needle, the tubes
-        from where they leave the lumen to their tip, which is at the target.
+    Args:
+        tip: Where the scope's tip is.
+        deployment: The tubes from there.
+        path: What the costs are of: the needle from the tip of the tubes to the target; without a needle, the
+            tubes from where they leave the lumen to their tip, which is at the target.
     """
 
     tip: ScopeTip

@@ -12,33 +12,22 @@ from lungaccess.plans.record import Record
 class Chance(Record):
     """How many simulated procedures of a plan succeed.
 
-    Parameters
-    ----------
-    errors, procedure : str
-        What the error model and the procedure are called.
-    corrections : str
-        What is measured and corrected on the way, in a sentence.
-    sizes : str
-        The sizes of the errors in words.
-    assumed : tuple of str
-        Kinds of error whose size nobody has published.
-    radius_mm, radius_origin : float, str
-        Radius of the goal about the target, and where it came from; of a tool, which nodule counts.
-    tissue : str
-        What has to be in the tool in words, such as "at least 5 mm of the nodule in the core needle"; empty
-        without a tool.
-    with_needle : bool
-        Whether it is the needle that ends at the target; the tubes do so without one.
-    samples, seed : int
-        Simulated procedures, and the seed of their random numbers.
-    successes : int
-    failures : mapping of str to int
-        What made procedures fail, and how many; in open loop one procedure may fail for several reasons.
+    Args:
+        errors, procedure: What the error model and the procedure are called.
+        corrections: What is measured and corrected on the way, in a sentence.
+        sizes: The sizes of the errors in words.
+        assumed: Kinds of error whose size nobody has published.
+        radius_mm, radius_origin: Radius of the goal about the target, and where it came from; of a tool,
+            which nodule counts.
+        tissue: What has to be in the tool in words, such as "at least 5 mm of the nodule in the core needle";
+            empty without a tool.
+        with_needle: Whether it is the needle that ends at the target; the tubes do so without one.
+        samples, seed: Simulated procedures, and the seed of their random numbers.
+        failures: What made procedures fail, and how many; in open loop one procedure may fail for several
+            reasons.
 
-    Raises
-    ------
-    PlanFileError
-        If a count is negative or exceeds the samples.
+    Raises:
+        PlanFileError: If a count is negative or exceeds the samples.
     """
 
     errors: str

@@ -24,20 +24,14 @@ def path_cost(
 ) -> float:
     """Return the cost of a path under an objective.
 
-    Parameters
-    ----------
-    lung : Lung
-        Without a cost map, the costs of the map are 0.
-    objective : str or Objective
-        See `stages.needle.objective.Objective.of`.
-    with_fissures : bool
-        Whether fissures are obstacles.
-    wall_mm : float
-        Length at the beginning of the path that lies in the wall which the tubes pierce.  The costs of the
-        map, which forbids walls, count beyond it.
-    parts : sequence of InTissue
-        All that lies in tissue, the path too; see `lungaccess.plans.candidate.parts_in_tissue`.  None where
-        that is not known, and the objective does not weigh it.
+    Args:
+        lung: Without a cost map, the costs of the map are 0.
+        objective: See `stages.needle.objective.Objective.of`.
+        with_fissures: Whether fissures are obstacles.
+        wall_mm: Length at the beginning of the path that lies in the wall which the tubes pierce.  The costs
+            of the map, which forbids walls, count beyond it.
+        parts: All that lies in tissue, the path too; see `lungaccess.plans.candidate.parts_in_tissue`.  None
+            where that is not known, and the objective does not weigh it.
     """
     weighed = Objective.of(objective)
     terms = [term for term, _weight in weighed.weighed]

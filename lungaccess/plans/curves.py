@@ -132,18 +132,14 @@ def radii_at(tubes: ConcentricTubes, insertions_mm: Sequence[float], arc_mm: Flo
 def pieces_beyond(lps_from_start: Float, pieces: Float, begin_mm: float) -> tuple[Float, Float]:
     """Return pose and arcs of what lies beyond an arc length of a row of arcs.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-        Where the first arc starts.
-    pieces : (P, 3) float64
-        Length in mm, roll before it in rad, which is kept for the next, and curvature in 1/mm of each arc.
-    begin_mm : float
-        From 0 to less than the length of all arcs.
+    Args:
+        lps_from_start ((4, 4) float64): Where the first arc starts.
+        pieces ((P, 3) float64): Length in mm, roll before it in rad, which is kept for the next, and
+            curvature in 1/mm of each arc.
+        begin_mm: From 0 to less than the length of all arcs.
 
-    Returns
-    -------
-    (4, 4) float64, (R, 3) float64
+    Returns:
+        (4, 4) float64, (R, 3) float64.
     """
     pose, left_mm = np.asarray(lps_from_start), begin_mm
     for number, (length, roll, curvature) in enumerate(pieces):

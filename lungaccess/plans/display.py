@@ -15,12 +15,9 @@ def plan_html(
 ) -> str:
     """Return a plan as HTML.
 
-    Parameters
-    ----------
-    rows : iterable of (str, str)
-        Names and values of the table.
-    exit_lps, target_lps : (3,) float64, LPS mm
-        Where rings are drawn.
+    Args:
+        rows (iterable of (str, str)): Names and values of the table.
+        exit_lps, target_lps ((3,) float64, LPS mm): Where rings are drawn.
     """
     drawings = [_drawing(view, curves, exit_lps, target_lps) for view in (CORONAL, AXIAL)]
     return side_by_side(table(rows, heading), *drawings)

@@ -44,14 +44,11 @@ from stages.tube import Deployment, DeploymentValidator, TubeShape
 class NeedleArrays(NamedTuple):
     """A needle among obstacles, and what its path is to keep small, for the compiled kernels.
 
-    Parameters
-    ----------
-    has_forbidden_voxels : bool
-        Whether a cost map forbids voxels, by infinite costs, that the objective does not weigh.
-    forbidden_map : (ni, nj, nk) float32
-        That cost map.
-    of_tubes : ObjectiveArrays
-        What the tubes in tissue cost for each mm of their width.
+    Args:
+        has_forbidden_voxels: Whether a cost map forbids voxels, by infinite costs, that the objective does
+            not weigh.
+        forbidden_map ((ni, nj, nk) float32): That cost map.
+        of_tubes: What the tubes in tissue cost for each mm of their width.
     """
 
     obstacles: Obstacles
@@ -74,16 +71,9 @@ TIP_OFF_MM = 1e-6
 class CandidateEvaluator:
     """Proves and costs the candidates of one task, from the numbers that a plan will state.
 
-    Parameters
-    ----------
-    task : Task
-
-    Attributes
-    ----------
-    tubes : DeploymentValidator
-        Validates deployments of the tubes.
-    blocked : Counter of str
-        How many direct arcs were stopped, by what stopped them.
+    Attributes:
+        tubes: Validates deployments of the tubes.
+        blocked: How many direct arcs were stopped, by what stopped them.
     """
 
     def __init__(self, task: Task) -> None:
@@ -180,12 +170,9 @@ class CandidateEvaluator:
     ) -> Candidate | None:
         """Return a deployment with a direct arc to the target, None if the deployment is refused.
 
-        Parameters
-        ----------
-        rotation_rad, shape
-            As those of `DeploymentValidator.choose`.
-        end : (3,) float64, optional
-            Where the arc ends, LPS mm; at the aim if None.
+        Args:
+            rotation_rad, shape: As those of `DeploymentValidator.choose`.
+            end ((3,) float64): Where the arc ends, LPS mm; at the aim if None.
         """
         deployment = self.tubes.choose(tip.lps_from_scope_tip, rotation_rad, shape)
         if isinstance(deployment, str):

@@ -21,14 +21,11 @@ def scope_insertion(
 ) -> ScopeInsertion:
     """Return the part of a plan that a motion makes.
 
-    Parameters
-    ----------
-    tree : AirwayTree
-        The airway of the patient.
-    tree_point : int
-        Its point nearest to the tip.
-    min_lumen_margin_mm : float
-        Smallest lumen depth of the body's axis over the whole motion, minus the radius of the scope.
+    Args:
+        tree: The airway of the patient.
+        tree_point: Its point nearest to the tip.
+        min_lumen_margin_mm: Smallest lumen depth of the body's axis over the whole motion, minus the radius
+            of the scope.
     """
     branches = _branches_to(tree, int(tree.branch_of_point[tree_point]))
     length = motion.length_mm

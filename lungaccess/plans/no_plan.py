@@ -15,20 +15,15 @@ if TYPE_CHECKING:
 class NoPlan(LungaccessError):  # noqa: N818
     """No plan was found; says why, stage by stage.
 
-    Parameters
-    ----------
-    found : str
-        One sentence: what prevents a plan.
-    reasons : mapping of str to int
-        How many sites, deployments or needle paths each reason ruled out.
-    main_reason : str
-        What prevents a plan, without the length of the search; `found` if it is not stated.
-    advice : str
-        The smallest change of device that would make the target reachable, if one was found.
-    counterfactuals : mapping of str to Plan
-        For each change of one device parameter that makes the target reachable, a plan with that change.
-    attempts : mapping of str to str
-        Where several systems were tried: why each failed, by its name, in the order in which they were tried.
+    Args:
+        found: One sentence: what prevents a plan.
+        reasons: How many sites, deployments or needle paths each reason ruled out.
+        main_reason: What prevents a plan, without the length of the search; `found` if it is not stated.
+        advice: The smallest change of device that would make the target reachable, if one was found.
+        counterfactuals: For each change of one device parameter that makes the target reachable, a plan with
+            that change.
+        attempts: Where several systems were tried: why each failed, by its name, in the order in which they
+            were tried.
     """
 
     def __init__(

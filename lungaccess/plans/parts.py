@@ -18,27 +18,21 @@ from stages.tube.device import ConcentricTubes
 class ScopeInsertion(Record):
     """How the bronchoscope gets from the trachea to where it stops, and the frame of its tip there.
 
-    Parameters
-    ----------
-    lps_from_entry : (4, 4) float64
-        Base of the bending section when the motion begins, in the trachea; +z is forward, +x the way a
-        positive bend turns the tip at twist 0.
-    states : (M, 3) float64
-        Advance of that base in mm, twist in rad and bend in rad; see `stages.scope.ScopeMotion`.
-    lps_from_scope_tip : (4, 4) float64
-        Frame of the working channel in the last state: +z is forward, +x the way a positive bend turns the
-        tip, which is up in the camera's picture.
-    branches : (B,) int64
-        Branches of the airway tree from the trachea to the one in which the tip is.
-    generation : int
-        Generation of the last branch; the trachea is 0.
-    length_mm, length_from_carina_mm : float
-        Length of the body from the entry to the tip, and of its part beyond the place nearest to the carina.
-    min_lumen_margin_mm : float
-        Smallest distance of the body's axis from the border of the lumen, in every state and between them,
-        minus the radius of the scope.
-    max_curvature_per_mm : float
-        Largest curvature of the body in the last state, which the tubes pass in the working channel.
+    Args:
+        lps_from_entry ((4, 4) float64): Base of the bending section when the motion begins, in the trachea;
+            +z is forward, +x the way a positive bend turns the tip at twist 0.
+        states ((M, 3) float64): Advance of that base in mm, twist in rad and bend in rad; see
+            `stages.scope.ScopeMotion`.
+        lps_from_scope_tip ((4, 4) float64): Frame of the working channel in the last state: +z is forward, +x
+            the way a positive bend turns the tip, which is up in the camera's picture.
+        branches ((B,) int64): Branches of the airway tree from the trachea to the one in which the tip is.
+        generation: Generation of the last branch; the trachea is 0.
+        length_mm, length_from_carina_mm: Length of the body from the entry to the tip, and of its part beyond
+            the place nearest to the carina.
+        min_lumen_margin_mm: Smallest distance of the body's axis from the border of the lumen, in every state
+            and between them, minus the radius of the scope.
+        max_curvature_per_mm: Largest curvature of the body in the last state, which the tubes pass in the
+            working channel.
     """
 
     lps_from_entry: Float = field(metadata=shaped(4, 4))
@@ -56,17 +50,12 @@ class ScopeInsertion(Record):
 class WallExit(Record):
     """Where the axis of the tube leaves the airway lumen for good.
 
-    Parameters
-    ----------
-    branch : int
-        Branch whose wall is pierced.
-    point_lps : (3,) float64, LPS mm
-    arc_length_mm : float
-        Length of tube between the tip of the scope and that point.
-    wall_angle_rad : float
-        Angle between tube and wall; pi/2 is perpendicular.
-    wall_run_mm : float
-        Length of the tube's body, beyond that point, that lies in the wall of the branch.
+    Args:
+        branch: Branch whose wall is pierced.
+        point_lps: (3,) float64, LPS mm.
+        arc_length_mm: Length of tube between the tip of the scope and that point.
+        wall_angle_rad: Angle between tube and wall; pi/2 is perpendicular.
+        wall_run_mm: Length of the tube's body, beyond that point, that lies in the wall of the branch.
     """
 
     branch: int
@@ -80,19 +69,14 @@ class WallExit(Record):
 class DeployedShape(Record):
     """The shape of the tubes, as the mechanics give it.
 
-    Parameters
-    ----------
-    relative_rotations_rad : mapping of str to float
-        By "outer", "middle" and "inner": how much farther than `TubeDeployment.rotation_rad` the rear end of
-        that tube is turned.
-    arcs : (A, 4) float64
-        Length in mm; direction of the bend in rad about the tangent, from +x of a frame that is carried from
-        the scope tip, turned by `TubeDeployment.rotation_rad`, without turning; curvature in 1/mm; radius of
-        the outermost tube in mm.
-    arc_error_mm : float
-        Largest distance between the arcs and the tubes.
-    least_determinant : float
-        Least on the way of the derivative of rear by front rotations: the tubes snap at 0.
+    Args:
+        relative_rotations_rad: By "outer", "middle" and "inner": how much farther than
+            `TubeDeployment.rotation_rad` the rear end of that tube is turned.
+        arcs ((A, 4) float64): Length in mm; direction of the bend in rad about the tangent, from +x of a
+            frame that is carried from the scope tip, turned by `TubeDeployment.rotation_rad`, without
+            turning; curvature in 1/mm; radius of the outermost tube in mm.
+        arc_error_mm: Largest distance between the arcs and the tubes.
+        least_determinant: Least on the way of the derivative of rear by front rotations: the tubes snap at 0.
     """
 
     relative_rotations_rad: Mapping[str, float]
@@ -116,23 +100,15 @@ class DeployedShape(Record):
 class TubeDeployment(Record):
     """How the concentric tubes are turned and inserted, and what that does.
 
-    Parameters
-    ----------
-    rotation_rad : float
-        All tubes are turned by this: a tube that is turned no farther bends towards local (cos, sin) of the
-        scope tip.
-    outer_insertion_mm, inner_insertion_mm : float
-        Lengths of outer and inner tube beyond the tip of the scope.
-    middle_insertion_mm : float
-        That of the middle tube, 0 where there is none.
-    lps_from_tip : (4, 4) float64
-        Pose of the tip of the inner tube; +z is forward; +x is carried from the scope tip, turned by
-        `rotation_rad`, without turning.
-    shape : DeployedShape
-    lateral_sweep_mm : float
-        Largest sideways motion of the tubes while they are deployed.
-    follow_the_leader_error_mm : float
-        Largest distance between the path of the tip and the final shape.
+    Args:
+        rotation_rad: All tubes are turned by this: a tube that is turned no farther bends towards local (cos,
+            sin) of the scope tip.
+        outer_insertion_mm, inner_insertion_mm: Lengths of outer and inner tube beyond the tip of the scope.
+        middle_insertion_mm: That of the middle tube, 0 where there is none.
+        lps_from_tip ((4, 4) float64): Pose of the tip of the inner tube; +z is forward; +x is carried from
+            the scope tip, turned by `rotation_rad`, without turning.
+        lateral_sweep_mm: Largest sideways motion of the tubes while they are deployed.
+        follow_the_leader_error_mm: Largest distance between the path of the tip and the final shape.
     """
 
     rotation_rad: float
@@ -181,15 +157,11 @@ class NeedleArc(Record):
 class NeedlePath(Record):
     """The arcs of the steerable needle, from the tip of the tube to the target.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-        Pose of the needle where it leaves the tube.
-    end_lps : (3,) float64, LPS mm
-    max_angle_from_start_rad : float
-        Largest angle between the needle and its start direction.
-    accumulated_turn_rad : float
-        Sum of the angles of all arcs.
+    Args:
+        lps_from_start ((4, 4) float64): Pose of the needle where it leaves the tube.
+        end_lps: (3,) float64, LPS mm.
+        max_angle_from_start_rad: Largest angle between the needle and its start direction.
+        accumulated_turn_rad: Sum of the angles of all arcs.
     """
 
     lps_from_start: Float = field(metadata=shaped(4, 4))

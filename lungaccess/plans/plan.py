@@ -38,58 +38,42 @@ if TYPE_CHECKING:
 class Plan(Record):
     """One plan: scope motion, tube deployment and needle arcs, with costs, margins and provenance.
 
-    Parameters
-    ----------
-    schema : str
-        `lungaccess.plans.file.SCHEMA`.
-    patient_name, lung_key : str
-        The patient, and the content hash of the lung planned on.
-    sources : mapping of str to str
-        SHA-256 of every image file.
-    breath_hold : str or None
-        In which breath-hold the image was taken.
-    system_fingerprint : str
-        SHA-256 of the system's settings.
-    target_lps : (3,) float64, LPS mm
-    target_origin : str
-        Where the target came from; starts with "nodule" if it is the nodule mask.
-    objective : str
-        What was minimised: a key of `costs`; see `stages.needle.objective.Objective`.
-    scope, tube, needle
-        The stages; `needle` is None where the system has none, and the tip of the tubes is at the target.
-    required_clearance_mm : mapping of str to float
-        Radius plus margins of "outer_tube", "inner_tube" and, where there is one, "needle".
-    clearance_mm : mapping of str to mapping of str to float
-        For "tube" and, where there is one, "needle": smallest distance of the axis from each structure
-        ("airway", "vessel", "outside", "fissure"; voxels as solid boxes) where it must be kept.  A structure
-        may be left out.
-    costs : mapping of str to float
-        By the keys of `stages.needle.TERMS`: of the needle, or without one of the tubes beyond the lumen
-        (costs of the map: beyond the wall); "tissue" of both, where the objective weighs it; and the cost
-        under the objective where that is a weighted sum.  A plan of an earlier version may lack "voxel_sum".
-    kernels : str
-        What the planner's machine code was compiled from: `lungaccess.plans.version.software_kernels`; "" in
-        a plan that was not planned, or of an earlier version.
-    needle_planner : str
-        The planner of the needle that the search was told to use; "" for the method's own.
-    system_choice : tuple of str
-        Where the system was chosen among several: in sentences, which were tried, why each failed, and why
-        this one was chosen; see `lungaccess.judging.answering`.  Empty otherwise.
-    timing : mapping of str to float
-        Seconds; the only values that differ between two equal runs.
-    chance : Chance or None
-        Of success, counted on draws that no search saw: for a plan that was searched by it, and of studies
-        that count it; None for any other.
-    window : BreathingWindow or None
-        The phases of the breath in which it is proved clear and on target; None where no motion was known.
-    aim : BreathingAim or None
-        Where the devices end, of a plan made for its window, or of one whose tool is behind the tip; None for
-        any other, which ends at the target.
-    cost_bound : float
-        Proved lower bound of the cost of every plan from a scope tip of the atlas, where the search was told
-        to find one; 0 for any other.
-    goals : mapping of str to float
-        Values of functions of the plan that it was made good at; see `lungaccess.problem.goals.Goal`.
+    Args:
+        schema: `lungaccess.plans.file.SCHEMA`.
+        patient_name, lung_key: The patient, and the content hash of the lung planned on.
+        sources: SHA-256 of every image file.
+        breath_hold: In which breath-hold the image was taken.
+        system_fingerprint: SHA-256 of the system's settings.
+        target_lps: (3,) float64, LPS mm.
+        target_origin: Where the target came from; starts with "nodule" if it is the nodule mask.
+        objective: What was minimised: a key of `costs`; see `stages.needle.objective.Objective`.
+        scope, tube, needle: The stages; `needle` is None where the system has none, and the tip of the tubes
+            is at the target.
+        required_clearance_mm: Radius plus margins of "outer_tube", "inner_tube" and, where there is one,
+            "needle".
+        clearance_mm: For "tube" and, where there is one, "needle": smallest distance of the axis from each
+            structure ("airway", "vessel", "outside", "fissure"; voxels as solid boxes) where it must be kept.
+            A structure may be left out.
+        costs: By the keys of `stages.needle.TERMS`: of the needle, or without one of the tubes beyond the
+            lumen (costs of the map: beyond the wall); "tissue" of both, where the objective weighs it; and
+            the cost under the objective where that is a weighted sum.  A plan of an earlier version may lack
+            "voxel_sum".
+        kernels: What the planner's machine code was compiled from:
+            `lungaccess.plans.version.software_kernels`; "" in a plan that was not planned, or of an earlier
+            version.
+        needle_planner: The planner of the needle that the search was told to use; "" for the method's own.
+        system_choice: Where the system was chosen among several: in sentences, which were tried, why each
+            failed, and why this one was chosen; see `lungaccess.judging.answering`.  Empty otherwise.
+        timing: Seconds; the only values that differ between two equal runs.
+        chance: Of success, counted on draws that no search saw: for a plan that was searched by it, and of
+            studies that count it; None for any other.
+        window: The phases of the breath in which it is proved clear and on target; None where no motion was
+            known.
+        aim: Where the devices end, of a plan made for its window, or of one whose tool is behind the tip;
+            None for any other, which ends at the target.
+        cost_bound: Proved lower bound of the cost of every plan from a scope tip of the atlas, where the
+            search was told to find one; 0 for any other.
+        goals: Values of functions of the plan that it was made good at; see `lungaccess.problem.goals.Goal`.
     """
 
     schema: str = plan_file.SCHEMA
@@ -276,10 +260,8 @@ class Plan(Record):
     def to_json(self) -> str:
         """Return the plan as JSON text, with its digest; `from_json` restores it without loss.
 
-        Raises
-        ------
-        PlanFileError
-            If a number is not finite.
+        Raises:
+            PlanFileError: If a number is not finite.
         """
         return plan_file.to_json(self)
 
@@ -287,22 +269,18 @@ class Plan(Record):
     def from_json(cls, text: str) -> Self:
         """Return the plan that `to_json` wrote.
 
-        Raises
-        ------
-        PlanFileError
-            If the text is no JSON, of another schema, incomplete, or not what its digest was made from.
+        Raises:
+            PlanFileError: If the text is no JSON, of another schema, incomplete, or not what its digest was
+                made from.
         """
         return plan_file.from_json(cls, text)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan to `path`, all or nothing.
 
-        Raises
-        ------
-        FileError
-            If the file cannot be written.
-        PlanFileError
-            If a number is not finite.
+        Raises:
+            FileError: If the file cannot be written.
+            PlanFileError: If a number is not finite.
         """
         plan_file.save(self, path)
 
@@ -310,9 +288,7 @@ class Plan(Record):
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a plan from `path`.
 
-        Raises
-        ------
-        PlanFileError
-            If there is no such file or it is not an intact plan.
+        Raises:
+            PlanFileError: If there is no such file or it is not an intact plan.
         """
         return plan_file.load(cls, path)

@@ -44,25 +44,20 @@ class ScopeStep:
 
     It advances, turns the scope, or bends the tip; where both of the last change, they change evenly.
 
-    Parameters
-    ----------
-    advance_mm, inserted_mm : float
-        Advance in this step, and the whole advance at its end; 0 mm is where the motion begins.
-    twist_deg, to_twist_deg : float
-        Change of the twist and its value at the end; positive is clockwise seen from behind, as the picture
-        sees it.
-    from_bend_deg, to_bend_deg : float
-        Bend at begin and end; positive is towards the top of the picture, and negative is down.
-    advance_tolerance_mm, twist_tolerance_deg, bend_tolerance_deg : float
-        By how much the advance at the end, or twist or bend anywhere in the step, may err, all else being
-        as stated, with the scope and its gap still proved to be in the lumen; see
-        `stages.scope.MotionProver.tolerances`.
-    goes_on : str
-        Where in the picture the airway goes on as the step begins.
-    branch, generation : int
-        Of the airway in which the tip is at the end; branches go by their numbers, as in the whole plan.
-    state : int
-        The state of the plan in which it ends.
+    Args:
+        advance_mm, inserted_mm: Advance in this step, and the whole advance at its end; 0 mm is where the
+            motion begins.
+        twist_deg, to_twist_deg: Change of the twist and its value at the end; positive is clockwise seen from
+            behind, as the picture sees it.
+        from_bend_deg, to_bend_deg: Bend at begin and end; positive is towards the top of the picture, and
+            negative is down.
+        advance_tolerance_mm, twist_tolerance_deg, bend_tolerance_deg: By how much the advance at the end, or
+            twist or bend anywhere in the step, may err, all else being as stated, with the scope and its gap
+            still proved to be in the lumen; see `stages.scope.MotionProver.tolerances`.
+        goes_on: Where in the picture the airway goes on as the step begins.
+        branch, generation: Of the airway in which the tip is at the end; branches go by their numbers, as in
+            the whole plan.
+        state: The state of the plan in which it ends.
     """
 
     advance_mm: float
@@ -191,14 +186,10 @@ def steps_of(
 ) -> tuple[ScopeStep, ...]:
     """Return a motion as steps; where nothing changes there is none.
 
-    Parameters
-    ----------
-    motion : ScopeMotion
-        As it is written, M states.
-    allowed : (M - 1, 3) float64
-        Its tolerances, see `stages.scope.MotionProver.tolerances`.
-    goes_on : function of a state
-        Says where in its picture the airway goes on.
+    Args:
+        motion: As it is written, M states.
+        allowed ((M - 1, 3) float64): Its tolerances, see `stages.scope.MotionProver.tolerances`.
+        goes_on (function of a state): Says where in its picture the airway goes on.
     """
     tips, degrees = motion.tips, np.degrees(motion.states[:, 1:])
     written = np.round(np.column_stack([motion.states[:, 0], degrees]), MOST_DECIMALS)

@@ -23,13 +23,11 @@ _BALL_STEPS = 12
 def wanted_of(lung: Lung, target_lps: Float, tool: Tool | None, radius_mm: float | None = None) -> Wanted:
     """Return what has to be in a tool, for kernels; errors as `goal_radius`.
 
-    Parameters
-    ----------
-    target_lps : (3,) float64
-    tool : Tool or None
-        None for the last tip itself, which has to end within the radius of the goal, see `goal_radius`.
-    radius_mm : float, optional
-        The nodule counts as a ball of that radius; if None, it is that of the mask where there is one.
+    Args:
+        target_lps: (3,) float64.
+        tool: None for the last tip itself, which has to end within the radius of the goal, see `goal_radius`.
+        radius_mm: The nodule counts as a ball of that radius; if None, it is that of the mask where there is
+            one.
     """
     radius, _origin = goal_radius(lung, target_lps, radius_mm)
     own = own_nodule(lung, target_lps) if tool is not None and radius_mm is None else None
@@ -97,10 +95,8 @@ def goal_radius(lung: Lung, target_lps: Float, radius_mm: float | None = None) -
     It is the given one, or that of the ball as large as the target's nodule, or 5 mm, of a nodule of 10 mm,
     where the target lies in none of the mask.
 
-    Raises
-    ------
-    SettingsError
-        If a given radius is not above 0 and finite.
+    Raises:
+        SettingsError: If a given radius is not above 0 and finite.
     """
     if radius_mm is not None:
         if not 0.0 < radius_mm < math.inf:

@@ -16,20 +16,14 @@ from lungaccess.plans.record import Record, shaped
 class WindowLimit(Record):
     """What ends a window, or leaves none.
 
-    Parameters
-    ----------
-    phase : float
-        The end of the window; without a window a phase near that of the masks.
-    reason : str
-        "target" if the end of the devices is too far from it, "lumen" if the tubes leave the airway before
-        their exit, "hole" if they shift in the hole in its wall by more than their radius, else the structure
-        that is too near: "airway", "vessel", "outside" or "fissure".
-    device : str
-        "tube" or "needle".
-    arc_length_mm : float
-        Where on the device, from the tip of the scope or of the tubes.
-    place_lps : (3,) float64, LPS mm
-        The same in the frame of the plan.
+    Args:
+        phase: The end of the window; without a window a phase near that of the masks.
+        reason: "target" if the end of the devices is too far from it, "lumen" if the tubes leave the airway
+            before their exit, "hole" if they shift in the hole in its wall by more than their radius, else
+            the structure that is too near: "airway", "vessel", "outside" or "fissure".
+        device: "tube" or "needle".
+        arc_length_mm: Where on the device, from the tip of the scope or of the tubes.
+        place_lps ((3,) float64, LPS mm): The same in the frame of the plan.
     """
 
     phase: float
@@ -59,18 +53,13 @@ class WindowLimit(Record):
 class BreathingAim(Record):
     """Where devices end beside the target of the masks' phase: planned for a window, or with a tool.
 
-    Parameters
-    ----------
-    point_lps : (3,) float64, LPS mm
-        Where tubes and needle end in the masks' phase.
-    phases : (N, 2) float64
-        First and last of the phases that were asked for, all of which the window holds; N is 0 or 1, and 0
-        with a tool.
+    Args:
+        point_lps ((3,) float64, LPS mm): Where tubes and needle end in the masks' phase.
+        phases ((N, 2) float64): First and last of the phases that were asked for, all of which the window
+            holds; N is 0 or 1, and 0 with a tool.
 
-    Raises
-    ------
-    PlanFileError
-        If the phases are not one stretch within 0 to 1.
+    Raises:
+        PlanFileError: If the phases are not one stretch within 0 to 1.
     """
 
     point_lps: Float = field(metadata=shaped(3))
@@ -89,35 +78,23 @@ class BreathingAim(Record):
 class BreathingWindow(Record):
     """Phases from 0 (end-exhale) to 1 (end-inhale) in which tubes and needle, held still, may be in the lung.
 
-    Parameters
-    ----------
-    motion_key : str
-        SHA-256 of the motion that it was made with.
-    motion_source : str
-        Where that came from, in words.
-    warning_only : bool
-        Whether it is a model of other people's lungs.
-    masks_phase, amplitude : float
-        The phase that the masks show, and the motion as a share of the source's.
-    tolerance_mm : float
-        Largest distance between the end of the devices and the moving target.
-    phases : (N, 2) float64
-        First and last phase of each stretch that is proved.
-    undecided_share : float
-        Share of the breath of which neither could be proved; it is not in the window.
-    limits : tuple of WindowLimit
-        What ends the stretches within the breath, in their order; without any, what forbids a phase near
-        that of the masks.
-    hysteresis : float
-        How far tissue may stray from where the motion puts it, as a share of its distance from the scope's
-        tip; all of the above holds for any such way.
-    beside_target_mm : float
-        How far beside the target devices with an aim end in the masks' phase; 0 for others, which end there.
+    Args:
+        motion_key: SHA-256 of the motion that it was made with.
+        motion_source: Where that came from, in words.
+        warning_only: Whether it is a model of other people's lungs.
+        masks_phase, amplitude: The phase that the masks show, and the motion as a share of the source's.
+        tolerance_mm: Largest distance between the end of the devices and the moving target.
+        phases ((N, 2) float64): First and last phase of each stretch that is proved.
+        undecided_share: Share of the breath of which neither could be proved; it is not in the window.
+        limits: What ends the stretches within the breath, in their order; without any, what forbids a phase
+            near that of the masks.
+        hysteresis: How far tissue may stray from where the motion puts it, as a share of its distance from
+            the scope's tip; all of the above holds for any such way.
+        beside_target_mm: How far beside the target devices with an aim end in the masks' phase; 0 for others,
+            which end there.
 
-    Raises
-    ------
-    PlanFileError
-        If the phases are not stretches in order within 0 to 1.
+    Raises:
+        PlanFileError: If the phases are not stretches in order within 0 to 1.
     """
 
     motion_key: str

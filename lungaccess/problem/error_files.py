@@ -40,22 +40,16 @@ def load_errors(name_or_path: str | os.PathLike[str] = DEFAULT_ERRORS) -> ErrorM
     A table that a file leaves out is that of the preset that its key `like` names, of `breath-hold` without
     that key.  The model is called what the file says in `name`, else as the file is.
 
-    Parameters
-    ----------
-    name_or_path : str or path
-        Name of a preset (see `error_preset_names`), or path of a file that ends in ``.toml``.
+    Args:
+        name_or_path: Name of a preset (see `error_preset_names`), or path of a file that ends in ``.toml``.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such preset, the file is not TOML, or a value in it is wrong.
-    FileError
-        If the file cannot be read.
+    Raises:
+        SettingsError: If there is no such preset, the file is not TOML, or a value in it is wrong.
+        FileError: If the file cannot be read.
 
-    Examples
-    --------
-    >>> load_errors("gated-ct").scope_position.attempt_mm
-    1.3
+    Examples:
+        >>> load_errors("gated-ct").scope_position.attempt_mm
+        1.3
     """
     given = os.fspath(name_or_path)
     if given in _FILES.names:

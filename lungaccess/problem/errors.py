@@ -135,22 +135,17 @@ class _Term:
 class PositionError(_Term):
     """An error of a length, mm, along each axis or of each device.
 
-    Parameters
-    ----------
-    distribution : str
-        "normal": the sizes are standard deviations.  "bounded": uniform, the sizes are the largest errors.
-        "resting", of the scope's tip: normal about where the shaft rests, whose spread adds to the sizes.
-    patient_mm, attempt_mm : float
-        Size of the part drawn once for each patient, and of that drawn once for each attempt; they add up.
-    bias_mm : tuple of float
-        Mean of the error, added to both parts: as many numbers as `AXES` says, none for no bias.
-    source : str
-        Where the sizes come from; what nobody has published begins with "assumption".
+    Args:
+        distribution: "normal": the sizes are standard deviations.  "bounded": uniform, the sizes are the
+            largest errors.  "resting", of the scope's tip: normal about where the shaft rests, whose spread
+            adds to the sizes.
+        patient_mm, attempt_mm: Size of the part drawn once for each patient, and of that drawn once for each
+            attempt; they add up.
+        bias_mm: Mean of the error, added to both parts: as many numbers as `AXES` says, none for no bias.
+        source: Where the sizes come from; what nobody has published begins with "assumption".
 
-    Raises
-    ------
-    SettingsError
-        If a size is not finite, negative or absurd, or the distribution unknown.
+    Raises:
+        SettingsError: If a size is not finite, negative or absurd, or the distribution unknown.
     """
 
     unit: ClassVar[str] = "mm"
@@ -177,16 +172,12 @@ class AngleError(_Term):
 class CurvatureError(_Term):
     """The factor by which a needle bends more or less than planned, the same in all arcs of an insertion.
 
-    Parameters
-    ----------
-    distribution : str
-        "lognormal-factor", the only one: the logarithm of the factor is normal.
-    median : float
-        Factor that half of the needles exceed.
-    patient_ln, attempt_ln : float
-        Standard deviation of the logarithm, see `PositionError`.
-    straight_share : float
-        Share of the attempts in which the needle does not bend at all, whatever was drawn otherwise.
+    Args:
+        distribution: "lognormal-factor", the only one: the logarithm of the factor is normal.
+        median: Factor that half of the needles exceed.
+        patient_ln, attempt_ln: Standard deviation of the logarithm, see `PositionError`.
+        straight_share: Share of the attempts in which the needle does not bend at all, whatever was drawn
+            otherwise.
     """
 
     unit: ClassVar[str] = "ln"
@@ -207,16 +198,13 @@ class CurvatureError(_Term):
 class BreathingError(_Term):
     """Motion of the lung by breathing between scope and target, see `lungaccess.uncertainty.risk.breathing`.
 
-    Parameters
-    ----------
-    distribution : str
-        "lognormal": the logarithm of the patient's motion is normal, and the procedure is at any time of the
-        cycle.  "lognormal-in-window": it is in the plan's window, which needs the motion of the patient.
-    median_mm : float
-        Median over patients of A, the motion from end-exhale to end-inhale that 95 % of the points of a lung
-        do not exceed; 0 for none.
-    patient_ln : float
-        Standard deviation of the logarithm of A.
+    Args:
+        distribution: "lognormal": the logarithm of the patient's motion is normal, and the procedure is at
+            any time of the cycle.  "lognormal-in-window": it is in the plan's window, which needs the motion
+            of the patient.
+        median_mm: Median over patients of A, the motion from end-exhale to end-inhale that 95 % of the points
+            of a lung do not exceed; 0 for none.
+        patient_ln: Standard deviation of the logarithm of A.
     """
 
     unit: ClassVar[str] = "mm"
@@ -258,14 +246,11 @@ def _require_fit(kind: str, term: Term | None) -> None:
 class Place:
     """Errors of other sizes where the scope's tip stands in some of the airways.
 
-    Parameters
-    ----------
-    lobe : str
-        Lobe of the scope's tip, such as "right upper"; any where it is empty.
-    generation_from, generation_to : int
-        Generations of the tip's airway for which it holds, both included; the trachea is 0.
-    scope_position, ... : of the classes of `ErrorModel`, optional
-        What stands there in place of the model's own.
+    Args:
+        lobe: Lobe of the scope's tip, such as "right upper"; any where it is empty.
+        generation_from, generation_to: Generations of the tip's airway for which it holds, both included; the
+            trachea is 0.
+        scope_position, ... (of the classes of `ErrorModel`): What stands there in place of the model's own.
     """
 
     lobe: Annotated[str, text("lobe of the scope's tip, any if empty", may_be_empty=True)] = ""
@@ -308,39 +293,23 @@ class ErrorModel:
 
     Without arguments there is no error at all; `load_errors` reads the presets, which state their sources.
 
-    Parameters
-    ----------
-    name : str
-        What the model is called where its results are shown, see `label`.
-    description : str
-        One sentence for people.
-    scope_position : PositionError
-        Position of the scope tip, along each axis.
-    scope_direction : AngleError
-        Tilt of the scope tip about each of two axes across it.
-    tube_rotation : AngleError
-        Rotation of planar tubes together, or of each tube that is not planar.
-    tube_insertion : PositionError
-        Insertion of each tube.
-    needle_curvature : CurvatureError
-    needle_roll : AngleError
-        Angle of the needle about its axis at each arc.
-    needle_insertion : PositionError
-        Insertion at which each arc ends.
-    target_position : PositionError
-        Position of the target, along each axis.
-    breathing : BreathingError
-    wall : WallContact, optional
-        What is known of the contact of shaft and wall, which errors of the distribution "resting" need; see
-        `lungaccess.uncertainty.risk.resting`.
-    place : tuple of Place
-        Other errors by the place of the scope's tip; of several that hold the last one counts.
+    Args:
+        name: What the model is called where its results are shown, see `label`.
+        description: One sentence for people.
+        scope_position: Position of the scope tip, along each axis.
+        scope_direction: Tilt of the scope tip about each of two axes across it.
+        tube_rotation: Rotation of planar tubes together, or of each tube that is not planar.
+        tube_insertion: Insertion of each tube.
+        needle_roll: Angle of the needle about its axis at each arc.
+        needle_insertion: Insertion at which each arc ends.
+        target_position: Position of the target, along each axis.
+        wall: What is known of the contact of shaft and wall, which errors of the distribution "resting" need;
+            see `lungaccess.uncertainty.risk.resting`.
+        place: Other errors by the place of the scope's tip; of several that hold the last one counts.
 
-    Raises
-    ------
-    SettingsError
-        If a value is not finite, negative or absurd, a bias has not as many numbers as `AXES` says, or errors
-        are about the resting shaft and no wall is stated.
+    Raises:
+        SettingsError: If a value is not finite, negative or absurd, a bias has not as many numbers as `AXES`
+            says, or errors are about the resting shaft and no wall is stated.
     """
 
     name: Annotated[str, text("what the model is called where its results are shown", may_be_empty=True)] = ""
@@ -436,10 +405,8 @@ def _listed(term: Term) -> str:
 def with_known(errors: ErrorModel, kind: str, size: float) -> ErrorModel:
     """Return an error model in which one kind of error has another size, wherever the scope stands.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such kind, or the size is absurd.
+    Raises:
+        SettingsError: If there is no such kind, or the size is absurd.
     """
     if kind not in UNITS:
         raise SettingsError(

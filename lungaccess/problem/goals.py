@@ -24,20 +24,13 @@ PlanFunction = Callable[[Any, Any], float]
 class Goal:
     """What is made small, or large.
 
-    Parameters
-    ----------
-    name : str
-        What the command line, studies and plans call it.
-    words : str
-        What people call it.
-    unit : str
-        "" for a pure number.
-    larger_is_better : bool
-    of : callable, optional
-        Returns its value of a plan in a lung, finite; the plan states it, and the check computes it again.
-        None for costs, success and windows, which a plan states by itself.
-    objective : stages.needle.Objective, optional
-        The costs that it weighs, where it is a cost.
+    Args:
+        name: What the command line, studies and plans call it.
+        words: What people call it.
+        unit: "" for a pure number.
+        of: Returns its value of a plan in a lung, finite; the plan states it, and the check computes it
+            again.  None for costs, success and windows, which a plan states by itself.
+        objective: The costs that it weighs, where it is a cost.
     """
 
     name: str
@@ -81,10 +74,8 @@ class Goal:
     def computed(self, plan: Any, lung: Any) -> float:
         """Return the value of its function of a plan.
 
-        Raises
-        ------
-        SettingsError
-            If the function fails, or its value is no finite number.
+        Raises:
+            SettingsError: If the function fails, or its value is no finite number.
         """
         try:
             value = float(self.of(plan, lung)) if self.of is not None else math.nan

@@ -17,15 +17,11 @@ if TYPE_CHECKING:
 class NeedleLoad:
     """What the needle does to tubes, in the air, when its tip arrives at theirs.
 
-    Parameters
-    ----------
-    ratio : float
-        See `stiffness_ratio`.
-    out_mm : float
-        How far the inner tube is inserted beyond the scope, the others not at all: its whole curve is out, or
-        as much of it as its limits allow.
-    shift_mm, turn_deg : float
-        By how much the tip of the inner tube moves, and its direction turns.
+    Args:
+        ratio: See `stiffness_ratio`.
+        out_mm: How far the inner tube is inserted beyond the scope, the others not at all: its whole curve is
+            out, or as much of it as its limits allow.
+        shift_mm, turn_deg: By how much the tip of the inner tube moves, and its direction turns.
     """
 
     ratio: float

@@ -15,19 +15,13 @@ from anatomy.organ import Organ
 class Nodule:
     """A nodule of the nodule mask.
 
-    Parameters
-    ----------
-    number : int
-        Its label in the patient's files, where these tell nodules apart; else its rank by size, from 1.
-    is_label : bool
-        Whether the number is a label of the files.
-    voxels : (N, 3) int64
-        On the grid of the organ.
-    size : NoduleSize
-    diameter_mm : float
-        Of the ball with its volume.
-    centre_lps : (3,) float64
-        Mean of its voxels, LPS mm.
+    Args:
+        number: Its label in the patient's files, where these tell nodules apart; else its rank by size, from
+            1.
+        is_label: Whether the number is a label of the files.
+        voxels ((N, 3) int64): On the grid of the organ.
+        diameter_mm: Of the ball with its volume.
+        centre_lps ((3,) float64): Mean of its voxels, LPS mm.
     """
 
     number: int
@@ -59,10 +53,8 @@ def nodules_of(organ: Organ) -> tuple[Nodule, ...]:
 def find_nodule(organ: Organ, number: int) -> Nodule:
     """Return the nodule with a number; the largest for 0.
 
-    Raises
-    ------
-    TargetError
-        If there is none.
+    Raises:
+        TargetError: If there is none.
     """
     found = nodules_of(organ)
     if not found:

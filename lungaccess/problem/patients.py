@@ -20,23 +20,16 @@ def load_patient(
 ) -> Lung:
     """Return the `Lung` of a patient folder; the second time it comes from the cache.
 
-    Parameters
-    ----------
-    path : path
-        A Med-RAD folder, a folder with a `patient.toml`, or output of TotalSegmentator.
-    cache : path, optional
-        Folder for prepared anatomies; `anatomy.base.cache.default_cache()` if None.
-    progress : callable, optional
-        Receives each step as it begins.
-    accept : collection of str, optional
-        Names of checks of `anatomy.plausibility.CHECKS` whose failure is accepted; None refuses nothing.
+    Args:
+        path: A Med-RAD folder, a folder with a `patient.toml`, or output of TotalSegmentator.
+        cache: Folder for prepared anatomies; `anatomy.base.cache.default_cache()` if None.
+        progress: Receives each step as it begins.
+        accept (collection of str): Names of checks of `anatomy.plausibility.CHECKS` whose failure is
+            accepted; None refuses nothing.
 
-    Raises
-    ------
-    LungaccessError
-        If the folder cannot be understood or an image in it is wrong, see `anatomy.io.load_patient`; or if
-        the
-        masks cannot be those of a patient.
+    Raises:
+        LungaccessError: If the folder cannot be understood or an image in it is wrong, see
+            `anatomy.io.load_patient`; or if the masks cannot be those of a patient.
     """
     from anatomy.io.inputs import input_hashes
     from anatomy.io.patients import load_patient as read_images

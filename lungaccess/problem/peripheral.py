@@ -18,22 +18,15 @@ DRAWS_A_POINT = 100_000
 def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
     """Draw targets 5 to 25 mm from the pleura and at least 3 mm clear of airway, vessels and pleura.
 
-    Parameters
-    ----------
-    per_lung : int
-        How many on each side of the carina.
-    seed : int
-        The same seed and number give the same points.
+    Args:
+        per_lung: How many on each side of the carina.
+        seed: The same seed and number give the same points.
 
-    Returns
-    -------
-    (2 per_lung, 3) float64, LPS mm
-        Those of the patient's left lung first.
+    Returns:
+        (2 per_lung, 3) float64, LPS mm: Those of the patient's left lung first.
 
-    Raises
-    ------
-    TargetError
-        If one side has no such target.
+    Raises:
+        TargetError: If one side has no such target.
     """
     rng = np.random.default_rng(seed)
     points = [_peripheral_point(lung, rng, side) for side in (1.0, -1.0) for _ in range(per_lung)]

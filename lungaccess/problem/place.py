@@ -25,20 +25,14 @@ TISSUES = (
 class Place:
     """A point of the lung.
 
-    Parameters
-    ----------
-    lps_mm : (3,) float64, LPS mm
-    tissue : str
-        What its voxel is: one of `TISSUES`, "nodule" or "lung tissue".
-    lobe : str
-        Its lobe, or the nearest within 10 mm; "" if not known.
-    distance_mm : mapping of str to float
-        Distance to the nearest voxel of "airway", "vessel", "pleura" and, where the patient has a mask of
-        them, "fissure", voxels as solid boxes; `CAP_MM` where it is that or more, 0 inside.
-    generation : int
-        Of the airway branch nearest to the point.
-    may_be_target : bool
-        Whether a needle may end here, as far as the voxel goes.
+    Args:
+        lps_mm: (3,) float64, LPS mm.
+        tissue: What its voxel is: one of `TISSUES`, "nodule" or "lung tissue".
+        lobe: Its lobe, or the nearest within 10 mm; "" if not known.
+        distance_mm: Distance to the nearest voxel of "airway", "vessel", "pleura" and, where the patient has
+            a mask of them, "fissure", voxels as solid boxes; `CAP_MM` where it is that or more, 0 inside.
+        generation: Of the airway branch nearest to the point.
+        may_be_target: Whether a needle may end here, as far as the voxel goes.
     """
 
     lps_mm: Float
@@ -52,10 +46,8 @@ class Place:
 def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
     """Return what is at a point `(3,)` LPS mm.
 
-    Raises
-    ------
-    TargetError
-        If the point is not three finite numbers.
+    Raises:
+        TargetError: If the point is not three finite numbers.
     """
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():

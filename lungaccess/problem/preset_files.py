@@ -19,14 +19,10 @@ _ROOM = resources.files("lungaccess.problem")
 class PresetFiles:
     """The presets of one kind of settings, and files of one's own.
 
-    Parameters
-    ----------
-    what : str
-        What one of them is called in an error.
-    folders : tuple of str
-        Where the presets lie in the package.
-    expected, remedy : str
-        What a file holds, and what to do where it does not.
+    Args:
+        what: What one of them is called in an error.
+        folders: Where the presets lie in the package.
+        expected, remedy: What a file holds, and what to do where it does not.
     """
 
     what: str
@@ -48,10 +44,8 @@ class PresetFiles:
     def text(self, name: str) -> str:
         """Return the TOML text of a preset, with its comments.
 
-        Raises
-        ------
-        SettingsError
-            If there is no such preset.
+        Raises:
+            SettingsError: If there is no such preset.
         """
         for folder in self.folders:
             if name in self.names_in(folder):
@@ -66,12 +60,9 @@ class PresetFiles:
     def read(self, name_or_path: str | os.PathLike[str]) -> dict[str, Any]:
         """Return the values of a preset, or of a file whose name ends in ``.toml``.
 
-        Raises
-        ------
-        SettingsError
-            If there is no such preset, or the file is not TOML.
-        FileError
-            If the file cannot be read.
+        Raises:
+            SettingsError: If there is no such preset, or the file is not TOML.
+            FileError: If the file cannot be read.
         """
         given = os.fspath(name_or_path)
         if given in self.names or (isinstance(name_or_path, str) and not given.endswith(".toml")):

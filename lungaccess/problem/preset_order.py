@@ -12,18 +12,13 @@ class Invasiveness(NamedTuple):
 
     The fields are compared one after the other, the worst injury first.
 
-    Parameters
-    ----------
-    fissures_allowed : bool
-        Whether a fissure may be crossed, which pierces the pleura twice.
-    hole_mm2 : float
-        Cross-section of the outer tube: the hole in the airway wall.
-    track_mm2 : float
-        Cross-section of what goes to the target, the needle or the inner tube: its track through the lung.
-    scope_diameter_mm : float
-        Outer diameter of the bronchoscope, which stays in the airways and injures least.
-    track_curvature_per_mm : float
-        Greatest curvature of what goes to the target.
+    Args:
+        fissures_allowed: Whether a fissure may be crossed, which pierces the pleura twice.
+        hole_mm2: Cross-section of the outer tube: the hole in the airway wall.
+        track_mm2: Cross-section of what goes to the target, the needle or the inner tube: its track through
+            the lung.
+        scope_diameter_mm: Outer diameter of the bronchoscope, which stays in the airways and injures least.
+        track_curvature_per_mm: Greatest curvature of what goes to the target.
     """
 
     fissures_allowed: bool
@@ -36,10 +31,9 @@ class Invasiveness(NamedTuple):
 def invasiveness(system: System) -> Invasiveness:
     """Return how invasive a system is.
 
-    Examples
-    --------
-    >>> invasiveness(load_system("ultrathin")) < invasiveness(load_system("therapeutic-scope"))
-    True
+    Examples:
+        >>> invasiveness(load_system("ultrathin")) < invasiveness(load_system("therapeutic-scope"))
+        True
     """
     needle, inner = system.needle, system.tubes.inner
     bent_per_mm = inner.max_precurvature_per_mm if needle is None else needle.max_curvature_per_mm
@@ -60,10 +54,8 @@ def least_invasive_first(systems: Iterable[System]) -> tuple[System, ...]:
 def presets_by_invasiveness(*, fissures_allowed: bool | None = None) -> tuple[System, ...]:
     """Return the systems that ship with the package, the least invasive first.
 
-    Parameters
-    ----------
-    fissures_allowed : bool, optional
-        Whether fissures may be crossed, instead of what each system says.
+    Args:
+        fissures_allowed: Whether fissures may be crossed, instead of what each system says.
     """
     return least_invasive_first(
         load_system(name, fissures_allowed=fissures_allowed) for name in preset_names()

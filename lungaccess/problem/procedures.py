@@ -30,17 +30,14 @@ _Source = Annotated[str, text("where the errors of measuring come from, or 'assu
 class ScopePlacing:
     """What is done once the bronchoscope stands where the plan has it.
 
-    Parameters
-    ----------
-    measured : bool
-        Whether its tip is measured, and tubes and needle are planned again from there.
-    position_mm, direction_deg : float
-        Errors of measuring: of the position along each axis, of the direction about each of two axes.
-    placements : int
-        How often the scope may be placed.  It is moved away and placed again, at the same tip, where no path
-        is left from the pose as measured, or a further placement promises more; each has errors of its own.
-    source : str
-        Where the errors of measuring come from.
+    Args:
+        measured: Whether its tip is measured, and tubes and needle are planned again from there.
+        position_mm, direction_deg: Errors of measuring: of the position along each axis, of the direction
+            about each of two axes.
+        placements: How often the scope may be placed.  It is moved away and placed again, at the same tip,
+            where no path is left from the pose as measured, or a further placement promises more; each has
+            errors of its own.
+        source: Where the errors of measuring come from.
     """
 
     measured: _Measured = False
@@ -77,22 +74,15 @@ class Imaging:
 class NeedleSteering:
     """Whether the needle is measured and planned again while it is inserted, and by what tracker.
 
-    Parameters
-    ----------
-    closed_loop : bool
-    measure_every_mm : float
-        Insertion between two measurements: the speed over the tracker's rate.
-    replan_every_mm : float
-        Least insertion between two replans; measurements between them only correct what is believed.
-    position_mm, direction_deg : float
-        Errors of measuring, as of `ScopePlacing`.
-    target_mm : float, optional
-        Error of the target as tracked, along each axis; None where it is not seen during the insertion.
-    latency_mm : float
-        Insertion between a measurement and its use: the speed times the tracker's delay.
-    lost_share : float
-        Share of the measurements that are lost.
-    source : str
+    Args:
+        measure_every_mm: Insertion between two measurements: the speed over the tracker's rate.
+        replan_every_mm: Least insertion between two replans; measurements between them only correct what is
+            believed.
+        position_mm, direction_deg: Errors of measuring, as of `ScopePlacing`.
+        target_mm: Error of the target as tracked, along each axis; None where it is not seen during the
+            insertion.
+        latency_mm: Insertion between a measurement and its use: the speed times the tracker's delay.
+        lost_share: Share of the measurements that are lost.
     """
 
     closed_loop: Annotated[bool, switch("whether the needle is measured and planned again on its way")] = (
@@ -120,22 +110,13 @@ class NeedleSteering:
 class Procedure:
     """What is measured and corrected after each stage; without arguments nothing is.
 
-    Parameters
-    ----------
-    name, description : str
-        What it is, for people.
-    least_margin_share : float
-        Share of the margins that a path from a measured pose has to keep where none keeps them whole; margins
-        allow for errors that are known by then.
-    scope : ScopePlacing
-    tubes : TubesOut
-    imaging : Imaging
-    needle : NeedleSteering
+    Args:
+        name, description: What it is, for people.
+        least_margin_share: Share of the margins that a path from a measured pose has to keep where none keeps
+            them whole; margins allow for errors that are known by then.
 
-    Raises
-    ------
-    SettingsError
-        If a value is not finite or outside its range.
+    Raises:
+        SettingsError: If a value is not finite or outside its range.
     """
 
     name: Annotated[str, text("what the procedure is called where its results are shown")] = "stated"
@@ -163,17 +144,12 @@ def procedure_names() -> tuple[str, ...]:
 def load_procedure(name_or_path: str | os.PathLike[str] = DEFAULT_PROCEDURE) -> Procedure:
     """Read a procedure from a preset or from a TOML file; tables that are left out measure nothing.
 
-    Parameters
-    ----------
-    name_or_path : str or path
-        Name of a preset (see `procedure_names`), or path of a file that ends in ``.toml``.
+    Args:
+        name_or_path: Name of a preset (see `procedure_names`), or path of a file that ends in ``.toml``.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such preset, the file is not TOML, or a value in it is wrong.
-    FileError
-        If the file cannot be read.
+    Raises:
+        SettingsError: If there is no such preset, the file is not TOML, or a value in it is wrong.
+        FileError: If the file cannot be read.
     """
     given = os.fspath(name_or_path)
     stated = _FILES.read(name_or_path)

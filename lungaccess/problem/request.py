@@ -40,14 +40,11 @@ AUTO = "auto"
 class Limits:
     """How long a search may take; None is no limit.
 
-    Parameters
-    ----------
-    iterations : int, optional
-        The only limit with which the same request gives the same plans.
-    time_s, cpu_s : float, optional
-        Seconds of the clock, and of this process's processor time; neither counts compiling kernels.
-    first_plan_s : float, optional
-        Seconds of the clock without a plan.
+    Args:
+        iterations: The only limit with which the same request gives the same plans.
+        time_s, cpu_s: Seconds of the clock, and of this process's processor time; neither counts compiling
+            kernels.
+        first_plan_s: Seconds of the clock without a plan.
     """
 
     iterations: int | None = None
@@ -69,13 +66,10 @@ class Limits:
 class StatedPlace:
     """A point that a plan has to go through.
 
-    Parameters
-    ----------
-    kind : str
-        "exit", where the tubes leave the lumen, or "scope tip".
-    lps_mm : (3,) float64
-    within_mm : float
-        How far from it the plan's may be.
+    Args:
+        kind: "exit", where the tubes leave the lumen, or "scope tip".
+        lps_mm: (3,) float64.
+        within_mm: How far from it the plan's may be.
     """
 
     kind: Literal["exit", "scope tip"]
@@ -95,30 +89,20 @@ class Request:
 
     `Request.of` makes one from names and plain values.
 
-    Parameters
-    ----------
-    systems : tuple of System
-        One, or several of which the least invasive that reaches the target is chosen.
-    goal : Goal
-    errors, procedure : optional
-        Under which success is counted; presets `breath-hold` and `measured-tip` if None.
-    radius_mm : float, optional
-        Radius within which a procedure has to end; see `lungaccess.uncertainty.risk.RiskAssessor`.
-    phases : tuple of 2 floats, optional
-        Phases of the breath, 0 end-exhale to 1 end-inhale, in all of which the plan is proved.
-    place : StatedPlace, optional
-    gap : float, optional
-        The search ends once the cost is proved to be at most this share above the least.
-    method, needle_planner : str
-        The searches for plans and for the needle's path; see `lungaccess.planning.driver.planners`.
-    seed, processes : int
+    Args:
+        systems: One, or several of which the least invasive that reaches the target is chosen.
+        errors, procedure (optional): Under which success is counted; presets `breath-hold` and `measured-tip`
+            if None.
+        radius_mm: Radius within which a procedure has to end; see `lungaccess.uncertainty.risk.RiskAssessor`.
+        phases (tuple of 2 floats): Phases of the breath, 0 end-exhale to 1 end-inhale, in all of which the
+            plan is proved.
+        gap: The search ends once the cost is proved to be at most this share above the least.
+        method, needle_planner: The searches for plans and for the needle's path; see
+            `lungaccess.planning.driver.planners`.
 
-    Raises
-    ------
-    SettingsError
-        If a value is wrong, or goal and constraints exclude each other; says why.
-    AnatomyError
-        If phases or a window are asked of a patient without a motion.
+    Raises:
+        SettingsError: If a value is wrong, or goal and constraints exclude each other; says why.
+        AnatomyError: If phases or a window are asked of a patient without a motion.
     """
 
     lung: Lung
@@ -156,18 +140,13 @@ class Request:
     ) -> Request:
         """Return the request that plain values state.
 
-        Parameters
-        ----------
-        system : System, str, or sequence of them
-            Devices, the name of a preset, the path of a file, or "auto" for all presets.
-        goal
-            See `goal_of`.
-        fissures_allowed : bool, optional
-            Whether fissures may be crossed, instead of what the systems say.
-        least_clearance_mm : float
-            Every axis in tissue keeps at least this distance from every obstacle.
-        **others
-            Fields of `Request`.
+        Args:
+            system (System, str, or sequence of them): Devices, the name of a preset, the path of a file, or
+                "auto" for all presets.
+            goal: See `goal_of`.
+            fissures_allowed: Whether fissures may be crossed, instead of what the systems say.
+            least_clearance_mm: Every axis in tissue keeps at least this distance from every obstacle.
+            **others: Fields of `Request`.
         """
         return cls(
             lung=lung, target=target, goal=goal_of(goal, lung),
@@ -249,10 +228,8 @@ class Request:
     def task(self) -> Task:
         """What a search by cost is asked with the first system.
 
-        Raises
-        ------
-        TargetError
-            If the target lies outside the lung or inside an obstacle.
+        Raises:
+            TargetError: If the target lies outside the lung or inside an obstacle.
         """
         from lungaccess.problem.task import Task, objective_of
 
@@ -271,10 +248,8 @@ class Request:
 def register_goal(goal: Goal) -> Goal:
     """Make a goal known by its name in this process, and return it; a package does so by an entry point.
 
-    Raises
-    ------
-    SettingsError
-        If the name is that of another goal or of a cost.
+    Raises:
+        SettingsError: If the name is that of another goal or of a cost.
     """
     taken = {SUCCESS.name, WINDOW.name, *(name for term in TERMS for name in (term.key, term.option))}
     if goal.name in taken or not goal.name.isidentifier():
@@ -289,18 +264,13 @@ def register_goal(goal: Goal) -> Goal:
 def goal_of(stated: str | Goal | Objective | PlanFunction, lung: Organ | None = None) -> Goal:
     """Return the goal that is stated: by its name, as costs, or as a function of plan and lung.
 
-    Parameters
-    ----------
-    stated : str, Goal, Objective or callable
-        A name of `goals`; a cost or a weighted sum of costs as `stages.needle.objective.Objective.of` reads
-        them; or a function, which is made small and named as in the code.
-    lung : Lung, optional
-        The default cost weighs a cost map only where the patient has one.
+    Args:
+        stated: A name of `goals`; a cost or a weighted sum of costs as `stages.needle.objective.Objective.of`
+            reads them; or a function, which is made small and named as in the code.
+        lung: The default cost weighs a cost map only where the patient has one.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such goal.
+    Raises:
+        SettingsError: If there is no such goal.
     """
     if isinstance(stated, Goal):
         return stated
@@ -344,10 +314,8 @@ def systems_of(
 def with_least_clearance(system: System, least_clearance_mm: float) -> System:
     """Return a system whose margins keep every axis in tissue so far from obstacles, under a name of its own.
 
-    Raises
-    ------
-    SettingsError
-        If the distance is negative, not finite or absurd.
+    Raises:
+        SettingsError: If the distance is negative, not finite or absurd.
     """
     thinnest = system.track_radius_mm if system.needle is None else system.needle.radius_mm
     more = least_clearance_mm - thinnest - system.margins.total_mm

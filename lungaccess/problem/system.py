@@ -38,31 +38,20 @@ _FILES = PresetFiles(
 class System:
     """Everything a plan depends on besides the patient and the target.
 
-    Parameters
-    ----------
-    name, description : str
-        What it is, for people.
-    sources : tuple of str
-        Where the numbers come from; what has no source says "assumption".
-    tubes : ConcentricTubes
-        The outer tube, or the only one, runs in the channel of the scope.
-    needle : Needle, optional
-        Runs inside the inner tube.  Without one the tip of the inner tube goes to the target itself.
-    margins : Margins, optional
-        Kept around every device.
-    needle_preloaded : bool, optional
-        Whether the needle's tip stays at that of the inner tube while the tubes are deployed.  Then it bends
-        with them, and `tubes` know its shaft; else its stiffness is neglected.
-    fissures_allowed : bool, optional
-        Whether tubes and needle may cross a fissure, which pierces the pleura twice.
-    tool : Tool, optional
-        What is done at the target, on the needle.  With one a procedure succeeds if enough of the nodule is
-        in it, and without one if the last tip ends near the target.
+    Args:
+        name, description: What it is, for people.
+        sources: Where the numbers come from; what has no source says "assumption".
+        tubes: The outer tube, or the only one, runs in the channel of the scope.
+        needle: Runs inside the inner tube.  Without one the tip of the inner tube goes to the target itself.
+        margins: Kept around every device.
+        needle_preloaded: Whether the needle's tip stays at that of the inner tube while the tubes are
+            deployed.  Then it bends with them, and `tubes` know its shaft; else its stiffness is neglected.
+        fissures_allowed: Whether tubes and needle may cross a fissure, which pierces the pleura twice.
+        tool: What is done at the target, on the needle.  With one a procedure succeeds if enough of the
+            nodule is in it, and without one if the last tip ends near the target.
 
-    Raises
-    ------
-    SettingsError
-        If a value is wrong or one device does not fit into the other.
+    Raises:
+        SettingsError: If a value is wrong or one device does not fit into the other.
     """
 
     name: Annotated[str, text("name of the system")]
@@ -189,15 +178,11 @@ class System:
     def require_needle(self, use: str) -> Needle:
         """Return the needle.
 
-        Parameters
-        ----------
-        use : str
-            What needs it, in words that begin a sentence.
+        Args:
+            use: What needs it, in words that begin a sentence.
 
-        Raises
-        ------
-        SettingsError
-            If the system has none.
+        Raises:
+            SettingsError: If the system has none.
         """
         if self.needle is None:
             raise SettingsError(
@@ -237,10 +222,8 @@ def shipped_names() -> tuple[str, ...]:
 def preset_text(name: str) -> str:
     """Return the TOML text of a preset, with its comments.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such preset.
+    Raises:
+        SettingsError: If there is no such preset.
     """
     return _FILES.text(name)
 
@@ -248,28 +231,18 @@ def preset_text(name: str) -> str:
 def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool | None = None) -> System:
     """Read a system from a preset or from a TOML file.
 
-    Parameters
-    ----------
-    name_or_path : str or path
-        Name of a preset (see `preset_names`), or path of a file that ends in ``.toml``.
-    fissures_allowed : bool, optional
-        Whether fissures may be crossed, instead of what the system says; its name then says so, too.
+    Args:
+        name_or_path: Name of a preset (see `preset_names`), or path of a file that ends in ``.toml``.
+        fissures_allowed: Whether fissures may be crossed, instead of what the system says; its name then says
+            so, too.
 
-    Returns
-    -------
-    System
+    Raises:
+        SettingsError: If there is no such preset, the file is not TOML, or a value in it is wrong.
+        FileError: If the file cannot be read.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such preset, the file is not TOML, or a value in it is wrong.
-    FileError
-        If the file cannot be read.
-
-    Examples
-    --------
-    >>> load_system("lung-default").needle.diameter_mm
-    0.8
+    Examples:
+        >>> load_system("lung-default").needle.diameter_mm
+        0.8
     """
     given = os.fspath(name_or_path)
     loaded = parse(System, _FILES.read(name_or_path), given, remedy=_FILES.remedy)
@@ -304,10 +277,9 @@ def systems_with_tool(systems: tuple[System, ...], name_or_path: str | None) -> 
 def preset_named(name: str) -> System | None:
     """Return the preset with which `load_system` made a system of this name; None if there is none.
 
-    Examples
-    --------
-    >>> preset_named("ultrathin (fissures may be crossed)").fissures_allowed
-    True
+    Examples:
+        >>> preset_named("ultrathin (fissures may be crossed)").fissures_allowed
+        True
     """
     for allowed, rule in FISSURE_RULES.items():
         if name.endswith(rule):
@@ -328,10 +300,8 @@ def _preset(name: str, fissures_allowed: bool | None) -> System | None:
 def require_own_name(system: System, where: str = "The system") -> None:
     """Refuse a system that bears the name of a preset and is not that preset.
 
-    Raises
-    ------
-    SettingsError
-        If it differs from the preset of its name.
+    Raises:
+        SettingsError: If it differs from the preset of its name.
     """
     preset = preset_named(system.name)
     if preset is None or preset == system:

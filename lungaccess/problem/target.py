@@ -18,11 +18,9 @@ from lungaccess.problem.nodules import find_nodule
 class Target:
     """Where the needle has to end.
 
-    Parameters
-    ----------
-    lps_mm : (3,) float64, LPS mm
-    origin : str
-        Where it came from; starts with "nodule" if it lies in the nodule mask.
+    Args:
+        lps_mm: (3,) float64, LPS mm.
+        origin: Where it came from; starts with "nodule" if it lies in the nodule mask.
     """
 
     lps_mm: Float
@@ -33,16 +31,11 @@ class Target:
 class StatedTarget:
     """A target as a user states it, before any lung is looked at.
 
-    Parameters
-    ----------
-    lps_mm : (3,) float64 or None
-        A point, LPS mm; None for a nodule.
-    nodule : int
-        Number of a nodule, 0 for the largest one, if there is no point.
-    origin : str
-        What the user wrote.
-    name : str
-        Name of a target that came with the patient, if there is neither a point nor a nodule.
+    Args:
+        lps_mm ((3,) float64 or None): A point, LPS mm; None for a nodule.
+        nodule: Number of a nodule, 0 for the largest one, if there is no point.
+        origin: What the user wrote.
+        name: Name of a target that came with the patient, if there is neither a point nor a nodule.
     """
 
     lps_mm: Float | None
@@ -68,23 +61,16 @@ class StatedTarget:
 def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
     """Return what a user states.
 
-    Parameters
-    ----------
-    text : str or None
-        A point with its frame, ``ras:x,y,z`` or ``lps:x,y,z``, mm; a point that 3D Slicer saved, such as
-        ``scene.mrml#target``, see `anatomy.io.markups`; or the name or number of a target that came with the
-        patient, such as ``target1``.
-    nodule : int or None
-        Number of a nodule.
+    Args:
+        text: A point with its frame, ``ras:x,y,z`` or ``lps:x,y,z``, mm; a point that 3D Slicer saved, such
+            as ``scene.mrml#target``, see `anatomy.io.markups`; or the name or number of a target that came
+            with the patient, such as ``target1``.
+        nodule: Number of a nodule.
 
-    Raises
-    ------
-    FrameError
-        If the text states no frame, or the point of 3D Slicer has none that is plain.
-    FileError
-        If the file of 3D Slicer cannot be read, or has no such point.
-    TargetError
-        If there is not exactly one of the two.
+    Raises:
+        FrameError: If the text states no frame, or the point of 3D Slicer has none that is plain.
+        FileError: If the file of 3D Slicer cannot be read, or has no such point.
+        TargetError: If there is not exactly one of the two.
     """
     if (text is None) == (nodule is None):
         raise TargetError(
@@ -110,10 +96,8 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
 def named_target(lung: Organ, name: str) -> Float:
     """Return the point `(3,)` LPS mm of a target that came with the patient, by its name or number.
 
-    Raises
-    ------
-    TargetError
-        If there is none of this name.
+    Raises:
+        TargetError: If there is none of this name.
     """
     names = [known.lower() for known in lung.target_names]
     if name.lower() in names:
@@ -130,20 +114,14 @@ def named_target(lung: Organ, name: str) -> Float:
 def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = None) -> Target:
     """Return the target that a user names.
 
-    Parameters
-    ----------
-    text : str, optional
-        A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm; or as `stated_target` takes it.
-    nodule : int, optional
-        Its label in the files, else its rank by size; 0, the default, for the largest.  The target is its
-        centroid where a needle may end there, else its voxel farthest from every obstacle.
+    Args:
+        text: A point with its frame: ``ras:x,y,z`` or ``lps:x,y,z``, mm; or as `stated_target` takes it.
+        nodule: Its label in the files, else its rank by size; 0, the default, for the largest.  The target is
+            its centroid where a needle may end there, else its voxel farthest from every obstacle.
 
-    Raises
-    ------
-    FrameError
-        If the text states no frame.
-    TargetError
-        If there is no such nodule, or the point lies outside the lung or inside an obstacle.
+    Raises:
+        FrameError: If the text states no frame.
+        TargetError: If there is no such nodule, or the point lies outside the lung or inside an obstacle.
     """
     if text is None and nodule is None:
         nodule = 0
@@ -153,10 +131,8 @@ def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = No
 def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target:
     """Return a target at a point `(3,)` LPS mm.
 
-    Raises
-    ------
-    TargetError
-        If the point is not finite, outside the lung or inside an obstacle.
+    Raises:
+        TargetError: If the point is not finite, outside the lung or inside an obstacle.
     """
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():
@@ -172,10 +148,8 @@ def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target
 def nodule_target(lung: Organ, number: int) -> Target:
     """Return a target in a nodule, by its number as of `lungaccess.problem.nodules`; 0 is the largest one.
 
-    Raises
-    ------
-    TargetError
-        If there is no such nodule or none of it can be entered.
+    Raises:
+        TargetError: If there is no such nodule or none of it can be entered.
     """
     nodule = find_nodule(lung, number)
     centres = lung.grid.lps(nodule.voxels)

@@ -30,30 +30,22 @@ _FILES = PresetFiles(
 class Tool:
     """A tool that takes or treats the tissue in a body of revolution about the needle's direction.
 
-    Parameters
-    ----------
-    name, description, source : str
-        What it is, for people, and where its sizes come from.
-    shape : str
-        "cylinder" of what a device cuts or holds, or "ellipsoid" of what is frozen or heated.
-    from_tip_mm, to_tip_mm : float
-        Where the body begins and ends along the needle's direction, from the tip; behind it is negative.
-        What goes on mechanically is part of the needle, whose tip is at its end: a cylinder does not reach
-        ahead of the tip, and no tool has its middle ahead of it.
-    diameter_mm : float
-    least : float
-        Tissue of the nodule in the tool that counts as success, in `unit`.
-    unit : str
-        "mm" of the tool's length, "mm3" of its volume, or "share" of the nodule.
-    margin_mm : float
-        Tissue about the nodule counts as nodule up to this distance: what an ablation has to cover.
-    rim_mm : float
-        Only tissue so near to the nodule's surface counts, 0 for all of it: the inside may be necrotic.
+    Args:
+        name, description, source: What it is, for people, and where its sizes come from.
+        shape: "cylinder" of what a device cuts or holds, or "ellipsoid" of what is frozen or heated.
+        from_tip_mm, to_tip_mm: Where the body begins and ends along the needle's direction, from the tip;
+            behind it is negative.  What goes on mechanically is part of the needle, whose tip is at its end:
+            a cylinder does not reach ahead of the tip, and no tool has its middle ahead of it.
+        least: Tissue of the nodule in the tool that counts as success, in `unit`.
+        unit: "mm" of the tool's length, "mm3" of its volume, or "share" of the nodule.
+        margin_mm: Tissue about the nodule counts as nodule up to this distance: what an ablation has to
+            cover.
+        rim_mm: Only tissue so near to the nodule's surface counts, 0 for all of it: the inside may be
+            necrotic.
 
-    Raises
-    ------
-    SettingsError
-        If the body has no length, reaches ahead, or has less room than the tissue that has to be in it.
+    Raises:
+        SettingsError: If the body has no length, reaches ahead, or has less room than the tissue that has to
+            be in it.
     """
 
     name: Annotated[str, text("what the tool is called")] = "stated"
@@ -133,21 +125,15 @@ def tool_names() -> tuple[str, ...]:
 def load_tool(name_or_path: str | os.PathLike[str]) -> Tool:
     """Read a tool from a preset or from a TOML file.
 
-    Parameters
-    ----------
-    name_or_path : str or path
-        Name of a preset (see `tool_names`), or path of a file that ends in ``.toml``.
+    Args:
+        name_or_path: Name of a preset (see `tool_names`), or path of a file that ends in ``.toml``.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such preset, the file is not TOML, or a value in it is wrong.
-    FileError
-        If the file cannot be read.
+    Raises:
+        SettingsError: If there is no such preset, the file is not TOML, or a value in it is wrong.
+        FileError: If the file cannot be read.
 
-    Examples
-    --------
-    >>> load_tool("core").words
-    'at least 5 mm of the nodule in the core needle'
+    Examples:
+        >>> load_tool("core").words
+        'at least 5 mm of the nodule in the core needle'
     """
     return parse(Tool, _FILES.read(name_or_path), os.fspath(name_or_path), remedy=_FILES.remedy)

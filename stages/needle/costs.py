@@ -22,10 +22,9 @@ SAMPLE_MM = 0.1
 def obstacle_clearance_mm(obstacles: Obstacles, points: Float) -> Float:
     """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle.
 
-    Parameters
-    ----------
-    obstacles : Obstacles
-        See `NeedleEnvironment`: obstacles are taken as solid boxes or voxel centres as stated there.
+    Args:
+        obstacles: See `NeedleEnvironment`: obstacles are taken as solid boxes or voxel centres as stated
+            there.
     """
     field, labels, geometry, bits = obstacles
     places = np.array(points, dtype=np.float64, order="C")
@@ -47,10 +46,8 @@ def inverse_clearance(obstacles: Obstacles, path: ArcPath) -> float:
     By the trapezoid rule with steps of at most 0.1 mm; clearance is that of the needle's axis, no less than
     0.1 mm.
 
-    Parameters
-    ----------
-    obstacles : Obstacles
-        See `NeedleEnvironment`.
+    Args:
+        obstacles: See `NeedleEnvironment`.
     """
     points, lengths = path.sample(SAMPLE_MM)
     clearance = np.maximum(obstacle_clearance_mm(obstacles, points), kernel.CLEARANCE_FLOOR_MM)
@@ -121,16 +118,11 @@ def path_costs(
 ) -> dict[str, float]:
     """Return costs of a path by their keys, exactly; see `stages.needle.objective.TERMS`.
 
-    Parameters
-    ----------
-    obstacles : Obstacles
-        See `NeedleEnvironment`.
-    cost_map : Volume or None
-        Without a map its costs are 0.
-    parts : sequence of InTissue
-        All that lies in tissue: the tubes beyond the wall, and the path of the needle.
-    terms : iterable of Term
-        Which costs.
+    Args:
+        obstacles: See `NeedleEnvironment`.
+        cost_map: Without a map its costs are 0.
+        parts: All that lies in tissue: the tubes beyond the wall, and the path of the needle.
+        terms: Which costs.
     """
     return {term.key: _EVALUATED[term.key](obstacles, cost_map, path, parts) for term in terms}
 

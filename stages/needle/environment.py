@@ -26,14 +26,10 @@ from stages.needle.objective import Objective
 class NeedleEnvironment:
     """One needle among obstacles.
 
-    Parameters
-    ----------
-    required_clearance_mm : float
-        Distance that the needle's axis keeps from obstacles.
-    goal_tolerance_mm : float
-        How far from the target a path may end.
-    cost_map : Volume or None
-        Cost of a mm of path at each voxel, on `grid`; infinite is an obstacle.
+    Args:
+        required_clearance_mm: Distance that the needle's axis keeps from obstacles.
+        goal_tolerance_mm: How far from the target a path may end.
+        cost_map: Cost of a mm of path at each voxel, on `grid`; infinite is an obstacle.
     """
 
     grid: Grid
@@ -60,12 +56,9 @@ def needle_environment(
 
     The needle's axis keeps its radius and the margins from obstacles, whose voxels are solid boxes.
 
-    Parameters
-    ----------
-    with_fissures : bool
-        Whether fissures are obstacles.
-    goal_tolerance_mm : float
-        How far from the target a path may end.
+    Args:
+        with_fissures: Whether fissures are obstacles.
+        goal_tolerance_mm: How far from the target a path may end.
     """
     clearance = lung.obstacle_field(with_fissures=with_fissures)
     bits = obstacle_bits(with_fissures)
@@ -88,29 +81,19 @@ def environment_of_labels(
 ) -> NeedleEnvironment:
     """Gather the same from a label volume alone.
 
-    Parameters
-    ----------
-    labels : (ni, nj, nk) uint16
-        See `anatomy.structures`.
-    bits : int
-        Structures that are obstacles.
-    required_clearance_mm : float
-        Distance that the needle's axis keeps from obstacles.
-    obstacles_as : float
-        `SOLID`: the clearance is measured to voxels as solid boxes, and the outermost voxels count as
-        OUTSIDE, since what lies beyond the grid is not known; `CENTRES`: to voxel centres, and the axis alone
-        stays in the grid.
-    goal_tolerance_mm : float
-        How far from the target a path may end.
-    cost_map : Volume, optional
-        On `grid`.
+    Args:
+        labels ((ni, nj, nk) uint16): See `anatomy.structures`.
+        bits: Structures that are obstacles.
+        required_clearance_mm: Distance that the needle's axis keeps from obstacles.
+        obstacles_as: `SOLID`: the clearance is measured to voxels as solid boxes, and the outermost voxels
+            count as OUTSIDE, since what lies beyond the grid is not known; `CENTRES`: to voxel centres, and
+            the axis alone stays in the grid.
+        goal_tolerance_mm: How far from the target a path may end.
+        cost_map: On `grid`.
 
-    Raises
-    ------
-    GridMismatchError
-        If labels or cost map do not fit the grid.
-    SettingsError
-        If `obstacles_as` is neither, or a length is negative or not finite.
+    Raises:
+        GridMismatchError: If labels or cost map do not fit the grid.
+        SettingsError: If `obstacles_as` is neither, or a length is negative or not finite.
     """
     if labels.shape != grid.shape or (cost_map is not None and cost_map.array.shape != grid.shape):
         raise GridMismatchError(
@@ -140,13 +123,10 @@ def begun_at_wall(
 
     See `stages.needle.kernels.proof.exact_gap` for the rule, which is that of all searches and proofs.
 
-    Parameters
-    ----------
-    point : (3,) float64, LPS mm
-        Where the needle begins.
-    branches : tuple of int
-        The pierced branch and those that are pierced with it: their airway counts as that of the first,
-        as far as the exemption reaches.
+    Args:
+        point ((3,) float64, LPS mm): Where the needle begins.
+        branches: The pierced branch and those that are pierced with it: their airway counts as that of the
+            first, as far as the exemption reaches.
     """
     limits = environment.limits._replace(leaving_sine=math.sin(math.radians(LEAVING_DEG)))
     obstacles = environment.obstacles
@@ -214,14 +194,12 @@ def workspace_lengths(
     space what is left in can be reached if the angle from the start is limited to 90 degrees, or the turn to
     180, see `stages.needle.kernels.goal_ball`.
 
-    Parameters
-    ----------
-    positions, tangents : (E, 3) float64, LPS mm
-    target : (3,) float64, LPS mm
+    Args:
+        positions, tangents: (E, 3) float64, LPS mm.
+        target: (3,) float64, LPS mm.
 
-    References
-    ----------
-    .. [Kuntz2015] fig. 4; [Dubins1957]
+    References:
+        .. [Kuntz2015] fig. 4; [Dubins1957]
     """
     places = _plain(positions)
     lengths = np.zeros(len(places))
@@ -238,20 +216,16 @@ def direct_arcs(
 ) -> tuple[Int, Float, Float]:
     """Try the single arc to a target from each start pose.
 
-    Parameters
-    ----------
-    positions, tangents : (E, 3) float64, LPS mm
-    branches : (E,) int64
-        Branch whose wall each start has pierced; -1 for none.
-    target : (3,) float64, LPS mm
+    Args:
+        positions, tangents: (E, 3) float64, LPS mm.
+        branches ((E,) int64): Branch whose wall each start has pierced; -1 for none.
+        target: (3,) float64, LPS mm.
 
-    Returns
-    -------
-    blockers : (E,) int64
-        0 where the arc is proved clear, -1 where no arc fits the limits, else the label of the voxel
-        that is too near.
-    lengths, inverse_clearance : (E,) float64
-        Length in mm, and the estimated integral of 1 / clearance where the arc is clear.
+    Returns:
+        - blockers ((E,) int64) - 0 where the arc is proved clear, -1 where no arc fits the limits, else the
+          label of the voxel that is too near.
+        - lengths, inverse_clearance ((E,) float64) - Length in mm, and the estimated integral of 1 /
+          clearance where the arc is clear.
     """
     blockers = np.zeros(len(branches), dtype=np.int64)
     costs = np.zeros((len(branches), 2))

@@ -33,20 +33,14 @@ NO_MAP = read_only(np.zeros((2, 2, 2), dtype=np.float32, order="F"))
 class Term:
     """One cost of a plan, which an objective can weigh.
 
-    Parameters
-    ----------
-    key : str
-        What plans, results and files call it.
-    weight : str
-        The field of `Objective` that weighs it.
-    words : str
-        What people call it.
-    unit : str
-        "" for a pure number, or the unit of the cost map.
-    of_map : bool
-        Whether it is a cost of the map, so that there is none without a map.
-    of_all : bool
-        Whether it is of all that lies in tissue, the tubes too; other costs are of the needle's path alone.
+    Args:
+        key: What plans, results and files call it.
+        weight: The field of `Objective` that weighs it.
+        words: What people call it.
+        unit: "" for a pure number, or the unit of the cost map.
+        of_map: Whether it is a cost of the map, so that there is none without a map.
+        of_all: Whether it is of all that lies in tissue, the tubes too; other costs are of the needle's path
+            alone.
     """
 
     key: str
@@ -88,33 +82,24 @@ class Objective:
     The text of an objective is the key of a cost, or a sum such as ``cost_map=0.5,length_mm=1``; `of` reads
     it and `str` writes it.
 
-    Parameters
-    ----------
-    inverse_clearance : float
-        Weight of the integral of 1 / clearance over arc length [Kuntz2015, eq. 1].
-    cost_map : float
-        Weight of the line integral of the cost map, 1/mm.
-    length : float
-        Weight of the length, 1/mm.
-    voxel_sum : float
-        Weight of the sum of the cost map over the set of voxels that the path crosses, each counted once
-        [Fu2018, eq. 1].  The searches add it up arc by arc: a voxel that the path leaves and meets again
-        on another arc counts again, which `stages.needle.costs.voxel_sum` does not.
-    tissue : float
-        Weight of the integral, over tubes and needle in tissue, of their width times the sum of 1 / clearance
-        and the cost map, 1/mm; see `stages.needle.costs.tissue`.
+    Args:
+        inverse_clearance: Weight of the integral of 1 / clearance over arc length [Kuntz2015, eq. 1].
+        cost_map: Weight of the line integral of the cost map, 1/mm.
+        length: Weight of the length, 1/mm.
+        voxel_sum: Weight of the sum of the cost map over the set of voxels that the path crosses, each
+            counted once [Fu2018, eq. 1].  The searches add it up arc by arc: a voxel that the path leaves and
+            meets again on another arc counts again, which `stages.needle.costs.voxel_sum` does not.
+        tissue: Weight of the integral, over tubes and needle in tissue, of their width times the sum of 1 /
+            clearance and the cost map, 1/mm; see `stages.needle.costs.tissue`.
 
-    Raises
-    ------
-    SettingsError
-        If a weight is negative or not finite, or all are 0.
+    Raises:
+        SettingsError: If a weight is negative or not finite, or all are 0.
 
-    Examples
-    --------
-    >>> str(Objective(length=1.0))
-    'length_mm'
-    >>> str(Objective.of("length=1, cost-map=0.5"))
-    'cost_map=0.5,length_mm=1'
+    Examples:
+        >>> str(Objective(length=1.0))
+        'length_mm'
+        >>> str(Objective.of("length=1, cost-map=0.5"))
+        'cost_map=0.5,length_mm=1'
     """
 
     inverse_clearance: float = 0.0
@@ -136,17 +121,14 @@ class Objective:
     def of(cls, stated: str | Objective) -> Objective:
         """Return the objective that a text states, or the objective itself.
 
-        Parameters
-        ----------
-        stated : str or Objective
-            The names of costs, each with its weight after "=", separated by commas.  A cost is named by its
-            key (``length_mm``) or as on the command line (``length``); a name alone has the weight 1.
-            "default" is ``inverse_clearance=1,cost_map=1``.
+        Args:
+            stated: The names of costs, each with its weight after "=", separated by commas.  A cost is named
+                by its key (``length_mm``) or as on the command line (``length``); a name alone has the weight
+                1.  "default" is ``inverse_clearance=1,cost_map=1``.
 
-        Raises
-        ------
-        SettingsError
-            If there is no such cost, one is named twice, or a weight is not a number of 0 or more.
+        Raises:
+            SettingsError: If there is no such cost, one is named twice, or a weight is not a number of 0 or
+                more.
         """
         if isinstance(stated, Objective):
             return stated
@@ -226,18 +208,13 @@ class Objective:
         lower bound.  The voxel sum adds nothing to it: however small the cost, an arc can be so short that
         it enters no other voxel.
 
-        Parameters
-        ----------
-        cost_map : (ni, nj, nk) float32 or None
-            Not negative; infinite is an obstacle.
-        width_mm : float
-            Outer diameter of the needle.
+        Args:
+            cost_map ((ni, nj, nk) float32 or None): Not negative; infinite is an obstacle.
+            width_mm: Outer diameter of the needle.
 
-        Raises
-        ------
-        SettingsError
-            If the objective weighs a map, and there is none, or one with negative costs, NaN, or no finite
-            cost.
+        Raises:
+            SettingsError: If the objective weighs a map, and there is none, or one with negative costs, NaN,
+                or no finite cost.
         """
         if self.weighs_map and cost_map is None:
             raise SettingsError(

@@ -27,30 +27,22 @@ NEAR_MM = 1e-3
 class Obstruction:
     """What stands in the way of a needle.
 
-    Parameters
-    ----------
-    place : str
-        "reach": the target lies outside the needle's workspace, whatever the obstacles.  "start": every path
-        is blocked at the beginning.  "target": no needle may end there.  "path": both are free.
-    proved : bool
-        Whether this alone proves that there is no path.
-    label : int
-        Of the obstacle voxel that is too near; 0 for "reach".
-    point_lps : (3,) float64, LPS mm
-        The blocked point of the needle's axis: for "path", the tightest place of the easiest path that was
-        tried; for "reach", the target.
-    obstacle_lps : (3,) float64 or None, LPS mm
-        The nearest point of what is too near; None for "reach".
-    inserted_mm : float or None
-        Length of the needle there, where it is known.
-    distance_mm, needed_mm : float or None
-        From that voxel; None for "reach".
-    limit : str
-        For "reach": "radius", "angle", "turn" or "length".
-    radius_mm : float or None
-        For "reach": the largest radius of curvature that would reach the target; None if none does.
-    direction_rad, straight_mm : float
-        Direction of the target off straight ahead, and its distance from the start.
+    Args:
+        place: "reach": the target lies outside the needle's workspace, whatever the obstacles.  "start":
+            every path is blocked at the beginning.  "target": no needle may end there.  "path": both are
+            free.
+        proved: Whether this alone proves that there is no path.
+        label: Of the obstacle voxel that is too near; 0 for "reach".
+        point_lps ((3,) float64, LPS mm): The blocked point of the needle's axis: for "path", the tightest
+            place of the easiest path that was tried; for "reach", the target.
+        obstacle_lps ((3,) float64 or None, LPS mm): The nearest point of what is too near; None for "reach".
+        inserted_mm: Length of the needle there, where it is known.
+        distance_mm, needed_mm: From that voxel; None for "reach".
+        limit: For "reach": "radius", "angle", "turn" or "length".
+        radius_mm: For "reach": the largest radius of curvature that would reach the target; None if none
+            does.
+        direction_rad, straight_mm: Direction of the target off straight ahead, and its distance from the
+            start.
     """
 
     place: str

@@ -26,25 +26,19 @@ from stages.needle.kernels.proof import blocker_on_arc
 class Query:
     """A start pose and a target.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-        +z is the direction of insertion.
-    target : (3,) float64, LPS mm
-    branch : int
-        Pierced branch, whose wall is exempt at the exit; -1 for none.
-    inserted_mm, turned_rad : float
-        Length of the needle behind the start and its accumulated turn: the limits count both, and so does
-        the exemption at the exit.
-    reference : (3,) float64, optional
-        Direction from which the limit of the angle counts; by default that of the start.
+    Args:
+        lps_from_start ((4, 4) float64): +z is the direction of insertion.
+        target: (3,) float64, LPS mm.
+        branch: Pierced branch, whose wall is exempt at the exit; -1 for none.
+        inserted_mm, turned_rad: Length of the needle behind the start and its accumulated turn: the limits
+            count both, and so does the exemption at the exit.
+        reference ((3,) float64): Direction from which the limit of the angle counts; by default that of the
+            start.
 
-    Raises
-    ------
-    FrameError
-        If there are not so many finite numbers, the pose is not rigid, or the reference has no length.
-    SettingsError
-        If the length or the turn behind the start is negative or not finite.
+    Raises:
+        FrameError: If there are not so many finite numbers, the pose is not rigid, or the reference has no
+            length.
+        SettingsError: If the length or the turn behind the start is negative or not finite.
     """
 
     lps_from_start: Float
@@ -103,13 +97,10 @@ LENGTH, ROLL, CURVATURE = 0, 1, 2
 class ArcPath:
     """A needle path of A arcs from a start pose.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-        +z is the direction of insertion.
-    arcs : (A, 3) float64
-        Length in mm, roll in rad about the tip's axis before the arc (it bends towards the +x of
-        the rolled frame, which stays), curvature in 1/mm.
+    Args:
+        lps_from_start ((4, 4) float64): +z is the direction of insertion.
+        arcs ((A, 3) float64): Length in mm, roll in rad about the tip's axis before the arc (it bends towards
+            the +x of the rolled frame, which stays), curvature in 1/mm.
     """
 
     lps_from_start: Float
@@ -156,10 +147,8 @@ class ArcPath:
     def max_angle_from_start_rad(self, reference: Float | None = None) -> float:
         """Return the largest angle between the tip and a direction, on all of the path.
 
-        Parameters
-        ----------
-        reference : (3,) float64, optional
-            Unit vector; by default the direction at the start.
+        Args:
+            reference ((3,) float64): Unit vector; by default the direction at the start.
         """
         direction = self.lps_from_start[:3, 2] if reference is None else reference
         least = 1.0
@@ -205,11 +194,9 @@ def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
 def path_from_tree(lps_from_start: Float, nodes: Float, parents: Int, last: int) -> ArcPath:
     """Return the path from the root of a search tree to its node `last`.
 
-    Parameters
-    ----------
-    nodes : (M, NODE_COLUMNS) float64
-        See `stages.needle.kernels.tree`.
-    parents : (M,) int64
+    Args:
+        nodes ((M, NODE_COLUMNS) float64): See `stages.needle.kernels.tree`.
+        parents: (M,) int64.
     """
     chain = []
     node = last
@@ -232,12 +219,9 @@ def blocker_on_path(
 ) -> int:
     """Prove every arc of a path clear; return 0, or the label of the voxel that is too near.
 
-    Parameters
-    ----------
-    branch : int
-        Pierced branch, whose wall is exempt at the exit; -1 for none.
-    inserted_mm : float
-        Length of the needle behind the start of the path.
+    Args:
+        branch: Pierced branch, whose wall is exempt at the exit; -1 for none.
+        inserted_mm: Length of the needle behind the start of the path.
     """
     for pose, bend, length in kernel_arcs(path):
         label = blocker_on_arc(
@@ -263,10 +247,9 @@ def violation(
 
     All limits of the needle are tested, and every arc is proved clear.
 
-    Parameters
-    ----------
-    goal_tolerance_mm : float
-        How far from the target the path may end, where the environment's own tolerance is smaller.
+    Args:
+        goal_tolerance_mm: How far from the target the path may end, where the environment's own tolerance is
+            smaller.
     """
     needle = environment.needle
     reference = query.lps_from_start[:3, 2] if query.reference is None else query.reference

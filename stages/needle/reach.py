@@ -29,20 +29,17 @@ DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
 class Reached:
     """What became of N points.
 
-    Parameters
-    ----------
-    kinds : (N,) uint8
-        `DIRECT`: a single arc is proved clear.  `SEARCHED`: a path of several arcs is.  `UNREACHED`: no
-        single arc is, and the search, if there was one, found nothing.  `NO_CLEARANCE`: no needle can end at
-        the point, because an obstacle that is no airway is nearer than the axis may be.
-    cost : (N,) float64
-        Estimated integral of 1 / clearance of the path found; 0 where there is none.
-    clearance_mm : (N,) float64
-        Lower bound of its clearance beyond the exempt length; 0 where there is none.
-    entries : (N,) int64
-        Its start pose; -1 where there is none.
-    window_share : (N,) float64 or None
-        Share of the breath in which it is proved, where phases of the breath are asked for.
+    Args:
+        kinds ((N,) uint8): `DIRECT`: a single arc is proved clear.  `SEARCHED`: a path of several arcs is.
+            `UNREACHED`: no single arc is, and the search, if there was one, found nothing.  `NO_CLEARANCE`:
+            no needle can end at the point, because an obstacle that is no airway is nearer than the axis may
+            be.
+        cost ((N,) float64): Estimated integral of 1 / clearance of the path found; 0 where there is none.
+        clearance_mm ((N,) float64): Lower bound of its clearance beyond the exempt length; 0 where there is
+            none.
+        entries ((N,) int64): Its start pose; -1 where there is none.
+        window_share ((N,) float64 or None): Share of the breath in which it is proved, where phases of the
+            breath are asked for.
     """
 
     kinds: UInt8
@@ -65,21 +62,14 @@ class ReachScan:
 
     It may be used by several threads at once.
 
-    Parameters
-    ----------
-    positions, tangents : (E, 3) float64, LPS mm
-        Start poses; neighbours in the list should be alike.
-    branches : (E,) int64
-        Branch whose wall each has pierced; -1 for none.
-    arcs : int
-        Clear arcs of which the cheapest is improved.
-    trees : int
-        RRTs for each point that no single arc reaches; 0 for no search at all.
+    Args:
+        positions, tangents ((E, 3) float64, LPS mm): Start poses; neighbours in the list should be alike.
+        branches ((E,) int64): Branch whose wall each has pierced; -1 for none.
+        arcs: Clear arcs of which the cheapest is improved.
+        trees: RRTs for each point that no single arc reaches; 0 for no search at all.
 
-    Raises
-    ------
-    SettingsError
-        If `arcs` is below 1 or `trees` below 0.
+    Raises:
+        SettingsError: If `arcs` is below 1 or `trees` below 0.
     """
 
     def __init__(
@@ -111,13 +101,10 @@ class ReachScan:
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
         """Try all points, cube by cube of `BLOCK_MM`: what neighbours have in common is found once.
 
-        Parameters
-        ----------
-        points : (N, 3) float64, LPS mm
-        seeds : (N,) uint64
-            Seed of the search to each point.
-        near : (N, K) int64, optional
-            Indices of points near each, -1 for none; by default the one before.
+        Args:
+            points: (N, 3) float64, LPS mm.
+            seeds ((N,) uint64): Seed of the search to each point.
+            near ((N, K) int64): Indices of points near each, -1 for none; by default the one before.
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds, found = np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 2))
@@ -160,10 +147,8 @@ class StartIndex:
 
     It does not depend on the needle, so one index serves all of them.
 
-    Parameters
-    ----------
-    positions, tangents : (E, 3) float64
-        Points, LPS mm, and unit tangents.
+    Args:
+        positions, tangents ((E, 3) float64): Points, LPS mm, and unit tangents.
     """
 
     def __init__(self, positions: ArrayLike, tangents: ArrayLike) -> None:
@@ -193,11 +178,9 @@ class StartIndex:
         The same as finite entries of `stages.needle.environment.workspace_lengths`; poses at the same length
         come in their own order.
 
-        Parameters
-        ----------
-        environment : NeedleEnvironment
-            The needle.
-        target : (3,) float64, LPS mm
+        Args:
+            environment: The needle.
+            target: (3,) float64, LPS mm.
         """
         found = np.zeros(self.count, dtype=np.int64)
         lengths = np.zeros(self.count)

@@ -37,11 +37,9 @@ class ProvedStarts:
     For every `n`: each pose at most `offsets_mm[n]` from the planned start whose direction is at most
     `tilts_rad[n]` from the planned one.  The path goes by single arcs through `vias[n]` to the target.
 
-    Parameters
-    ----------
-    offsets_mm, tilts_rad : (K,) float64
-        Rising and falling; empty where nothing is proved.
-    vias : tuple of (V, 3) float64, LPS mm
+    Args:
+        offsets_mm, tilts_rad ((K,) float64): Rising and falling; empty where nothing is proved.
+        vias: tuple of (V, 3) float64, LPS mm.
     """
 
     offsets_mm: Float
@@ -78,21 +76,14 @@ class TriedStarts:
 
     Every pose stands for the same volume of places and the same solid angle.
 
-    Parameters
-    ----------
-    offset_mm, tilt_rad : float
-        Radius of the ball and half angle of the cone.
-    positions : (P, 3) float64, LPS mm
-    tangents : (P, D, 3) float64
-        Unit vectors.
-    offsets_mm : (P,) float64, tilts_rad : (P, D) float64
-        From the planned start and direction.
-    kinds : (P, D) uint8
-        What was found, see `KINDS`; every path is proved clear.
-    spacing_mm : float
-        Of the lattice, whose axes are those of the start.
-    lattice : (P, 3) int64
-        Places on it.
+    Args:
+        offset_mm, tilt_rad: Radius of the ball and half angle of the cone.
+        positions: (P, 3) float64, LPS mm.
+        tangents ((P, D, 3) float64): Unit vectors.
+        offsets_mm ((P,) float64, tilts_rad : (P, D) float64): From the planned start and direction.
+        kinds ((P, D) uint8): What was found, see `KINDS`; every path is proved clear.
+        spacing_mm: Of the lattice, whose axes are those of the start.
+        lattice ((P, 3) int64): Places on it.
     """
 
     offset_mm: float
@@ -147,12 +138,9 @@ class TriedStarts:
 class StartRegion:
     """From which poses near a planned start the needle reaches its target clear, within all limits.
 
-    Parameters
-    ----------
-    radius_mm : float
-        So far from the target a path may end.
-    max_curvature_per_mm : float
-        Of the needle.
+    Args:
+        radius_mm: So far from the target a path may end.
+        max_curvature_per_mm: Of the needle.
     """
 
     lps_from_start: Float
@@ -241,10 +229,8 @@ def prove_starts(environment: NeedleEnvironment, query: Query, path: ArcPath) ->
     The paths end within the environment's goal tolerance.  docs/explanation/start_region.md has the
     theorem.
 
-    Parameters
-    ----------
-    path : ArcPath
-        The planned path from the query's start: its corners are what the proved paths may go through.
+    Args:
+        path: The planned path from the query's start: its corners are what the proved paths may go through.
     """
     limits, branch = environment.limits, query.branch
     families = [_Family(environment, query, vias) for vias in _vias_of(path)]
@@ -273,10 +259,8 @@ def proved_factor(
     For many paths this is a fast measure of how much of a deviation of the start they bear: it takes a
     fraction of `prove_starts`.
 
-    Parameters
-    ----------
-    offset_mm, tilt_rad : float
-        The whole deviation, such as three times the errors that are expected; above 0.
+    Args:
+        offset_mm, tilt_rad: The whole deviation, such as three times the errors that are expected; above 0.
     """
     limits, branch = environment.limits, query.branch
     families = (_Family(environment, query, vias) for vias in _vias_of(path))

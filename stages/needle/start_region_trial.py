@@ -43,21 +43,14 @@ def try_starts(
 ) -> TriedStarts:
     """Try start poses around a planned one; the same input and seed give the same answer.
 
-    Parameters
-    ----------
-    path : ArcPath
-        The planned path; paths of several arcs are looked for through points on it and beside it.
-    offset_mm, tilt_rad : float
-        How far the poses may be from the planned start.
-    poses : int
-        About how many; they are `DIRECTIONS` at each place.
-    iterations : int
-        Of the RRT from each pose from which nothing simpler leads to the target; 0 for none.
+    Args:
+        path: The planned path; paths of several arcs are looked for through points on it and beside it.
+        offset_mm, tilt_rad: How far the poses may be from the planned start.
+        poses: About how many; they are `DIRECTIONS` at each place.
+        iterations: Of the RRT from each pose from which nothing simpler leads to the target; 0 for none.
 
-    Raises
-    ------
-    SettingsError
-        If a number is out of its range.
+    Raises:
+        SettingsError: If a number is out of its range.
     """
 
     def tried(positions: Float, tangents: Float) -> UInt8:
@@ -83,19 +76,13 @@ def try_around(
 ) -> TriedStarts:
     """Try poses around a pose: places on a lattice in a ball, each with directions spread evenly in a cone.
 
-    Parameters
-    ----------
-    frame : (4, 4) float64
-        +z is the axis of the cone.
-    tried : callable
-        Takes positions and tangents `(N, 3)` and returns `KINDS` `(N,)`.
-    directions : int
-        At each place.
+    Args:
+        frame ((4, 4) float64): +z is the axis of the cone.
+        tried: Takes positions and tangents `(N, 3)` and returns `KINDS` `(N,)`.
+        directions: At each place.
 
-    Raises
-    ------
-    SettingsError
-        If a number is out of its range.
+    Raises:
+        SettingsError: If a number is out of its range.
     """
     _require_ranges(offset_mm, tilt_rad, poses, directions)
     places = max(poses // directions, 1)
@@ -135,14 +122,10 @@ def try_poses(
 ) -> UInt8:
     """Tell for each of N start poses how a clear path was found, or why none was: `KINDS`, `(N,)`.
 
-    Parameters
-    ----------
-    query : Query
-        Of the planned start: its target, and the branch that it has pierced.
-    path, iterations, seed
-        See `try_starts`.
-    positions, tangents : (N, 3) float64
-        Points, LPS mm, and unit vectors.
+    Args:
+        query: Of the planned start: its target, and the branch that it has pierced.
+        path, iterations, seed: See `try_starts`.
+        positions, tangents ((N, 3) float64): Points, LPS mm, and unit vectors.
     """
     places = np.array(positions, dtype=np.float64, order="C")
     kinds = np.zeros(len(places), dtype=np.uint8)

@@ -90,10 +90,8 @@ def laid_pieces(states: Float, bending_length_mm: float) -> Float:
 
     The section lays the shaft where it advances; the section itself is the last arc.
 
-    Parameters
-    ----------
-    states : (M, 3) float64
-        Advance in mm, twist in rad and bend in rad; see `stages.scope.ScopeMotion`.
+    Args:
+        states ((M, 3) float64): Advance in mm, twist in rad and bend in rad; see `stages.scope.ScopeMotion`.
     """
     advance, twist, bend = states.T
     moved = np.flatnonzero(np.diff(advance) > SHORTEST_MM) + 1

@@ -31,18 +31,13 @@ TURNED_A_LAYER = 16
 class StateTree:
     """States of a scope, each reached from an earlier one; N states.
 
-    Parameters
-    ----------
-    states : (N, 26) float64
-        See `stages.scope.kernels.growth`.
-    parent : (N,) int64
-        -1 for the first one.
-    by_straight : (N,) bool
-        Whether the section is straightened before it twists on the way from the parent.
-    advance_mm : (N,) float64
-        Advance of the base since the first state.
-    turned_from : (T,) int64
-        States from which tips may be turned: some of each layer.
+    Args:
+        states ((N, 26) float64): See `stages.scope.kernels.growth`.
+        parent ((N,) int64): -1 for the first one.
+        by_straight ((N,) bool): Whether the section is straightened before it twists on the way from the
+            parent.
+        advance_mm ((N,) float64): Advance of the base since the first state.
+        turned_from ((T,) int64): States from which tips may be turned: some of each layer.
     """
 
     states: Float
@@ -54,10 +49,8 @@ class StateTree:
     def only(self, needed: Int) -> tuple[StateTree, Int]:
         """Return the states on the ways to some of them, and the new numbers of those.
 
-        Parameters
-        ----------
-        needed : (S,) int64
-            Numbers of states.
+        Args:
+            needed ((S,) int64): Numbers of states.
         """
         keep = np.zeros(len(self.parent), dtype=np.bool_)
         keep[needed] = True
@@ -79,12 +72,9 @@ class StateTree:
 class Growth:
     """Grows the states of a scope along the routes of an airway.
 
-    Parameters
-    ----------
-    tried : (N,) bool
-        Tree points that the scope might get to; routes end at the last of them.
-    passable : (N,) bool
-        Tree points to which a ball as thick as the scope gets along the axis.
+    Args:
+        tried ((N,) bool): Tree points that the scope might get to; routes end at the last of them.
+        passable ((N,) bool): Tree points to which a ball as thick as the scope gets along the axis.
     """
 
     def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, passable: Bool, device: Device) -> None:

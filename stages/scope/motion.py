@@ -27,17 +27,13 @@ ADVANCE, TWIST, BEND = range(3)
 class ScopeMotion:
     """How a bronchoscope gets from the trachea to where it stops; M states.
 
-    Parameters
-    ----------
-    lps_from_entry : (4, 4) float64
-        Base of the bending section when the motion begins: +z forward, +x the way a positive bend turns
-        the tip at twist 0.
-    states : (M, 3) float64
-        Advance of that base in mm, which never falls, twist in rad about the scope's axis, and bend in rad,
-        the angle of the whole section.  A twist turns the scope as a whole; its frame does not roll
-        otherwise (it is a Bishop frame).
-    bending_length_mm : float
-        Length of the bending section.
+    Args:
+        lps_from_entry ((4, 4) float64): Base of the bending section when the motion begins: +z forward, +x
+            the way a positive bend turns the tip at twist 0.
+        states ((M, 3) float64): Advance of that base in mm, which never falls, twist in rad about the scope's
+            axis, and bend in rad, the angle of the whole section.  A twist turns the scope as a whole; its
+            frame does not roll otherwise (it is a Bishop frame).
+        bending_length_mm: Length of the bending section.
     """
 
     lps_from_entry: Float
@@ -95,12 +91,9 @@ class ScopeMotion:
     def between(self, advance_mm: float, turn_rad: float) -> ScopeMotion:
         """Return the same motion with states put between, so that none differs more from the one before it.
 
-        Parameters
-        ----------
-        advance_mm : float
-            Largest advance from one state to the next.
-        turn_rad : float
-            Largest change of twist or bend.
+        Args:
+            advance_mm: Largest advance from one state to the next.
+            turn_rad: Largest change of twist or bend.
         """
         shares = np.abs(np.diff(self.states, axis=0)) / [advance_mm, turn_rad, turn_rad]
         states = [self.states[:1]]

@@ -68,11 +68,9 @@ class MotionProver:
         beyond the gap that the scope keeps, over all places of the body during the whole motion.  Near
         the wall the bound is about 0.1 mm too low at most.
 
-        Parameters
-        ----------
-        motion : ScopeMotion
-        turn_mm, step_mm : float
-            Longest parts of changes in place and longest steps along the body: longer ones prove less.
+        Args:
+            turn_mm, step_mm: Longest parts of changes in place and longest steps along the body: longer ones
+                prove less.
         """
         wrong = broken_limit(self._scope, motion)
         if wrong:
@@ -99,10 +97,8 @@ class MotionProver:
         If one of the three errs by no more than this anywhere in a step, and all else is as stated, the scope
         with its gap stays in the lumen during the step.  Larger values may be possible, smaller ones are.
 
-        Parameters
-        ----------
-        motion : ScopeMotion
-            A proved one of M states.
+        Args:
+            motion: A proved one of M states.
         """
         out = np.zeros((len(motion.states) - 1, 3))
         section_mm = self._scope.bending_length_mm
@@ -117,14 +113,11 @@ class MotionProver:
     ) -> ScopeMotion:
         """Return a proved motion of fewer changes and twists to the same tip, the given one if none is found.
 
-        Parameters
-        ----------
-        motion : ScopeMotion
-            A proved one.
-        max_curvature_per_mm : float
-            Largest curvature of the body that the tubes in its channel can stand.
-        end_bends_rad : (float, float)
-            Bends farthest down and up of the section at the tip, where tubes in it take some.
+        Args:
+            motion: A proved one.
+            max_curvature_per_mm: Largest curvature of the body that the tubes in its channel can stand.
+            end_bends_rad ((float, float)): Bends farthest down and up of the section at the tip, where tubes
+                in it take some.
         """
         room = self.prove(motion)
         if isinstance(room, str):
@@ -141,12 +134,10 @@ class MotionProver:
 
         Those have a proved motion and lie in the region of scope tips, as all tips of `find_motions` do.
 
-        Parameters
-        ----------
-        motion : ScopeMotion
-            A proved one.
-        shifts_mm : (K,) float64
-            How much farther the base stops, see `stages.scope.motion_proof.shifted`.
+        Args:
+            motion: A proved one.
+            shifts_mm ((K,) float64): How much farther the base stops, see
+                `stages.scope.motion_proof.shifted`.
         """
         shifts = np.ascontiguousarray(np.atleast_1d(np.asarray(shifts_mm, dtype=np.float64)))
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
@@ -208,10 +199,8 @@ def in_tip_region(tree: AirwayTree, tips: Float) -> tuple[Int, Bool]:
 
     Proofs that a target is unreachable rule out all of this region, so every tip of a motion lies in it.
 
-    Parameters
-    ----------
-    tips : (S, >= 6) float64
-        Point and unit direction of each tip, LPS mm.
+    Args:
+        tips ((S, >= 6) float64): Point and unit direction of each tip, LPS mm.
     """
     distance_mm, nearest = tree.nearest_point_index.query(tips[:, :3])
     cosine = np.einsum("sk,sk->s", tips[:, 3:6], tree.tangents[nearest])
@@ -264,16 +253,12 @@ def kernel_device(scope: Bronchoscope, max_curvature_per_mm: float) -> Device:
 class TipRow:
     """Tips in a row along the motion to one of them; K tips.
 
-    Parameters
-    ----------
-    motion : ScopeMotion
-        That of the tip at shift 0.
-    shifts_mm : (K,) float64
-        How much farther the base of the bending section stops, negative for less far.
-    tips : (K, 9) float64
-        Point, direction, and +x of the working channel's frame, LPS mm.
-    proved : (K,) bool
-        Whether the motion to the tip is proved, and the tip where tips of plans may be.
+    Args:
+        motion: That of the tip at shift 0.
+        shifts_mm ((K,) float64): How much farther the base of the bending section stops, negative for less
+            far.
+        tips ((K, 9) float64): Point, direction, and +x of the working channel's frame, LPS mm.
+        proved ((K,) bool): Whether the motion to the tip is proved, and the tip where tips of plans may be.
     """
 
     motion: ScopeMotion

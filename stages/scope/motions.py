@@ -34,12 +34,10 @@ from stages.scope.passages import Passages, find_passages
 class ScopeTip:
     """A pose of the scope's tip, and the motion that brings the device there.
 
-    Parameters
-    ----------
-    lps_from_scope_tip : (4, 4) float64
-        Frame of the working channel: +z is forward, rotations of the tubes count from +x.
-    tree_point : int
-        Nearest point of the airway tree.
+    Args:
+        lps_from_scope_tip ((4, 4) float64): Frame of the working channel: +z is forward, rotations of the
+            tubes count from +x.
+        tree_point: Nearest point of the airway tree.
     """
 
     motion: ScopeMotion
@@ -51,28 +49,19 @@ class ScopeTip:
 class ScopeMotions:
     """Tips of a scope in one airway, each with a proved motion to it; S tips, N states.
 
-    Parameters
-    ----------
-    tips : (S, 9) float64
-        Point, direction, and +x of the working channel's frame, LPS mm.
-    tree_point : (S,) int64
-        Nearest point of the airway tree.
-    turned : (S,) bool
-        Whether the tip is one of many directions at its place, or the one nearest to the axis and its
-        direction.
-    room_mm : (S,) float64
-        A room between the scope with its gap and the wall that the proof of the motion found everywhere.
-    max_curvature_per_mm : (S,) float64
-        Largest curvature of the body.
-    state : (S,) int64
-        State of the tree before the last change in place.
-    settings : (S, 3) float64
-        Twist and bend in rad after it, and 1 if it goes by the straight section, else 0.
-    lps_from_entry : (4, 4) float64
-    states : StateTree
-    bending_length_mm : float
-    passages : Passages
-        Where the scope passes along the axis, and why it does not get farther.
+    Args:
+        tips ((S, 9) float64): Point, direction, and +x of the working channel's frame, LPS mm.
+        tree_point ((S,) int64): Nearest point of the airway tree.
+        turned ((S,) bool): Whether the tip is one of many directions at its place, or the one nearest to the
+            axis and its direction.
+        room_mm ((S,) float64): A room between the scope with its gap and the wall that the proof of the
+            motion found everywhere.
+        max_curvature_per_mm ((S,) float64): Largest curvature of the body.
+        state ((S,) int64): State of the tree before the last change in place.
+        settings ((S, 3) float64): Twist and bend in rad after it, and 1 if it goes by the straight section,
+            else 0.
+        lps_from_entry: (4, 4) float64.
+        passages: Where the scope passes along the axis, and why it does not get farther.
     """
 
     tips: Float
@@ -123,10 +112,8 @@ class ScopeMotions:
     def nearest(self, point_lps: ArrayLike, forward: ArrayLike) -> int:
         """Return the tip nearest to a pose; 10 degrees count as much as 1 mm.
 
-        Raises
-        ------
-        AnatomyError
-            If there is no tip.
+        Raises:
+            AnatomyError: If there is no tip.
         """
         if not self.count:
             raise _no_tip()
@@ -159,17 +146,12 @@ def find_motions(
 ) -> ScopeMotions:
     """Find scope tips from which tubes can leave the airway, each with a proved motion of the scope.
 
-    Parameters
-    ----------
-    reach_mm : float
-        How far ahead of the scope tip the airway may be left.
-    max_curvature_per_mm : float
-        Largest curvature of the body that the tubes in its channel can stand.
-    tip_bends_rad : (float, float), optional
-        Bends farthest down and up of the section at the tip, where tubes in it take some; those of the scope
-        by default.
-    spacing_mm : float
-        Distance between tips along a branch; those turned aside are twice as far apart.
+    Args:
+        reach_mm: How far ahead of the scope tip the airway may be left.
+        max_curvature_per_mm: Largest curvature of the body that the tubes in its channel can stand.
+        tip_bends_rad ((float, float)): Bends farthest down and up of the section at the tip, where tubes in
+            it take some; those of the scope by default.
+        spacing_mm: Distance between tips along a branch; those turned aside are twice as far apart.
     """
     passages = find_passages(lung, scope, reach_mm=reach_mm)
     walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)
@@ -236,17 +218,14 @@ def find_tips(
 ) -> tuple[Float, Int, int]:
     """Return tips that are proved reachable in place from states, their tree points, and how many look ahead.
 
-    Parameters
-    ----------
-    wanted : (N,) bool
-        Tree points at which tips are wanted.
+    Args:
+        wanted ((N,) bool): Tree points at which tips are wanted.
 
-    Returns
-    -------
-    tips : (S, 15) float64
-        See `stages.scope.kernels.turning`; those that look ahead on the axis come first.
-    tree_point : (S,) int64
-    ahead : int
+    Returns:
+        - tips ((S, 15) float64) - See `stages.scope.kernels.turning`; those that look ahead on the axis come
+          first.
+        - tree_point ((S,) int64)
+        - ahead
     """
     places, ahead, count = _places(tree, wanted, spacing_mm)
     from_states = states.states[states.turned_from]

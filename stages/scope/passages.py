@@ -16,20 +16,17 @@ from stages.scope.device import Bronchoscope
 class Passages:
     """How far a ball as thick as the scope gets along the medial axis; N tree points.
 
-    Parameters
-    ----------
-    lumen_radius_mm : (N,) float64
-        For each tree point, the smallest radius of the lumen on the route to it from the root, proved for
-        every point of the route and not only for the tree points.
-    passable : (N,) bool
-        Whether the scope fits at each tree point and on the whole route to it.
-    exits_ahead : (N,) bool
-        Whether an airway lying in lung tissue, not in the mediastinum, is within reach ahead.
-    narrowest : tuple of (int, float)
-        Generation at which the most branches become too narrow, and by how much the scope's radius
-        exceeds that of the lumen there, in mm (median); (-1, 0) if every branch is passable.
-    widest_scope_mm : float
-        Outer diameter of the thickest scope that would pass a place with an exit ahead; 0 if none does.
+    Args:
+        lumen_radius_mm ((N,) float64): For each tree point, the smallest radius of the lumen on the route to
+            it from the root, proved for every point of the route and not only for the tree points.
+        passable ((N,) bool): Whether the scope fits at each tree point and on the whole route to it.
+        exits_ahead ((N,) bool): Whether an airway lying in lung tissue, not in the mediastinum, is within
+            reach ahead.
+        narrowest (tuple of (int, float)): Generation at which the most branches become too narrow, and by how
+            much the scope's radius exceeds that of the lumen there, in mm (median); (-1, 0) if every branch
+            is passable.
+        widest_scope_mm: Outer diameter of the thickest scope that would pass a place with an exit ahead; 0 if
+            none does.
     """
 
     lumen_radius_mm: Float

@@ -51,15 +51,11 @@ PRESSED_MM = 10.0
 class Circumstances:
     """One choice of what is not known of a shaft at rest; the defaults are the nominal one.
 
-    Parameters
-    ----------
-    stiffer, wall_stiffer : float
-        Factors of the bending stiffness of the scope and of the stiffness of the wall.
-    friction : float
-        Coefficient of friction between shaft and wall.
-    slid_rad : float
-        The way in which the shaft slid last, which friction resists: 0 is ahead, pi back, and pi / 2 and
-        -pi / 2 are about its axis, to either side.
+    Args:
+        stiffer, wall_stiffer: Factors of the bending stiffness of the scope and of the stiffness of the wall.
+        friction: Coefficient of friction between shaft and wall.
+        slid_rad: The way in which the shaft slid last, which friction resists: 0 is ahead, pi back, and pi /
+            2 and -pi / 2 are about its axis, to either side.
     """
 
     stiffer: float = 1.0
@@ -76,22 +72,16 @@ NOMINAL = Circumstances()
 class RestingShape:
     """A shaft at rest; N arcs.
 
-    Parameters
-    ----------
-    lps_from_scope_tip : (4, 4) float64
-        Frame of the working channel, as in `ScopeMotion.lps_from_tip`.
-    frames : (N + 1, 12) float64
-        Frames of the entry and of the ends of all arcs, as in `stages.scope.kernels.body`.
-    lengths_mm : (N,) float64
-    curvature : (N, 2) float64
-        Of each arc in its Bishop frame, 1/mm.
-    force_n, give_mm : (N,) float64
-        How the wall presses at the end of each arc, and how far it yields there.
-    farther_mm : float
-        How much farther than planned the shaft is advanced at the entry.
-    energy_n_mm : float
-    settled : bool
-        Whether it is at rest: no step lowers the energy any more, and the tip has its depth.
+    Args:
+        lps_from_scope_tip ((4, 4) float64): Frame of the working channel, as in `ScopeMotion.lps_from_tip`.
+        frames ((N + 1, 12) float64): Frames of the entry and of the ends of all arcs, as in
+            `stages.scope.kernels.body`.
+        lengths_mm: (N,) float64.
+        curvature ((N, 2) float64): Of each arc in its Bishop frame, 1/mm.
+        force_n, give_mm ((N,) float64): How the wall presses at the end of each arc, and how far it yields
+            there.
+        farther_mm: How much farther than planned the shaft is advanced at the entry.
+        settled: Whether it is at rest: no step lowers the energy any more, and the tip has its depth.
     """
 
     lps_from_scope_tip: Float
@@ -127,12 +117,8 @@ class RestingShape:
 class RestingShaft:
     """Brings the shaft of a bronchoscope to rest in a lumen.
 
-    Parameters
-    ----------
-    lumen : Lumen
-        See `lumen_of`.
-    scope : Bronchoscope
-    contact : WallContact
+    Args:
+        lumen: See `lumen_of`.
     """
 
     def __init__(self, lumen: Lumen, scope: Bronchoscope, contact: WallContact) -> None:
@@ -148,13 +134,10 @@ class RestingShaft:
     ) -> RestingShape:
         """Return the shape of the shaft at rest in the last state of a motion.
 
-        Parameters
-        ----------
-        start : RestingShape, optional
-            What to begin from, of a motion of the same length; by default the shape as it was laid.
-        as_advanced : bool
-            Leave the advance as planned; by default the hand advances more or less until the tip has the
-            planned depth, which cameras and trackers show.
+        Args:
+            start: What to begin from, of a motion of the same length; by default the shape as it was laid.
+            as_advanced: Leave the advance as planned; by default the hand advances more or less until the tip
+                has the planned depth, which cameras and trackers show.
         """
         planned, entry = motion.lps_from_tip, _row(motion.lps_from_entry)
         shaft, curvature = self._shaft(motion, chosen)
@@ -340,21 +323,16 @@ class WallContact:
 
     `docs/explanation/resting_scope.md` says where the defaults come from.
 
-    Parameters
-    ----------
-    wall_stiffness_n_per_mm2 : float
-        Force on a mm of the shaft's length that presses the wall in by a mm.  Mucosa of 0.02 to 0.28 MPa
-        [Wang2011] yields by about as much as a bed of that modulus.
-    wall_stiffness_range, scope_stiffness_range : float
-        Factors by which the stiffness of wall and scope may be less or more.
-    max_friction : float
-        Largest coefficient of friction; the least is 0.
-    max_wall_force_n : float
-        Largest force on 10 mm of wall.
-    max_wall_give_mm : float
-        How far the wall may be pressed in; it is then twice as hard as at first, as soft tissue stiffens.
-    source : str
-        Where the numbers come from; what nobody has published begins with "assumption".
+    Args:
+        wall_stiffness_n_per_mm2: Force on a mm of the shaft's length that presses the wall in by a mm.
+            Mucosa of 0.02 to 0.28 MPa [Wang2011] yields by about as much as a bed of that modulus.
+        wall_stiffness_range, scope_stiffness_range: Factors by which the stiffness of wall and scope may be
+            less or more.
+        max_friction: Largest coefficient of friction; the least is 0.
+        max_wall_force_n: Largest force on 10 mm of wall.
+        max_wall_give_mm: How far the wall may be pressed in; it is then twice as hard as at first, as soft
+            tissue stiffens.
+        source: Where the numbers come from; what nobody has published begins with "assumption".
     """
 
     wall_stiffness_n_per_mm2: Annotated[

@@ -35,19 +35,14 @@ MOST_TRIES = 60
 class Legs:
     """A motion by its legs: K of them, with G twists.
 
-    Parameters
-    ----------
-    group : (K + 1,) int64
-        Which twist each leg and the end have; they never fall.
-    twists : (G,) float64
-        rad.
-    bends : (K + 1,) or (K,) float64
-        rad; without the last one the end has that of the last leg.  Where the first is 0 it stays so: the
-        scope enters with its tip straight.
-    advances : (K,) float64
-        mm.
-    orders : (K + 1,) int64
-        In which order twist and bend change before each leg and at the end, where that is proved.
+    Args:
+        group ((K + 1,) int64): Which twist each leg and the end have; they never fall.
+        twists ((G,) float64): rad.
+        bends ((K + 1,) or (K,) float64): rad; without the last one the end has that of the last leg.  Where
+            the first is 0 it stays so: the scope enters with its tip straight.
+        advances ((K,) float64): mm.
+        orders ((K + 1,) int64): In which order twist and bend change before each leg and at the end, where
+            that is proved.
     """
 
     group: Int
@@ -98,16 +93,11 @@ def legs_of(motion: ScopeMotion) -> Legs:
 class Simplifier:
     """Looks for motions of fewer changes and twists to the end of a proved one.
 
-    Parameters
-    ----------
-    device : Device
-        The scope, and the largest curvature that what passes its channel can stand.
-    motion : ScopeMotion
-        A proved motion.
-    end_bends_rad : (float, float)
-        Bends farthest down and up of the section at the tip.
-    least_mm : float
-        The room that a simpler motion keeps.
+    Args:
+        device: The scope, and the largest curvature that what passes its channel can stand.
+        motion: A proved motion.
+        end_bends_rad ((float, float)): Bends farthest down and up of the section at the tip.
+        least_mm: The room that a simpler motion keeps.
     """
 
     def __init__(
@@ -253,10 +243,8 @@ class Simplifier:
     def _fitted(self, legs: Legs, bounds: Float | None = None) -> Legs | None:
         """Return legs near to some that end in the pose and are proved, None if none are found.
 
-        Parameters
-        ----------
-        bounds : (n, 2) float64, optional
-            Those of the unknowns, if they are narrower than those of the device.
+        Args:
+            bounds ((n, 2) float64): Those of the unknowns, if they are narrower than those of the device.
         """
         x = legs.unknowns
         counts = np.ceil((np.append(legs.advances, 0.0) + self._device.length) / SAMPLE_MM).astype(np.int64)

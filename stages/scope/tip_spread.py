@@ -19,28 +19,20 @@ SAME_MM, SAME_DEG = 0.5, 1.0
 class TipSpread:
     """The distribution of a resting tip about a pose, in the frame of that pose.
 
-    Parameters
-    ----------
-    nominal : RestingShape
-        Scope and wall as stiff as stated, and no friction.
-    nominal_off : (5,) float64
-        How its tip is off the pose, see `off_pose`.
-    other : RestingShape or None
-        Where the shaft rests if its section is bent only where it stands, and not on the way; None if
-        it is the same.
-    bias_mm : (3,) float64
-        Mean of the tip's place less that of the pose, along its x, y and z.
-    bias_deg : (2,) float64
-        Mean of the turn of the tip's direction about the x and y of the pose.
-    patient_mm, patient_deg : float
-        Standard deviation along an axis, or about one, over the stiffness of scope and wall.
-    attempt_mm, attempt_deg : float
-        The same over friction.
-    wall_force_n, give_mm : (D,) float64
-        Largest force on the wall and how far it yields, of all choices that came to rest.
-    held_share : float
-        Share of the choices in which the shaft came to rest with its tip at its depth; of none, the bias is
-        that of `nominal`.
+    Args:
+        nominal: Scope and wall as stiff as stated, and no friction.
+        nominal_off ((5,) float64): How its tip is off the pose, see `off_pose`.
+        other: Where the shaft rests if its section is bent only where it stands, and not on the way; None if
+            it is the same.
+        bias_mm ((3,) float64): Mean of the tip's place less that of the pose, along its x, y and z.
+        bias_deg ((2,) float64): Mean of the turn of the tip's direction about the x and y of the pose.
+        patient_mm, patient_deg: Standard deviation along an axis, or about one, over the stiffness of scope
+            and wall.
+        attempt_mm, attempt_deg: The same over friction.
+        wall_force_n, give_mm ((D,) float64): Largest force on the wall and how far it yields, of all choices
+            that came to rest.
+        held_share: Share of the choices in which the shaft came to rest with its tip at its depth; of none,
+            the bias is that of `nominal`.
     """
 
     nominal: RestingShape

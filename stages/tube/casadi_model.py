@@ -50,11 +50,9 @@ _NEWTON = {"abstol": 1e-12, "abstolStep": 1e-13, "max_iter": 60, "error_on_fail"
 class Order:
     """The order in which ends and bends of the tubes follow each other, seen from the tip.
 
-    Parameters
-    ----------
-    landmarks : tuple of (tube, index)
-        Landmarks ahead of the plate, the farthest first.  Those of a tube are the places where its
-        precurvature changes, counted from its base, and its end, the last.
+    Args:
+        landmarks (tuple of (tube, index)): Landmarks ahead of the plate, the farthest first.  Those of a tube
+            are the places where its precurvature changes, counted from its base, and its end, the last.
     """
 
     landmarks: tuple[tuple[int, int], ...]
@@ -64,14 +62,10 @@ class Order:
 class CasadiEquilibrium:
     """One equilibrium of the tubes.
 
-    Parameters
-    ----------
-    tip_angles_rad, base_angles_rad : (n,) float64
-        Angle of each tube at its own end, and at its base.
-    base_from_tip : (4, 4) float64
-        Material frame of the innermost tube at its end.
-    determinant : float
-        Determinant of the derivative of the base angles by the tip angles.
+    Args:
+        tip_angles_rad, base_angles_rad ((n,) float64): Angle of each tube at its own end, and at its base.
+        base_from_tip ((4, 4) float64): Material frame of the innermost tube at its end.
+        determinant: Determinant of the derivative of the base angles by the tip angles.
     """
 
     tip_angles_rad: Float
@@ -87,12 +81,9 @@ class OrderedTubes:
     Vectors are columns.  The order holds where `margins` is not negative; elsewhere the results mean
     nothing.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        n >= 1 tubes, innermost first.
-    steps_per_piece : int
-        Runge-Kutta steps between two landmarks.  The error falls with the fourth power.
+    Args:
+        tubes: n >= 1 tubes, innermost first.
+        steps_per_piece: Runge-Kutta steps between two landmarks.  The error falls with the fourth power.
     """
 
     def __init__(self, tubes: Sequence[Tube], order: Order, *, steps_per_piece: int) -> None:
@@ -251,17 +242,12 @@ class OrderedTubes:
 class CasadiTubes:
     """The mechanics of n >= 1 concentric tubes, whatever the order of their landmarks.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        Innermost, and so longest, first.
-    steps_per_piece : int, optional
-        Runge-Kutta steps between two landmarks.
+    Args:
+        tubes: Innermost, and so longest, first.
+        steps_per_piece: Runge-Kutta steps between two landmarks.
 
-    Raises
-    ------
-    SettingsError
-        If there is no tube or no step.
+    Raises:
+        SettingsError: If there is no tube or no step.
     """
 
     def __init__(self, tubes: Sequence[Tube], *, steps_per_piece: int = DEFAULT_STEPS) -> None:
@@ -276,16 +262,12 @@ class CasadiTubes:
     def order_at(self, beta_mm: ArrayLike) -> Order:
         """Return the order of the landmarks.
 
-        Parameters
-        ----------
-        beta_mm : (n,) float64
-            Arc lengths of the bases, at most 0.
+        Args:
+            beta_mm ((n,) float64): Arc lengths of the bases, at most 0.
 
-        Raises
-        ------
-        SettingsError
-            If a base is ahead of the plate, an end is behind it, a tube ends ahead of one inside it, or
-            numbers are missing or not finite.
+        Raises:
+            SettingsError: If a base is ahead of the plate, an end is behind it, a tube ends ahead of one
+                inside it, or numbers are missing or not finite.
         """
         beta = self._vector(beta_mm, "beta")
         ends = beta + [tube.length_mm for tube in self._tubes]
@@ -311,14 +293,11 @@ class CasadiTubes:
     def given_tip_angles(self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike) -> CasadiEquilibrium:
         """Return the equilibrium with these tip angles.
 
-        Parameters
-        ----------
-        tip_angles_rad, beta_mm : (n,) float64
+        Args:
+            tip_angles_rad, beta_mm: (n,) float64.
 
-        Raises
-        ------
-        SettingsError
-            As `order_at`.
+        Raises:
+            SettingsError: As `order_at`.
         """
         tip, beta = self._vector(tip_angles_rad, "tip angles"), self._vector(beta_mm, "beta")
         base, position, rotation, determinant = self.ordered(self.order_at(beta)).forward(tip, beta)
@@ -345,18 +324,13 @@ class CasadiTubes:
     ) -> CasadiEquilibrium:
         """Return the equilibrium with these base angles that Newton's method finds from a guess.
 
-        Parameters
-        ----------
-        base_angles_rad, beta_mm : (n,) float64
-        guess_rad : (n,) float64, optional
-            Guess of the tip angles; the base angles if none is given.
+        Args:
+            base_angles_rad, beta_mm: (n,) float64.
+            guess_rad ((n,) float64): Guess of the tip angles; the base angles if none is given.
 
-        Raises
-        ------
-        SettingsError
-            As `order_at`.
-        ConvergenceError
-            If the method does not converge from this guess.
+        Raises:
+            SettingsError: As `order_at`.
+            ConvergenceError: If the method does not converge from this guess.
         """
         base, beta = self._vector(base_angles_rad, "base angles"), self._vector(beta_mm, "beta")
         guess = base if guess_rad is None else self._vector(guess_rad, "guess")

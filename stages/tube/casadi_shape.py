@@ -33,20 +33,16 @@ LEAST_SHARE = 1.0 / 64.0
 class DerivedShape:
     """One deployment, followed from the scope tip on.
 
-    Parameters
-    ----------
-    arc_lengths_mm : (N,) float64
-        From the scope tip, rising from 0.
-    points_mm : (N, 3) float64
-        Of the centreline, in the frame of the scope tip.
-    relative_rad : (N, n - 1) float64
-        Angles of the tubes around the innermost, relative to it, where they are.
-    base_from_tip : (4, 4) float64
-        Material frame of the innermost tube at its end.
-    way : tuple of (K, 4) float64
-        Arc lengths and points, mm, of every step of the way, the last of which is the deployment.
-    least_determinant : float
-        Least on the way of the derivative of base angles by tip angles: above 0 the tubes nowhere snap.
+    Args:
+        arc_lengths_mm ((N,) float64): From the scope tip, rising from 0.
+        points_mm ((N, 3) float64): Of the centreline, in the frame of the scope tip.
+        relative_rad ((N, n - 1) float64): Angles of the tubes around the innermost, relative to it, where
+            they are.
+        base_from_tip ((4, 4) float64): Material frame of the innermost tube at its end.
+        way (tuple of (K, 4) float64): Arc lengths and points, mm, of every step of the way, the last of which
+            is the deployment.
+        least_determinant: Least on the way of the derivative of base angles by tip angles: above 0 the tubes
+            nowhere snap.
     """
 
     arc_lengths_mm: Float
@@ -67,21 +63,15 @@ def derive_shape(
 ) -> DerivedShape:
     """Follow the tubes to a deployment by the sequence `together`, with the CasADi model.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        The innermost first.
-    rotations_rad, insertions_mm : (n,) float64
-        As in `stages.tube.shapes.TubeShapes`.
-    needle : Tube, optional
-        Straight; its tip stays where that of the innermost tube is, so it is one more tube, the innermost.
+    Args:
+        tubes: The innermost first.
+        rotations_rad, insertions_mm ((n,) float64): As in `stages.tube.shapes.TubeShapes`.
+        needle: Straight; its tip stays where that of the innermost tube is, so it is one more tube, the
+            innermost.
 
-    Raises
-    ------
-    ConvergenceError
-        If the tubes snap on the way: their equilibrium loses stability or jumps.
-    SettingsError
-        If the insertions are impossible.
+    Raises:
+        ConvergenceError: If the tubes snap on the way: their equilibrium loses stability or jumps.
+        SettingsError: If the insertions are impossible.
     """
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     sequence = together(tubes, turned, insertions_mm)
@@ -123,12 +113,9 @@ def derive_arrival(
 
     With its tip at theirs a needle is one more tube, the innermost and straight.  No tissue holds the tubes.
 
-    Raises
-    ------
-    ConvergenceError
-        If no equilibrium is found.
-    SettingsError
-        If the insertions are impossible.
+    Raises:
+        ConvergenceError: If no equilibrium is found.
+        SettingsError: If the insertions are impossible.
     """
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     out = np.asarray(insertions_mm, dtype=np.float64)

@@ -40,15 +40,11 @@ POSITION, ROTATION, FORCE, MOMENT, FIRST_ANGLE = slice(0, 3), slice(3, 7), slice
 class LoadedShape:
     """Tubes with a needle in them, in the frame of the front plate.
 
-    Parameters
-    ----------
-    arc_lengths_mm : (N,) float64
-        From the front plate to the tubes' tip.
-    points_mm : (N, 3) float64
-    base_from_tip : (4, 4) float64
-        Frame of the tubes' tip, carried along without turning.
-    tip_angles_rad : (n,) float64
-        Angle of each tube at its own end.
+    Args:
+        arc_lengths_mm ((N,) float64): From the front plate to the tubes' tip.
+        points_mm: (N, 3) float64.
+        base_from_tip ((4, 4) float64): Frame of the tubes' tip, carried along without turning.
+        tip_angles_rad ((n,) float64): Angle of each tube at its own end.
     """
 
     arc_lengths_mm: Float
@@ -69,26 +65,17 @@ def derive_loaded(
 ) -> LoadedShape:
     """Return the shape of tubes that stood in tissue without a needle, when its tip is at `needle_mm`.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        The innermost first.
-    needle : Tube
-        Straight.
-    base_angles_rad, beta_mm : (n,) float64
-        See `stages.tube.mechanics.TubeMechanics`.
-    needle_mm : float
-        Arc length of the needle's tip from the front plate.
-    tissue_n_mm2, tissue_from_mm : float
-        Force for each mm of tube and mm aside, beyond an arc length.  Far stiffer tissue than lungs makes the
-        problem too steep.
+    Args:
+        tubes: The innermost first.
+        needle: Straight.
+        base_angles_rad, beta_mm ((n,) float64): See `stages.tube.mechanics.TubeMechanics`.
+        needle_mm: Arc length of the needle's tip from the front plate.
+        tissue_n_mm2, tissue_from_mm: Force for each mm of tube and mm aside, beyond an arc length.  Far
+            stiffer tissue than lungs makes the problem too steep.
 
-    Raises
-    ------
-    ConvergenceError
-        If no shape is found.
-    SettingsError
-        As `CasadiTubes.solve`, or if nothing is ahead of the front plate.
+    Raises:
+        ConvergenceError: If no shape is found.
+        SettingsError: As `CasadiTubes.solve`, or if nothing is ahead of the front plate.
     """
     beta, base = np.asarray(beta_mm, dtype=np.float64), np.asarray(base_angles_rad, dtype=np.float64)
     before = CasadiTubes(tubes).solve(base, beta)

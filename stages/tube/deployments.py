@@ -34,26 +34,18 @@ DEFAULT_STOP_MM = 2.0
 class Deployments:
     """Accepted deployments, E of them, and counts of the refused.
 
-    Parameters
-    ----------
-    site : (E,) int64
-        Index of the scope pose.
-    rotation_rad, outer_mm, inner_mm : (E,) float64
-        Rotation of all tubes together; insertions of the outermost and the innermost beyond the scope tip.
-    shape : (E,) int64
-        Index in `shapes_of(tubes)`.
-    branch : (E,) int64
-        Pierced branch.
-    exit_mm, wall_angle_rad : (E,) float64
-        Arc length at which the axis leaves the lumen for good, and its angle to the wall there.
-    wall_run_mm : (E,) float64
-        Length of body in the wall of the pierced branch, beyond the exit.
-    positions, tangents : (E, 3) float64
-        Tip of the inner tube, LPS mm.
-    candidates : int
-        Deployments looked at.
-    refused : dict of str to int
-        Counts by reason.
+    Args:
+        site ((E,) int64): Index of the scope pose.
+        rotation_rad, outer_mm, inner_mm ((E,) float64): Rotation of all tubes together; insertions of the
+            outermost and the innermost beyond the scope tip.
+        shape ((E,) int64): Index in `shapes_of(tubes)`.
+        branch ((E,) int64): Pierced branch.
+        exit_mm, wall_angle_rad ((E,) float64): Arc length at which the axis leaves the lumen for good, and
+            its angle to the wall there.
+        wall_run_mm ((E,) float64): Length of body in the wall of the pierced branch, beyond the exit.
+        positions, tangents ((E, 3) float64): Tip of the inner tube, LPS mm.
+        candidates: Deployments looked at.
+        refused: Counts by reason.
     """
 
     site: Int
@@ -104,25 +96,18 @@ def enumerate_deployments(
 ) -> Deployments:
     """Enumerate what the tubes can do from many scope tips: the shapes of the design that leave safely.
 
-    Parameters
-    ----------
-    scope_tips : (S, 9) float64
-        Point, direction and +x of the frame of each scope tip, LPS mm; rotations count from that +x.
-    with_fissures : bool
-        Whether fissures are obstacles.
-    rotations : int
-        Evenly spaced rotations of the tubes.  Where no tube is turned against another, a further one is
-        looked at between two of them where not the same shapes are accepted at both: there the tube or its
-        exit is near a limit.
-    stop_spacing_mm : float
-        Spacing of the insertions of all tubes.
-    worthwhile : callable, optional
-        Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are of use; no
-        others are looked at, but those between two rotations always are.
-    progress : callable, optional
-        Told the share of sites done.
-    enumerator : SiteEnumerator, optional
-        Made of the others if None.
+    Args:
+        scope_tips ((S, 9) float64): Point, direction and +x of the frame of each scope tip, LPS mm; rotations
+            count from that +x.
+        with_fissures: Whether fissures are obstacles.
+        rotations: Evenly spaced rotations of the tubes.  Where no tube is turned against another, a further
+            one is looked at between two of them where not the same shapes are accepted at both: there the
+            tube or its exit is near a limit.
+        stop_spacing_mm: Spacing of the insertions of all tubes.
+        worthwhile: Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are
+            of use; no others are looked at, but those between two rotations always are.
+        progress: Told the share of sites done.
+        enumerator: Made of the others if None.
     """
     tips = np.array(scope_tips, dtype=np.float64, order="C").reshape(-1, 9)
     enumerator = enumerator or SiteEnumerator(
@@ -156,17 +141,13 @@ class SiteEnumerator:
     exit, the angle and the run there are those of the shape that shares the beginning, which is within the
     tolerance of the tree.
 
-    Parameters
-    ----------
-    enough : int, optional
-        Where more deployments are of use, fewer rotations are looked at.
-    at_stops : tuple, optional
-        Numbers, set and tree of the shapes that are placed; `coarser_shapes` of the design's if None.
+    Args:
+        enough: Where more deployments are of use, fewer rotations are looked at.
+        at_stops: Numbers, set and tree of the shapes that are placed; `coarser_shapes` of the design's if
+            None.
 
-    Attributes
-    ----------
-    angles : (T,) float64
-        Rotations, rad: the even ones, then those between them, if there are any.
+    Attributes:
+        angles ((T,) float64): Rotations, rad: the even ones, then those between them, if there are any.
     """
 
     def __init__(

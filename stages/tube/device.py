@@ -43,10 +43,9 @@ class Tube:
 
     The curved part is one arc or, for several curvatures or out of one plane, `bent_pieces`, rearmost first.
 
-    Raises
-    ------
-    SettingsError
-        If a value is not finite or absurd, the tube has no wall, or the curved part contradicts itself.
+    Raises:
+        SettingsError: If a value is not finite or absurd, the tube has no wall, or the curved part
+            contradicts itself.
     """
 
     outer_diameter_mm: Annotated[float, quantity("outer diameter of the tube", above=0.0, at_most=10.0)]
@@ -179,11 +178,9 @@ class ConcentricTubes:
     that it holds against its precurvature.  Where no largest curvature of the channel is stated, it is what
     `max_strain` allows.
 
-    Raises
-    ------
-    SettingsError
-        If a value is not finite or absurd, the tubes do not nest, a tube held straight exceeds `max_strain`,
-        or slots would make the tubes bend otherwise than plain ones.
+    Raises:
+        SettingsError: If a value is not finite or absurd, the tubes do not nest, a tube held straight exceeds
+            `max_strain`, or slots would make the tubes bend otherwise than plain ones.
     """
 
     outer: Tube | None = None

@@ -21,10 +21,8 @@ THREADS = 2
 def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
     """Return what the tubes collide with in a lung.
 
-    Parameters
-    ----------
-    with_fissures : bool
-        Whether fissures are obstacles.
+    Args:
+        with_fissures: Whether fissures are obstacles.
     """
     field = lung.obstacle_field(with_fissures=with_fissures)
     bits = obstacle_bits(with_fissures)

@@ -20,16 +20,12 @@ class Equilibrium:
 
     Made by `TubeMechanics`.
 
-    Parameters
-    ----------
-    mechanics : NestedTubes
-        The tubes.
-    tip_angles_rad : (n,) float64
-        Rotation of each tube's material at its end against the Bishop frame, not wrapped.
-    beta_mm : (n,) float64
-        Where the rear ends are: 0 at the front plate, negative behind it.
-    needle_mm : float
-        How far the needle's tip is from the front plate, if there is a needle.
+    Args:
+        mechanics: The tubes.
+        tip_angles_rad ((n,) float64): Rotation of each tube's material at its end against the Bishop frame,
+            not wrapped.
+        beta_mm ((n,) float64): Where the rear ends are: 0 at the front plate, negative behind it.
+        needle_mm: How far the needle's tip is from the front plate, if there is a needle.
     """
 
     def __init__(
@@ -81,10 +77,8 @@ class Equilibrium:
     def frames(self, arc_lengths_mm: ArrayLike) -> Float:
         """Return Bishop frames `(N, 4, 4)` at arc lengths `(N,)` from the front plate, straight behind it.
 
-        Raises
-        ------
-        SettingsError
-            If an arc length is not finite or beyond the tip.
+        Raises:
+            SettingsError: If an arc length is not finite or beyond the tip.
         """
         s = self._arc_lengths(arc_lengths_mm)
         found = matrices(self._along(s)[0])
@@ -168,10 +162,9 @@ class Equilibrium:
 
         Rows: velocity of the tip in mm, then rotation in rad, in the base frame [Rucker2011].
 
-        Raises
-        ------
-        ConvergenceError
-            If the equilibrium is just losing stability, so that it does not follow the base smoothly.
+        Raises:
+            ConvergenceError: If the equilibrium is just losing stability, so that it does not follow the base
+                smoothly.
         """
         n = self.mechanics.count
         by_tip, by_shift = self.base_angle_derivatives

@@ -13,12 +13,10 @@ from stages.tube.device import ConcentricTubes
 def exit_points(tubes: ConcentricTubes, scope_tips: Float, deployments: Deployments, chosen: Int) -> Float:
     """Return the points `(N, 3)` LPS mm at which the axes of chosen deployments leave the lumen for good.
 
-    Parameters
-    ----------
-    scope_tips : (S, 9) float64
-        Point, direction and +x of the frame of each scope tip, LPS mm; `deployments.site` counts them.
-    chosen : (N,) int64
-        Which of the deployments.
+    Args:
+        scope_tips ((S, 9) float64): Point, direction and +x of the frame of each scope tip, LPS mm;
+            `deployments.site` counts them.
+        chosen ((N,) int64): Which of the deployments.
     """
     tips, at_mm = scope_tips[deployments.site[chosen]], deployments.exit_mm[chosen]
     rotations = deployments.rotation_rad[chosen]

@@ -28,14 +28,11 @@ HALVINGS = 12
 class SnapError(LungaccessError):
     """The tubes would snap: during the motion they lose stability, or their branch of equilibria ends.
 
-    Parameters
-    ----------
-    move : str
-        During which move of the sequence.
-    base_angles_rad, insertions_mm : (n,) float64
-        First joint values found that cannot be reached, innermost tube first.
-    last : Equilibrium
-        The last stable equilibrium before them.
+    Args:
+        move: During which move of the sequence.
+        base_angles_rad, insertions_mm ((n,) float64): First joint values found that cannot be reached,
+            innermost tube first.
+        last: The last stable equilibrium before them.
     """
 
     def __init__(
@@ -57,15 +54,13 @@ class SnapError(LungaccessError):
 class DeployedSequence:
     """All K steps of a deployment.
 
-    Parameters
-    ----------
-    move : (K,) int64
-        The move of the sequence that a step belongs to.
-    lateral_sweep_by_step_mm : (K,) float64
-        Largest distance of a point of the body from its final place: the point of the final centreline at
-        the same arc length from the scope tip, or the final tip if the body is longer by then.
-    follow_the_leader_by_step_mm : (K,) float64
-        Largest distance of a point of the body from the nearest point of the final centreline.
+    Args:
+        move ((K,) int64): The move of the sequence that a step belongs to.
+        lateral_sweep_by_step_mm ((K,) float64): Largest distance of a point of the body from its final place:
+            the point of the final centreline at the same arc length from the scope tip, or the final tip if
+            the body is longer by then.
+        follow_the_leader_by_step_mm ((K,) float64): Largest distance of a point of the body from the nearest
+            point of the final centreline.
     """
 
     sequence: Sequence
@@ -107,17 +102,12 @@ def deploy(
     Each step is solved from the tip angles of the one before.  A step is accepted if its equilibrium is
     stable, near the one before and, solved backwards, leads to it; otherwise the step is halved.
 
-    Parameters
-    ----------
-    step_mm, step_rad : float
-        Largest motion of any joint between two steps.
+    Args:
+        step_mm, step_rad: Largest motion of any joint between two steps.
 
-    Raises
-    ------
-    SnapError
-        If the tubes snap during the motion.
-    SettingsError
-        If the sequence does not fit the tubes.
+    Raises:
+        SnapError: If the tubes snap during the motion.
+        SettingsError: If the sequence does not fit the tubes.
     """
     angles, beta, move = joint_steps(sequence, mechanics.tubes, step_mm=step_mm, step_rad=step_rad)
     steps = [_first(mechanics, angles[0], beta[0])]

@@ -22,16 +22,12 @@ from stages.tube.nesting import SAME_MM, NestedTubes
 class Batch:
     """Equilibria of M configurations of n tubes.
 
-    Parameters
-    ----------
-    tip_angles_rad : (M, n) float64
-    base_from_tip : (M, 4, 4) float64
-        Tip frame of the innermost tube's material.
-    converged, stable : (M,) bool
-    least_determinant : (M,) float64
-        See `Equilibrium.determinant`.
-    residual_rad : (M,) float64
-        Largest error of a rear end's angle.
+    Args:
+        tip_angles_rad: (M, n) float64.
+        base_from_tip ((M, 4, 4) float64): Tip frame of the innermost tube's material.
+        converged, stable: (M,) bool.
+        least_determinant ((M,) float64): See `Equilibrium.determinant`.
+        residual_rad ((M,) float64): Largest error of a rear end's angle.
     """
 
     tip_angles_rad: Float
@@ -45,25 +41,19 @@ class Batch:
 class TubeMechanics(NestedTubes):
     """Nested tubes without external load, compliant in torsion [Rucker2010], [Dupont2010].
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        One or more, the innermost first.
-    needle : Tube, optional
-        A straight needle or wire in the innermost tube, of which only the bending stiffness matters.  It ends
-        where that tube does, or anywhere else; what is of it beyond the tubes is no part of their shape.
-    step_rad : float
-        Steps span at most this angle of the fastest torsional oscillation: a half of it makes errors 16
-        times smaller.
-    least_clearance_mm : float, optional
-        By how much each tube must be thinner than the bore of the next; None for textbook tubes of any
-        diameter.
+    Args:
+        tubes: One or more, the innermost first.
+        needle: A straight needle or wire in the innermost tube, of which only the bending stiffness matters.
+            It ends where that tube does, or anywhere else; what is of it beyond the tubes is no part of their
+            shape.
+        step_rad: Steps span at most this angle of the fastest torsional oscillation: a half of it makes
+            errors 16 times smaller.
+        least_clearance_mm: By how much each tube must be thinner than the bore of the next; None for textbook
+            tubes of any diameter.
 
-    Raises
-    ------
-    SettingsError
-        If there is no tube, a tube or needle does not fit into the next one or is shorter than it, the
-        needle is bent, or the step is not between 0 and 1.
+    Raises:
+        SettingsError: If there is no tube, a tube or needle does not fit into the next one or is shorter than
+            it, the needle is bent, or the step is not between 0 and 1.
     """
 
     def given_tip_angles(
@@ -71,21 +61,16 @@ class TubeMechanics(NestedTubes):
     ) -> Equilibrium:
         """Return the equilibrium with given rotations of the tubes' own ends: it always exists.
 
-        Parameters
-        ----------
-        tip_angles_rad : (n,) float64
-            Rotation of each tube's material at its end against the Bishop frame, not wrapped.
-        beta_mm : (n,) float64
-            Where the rear ends are: 0 at the front plate, negative behind it.
-        needle_mm : float, optional
-            Where the needle's tip is: at 0 or behind it changes nothing.  By default it is where that of the
-            innermost tube is.
+        Args:
+            tip_angles_rad ((n,) float64): Rotation of each tube's material at its end against the Bishop
+                frame, not wrapped.
+            beta_mm ((n,) float64): Where the rear ends are: 0 at the front plate, negative behind it.
+            needle_mm: Where the needle's tip is: at 0 or behind it changes nothing.  By default it is where
+                that of the innermost tube is.
 
-        Raises
-        ------
-        SettingsError
-            If numbers are missing or not finite, a rear end is ahead of the front plate or of that of the
-            next tube, or a tube ends behind the front plate or ahead of one that it encloses.
+        Raises:
+            SettingsError: If numbers are missing or not finite, a rear end is ahead of the front plate or of
+                that of the next tube, or a tube ends behind the front plate or ahead of one that it encloses.
         """
         tips, beta = self._joints(tip_angles_rad, "tip angles"), self._shifts(beta_mm)
         return Equilibrium(self, tips, beta, self._needle(needle_mm, beta[None])[0])
@@ -104,22 +89,16 @@ class TubeMechanics(NestedTubes):
         precurvature is raised from nothing, and then guesses all round are tried.  So what is returned is
         unstable only if no stable equilibrium was found.
 
-        Parameters
-        ----------
-        base_angles_rad : (n,) float64
-            Not wrapped: a full turn between tubes is another state.
-        beta_mm : (n,) float64
-        needle_mm : float, optional
-            See `given_tip_angles`.
-        guess_rad : (n,) float64, optional
-            Tip angles to start from, such as those of a configuration nearby; by default the base angles.
+        Args:
+            base_angles_rad ((n,) float64): Not wrapped: a full turn between tubes is another state.
+            beta_mm: (n,) float64.
+            needle_mm: See `given_tip_angles`.
+            guess_rad ((n,) float64): Tip angles to start from, such as those of a configuration nearby; by
+                default the base angles.
 
-        Raises
-        ------
-        ConvergenceError
-            If no equilibrium is found.
-        SettingsError
-            See `given_tip_angles`.
+        Raises:
+            ConvergenceError: If no equilibrium is found.
+            SettingsError: See `given_tip_angles`.
         """
         base, beta = self._joints(base_angles_rad, "base angles"), self._shifts(beta_mm)
         tip = base.copy() if guess_rad is None else self._joints(guess_rad, "guess")
@@ -141,16 +120,12 @@ class TubeMechanics(NestedTubes):
     ) -> Batch:
         """Return the equilibria of many configurations; see `given_base_angles`.
 
-        Parameters
-        ----------
-        base_angles_rad, beta_mm : (M, n) float64
-        needle_mm : float or (M,) float64, optional
-            See `given_tip_angles`.
+        Args:
+            base_angles_rad, beta_mm: (M, n) float64.
+            needle_mm (float or (M,) float64): See `given_tip_angles`.
 
-        Raises
-        ------
-        SettingsError
-            See `given_tip_angles`.  What does not converge is marked, not raised.
+        Raises:
+            SettingsError: See `given_tip_angles`.  What does not converge is marked, not raised.
         """
         base = np.array(base_angles_rad, dtype=np.float64, order="C", ndmin=2)
         beta = np.array(beta_mm, dtype=np.float64, order="C", ndmin=2)

@@ -42,11 +42,9 @@ class NearbyShape:
 class Neighbourhood:
     """One deployment of tubes, from which others nearby are reached straight.
 
-    Parameters
-    ----------
-    mechanics : TubeMechanics
-    insertions_mm, rotations_rad, tip_angles_rad : (n,) float64
-        Of that deployment, the innermost first; see `TubeShapes`.
+    Args:
+        insertions_mm, rotations_rad, tip_angles_rad ((n,) float64): Of that deployment, the innermost first;
+            see `TubeShapes`.
     """
 
     def __init__(
@@ -69,12 +67,9 @@ class Neighbourhood:
 
         A needle's tip stays where that of the innermost tube is.
 
-        Raises
-        ------
-        SnapError
-            If the tubes snap on the way.
-        SettingsError
-            If the insertions are impossible.
+        Raises:
+            SnapError: If the tubes snap on the way.
+            SettingsError: If the insertions are impossible.
         """
         mechanics = TubeMechanics(tubes, needle=needle)
         turned = np.array(rotations_rad, dtype=np.float64)
@@ -89,14 +84,11 @@ class Neighbourhood:
     def at(self, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
         """Return the shape of joint values, reached straight from that deployment; None if tubes snap.
 
-        Parameters
-        ----------
-        insertions_mm, rotations_rad : (n,) float64
+        Args:
+            insertions_mm, rotations_rad: (n,) float64.
 
-        Raises
-        ------
-        SettingsError
-            If numbers are missing or not finite, or the tubes get out of order.
+        Raises:
+            SettingsError: If numbers are missing or not finite, or the tubes get out of order.
         """
         mechanics = self._mechanics
         out, turned = (np.array(values, dtype=np.float64) for values in (insertions_mm, rotations_rad))

@@ -85,16 +85,12 @@ def _stretches(tube: Tube) -> Iterator[tuple[float, ...]]:
 def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0) -> None:
     """Check that tubes, the innermost first, fit into each other and that none is longer than one inside.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-    least_clearance_mm : float, optional
-        Least difference of diameters, which must be more than 0 in any case; None: any will do.
+    Args:
+        least_clearance_mm: Least difference of diameters, which must be more than 0 in any case; None: any
+            will do.
 
-    Raises
-    ------
-    SettingsError
-        If there is none, or they do not nest.
+    Raises:
+        SettingsError: If there is none, or they do not nest.
     """
     if not tubes:
         raise SettingsError(

@@ -105,10 +105,8 @@ def copies(shape: ShapeArrays, count: int) -> ManyShapes:
 def deployed(design: DesignArrays, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> ShapeArrays | None:
     """Return the shape of joint values, None if the tubes snap or a limit of the design is not kept.
 
-    Parameters
-    ----------
-    insertions_mm, rotations_rad : (n,) float64
-        See `TubeShape`.
+    Args:
+        insertions_mm, rotations_rad ((n,) float64): See `TubeShape`.
     """
     shape = shape_arrays(design)
     shape.joints[:] = np.concatenate([np.asarray(insertions_mm), np.asarray(rotations_rad)])

@@ -12,16 +12,13 @@ from anatomy.shafts import SlottedSegment
 class TubeParts(NamedTuple):
     """The parts of a tube of one precurvature and one pattern of slots each, K of them, from the tip on.
 
-    Parameters
-    ----------
-    begin_mm, end_mm : (K,) float64
-        Places along the tube, counted from its tip.
-    curvature_per_mm, direction_rad : (K,) float64
-        Precurvature, and its direction about the axis, 0 where it is straight.
-    stiffness_n_mm2 : (K,) float64
-        Bending stiffness.
-    strained_radius_mm : (K,) float64
-        Strain for each 1/mm of change of curvature: the radius by the factor of the slots.
+    Args:
+        begin_mm, end_mm ((K,) float64): Places along the tube, counted from its tip.
+        curvature_per_mm, direction_rad ((K,) float64): Precurvature, and its direction about the axis, 0
+            where it is straight.
+        stiffness_n_mm2 ((K,) float64): Bending stiffness.
+        strained_radius_mm ((K,) float64): Strain for each 1/mm of change of curvature: the radius by the
+            factor of the slots.
     """
 
     begin_mm: Float

@@ -35,12 +35,9 @@ ROUNDING = 1e-12
 class SequenceComparison:
     """Sequences to one final place, by their sweep.
 
-    Parameters
-    ----------
-    deployed : tuple of DeployedSequence
-        Those that can be carried out, least sweep first.
-    refused : dict of str to str
-        Why the others cannot: a tube is too short, or the tubes would snap.
+    Args:
+        deployed: Those that can be carried out, least sweep first.
+        refused: Why the others cannot: a tube is too short, or the tubes would snap.
     """
 
     deployed: tuple[DeployedSequence, ...]
@@ -50,10 +47,8 @@ class SequenceComparison:
     def best(self) -> DeployedSequence:
         """The sequence with the least sweep.
 
-        Raises
-        ------
-        SettingsError
-            If none can be carried out.
+        Raises:
+            SettingsError: If none can be carried out.
         """
         if not self.deployed:
             raise SettingsError(
@@ -77,19 +72,14 @@ def least_sweep_sequence(
     Looked at are: all tubes together, the innermost first, by increments in turns, and all tubes together
     without relative rotation, which then turn in place.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        Innermost first.
-    base_angles_rad : float or (n,) float64
-    insertions_mm : (n,) float64
-    needle : Tube, optional
-        A straight needle whose tip stays where that of the innermost tube is.
+    Args:
+        tubes: Innermost first.
+        base_angles_rad: float or (n,) float64.
+        insertions_mm: (n,) float64.
+        needle: A straight needle whose tip stays where that of the innermost tube is.
 
-    Raises
-    ------
-    SettingsError
-        If the insertions are out of order or beyond the tubes' lengths.
+    Raises:
+        SettingsError: If the insertions are out of order or beyond the tubes' lengths.
     """
     together(tubes, base_angles_rad, insertions_mm)
     angles = np.broadcast_to(np.asarray(base_angles_rad, dtype=np.float64), (len(tubes),))
@@ -149,14 +139,10 @@ class MakerLimits:
 class DesignProposal:
     """A pair of tubes, and what one deployment of it does, both tubes first, then the inner one alone.
 
-    Parameters
-    ----------
-    lateral_sweep_mm : float
-        Largest distance of any point of the body from its final place.
-    tip_offset_mm : float
-        Distance of the tip from the scope's axis: the sideways reach.
-    tip_angle_rad : float
-        Angle between tip and scope.
+    Args:
+        lateral_sweep_mm: Largest distance of any point of the body from its final place.
+        tip_offset_mm: Distance of the tip from the scope's axis: the sideways reach.
+        tip_angle_rad: Angle between tip and scope.
     """
 
     tubes: ConcentricTubes
@@ -175,20 +161,14 @@ def propose_designs(
     another one sweeps no more, reaches no less to the side, turns the tip no more and has no longer curved
     part.
 
-    Parameters
-    ----------
-    tubes : ConcentricTubes
-        What to start from; lengths, limits and the inner tube's diameters are kept.
-    outer_mm, inner_mm : float
-        Insertions of the deployment.
-    max_sweep_mm : float
-        Designs that sweep more are left out.
+    Args:
+        tubes: What to start from; lengths, limits and the inner tube's diameters are kept.
+        outer_mm, inner_mm: Insertions of the deployment.
+        max_sweep_mm: Designs that sweep more are left out.
 
-    Raises
-    ------
-    SettingsError
-        If there are not two tubes, the insertions are impossible, the sweep is not finite, or no outer tube
-        fits into the channel.
+    Raises:
+        SettingsError: If there are not two tubes, the insertions are impossible, the sweep is not finite, or
+            no outer tube fits into the channel.
     """
     if tubes.outer is None or tubes.middle is not None:
         raise SettingsError(
@@ -242,15 +222,11 @@ def propose_designs(
 def evaluate_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:
     """Return sweep and reach of a design, whose tubes are not turned against each other.
 
-    Parameters
-    ----------
-    outer_mm, inner_mm : float
-        Insertions of the deployment.
+    Args:
+        outer_mm, inner_mm: Insertions of the deployment.
 
-    Raises
-    ------
-    SettingsError
-        If the tubes cannot be inserted so, or snap.
+    Raises:
+        SettingsError: If the tubes cannot be inserted so, or snap.
     """
     inserted = np.array([inner_mm, outer_mm], dtype=np.float64)
     made = deployed(without_limits(design_arrays(tubes)), inserted, np.zeros(2))

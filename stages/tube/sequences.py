@@ -22,18 +22,13 @@ ROUNDING_MM = 1e-9
 class Sequence:
     """Waypoints of all joints; between two of them every joint moves at a steady rate.
 
-    Parameters
-    ----------
-    moves : tuple of str
-        What happens during the motion to each waypoint after the first, W - 1 of them.
-    base_angles_rad, beta_mm : (W, n) float64
-        Rotations of the tubes' bases and arc lengths of these bases from the scope tip (never above 0),
-        innermost tube first.
+    Args:
+        moves: What happens during the motion to each waypoint after the first, W - 1 of them.
+        base_angles_rad, beta_mm ((W, n) float64): Rotations of the tubes' bases and arc lengths of these
+            bases from the scope tip (never above 0), innermost tube first.
 
-    Raises
-    ------
-    SettingsError
-        If the numbers of waypoints, moves and tubes do not fit, or a value is not finite.
+    Raises:
+        SettingsError: If the numbers of waypoints, moves and tubes do not fit, or a value is not finite.
     """
 
     name: str
@@ -78,19 +73,13 @@ def together(
 ) -> Sequence:
     """Turn in the scope, insert all tubes with flush tips; each stops at its own insertion.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        n tubes, innermost first.
-    base_angles_rad : float or (n,) float64
-        Rotation of the bases; one number turns all of them.
-    insertions_mm : (n,) float64
-        How far each tube's tip comes out of the scope.
+    Args:
+        tubes: n tubes, innermost first.
+        base_angles_rad (float or (n,) float64): Rotation of the bases; one number turns all of them.
+        insertions_mm ((n,) float64): How far each tube's tip comes out of the scope.
 
-    Raises
-    ------
-    SettingsError
-        If an outer tube would be ahead of an inner one, or a tube is too short.
+    Raises:
+        SettingsError: If an outer tube would be ahead of an inner one, or a tube is too short.
     """
     insertions = _insertions(tubes, insertions_mm)
     levels = np.unique(insertions[insertions > 0.0])
@@ -103,19 +92,13 @@ def kuntz2015(
 ) -> Sequence:
     """Turn, insert both tubes together, insert the inner one alone [Kuntz2015, sec. IV-B].
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        Inner and outer tube, in this order.
-    rotation_rad : float or (2,) float64
-        Rotation of the bases in the scope; one number turns both.
-    outer_mm, inner_mm : float
-        How far the tubes come out of the scope.
+    Args:
+        tubes: Inner and outer tube, in this order.
+        rotation_rad (float or (2,) float64): Rotation of the bases in the scope; one number turns both.
+        outer_mm, inner_mm: How far the tubes come out of the scope.
 
-    Raises
-    ------
-    SettingsError
-        If there are not two tubes, the outer one would be ahead, or one is too short.
+    Raises:
+        SettingsError: If there are not two tubes, the outer one would be ahead, or one is too short.
     """
     if len(tubes) != 2:
         raise SettingsError(f"There are {len(tubes)} tubes", expected="two tubes, the inner one first")
@@ -154,12 +137,10 @@ def alternating(
 ) -> Sequence:
     """Turn in the scope, then insert by increments in turns, the innermost tube ahead.
 
-    Parameters
-    ----------
-    increment_mm : float
-        How far a tube moves before it is the next one's turn.
-
     The other parameters and the errors are those of `together`.
+
+    Args:
+        increment_mm: How far a tube moves before it is the next one's turn.
     """
     if not 0.0 < increment_mm < np.inf:
         raise SettingsError(f"The increment is {increment_mm:g} mm", expected="a finite length above 0")
@@ -179,21 +160,16 @@ def joint_steps(
 ) -> tuple[Float, Float, np.ndarray]:
     """Cut a sequence into steps, also where a curved part leaves the scope or the next tube.
 
-    Parameters
-    ----------
-    step_mm, step_rad : float
-        Largest motion of any joint in one step.
+    Args:
+        step_mm, step_rad: Largest motion of any joint in one step.
 
-    Returns
-    -------
-    base_angles_rad, beta_mm : (K, n) float64
-    move : (K,) int64
-        Index into `sequence.moves`; 0 for the first step, which is the first waypoint.
+    Returns:
+        - base_angles_rad, beta_mm ((K, n) float64)
+        - move ((K,) int64) - Index into `sequence.moves`; 0 for the first step, which is the first waypoint.
 
-    Raises
-    ------
-    SettingsError
-        If a step is not above 0, the tubes are others, or they get out of order during the motion.
+    Raises:
+        SettingsError: If a step is not above 0, the tubes are others, or they get out of order during the
+            motion.
     """
     if not (0.0 < step_mm < np.inf and 0.0 < step_rad < np.inf):
         raise SettingsError(f"The steps are {step_mm:g} mm, {step_rad:g} rad", expected="finite, above 0")

@@ -22,18 +22,13 @@ STILL_MM = 1e-6
 class ShapeTree:
     """The stretches of the shapes of a design, M nodes, each followed right after those before it.
 
-    Parameters
-    ----------
-    depth, skip : (M,) int64
-        Level from 1 on; the node to go on with where this one is refused.
-    first : (M + 1,) int64
-        Where the `stretches` of each node begin.
-    stretches : (R, 12) float64
-        See `stages.tube.kernels.placing`.
-    radius, clearance : (M,) float64
-        Outermost radius; what has to be free beside it and the margins, for sweep and tolerance; mm.
-    first_shape : (M + 1,) int64
-        Where the `shapes` (S,) begin that end with each node.
+    Args:
+        depth, skip ((M,) int64): Level from 1 on; the node to go on with where this one is refused.
+        first ((M + 1,) int64): Where the `stretches` of each node begin.
+        stretches ((R, 12) float64): See `stages.tube.kernels.placing`.
+        radius, clearance ((M,) float64): Outermost radius; what has to be free beside it and the margins, for
+            sweep and tolerance; mm.
+        first_shape ((M + 1,) int64): Where the `shapes` (S,) begin that end with each node.
     """
 
     depth: Int
@@ -56,12 +51,9 @@ class ShapeTree:
 def tree_of_shapes(shapes: TubeShapes, *, tolerance_mm: float | None = None) -> ShapeTree:
     """Return the tree of shapes that share their beginnings within a tolerance.
 
-    Parameters
-    ----------
-    shapes : TubeShapes
-    tolerance_mm : float, optional
-        Largest distance between shapes that share a stretch; how far they really are enters clearances.
-        TOLERANCE_MM, or EXACT_MM where nothing twists, if None.
+    Args:
+        tolerance_mm: Largest distance between shapes that share a stretch; how far they really are enters
+            clearances.  TOLERANCE_MM, or EXACT_MM where nothing twists, if None.
     """
     if tolerance_mm is None:
         tolerance_mm = TOLERANCE_MM if shapes.rotations_rad.any() else EXACT_MM

@@ -76,31 +76,23 @@ class TubeShapes:
 
     Tubes are listed from the innermost.  The sequence to each is that of `stages.tube.sequences.together`.
 
-    Parameters
-    ----------
-    insertions_mm, rotations_rad : (S, n) float64
-        How far each tube comes out, and how its rear end is turned; 0 bends towards +x of the scope tip.
-    tip_angles_rad : (S, n) float64
-        Rotation of each tube at its own end.
-    arcs : (A, 4) float64
-        Length in mm; direction of the bend in rad about the tangent, from +x of a frame that is carried along
-        without turning; curvature in 1/mm; radius of the outermost tube in mm.
-    first_arc : (S + 1,) int64
-        Where the arcs of each deployment begin.
-    scope_from_tip : (S, 4, 4) float64
-        Frame carried to the innermost tip without turning; +z forward.
-    least_determinant : (S,) float64
-        Least on the whole way; see `Equilibrium.determinant`.
-    lateral_sweep_mm, follow_the_leader_error_mm : (S,) float64
-        Largest on the whole way; see `DeployedSequence`.  Between steps it is bounded by second differences.
-    strain : (S,) float64
-        Largest of bending on the whole way, the scope being straight.
-    arc_error_mm : (S,) float64
-        Largest distance between the arcs and the tubes; clearances have to be larger by it.
-    candidates : int
-        Deployments looked at.
-    refused : dict of str to int
-        Counts by reason.
+    Args:
+        insertions_mm, rotations_rad ((S, n) float64): How far each tube comes out, and how its rear end is
+            turned; 0 bends towards +x of the scope tip.
+        tip_angles_rad ((S, n) float64): Rotation of each tube at its own end.
+        arcs ((A, 4) float64): Length in mm; direction of the bend in rad about the tangent, from +x of a
+            frame that is carried along without turning; curvature in 1/mm; radius of the outermost tube in
+            mm.
+        first_arc ((S + 1,) int64): Where the arcs of each deployment begin.
+        scope_from_tip ((S, 4, 4) float64): Frame carried to the innermost tip without turning; +z forward.
+        least_determinant ((S,) float64): Least on the whole way; see `Equilibrium.determinant`.
+        lateral_sweep_mm, follow_the_leader_error_mm ((S,) float64): Largest on the whole way; see
+            `DeployedSequence`.  Between steps it is bounded by second differences.
+        strain ((S,) float64): Largest of bending on the whole way, the scope being straight.
+        arc_error_mm ((S,) float64): Largest distance between the arcs and the tubes; clearances have to be
+            larger by it.
+        candidates: Deployments looked at.
+        refused: Counts by reason.
     """
 
     tubes: tuple[Tube, ...]
@@ -175,21 +167,14 @@ def tube_shapes(
 ) -> TubeShapes:
     """Return all deployments of a design that follow a stable branch of equilibria and keep its limits.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        One, two or three, the innermost first.
-    limits : ShapeLimits, optional
-    grid : ShapeGrid, optional
-        `ShapeGrid.default` if None.
-    needle : Tube, optional
-        A straight needle whose tip stays where that of the innermost tube is.
+    Args:
+        tubes: One, two or three, the innermost first.
+        grid: `ShapeGrid.default` if None.
+        needle: A straight needle whose tip stays where that of the innermost tube is.
 
-    Raises
-    ------
-    SettingsError
-        If there are more than three tubes, they do not nest, or slots make them other than plain tubes
-        scaled: several of them are bent, or not all are equally softened.
+    Raises:
+        SettingsError: If there are more than three tubes, they do not nest, or slots make them other than
+            plain tubes scaled: several of them are bent, or not all are equally softened.
     """
     if len(tubes) > 3:
         raise SettingsError(

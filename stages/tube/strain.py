@@ -22,13 +22,10 @@ def straightening(
     Where the tubes are not equally stiff all along the section, their stiffest part there counts, and of the
     needle the stiffest that passes the section on the whole of its way.
 
-    Parameters
-    ----------
-    insertions_mm : (n,) float64
-        Of the tubes beyond the scope's tip, the outermost first; the last are those of the tubes there are.
-    needle : Tube, optional
-    needle_out_mm : float
-        How far the needle goes beyond the tip of the inner tube.
+    Args:
+        insertions_mm ((n,) float64): Of the tubes beyond the scope's tip, the outermost first; the last are
+            those of the tubes there are.
+        needle_out_mm: How far the needle goes beyond the tip of the inner tube.
     """
     total = 0.0
     inserted = np.asarray(insertions_mm, dtype=np.float64)[-len(tubes.nested) :]

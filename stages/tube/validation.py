@@ -34,16 +34,11 @@ REASONS: dict[int, str] = {
 class Deployment:
     """One accepted deployment in full.
 
-    Parameters
-    ----------
-    rotation_rad : float
-        Rotation of all tubes together about +z of the scope tip.
-    outer_mm, inner_mm : float
-        Insertions of the outermost and the innermost tube.
-    lps_from_tip : (4, 4) float64
-        +z forward; +x carried from the scope tip, turned by the rotation, without turning: towards the bend
-        of tubes that bend in one plane.
-    shape : TubeShape
+    Args:
+        rotation_rad: Rotation of all tubes together about +z of the scope tip.
+        outer_mm, inner_mm: Insertions of the outermost and the innermost tube.
+        lps_from_tip ((4, 4) float64): +z forward; +x carried from the scope tip, turned by the rotation,
+            without turning: towards the bend of tubes that bend in one plane.
     """
 
     rotation_rad: float
@@ -74,10 +69,8 @@ class Deployment:
 class DeploymentValidator:
     """Accepts or refuses single deployments of tubes in one lung.
 
-    Parameters
-    ----------
-    with_fissures : bool
-        Whether fissures are obstacles.
+    Args:
+        with_fissures: Whether fissures are obstacles.
     """
 
     def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
@@ -103,20 +96,15 @@ class DeploymentValidator:
     ) -> Deployment | str:
         """Return the deployment of any joint values, or the reason why it is refused.
 
-        Parameters
-        ----------
-        lps_from_scope_tip : (4, 4) float64
-        rotation_rad : float
-            Direction of the bend about +z of the scope tip, counted from its +x.
-        insertions_mm : (n,) float64
-            Insertion of each tube beyond the scope tip, the outermost first.
-        rotations_rad : (n,) float64, optional
-            How much farther the rear end of each is turned, the outermost first; nothing if None.
+        Args:
+            lps_from_scope_tip: (4, 4) float64.
+            rotation_rad: Direction of the bend about +z of the scope tip, counted from its +x.
+            insertions_mm ((n,) float64): Insertion of each tube beyond the scope tip, the outermost first.
+            rotations_rad ((n,) float64): How much farther the rear end of each is turned, the outermost
+                first; nothing if None.
 
-        Raises
-        ------
-        SettingsError
-            If a tube would be ahead of one inside it, or numbers are missing or not finite.
+        Raises:
+            SettingsError: If a tube would be ahead of one inside it, or numbers are missing or not finite.
         """
         inserted = np.array(insertions_mm, dtype=np.float64, ndmin=1)[::-1]
         turned = np.zeros_like(inserted)
@@ -140,13 +128,10 @@ class DeploymentValidator:
     ) -> Deployment | str:
         """Return the deployment of a shape of the design, or the reason why it is refused.
 
-        Parameters
-        ----------
-        lps_from_scope_tip : (4, 4) float64
-        rotation_rad : float
-            Of all tubes together about +z of the scope tip, counted from its +x.
-        shape : TubeShape
-            Its own limits (extension, sweep, strain, snaps) are kept by all members of `TubeShapes`.
+        Args:
+            lps_from_scope_tip: (4, 4) float64.
+            rotation_rad: Of all tubes together about +z of the scope tip, counted from its +x.
+            shape: Its own limits (extension, sweep, strain, snaps) are kept by all members of `TubeShapes`.
         """
         base, normal = _start(lps_from_scope_tip, rotation_rad)
         reason = kernels.validate_arcs(

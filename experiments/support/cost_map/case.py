@@ -33,15 +33,10 @@ CONTOURS = "nodule_contours.json"
 class Case:
     """Both lungs of a CT.
 
-    Parameters
-    ----------
-    name : str
-    environment : NeedleEnvironment
-        Its cost map is that of [Fu2018]: vesselness, infinite in obstacles.
-    intensity : Volume
-        The CT as a map: HU + 1024, infinite in obstacles.
-    inner_lps : (N, 3) float64
-        Points of the centrelines of airways of the generations 4 to 9.
+    Args:
+        environment: Its cost map is that of [Fu2018]: vesselness, infinite in obstacles.
+        intensity: The CT as a map: HU + 1024, infinite in obstacles.
+        inner_lps ((N, 3) float64): Points of the centrelines of airways of the generations 4 to 9.
     """
 
     name: str
@@ -60,19 +55,14 @@ class Case:
 def case_of(name: str, work: Path, seed: int) -> Case:
     """Segment a CT, or take what an earlier run left in `work`.
 
-    Parameters
-    ----------
-    name : str
-        "phantom", the name of a folder below ct of LUNGACCESS_DATA, or a path to a CT.
-    work : Path
-        A patient folder for each CT is kept here.
-    seed : int
-        Of the phantom.
+    Args:
+        name: "phantom", the name of a folder below ct of LUNGACCESS_DATA, or a path to a CT.
+        work: A patient folder for each CT is kept here.
+        seed: Of the phantom.
 
-    Raises
-    ------
-    anatomy.base.errors.AnatomyError, anatomy.base.errors.FileError
-        If the CT cannot be read or segmented.
+    Raises:
+        anatomy.base.errors.AnatomyError, anatomy.base.errors.FileError: If the CT cannot be read or
+            segmented.
     """
     title, ct, given = _input_of(name, seed)
     parts = segment(SegmentationRequest(ct=ct, out=work / title, name=title, given=given)).parts

@@ -31,11 +31,9 @@ LEAST_STEP_MM = 1e-3
 def largest_step_mm(spacing_mm: ArrayLike, total_radius_mm: float) -> float:
     """Return the greatest step as printed: `2 sqrt(min(a_i s_i)^2 - r_total^2)` [Fu2018, sec. IV-B].
 
-    Raises
-    ------
-    SettingsError
-        If it is 0, as it is wherever `total_radius_mm` is a multiple of the voxel size along the axis that
-        decides.
+    Raises:
+        SettingsError: If it is 0, as it is wherever `total_radius_mm` is a multiple of the voxel size along
+            the axis that decides.
     """
     spacing = np.asarray(spacing_mm, dtype=np.float64)
     reach = float((inflation_voxels(spacing, total_radius_mm) * spacing).min())
@@ -61,15 +59,11 @@ def inflated_environment(environment: NeedleEnvironment) -> NeedleEnvironment:
 
     No path of this environment is proved clear, whatever the searches say of theirs: see `refuting_labels`.
 
-    Parameters
-    ----------
-    environment : NeedleEnvironment
-        Its `required_clearance_mm` is the paper's `r_total`.
+    Args:
+        environment: Its `required_clearance_mm` is the paper's `r_total`.
 
-    Raises
-    ------
-    SettingsError
-        If the step bound is 0.
+    Raises:
+        SettingsError: If the step bound is 0.
     """
     field, labels, geometry, bits = environment.obstacles
     step = largest_step_mm(environment.grid.spacing_mm, environment.required_clearance_mm)
@@ -97,17 +91,12 @@ def inflated_environment(environment: NeedleEnvironment) -> NeedleEnvironment:
 def refuting_labels(environment: NeedleEnvironment, paths: Iterable[ArcPath], branch: int = -1) -> Int:
     """Put paths to the proof: return `(P,)` 0 where a path is clear, else the label of what is too near.
 
-    Parameters
-    ----------
-    environment : NeedleEnvironment
-        That from which the inflated one was made.
-    branch : int
-        Pierced branch, whose wall is exempt at the exit; -1 for none.
+    Args:
+        environment: That from which the inflated one was made.
+        branch: Pierced branch, whose wall is exempt at the exit; -1 for none.
 
-    Raises
-    ------
-    SettingsError
-        If the environment is itself of the paper's mode.
+    Raises:
+        SettingsError: If the environment is itself of the paper's mode.
     """
     if environment.limits.lookup_step_mm > 0.0:
         raise SettingsError(

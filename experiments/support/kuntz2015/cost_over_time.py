@@ -92,10 +92,8 @@ def cost_at(run: dict[str, Any], time_s: float) -> float:
 def recorded(atlas: Atlas, name: list[Any], point: Float, time_s: float, file: Path) -> dict[str, Any]:
     """Return the run of that name from the file, or search and append it.
 
-    Parameters
-    ----------
-    name : list
-        Lung, system, goal, seed and seconds, as in the file; the seed is the fourth.
+    Args:
+        name: Lung, system, goal, seed and seconds, as in the file; the seed is the fourth.
     """
     done = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     run = next((each for each in done if each["name"] == name), None)

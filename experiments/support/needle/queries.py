@@ -47,21 +47,13 @@ EXEMPT_MM = 4.0
 class Query:
     """A start pose, a target and a needle, with what is known of them.
 
-    Parameters
-    ----------
-    name : str
-    patient : int
-    radius_mm : float
-        The needle's least radius of curvature.
-    lps_from_start : (4, 4) float64
-    target_lps : (3,) float64
-        LPS mm.
-    exempt_mm : float
-        Obstacles so near to the start do not count.
-    known : dict
-        What was recorded with the query.
-    runs : tuple of dict
-        Recorded runs of another planner.
+    Args:
+        radius_mm: The needle's least radius of curvature.
+        lps_from_start: (4, 4) float64.
+        target_lps ((3,) float64): LPS mm.
+        exempt_mm: Obstacles so near to the start do not count.
+        known: What was recorded with the query.
+        runs: Recorded runs of another planner.
     """
 
     name: str
@@ -134,14 +126,7 @@ def easy_queries(folder: Path, patients: Path) -> list[Query]:
 
 
 def generated_queries(obstacles: UncObstacles, tree: AirwayTree, count: int, seed: int) -> list[Query]:
-    """Draw queries of patient 0: from the ends of airways, to free points ahead; half of each radius.
-
-    Parameters
-    ----------
-    obstacles : Obstacles
-    tree : AirwayTree
-    count, seed : int
-    """
+    """Draw queries of patient 0: from the ends of airways, to free points ahead; half of each radius."""
     rng = np.random.default_rng(seed)
     ends = [int(tree.branch_points(int(branch))[-1]) for branch in tree.leaf_branches]
     queries: list[Query] = []

@@ -30,16 +30,14 @@ class NeedleArrivals:
 
     Frames are those of the tubes' tip in the frame of the front plate, carried along without turning.
 
-    Parameters
-    ----------
-    before, arrived, after : (M, 4, 4) float64
-        Tip before the needle comes, when its tip is at that of the tubes, and when it is inserted farthest.
-    sweep_mm, sweep_after_mm : (M,) float64
-        Largest distance of a point of the tubes from its place on arrival: before that, and after it.
-    strain, needle_strain : (M,) float64
-        Largest of bending, ahead of the scope's tip.
-    least_determinant : (M,) float64
-        See `Equilibrium.determinant`; where it is 0 or less the tubes snap, and the rest is not filled.
+    Args:
+        before, arrived, after ((M, 4, 4) float64): Tip before the needle comes, when its tip is at that of
+            the tubes, and when it is inserted farthest.
+        sweep_mm, sweep_after_mm ((M,) float64): Largest distance of a point of the tubes from its place on
+            arrival: before that, and after it.
+        strain, needle_strain ((M,) float64): Largest of bending, ahead of the scope's tip.
+        least_determinant ((M,) float64): See `Equilibrium.determinant`; where it is 0 or less the tubes snap,
+            and the rest is not filled.
     """
 
     before: Float
@@ -76,24 +74,16 @@ def needle_arrivals(
 
     Tissue does not hold the tubes here; see `experiments.support.needle_load.tissue` for what it does.
 
-    Parameters
-    ----------
-    mechanics : TubeMechanics
-        With a needle.
-    base_angles_rad, beta_mm : (M, n) float64
-        Deployments; see `TubeMechanics`.
-    needle_out_mm : float
-        How far the needle goes beyond the tubes' tip.
-    tip_angles_rad : (M, n) float64, optional
-        Angles at the tubes' own ends before the needle comes, such as those of `TubeShapes`; by default they
-        are looked for.
-    stop_mm : float
-        Motion of the needle between two looks.
+    Args:
+        mechanics: With a needle.
+        base_angles_rad, beta_mm ((M, n) float64): Deployments; see `TubeMechanics`.
+        needle_out_mm: How far the needle goes beyond the tubes' tip.
+        tip_angles_rad ((M, n) float64): Angles at the tubes' own ends before the needle comes, such as those
+            of `TubeShapes`; by default they are looked for.
+        stop_mm: Motion of the needle between two looks.
 
-    Raises
-    ------
-    SettingsError
-        If there is no needle, it is too short, or numbers are missing.
+    Raises:
+        SettingsError: If there is no needle, it is too short, or numbers are missing.
     """
     needle = mechanics.needle
     beta = np.array(beta_mm, dtype=np.float64, ndmin=2)
@@ -157,10 +147,8 @@ def bending_section(
     Its precurvature is what the handle gives it while it is empty.  So section, tubes and needle are one
     equilibrium.  In torsion it is as soft as in bending: no measurement is known, and real ones are stiffer.
 
-    Raises
-    ------
-    SettingsError
-        If it is no tube.
+    Raises:
+        SettingsError: If it is no tube.
     """
     area = second_moment_mm4(outer_diameter_mm, channel_diameter_mm)
     return Tube(

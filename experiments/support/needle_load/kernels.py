@@ -39,24 +39,17 @@ def _sweep(bodies, begin, end, final):
 def arrive_all(design, strained, base_angles, beta, stop, beyond, step, tips, results):
     """Let a needle come through deployed tubes and go on beyond their tip.
 
-    Parameters
-    ----------
-    design : tuple
-        See `assembly`: n tubes and, the last body, the needle.
-    strained : (n + 1,) float64
-        Strain of each body for each 1/mm of change of curvature, mm.
-    base_angles, beta : (M, n) float64
-        Deployments, rad and mm.
-    stop : float
-        Largest motion of the needle between two looks on its way to the tubes' tip, mm.
-    beyond : (K,) float64
-        How far it is beyond the tubes' tip in the looks after that, rising, mm.
-    step : float
-        See `assembly.cut`.
-    tips : (M, n) float64
-        Angles at the tubes' own ends before the needle comes; becomes those when it is inserted farthest.
-    results : (M, ARRIVAL_COLUMNS) float64
-        Is filled; a least determinant of 0 or less says that the tubes snap.
+    Args:
+        design (tuple): See `assembly`: n tubes and, the last body, the needle.
+        strained ((n + 1,) float64): Strain of each body for each 1/mm of change of curvature, mm.
+        base_angles, beta ((M, n) float64): Deployments, rad and mm.
+        stop (float): Largest motion of the needle between two looks on its way to the tubes' tip, mm.
+        beyond ((K,) float64): How far it is beyond the tubes' tip in the looks after that, rising, mm.
+        step (float): See `assembly.cut`.
+        tips ((M, n) float64): Angles at the tubes' own ends before the needle comes; becomes those when it is
+            inserted farthest.
+        results ((M, ARRIVAL_COLUMNS) float64): Is filled; a least determinant of 0 or less says that the
+            tubes snap.
     """
     n = base_angles.shape[1]
     needle_length = design[1][n]

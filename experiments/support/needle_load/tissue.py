@@ -49,17 +49,13 @@ more in rad."""
 class HeldShape:
     """The tubes at rest in tissue, with a needle in them, in the frame of the front plate.
 
-    Parameters
-    ----------
-    arc_lengths_mm : (N,) float64
-        From the front plate to the tubes' tip.
-    points_mm : (N, 3) float64
-    sideways_mm : (N,) float64
-        How far each point is from where it was without a needle, across the path there.
-    base_from_tip : (4, 4) float64
-        Frame of the tubes' tip, carried along without turning.
-    tissue_n_per_mm : float
-        Largest force of tissue for each mm of tube.
+    Args:
+        arc_lengths_mm ((N,) float64): From the front plate to the tubes' tip.
+        points_mm: (N, 3) float64.
+        sideways_mm ((N,) float64): How far each point is from where it was without a needle, across the path
+            there.
+        base_from_tip ((4, 4) float64): Frame of the tubes' tip, carried along without turning.
+        tissue_n_per_mm: Largest force of tissue for each mm of tube.
     """
 
     arc_lengths_mm: Float
@@ -98,27 +94,17 @@ def held_shape(
 ) -> HeldShape:
     """Return the shape of tubes that stand in tissue without a needle, when a needle has come.
 
-    Parameters
-    ----------
-    mechanics : TubeMechanics
-        With a needle.
-    base_angles_rad, beta_mm : (n,) float64
-        See `TubeMechanics`.
-    needle_mm : float
-        Where the needle's tip is.
-    tissue_n_mm2 : float
-        Force of tissue for each mm of beam and mm aside, 0 or more; see `LUNG_N_MM2`.
-    tissue_from_mm : float
-        Arc length at which the tubes leave the airway; before it nothing holds them.
-    element_mm : float
-        Longest arc of the discretised beam; errors fall with its square.
+    Args:
+        mechanics: With a needle.
+        base_angles_rad, beta_mm ((n,) float64): See `TubeMechanics`.
+        needle_mm: Where the needle's tip is.
+        tissue_n_mm2: Force of tissue for each mm of beam and mm aside, 0 or more; see `LUNG_N_MM2`.
+        tissue_from_mm: Arc length at which the tubes leave the airway; before it nothing holds them.
+        element_mm: Longest arc of the discretised beam; errors fall with its square.
 
-    Raises
-    ------
-    SettingsError
-        If a number is impossible.
-    ConvergenceError
-        If no shape at rest is found.
+    Raises:
+        SettingsError: If a number is impossible.
+        ConvergenceError: If no shape at rest is found.
     """
     if not (0.0 <= tissue_n_mm2 < math.inf and element_mm > 0.0):
         raise SettingsError(

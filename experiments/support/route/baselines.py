@@ -45,15 +45,11 @@ def sampled_route(
 
     Points are `(3,)` LPS mm.  With `any_curve`, the first path is taken, whatever limits its curve breaks.
 
-    Returns
-    -------
-    (Curve, bool)
-        The curve and whether it is proved; the last one found if none is.
+    Returns:
+        (Curve, bool): The curve and whether it is proved; the last one found if none is.
 
-    Raises
-    ------
-    NoRouteError
-        If the goal was never connected within the samples.
+    Raises:
+        NoRouteError: If the goal was never connected within the samples.
     """
     chosen = settings or SamplingSettings()
     points, parent = np.zeros((chosen.samples + 1, 3)), np.full(chosen.samples + 1, -1, dtype=np.int64)

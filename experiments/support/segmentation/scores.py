@@ -73,12 +73,9 @@ def distance_mm(mask: Mask, grid: Grid) -> Float32:
 def point_groups(truth: SyntheticCt, *, sure: bool) -> PointGroups:
     """Return where points are drawn.
 
-    Parameters
-    ----------
-    truth : SyntheticCt
-    sure : bool
-        Whether points outside vessels keep off the voxels that touch one.  Those are partly vessel, and
-        readers mark points they are sure of.
+    Args:
+        sure: Whether points outside vessels keep off the voxels that touch one.  Those are partly vessel, and
+            readers mark points they are sure of.
     """
     grid = truth.ct.grid
     tissue = truth.lung & ~truth.lumen

@@ -32,37 +32,24 @@ HALF = np.float32(0.5)
 class CtLook:
     """How a rendered CT looks.
 
-    Parameters
-    ----------
-    spacing_mm : float
-        Edge of the cubic voxels.
-    vessel_hu : float
-        Blood: 40 without contrast medium, 150 to 450 with it.
-    parenchyma_hu : float
-        Mean of the lung's tissue.
-    texture_hu, texture_mm : float
-        Standard deviation of the tissue's own variation, and the sigma of the Gaussian that correlates it.
-    psf_mm : float
-        Sigma of the Gaussian point spread.
-    noise_hu : float
-        Standard deviation of the noise at the full dose.
-    noise_voxels : float
-        Sigma of the Gaussian that correlates the noise, in voxels.
-    dose : float
-        Share of the full dose; the noise goes with 1 / sqrt(dose).
-    wall_mm : float
-        Thickness of airway walls where the patient has no mask of them.
-    fissure_mm : float
-        Thickness of the sheet between lobes.
-    convex : bool
-        The body is convex in every axial slice; for lungs too far apart for the tissue around them to meet.
-    seed : int
-        Of noise and texture.
+    Args:
+        spacing_mm: Edge of the cubic voxels.
+        vessel_hu: Blood: 40 without contrast medium, 150 to 450 with it.
+        parenchyma_hu: Mean of the lung's tissue.
+        texture_hu, texture_mm: Standard deviation of the tissue's own variation, and the sigma of the
+            Gaussian that correlates it.
+        psf_mm: Sigma of the Gaussian point spread.
+        noise_hu: Standard deviation of the noise at the full dose.
+        noise_voxels: Sigma of the Gaussian that correlates the noise, in voxels.
+        dose: Share of the full dose; the noise goes with 1 / sqrt(dose).
+        wall_mm: Thickness of airway walls where the patient has no mask of them.
+        fissure_mm: Thickness of the sheet between lobes.
+        convex: The body is convex in every axial slice; for lungs too far apart for the tissue around them to
+            meet.
+        seed: Of noise and texture.
 
-    Raises
-    ------
-    SettingsError
-        If a length, a deviation or the dose is not possible.
+    Raises:
+        SettingsError: If a length, a deviation or the dose is not possible.
     """
 
     spacing_mm: float = 0.7
@@ -113,10 +100,8 @@ def render_ct(images: PatientImages, look: CtLook | None = None) -> SyntheticCt:
     fissure, airway wall, nodule, vessel, lumen; then come point spread and noise.
     Same patient and look, same bits.
 
-    Raises
-    ------
-    AnatomyError
-        If the lung mask is empty.
+    Raises:
+        AnatomyError: If the lung mask is empty.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -52,27 +52,19 @@ def med_rad(
 ) -> ExitCode:
     """Plan the needle from each published start to each published target; exit code 1 if none is reached.
 
-    Parameters
-    ----------
-    folder : Path
-        A patient, or a folder of patients.
-    rules : str
-        ours: proved clearance of the system's needle, with the exemption at the airway wall. unc: a needle of
-        2 mm that keeps from voxel centres, obstacles within 3 mm of the start ignored, 1 mm goal tolerance.
-    planners : str
-        Names separated by commas: rrt, ao-rrt, optimal, resolution, decide; of OMPL control.RRT, control.EST,
-        control.KPIECE1.
-    radius : str
-        Least radii of curvature in mm, separated by commas; if not given, that of the system, or 50,100,121
-        by the rules of unc.
-    seeds : int
-        Runs of each planner that draws at random.
-    budget : float
-        Processor time of a run in seconds.
-    peer : Path
-        JSON file of another planner's recorded results, shown beside.
-    out : Path
-        File for all runs: .csv, or .json, which holds the arcs of the paths, too.
+    Args:
+        folder: A patient, or a folder of patients.
+        rules: ours: proved clearance of the system's needle, with the exemption at the airway wall. unc: a
+            needle of 2 mm that keeps from voxel centres, obstacles within 3 mm of the start ignored, 1 mm
+            goal tolerance.
+        planners: Names separated by commas: rrt, ao-rrt, optimal, resolution, decide; of OMPL control.RRT,
+            control.EST, control.KPIECE1.
+        radius: Least radii of curvature in mm, separated by commas; if not given, that of the system, or
+            50,100,121 by the rules of unc.
+        seeds: Runs of each planner that draws at random.
+        budget: Processor time of a run in seconds.
+        peer: JSON file of another planner's recorded results, shown beside.
+        out: File for all runs: .csv, or .json, which holds the arcs of the paths, too.
     """
     from lungaccess.running.benchmark import read_peer, summary_rows, write_rows
     from lungaccess.running.benchmark.runs import require_table_file

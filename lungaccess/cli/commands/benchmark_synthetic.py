@@ -31,10 +31,8 @@ synthetic = App(
 def names_of(text: str | None) -> tuple[str, ...]:
     """Return the names in a text that are separated by commas; none if there is no text.
 
-    Raises
-    ------
-    SettingsError
-        If a name is empty.
+    Raises:
+        SettingsError: If a name is empty.
     """
     if text is None:
         return ()
@@ -61,16 +59,11 @@ def make(
 
     What is there already stays; every phantom is compared with the hash of the manifest.
 
-    Parameters
-    ----------
-    out : Path
-        Folder of the cases.
-    phantoms : str
-        Names separated by commas, such as adult-01,child-03; all fifty if not given.
-    ct : bool
-        Also the CTs, about 25 MB each; no rule needs them.
-    tips : bool
-        Also the scope tips, from which a planner without a bronchoscope of its own can start.
+    Args:
+        out: Folder of the cases.
+        phantoms: Names separated by commas, such as adult-01,child-03; all fifty if not given.
+        ct: Also the CTs, about 25 MB each; no rule needs them.
+        tips: Also the scope tips, from which a planner without a bronchoscope of its own can start.
     """
     from lungaccess.running.benchmark.synthetic.cases import write_benchmark
 
@@ -107,30 +100,19 @@ def run(
 
     Exit code 1 if a run could not be made.
 
-    Parameters
-    ----------
-    folder : Path
-        The cases, as `make` wrote them.
-    methods : str
-        METHOD or METHOD+NEEDLE_PLANNER, separated by commas, such as atlas,kuntz2015,kuntz2015+control.RRT.
-    phantoms : str
-        Names separated by commas; those of the folder if not given.
-    devices : str
-        Presets separated by commas; all three if not given.
-    targets : int
-        The first so many of each lung of a phantom; all ten if not given.
-    iterations : int
-        Budget of a query beyond the direct arcs, which can be repeated exactly.
-    time_s : float
-        Budget in seconds beside it, for planners of OMPL.
-    out : Path
-        Results file (SQLite); made if it is not there.
-    answers : Path
-        Folder for one submission a method, METHOD.json, to be scored.
-    scheduler : str
-        Address of a running dask scheduler; this machine if not given.
-    workers : int
-        How many processes on this machine.
+    Args:
+        folder: The cases, as `make` wrote them.
+        methods: METHOD or METHOD+NEEDLE_PLANNER, separated by commas, such as
+            atlas,kuntz2015,kuntz2015+control.RRT.
+        phantoms: Names separated by commas; those of the folder if not given.
+        devices: Presets separated by commas; all three if not given.
+        targets: The first so many of each lung of a phantom; all ten if not given.
+        iterations: Budget of a query beyond the direct arcs, which can be repeated exactly.
+        time_s: Budget in seconds beside it, for planners of OMPL.
+        out: Results file (SQLite); made if it is not there.
+        answers: Folder for one submission a method, METHOD.json, to be scored.
+        scheduler: Address of a running dask scheduler; this machine if not given.
+        workers: How many processes on this machine.
     """
     from lungaccess.running.benchmark.synthetic.reference import benchmark_study
     from lungaccess.running.study.driver import run_study
@@ -183,21 +165,14 @@ def score(
 ) -> ExitCode:
     """Score a submission by the independent check alone; exit code 1 if an answer is refused.
 
-    Parameters
-    ----------
-    submission : Path
-        JSON file of poses and arcs; docs/reference/submission.md describes it.
-    folder : Path
-        The cases, as `make` wrote them.
-    samples : int
-        Deviated plans for the chance of success of each; 0 for no estimate.
-    certify : int
-        Budget, in ranges of deployments, of the proof that a target claimed unreachable is so; 0 for no
-        proof.
-    only_answered : bool
-        Leave out queries without an answer, which otherwise count as not solved.
-    out : Path
-        File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
+    Args:
+        submission: JSON file of poses and arcs; docs/reference/submission.md describes it.
+        folder: The cases, as `make` wrote them.
+        samples: Deviated plans for the chance of success of each; 0 for no estimate.
+        certify: Budget, in ranges of deployments, of the proof that a target claimed unreachable is so; 0 for
+            no proof.
+        only_answered: Leave out queries without an answer, which otherwise count as not solved.
+        out: File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
     """
     from lungaccess.running.benchmark.runs import require_table_file
     from lungaccess.running.benchmark.synthetic.scoring import REFUSED, score_submission
@@ -235,14 +210,10 @@ def sheet(
 ) -> ExitCode:
     """Print the score sheet of one or several planners.
 
-    Parameters
-    ----------
-    scores : Path
-        JSON files that `score --out` wrote.
-    csv : Path
-        Also write the sheet as a .csv or .json file.
-    brief : bool
-        One line a planner, without families and devices.
+    Args:
+        scores: JSON files that `score --out` wrote.
+        csv: Also write the sheet as a .csv or .json file.
+        brief: One line a planner, without families and devices.
     """
     from lungaccess.running.benchmark.synthetic.sheet import read_scores, score_sheet, write_sheet
 

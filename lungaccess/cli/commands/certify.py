@@ -41,14 +41,10 @@ def certify(
     Exit code 0 if it is proved, 1 if it is not: then nothing is known of the target, but which share of the
     deployments is ruled out, and where the others start.
 
-    Parameters
-    ----------
-    most_boxes : int
-        Ranges of deployments to look at before the proof is given up; 20 million if not given.
-    time_s : float
-        Seconds to look at them, after the preparation; the same time need not give the same answer.
-    out : Path
-        PNG file that shows what is ruled out and what is open.
+    Args:
+        most_boxes: Ranges of deployments to look at before the proof is given up; 20 million if not given.
+        time_s: Seconds to look at them, after the preparation; the same time need not give the same answer.
+        out: PNG file that shows what is ruled out and what is open.
     """
     from lungaccess.planning.reachability import MOST_BOXES, UnreachableProof
     from lungaccess.plans.version import made_by

@@ -33,16 +33,12 @@ def design(
     Stop it at any time and start it again: it goes on from what is stored.  Exit code 1 if the best device
     reaches no target.
 
-    Parameters
-    ----------
-    design : Path
-        TOML file of the search; that of `lungaccess template design`, on a synthetic patient, if not given.
-    out : Path
-        Folder for the runs, the record, the picture and the devices found.
-    scheduler : str
-        Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
-    workers : int
-        How many processes on this machine; as many as it has cores if not given.
+    Args:
+        design: TOML file of the search; that of `lungaccess template design`, on a synthetic patient, if not
+            given.
+        out: Folder for the runs, the record, the picture and the devices found.
+        scheduler: Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
+        workers: How many processes on this machine; as many as it has cores if not given.
     """
     from anatomy.base.settings import settings_toml
     from lungaccess.running.design import design_of, read_design, run_design

@@ -22,10 +22,8 @@ from lungaccess.cli.options import OutputOptions
 def doctor(*, cache: Path | None = None, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Show versions, machine, compiled kernels and folders; exit code 1 if something has to be mended.
 
-    Parameters
-    ----------
-    cache : Path
-        Folder of prepared anatomies; the usual one if not given.
+    Args:
+        cache: Folder of prepared anatomies; the usual one if not given.
     """
     health = examine(cache)
     if output.json:
@@ -93,17 +91,12 @@ class Library:
 class KernelCache:
     """Machine code of kernels on disk: for `warm` of the modules there is code of their present sources.
 
-    Parameters
-    ----------
-    folders : tuple of str
-        Where it is looked for: where `lungaccess-kernels` is installed, its folder first, then that in which
-        new code is kept.
-    size_bytes : int
-        Of all code for this numba and Python there, that of other sources included.
-    digest : str
-        Of all sources of kernels, as plans state it.
-    writable : bool
-        Whether new code can be kept; otherwise each process compiles anew.
+    Args:
+        folders: Where it is looked for: where `lungaccess-kernels` is installed, its folder first, then that
+            in which new code is kept.
+        size_bytes: Of all code for this numba and Python there, that of other sources included.
+        digest: Of all sources of kernels, as plans state it.
+        writable: Whether new code can be kept; otherwise each process compiles anew.
     """
 
     folders: tuple[str, ...]
@@ -136,16 +129,11 @@ class Folder:
 class Health:
     """What `examine` found.
 
-    Parameters
-    ----------
-    cores, usable_cores : int
-        Of the machine, and those that this process may use.
-    memory_bytes, free_memory_bytes : int or None
-        None where the system does not say.
-    cache : Folder
-        Prepared anatomies and atlases.
-    data : Folder or None
-        Real anatomy for the tests, if `LUNGACCESS_DATA` names it.
+    Args:
+        cores, usable_cores: Of the machine, and those that this process may use.
+        memory_bytes, free_memory_bytes: None where the system does not say.
+        cache: Prepared anatomies and atlases.
+        data: Real anatomy for the tests, if `LUNGACCESS_DATA` names it.
     """
 
     version: str
@@ -181,10 +169,8 @@ class Health:
 def examine(cache: Path | None = None) -> Health:
     """Look at the installation; no library is imported for it, so that it works where one is missing.
 
-    Parameters
-    ----------
-    cache : Path, optional
-        Folder of prepared anatomies; the usual one if None.
+    Args:
+        cache: Folder of prepared anatomies; the usual one if None.
     """
     data = os.environ.get("LUNGACCESS_DATA")
     return Health(

@@ -99,12 +99,9 @@ def explain_and_report(
 ) -> dict[str, Any]:
     """Explain a `NoPlan`, write and show what was learned, and return it as plain values.
 
-    Parameters
-    ----------
-    cost : str
-        By which plans of other systems are searched.
-    time_s : float or None
-        Processor time for the explanation; the default of `explain_no_plan` if None.
+    Args:
+        cost: By which plans of other systems are searched.
+        time_s: Processor time for the explanation; the default of `explain_no_plan` if None.
     """
     from lungaccess.judging.explanation import explanation_record, save_explanation
 

@@ -68,65 +68,42 @@ def segment(
 
     Run it again after correcting a mask in the folder: only what depends on the mask is done again.
 
-    Parameters
-    ----------
-    ct : Path
-        CT as NIfTI, NRRD or MetaImage file, or a folder of DICOM files; or a case of AeroPath (its folder) or
-        ATM'22 (its file), whose own masks are then used.
-    out : Path
-        Patient folder to write or to bring up to date.
-    nodule_contours : Path
-        Contours of radiologists (JSON, see docs/explanation/segmentation.md); the nodule becomes the target.
-    nodule_mask : Path
-        Mask of the nodule, which becomes the target.
-    nodule : tuple[str, ...]
-        A point in a nodule, ras:x,y,z or lps:x,y,z, which is outlined and becomes the target; repeated for
-        more nodules.
-    target : str
-        Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
-    series : str
-        UID of the DICOM series, where the folder holds several.
-    ex_vivo : bool
-        The image shows an inflated lung in air, not a patient.
-    thick_slices : bool
-        Accept slices of more than 3 mm; planning on the result must then be allowed as well.
-    large_radius_mm : float
-        Vessels of this radius in mm or more are obstacles, thinner ones cost: 1 to 4.  It is recorded in
-        patient.toml.
-    accept : tuple[str, ...]
-        A check that failed and is overruled, by the name in its message: axes, sides, airway, bronchi,
-        one-lung,
-        volume, density or masks. It is recorded in patient.toml.
-    seed : str
-        A point in the trachea, ras:x,y,z or lps:x,y,z, if it is not found by itself.
-    voxel_mm : float
-        Where the CT has larger voxels, as between thick slices, it is interpolated to about this size.
-    lungs : Path
-        Lungs from elsewhere: label map (1 right, 2 left; or lobes) or one mask. This and the next five may
-        also be FILE#1,2 for some labels of a label map, or a folder of TotalSegmentator.
-    airway : Path
-        Mask of the airway lumen from elsewhere.
-    airway_wall : Path
-        Mask of the airway wall from elsewhere.
-    vessels : Path
-        Mask of the vessels to avoid from elsewhere.
-    lobes : Path
-        Lobes from elsewhere: label map of lungmask, TotalSegmentator or this program.
-    fissures : Path
-        Mask of the fissures from elsewhere.
-    onnx_airway : Path
-        Your own network for the airway, with its settings in a TOML file of the same name beside it.
-    totalsegmentator : Path
-        Folder with output of TotalSegmentator's tasks lung_vessels or total: all that it holds is used in
-        place of these steps.
-    name : str
-        How reports call the patient.
-    pictures : bool
-        Draw the pictures of the quality report.
-    force : bool
-        Take masks and a patient.toml of others that lie in the folder for corrections, instead of refusing.
-    json : bool
-        Print JSON, the content of quality.json, instead of tables.
+    Args:
+        ct: CT as NIfTI, NRRD or MetaImage file, or a folder of DICOM files; or a case of AeroPath (its
+            folder) or ATM'22 (its file), whose own masks are then used.
+        out: Patient folder to write or to bring up to date.
+        nodule_contours: Contours of radiologists (JSON, see docs/explanation/segmentation.md); the nodule
+            becomes the target.
+        nodule_mask: Mask of the nodule, which becomes the target.
+        nodule (tuple[str, ...]): A point in a nodule, ras:x,y,z or lps:x,y,z, which is outlined and becomes
+            the target; repeated for more nodules.
+        target: Target point in mm with its frame: ras:x,y,z or lps:x,y,z.
+        series: UID of the DICOM series, where the folder holds several.
+        ex_vivo: The image shows an inflated lung in air, not a patient.
+        thick_slices: Accept slices of more than 3 mm; planning on the result must then be allowed as well.
+        large_radius_mm: Vessels of this radius in mm or more are obstacles, thinner ones cost: 1 to 4.  It is
+            recorded in patient.toml.
+        accept (tuple[str, ...]): A check that failed and is overruled, by the name in its message: axes,
+            sides, airway, bronchi, one-lung, volume, density or masks. It is recorded in patient.toml.
+        seed: A point in the trachea, ras:x,y,z or lps:x,y,z, if it is not found by itself.
+        voxel_mm: Where the CT has larger voxels, as between thick slices, it is interpolated to about this
+            size.
+        lungs: Lungs from elsewhere: label map (1 right, 2 left; or lobes) or one mask. This and the next five
+            may also be FILE#1,2 for some labels of a label map, or a folder of TotalSegmentator.
+        airway: Mask of the airway lumen from elsewhere.
+        airway_wall: Mask of the airway wall from elsewhere.
+        vessels: Mask of the vessels to avoid from elsewhere.
+        lobes: Lobes from elsewhere: label map of lungmask, TotalSegmentator or this program.
+        fissures: Mask of the fissures from elsewhere.
+        onnx_airway: Your own network for the airway, with its settings in a TOML file of the same name beside
+            it.
+        totalsegmentator: Folder with output of TotalSegmentator's tasks lung_vessels or total: all that it
+            holds is used in place of these steps.
+        name: How reports call the patient.
+        pictures: Draw the pictures of the quality report.
+        force: Take masks and a patient.toml of others that lie in the folder for corrections, instead of
+            refusing.
+        json: Print JSON, the content of quality.json, instead of tables.
     """
     from anatomy.segmentation.pipeline import memory_estimate_gib, read_ct
     from anatomy.segmentation.pipeline import segment as run

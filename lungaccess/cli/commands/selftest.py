@@ -23,10 +23,8 @@ def selftest(
 
     Exit code 0 if all agree; 1 if a proof disagrees: kind, seed of the case and both numbers are said.
 
-    Parameters
-    ----------
-    kind : str
-        Kinds of proofs, as the table names them; all of them if not given.
+    Args:
+        kind: Kinds of proofs, as the table names them; all of them if not given.
     """
     from lungaccess.judging.selftest import self_test
 

@@ -43,16 +43,11 @@ def run(
 
     Stop it at any time and start it again: it goes on from what is stored.
 
-    Parameters
-    ----------
-    study : Path
-        TOML file of the study.
-    out : Path
-        Results file (SQLite); made if it is not there.
-    scheduler : str
-        Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
-    workers : int
-        How many processes on this machine; as many as it has cores if not given.
+    Args:
+        study: TOML file of the study.
+        out: Results file (SQLite); made if it is not there.
+        scheduler: Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
+        workers: How many processes on this machine; as many as it has cores if not given.
     """
     from lungaccess.plans.version import software_kernels
     from lungaccess.running.study.driver import run_study
@@ -89,10 +84,8 @@ def run(
 def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Show what is stored, by case and planner.
 
-    Parameters
-    ----------
-    results : Path
-        Results file.
+    Args:
+        results: Results file.
     """
     from lungaccess.running.study.summary import summarise
 
@@ -114,14 +107,10 @@ def export(
 ) -> ExitCode:
     """Write the tables of the results as CSV or Parquet.
 
-    Parameters
-    ----------
-    results : Path
-        Results file.
-    csv : Path
-        Folder for runs.csv, progress.csv, findings.csv, rejections.csv and plans.csv.
-    parquet : Path
-        Folder for the same as Parquet.
+    Args:
+        results: Results file.
+        csv: Folder for runs.csv, progress.csv, findings.csv, rejections.csv and plans.csv.
+        parquet: Folder for the same as Parquet.
     """
     from lungaccess.running.study.tables import export_csv, export_parquet
 
@@ -145,10 +134,8 @@ def export(
 def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     """Compare two results files, but for times and memory; exit code 1 if they differ.
 
-    Parameters
-    ----------
-    first, second : Path
-        Results files.
+    Args:
+        first, second: Results files.
     """
     from lungaccess.running.study.tables import differences
 

@@ -86,10 +86,8 @@ def template(
 def template_text(kind: Kind) -> str:
     """Return the example of a file.
 
-    Raises
-    ------
-    SettingsError
-        If files of the kind are not written by hand.
+    Raises:
+        SettingsError: If files of the kind are not written by hand.
     """
     if kind not in FILES:
         raise SettingsError(
@@ -103,10 +101,8 @@ def template_text(kind: Kind) -> str:
 def schema_text(kind: Kind) -> str:
     """Return the JSON Schema of the files of a kind.
 
-    Raises
-    ------
-    SettingsError
-        If its files have no keys.
+    Raises:
+        SettingsError: If its files have no keys.
     """
     from lungaccess.plans.schema import schema_of
 

@@ -36,17 +36,13 @@ SEED = 0
 class Appraisal:
     """What is said of a plan before anything else.
 
-    Parameters
-    ----------
-    check : CheckReport
-        All findings of the independent check.
-    risk : RiskReport, ProcedureReport, Chance or None
-        The estimate of success, or what the plan states of one; None for a refused plan and where no draws
-        were asked for.
-    without_measuring : Share or None
-        How often it succeeds in open loop, where the estimate is of a procedure that measures.
-    limits : tuple of Limit
-        The limits of devices and distances, broken ones first, then the nearest.
+    Args:
+        check: All findings of the independent check.
+        risk: The estimate of success, or what the plan states of one; None for a refused plan and where no
+            draws were asked for.
+        without_measuring: How often it succeeds in open loop, where the estimate is of a procedure that
+            measures.
+        limits: The limits of devices and distances, broken ones first, then the nearest.
     """
 
     check: CheckReport
@@ -87,26 +83,18 @@ class Appraisal:
 class Appraiser:
     """Appraises many plans of one lung: what the check needs of the lung is prepared once.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient that the plans are for.
-    errors : ErrorModel, optional
-        The errors of devices and target; the preset `breath-hold` if None.
-    procedure : Procedure, optional
-        What is measured and planned again on the way; the preset `open-loop` if None.
-    draws : int, optional
-        Number of deviated plans or procedures of an estimate; `DRAWS` if None, or `MEASURED_DRAWS` of
-        procedures that measure, and 0 for no estimate.
-    seed : int, optional
-        Seed of the random numbers; `SEED` if None.
-
     A plan that states its own chance of success is not estimated again if none of these is given.
 
-    Raises
-    ------
-    SettingsError
-        If the number of draws is negative.
+    Args:
+        lung: The patient that the plans are for.
+        errors: The errors of devices and target; the preset `breath-hold` if None.
+        procedure: What is measured and planned again on the way; the preset `open-loop` if None.
+        draws: Number of deviated plans or procedures of an estimate; `DRAWS` if None, or `MEASURED_DRAWS` of
+            procedures that measure, and 0 for no estimate.
+        seed: Seed of the random numbers; `SEED` if None.
+
+    Raises:
+        SettingsError: If the number of draws is negative.
     """
 
     def __init__(
@@ -176,22 +164,16 @@ def appraise(
 
     A plan that the check refuses has no chance of success: it must not be used, so none is estimated.
 
-    Parameters
-    ----------
-    plan, lung
-        The plan, and the patient that it is for.
-    errors, procedure, draws, seed
-        See `Appraiser`.
-    system, target_lps
-        What was asked for; see `lungaccess.judging.checking.check`.
-    each_kind : bool
-        Whether success under errors of one kind only is estimated, too.
+    Args:
+        plan, lung: The plan, and the patient that it is for.
+        errors, procedure, draws, seed: See `Appraiser`.
+        system, target_lps: What was asked for; see `lungaccess.judging.checking.check`.
+        each_kind: Whether success under errors of one kind only is estimated, too.
 
-    Examples
-    --------
-    >>> appraisal = la.appraise(plan, lung)  # doctest: +SKIP
-    >>> print(appraisal.headline.text)  # doctest: +SKIP
-    Estimated to succeed in 24 of 100 procedures (95 % interval 22 to 27); fails most because it ...
+    Examples:
+        >>> appraisal = la.appraise(plan, lung)  # doctest: +SKIP
+        >>> print(appraisal.headline.text)  # doctest: +SKIP
+        Estimated to succeed in 24 of 100 procedures (95 % interval 22 to 27); fails most because it ...
     """
     appraiser = Appraiser(lung, errors, procedure=procedure, draws=draws, seed=seed)
     return appraiser.appraise(plan, system, target_lps=target_lps, each_kind=each_kind)

@@ -45,21 +45,17 @@ class Geometry(StrEnum):
 class Headline:
     """The verdict of the check and the chance of success of one plan.
 
-    Parameters
-    ----------
-    geometry : Geometry
-    refusals : int
-        Findings of the check that are not ok.
-    estimate : RiskReport, ProcedureReport, Chance or None
-        The estimate of success, or what the plan states of one; None if there is none, as for a refused plan.
-    fissures_unknown : bool
-        Whether fissures must not be crossed, and the patient has no mask of them.
-    needle_load : str
-        What the needle does to the tubes that aim it, where the plan does not count it; empty where nothing.
-    without_measuring : Share or None
-        How often the plan succeeds in open loop, where the estimate is of a procedure that measures.
-    has_aim : bool
-        Whether the plan was made for a window of the breath, and ends beside the target of the masks' phase.
+    Args:
+        refusals: Findings of the check that are not ok.
+        estimate: The estimate of success, or what the plan states of one; None if there is none, as for a
+            refused plan.
+        fissures_unknown: Whether fissures must not be crossed, and the patient has no mask of them.
+        needle_load: What the needle does to the tubes that aim it, where the plan does not count it; empty
+            where nothing.
+        without_measuring: How often the plan succeeds in open loop, where the estimate is of a procedure that
+            measures.
+        has_aim: Whether the plan was made for a window of the breath, and ends beside the target of the
+            masks' phase.
     """
 
     geometry: Geometry

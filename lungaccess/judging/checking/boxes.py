@@ -19,12 +19,9 @@ STRIDE = 16
 class Boxes:
     """One structure of a lung as solid boxes.
 
-    Parameters
-    ----------
-    select : Select
-        Tells from the labels which voxels belong to the structure.
-    reach_mm : float
-        What lies farther counts as this far.
+    Args:
+        select: Tells from the labels which voxels belong to the structure.
+        reach_mm: What lies farther counts as this far.
     """
 
     def __init__(self, tiles: Tiles, select: Select, reach_mm: float) -> None:

@@ -31,10 +31,8 @@ ROUNDING = 1e-9
 class Checker:
     """Checks many plans of one lung: what follows from the lung alone is computed once.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient that the plans are for; its arrays must not change while the checker is used.
+    Args:
+        lung: The patient that the plans are for; its arrays must not change while the checker is used.
     """
 
     def __init__(self, lung: Lung) -> None:
@@ -75,19 +73,11 @@ def check(
     of the planners' arithmetic is used, nor the clearance fields.  `docs/explanation/check.md` explains every
     finding.  For many plans of one lung use `Checker`.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient that the plan is for.
-    system : System, optional
-        The devices that will be used; the plan's must be the same.  Without it only a plan whose system has
-        the name of a preset is compared with something.
-    target_lps : (3,) array_like, optional
-        The target that was asked for, LPS mm; the plan's must be the same.
-
-    Returns
-    -------
-    CheckReport
+    Args:
+        lung: The patient that the plan is for.
+        system: The devices that will be used; the plan's must be the same.  Without it only a plan whose
+            system has the name of a preset is compared with something.
+        target_lps ((3,) array_like): The target that was asked for, LPS mm; the plan's must be the same.
     """
     return Checker(lung).check(plan, system, target_lps=target_lps)
 

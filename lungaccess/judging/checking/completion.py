@@ -49,16 +49,14 @@ OBJECTIVE = "inverse_clearance"
 class Motions:
     """How tubes and a needle are brought to a target: all that somebody else's planner has to say.
 
-    Parameters
-    ----------
-    lps_from_entry, states, lps_from_scope_tip
-        As in `lungaccess.plans.parts.ScopeInsertion`.
-    rotation_rad, outer_insertion_mm, inner_insertion_mm, shape, lateral_sweep_mm, follow_the_leader_error_mm
-        As in `lungaccess.plans.parts.TubeDeployment`: what the mechanics make of the insertions.
-    lps_from_tube_tip : (4, 4) float64
-        Where the needle leaves the inner tube; see `lungaccess.plans.parts.TubeDeployment`.
-    arcs : tuple of NeedleArc
-        At least one.
+    Args:
+        lps_from_entry, states, lps_from_scope_tip: As in `lungaccess.plans.parts.ScopeInsertion`.
+        rotation_rad, outer_insertion_mm, inner_insertion_mm, shape, lateral_sweep_mm,
+            follow_the_leader_error_mm: As in `lungaccess.plans.parts.TubeDeployment`: what the mechanics make
+            of the insertions.
+        lps_from_tube_tip ((4, 4) float64): Where the needle leaves the inner tube; see
+            `lungaccess.plans.parts.TubeDeployment`.
+        arcs: At least one.
     """
 
     lps_from_entry: Float
@@ -82,13 +80,10 @@ def completed_plan(
     Nothing is judged here: where tubes do not leave the lumen, the plan states an exit that is none, and the
     check refuses it.
 
-    Parameters
-    ----------
-    system : System
-        With a needle, and an outer and an inner tube or one tube.
-    target_lps : (3,) float64, LPS mm
-    method : str
-        What the plan says it was made by.
+    Args:
+        system: With a needle, and an outer and an inner tube or one tube.
+        target_lps: (3,) float64, LPS mm.
+        method: What the plan says it was made by.
     """
     lung = environment.lung
     needle = system.require_needle("A plan of bare motions")

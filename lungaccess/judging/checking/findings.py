@@ -23,20 +23,13 @@ Row = tuple[str, ...]
 class Finding:
     """One thing that was checked.
 
-    Parameters
-    ----------
-    name : str
-        Stage and property, such as "needle.clearance.vessel".
-    ok : bool or None
-        None for what could not be checked.
-    value, limit : float or None
-        What was found and the bound it had to keep; None for what is not a number.
-    side : str or None
-        Whether the value must be "at least" or "at most" the limit; None without a limit.
-    tolerance : float
-        It is ok if it misses the limit by no more than this.
-    detail : str
-        What was compared, in words.
+    Args:
+        name: Stage and property, such as "needle.clearance.vessel".
+        ok: None for what could not be checked.
+        value, limit: What was found and the bound it had to keep; None for what is not a number.
+        side: Whether the value must be "at least" or "at most" the limit; None without a limit.
+        tolerance: It is ok if it misses the limit by no more than this.
+        detail: What was compared, in words.
     """
 
     name: str

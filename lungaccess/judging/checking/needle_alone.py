@@ -44,16 +44,12 @@ def check_needle_alone(
 ) -> CheckReport:
     """Check a needle path that no tube leads to, independently of how it was made.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-    arcs : (A, 3) array_like
-        Length in mm, roll in rad before it, curvature in 1/mm.
-    target_lps : (3,) float64, LPS mm
-    branches : sequence of int
-        Pierced branches of the airway tree.
-    at_wall : bool
-        Whether the needle begins at the wall and pierces it itself.
+    Args:
+        lps_from_start: (4, 4) float64.
+        arcs ((A, 3) array_like): Length in mm, roll in rad before it, curvature in 1/mm.
+        target_lps: (3,) float64, LPS mm.
+        branches: Pierced branches of the airway tree.
+        at_wall: Whether the needle begins at the wall and pierces it itself.
     """
     found = Findings()
     needle = system.require_needle("The check of a needle alone")

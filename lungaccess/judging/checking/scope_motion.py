@@ -22,16 +22,11 @@ TINY_RAD = 1e-9
 class Motion:
     """The bases of a bending section in all states of a motion, re-derived; M states.
 
-    Parameters
-    ----------
-    states : (M, 3) float64
-        Advance in mm, twist in rad, bend in rad.
-    bends : (M, 2) float64
-        Curvature of the section in the x and y directions of its base, 1/mm.
-    bases : (M, 4, 4) float64
-        `lps_from_base`; none is rolled by the twist.
-    section_mm : float
-        Length of the section.
+    Args:
+        states ((M, 3) float64): Advance in mm, twist in rad, bend in rad.
+        bends ((M, 2) float64): Curvature of the section in the x and y directions of its base, 1/mm.
+        bases ((M, 4, 4) float64): `lps_from_base`; none is rolled by the twist.
+        section_mm: Length of the section.
     """
 
     states: Float
@@ -66,13 +61,10 @@ class Motion:
     def points(self, states: Int, along_mm: Float, bends: Float | None = None) -> Float:
         """Return points `(N, 3)`, LPS mm, on the arcs that begin at the bases of some states.
 
-        Parameters
-        ----------
-        states : (N,) int64
-        along_mm : (N,) float64
-            Lengths from the bases.
-        bends : (N, 2) float64, optional
-            Curvatures, if not those of the states.
+        Args:
+            states: (N,) int64.
+            along_mm ((N,) float64): Lengths from the bases.
+            bends ((N, 2) float64): Curvatures, if not those of the states.
         """
         local = screws(self.bends[states] if bends is None else bends, along_mm)[:, :3, 3]
         return np.asarray(
@@ -114,11 +106,9 @@ def screws(bends: Float, lengths_mm: Float) -> Float:
 
     They follow Rodrigues' formula for rigid motions [Rucker2010, twist exponentials].
 
-    Parameters
-    ----------
-    bends : (N, 2) float64
-        Curvature in the x and y directions, 1/mm.
-    lengths_mm : (N,) float64
+    Args:
+        bends ((N, 2) float64): Curvature in the x and y directions, 1/mm.
+        lengths_mm: (N,) float64.
     """
     s = np.asarray(lengths_mm, dtype=np.float64)
     spin = np.zeros((len(s), 3, 3))

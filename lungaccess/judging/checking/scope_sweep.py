@@ -25,14 +25,12 @@ SURE_MM = 1e-3
 class Cells:
     """Places of a moving section: C cells.
 
-    Parameters
-    ----------
-    state : (C,) int64
-        State from which on the scope moves.
-    along_mm, half_mm : (C,) float64
-        Middle and half length of the piece of arc, from the base of that state.
-    time, half_time : (C,) float64
-        Middle and half length of the share of the way to the next state; 0 where the section slides.
+    Args:
+        state ((C,) int64): State from which on the scope moves.
+        along_mm, half_mm ((C,) float64): Middle and half length of the piece of arc, from the base of that
+            state.
+        time, half_time ((C,) float64): Middle and half length of the share of the way to the next state; 0
+            where the section slides.
     """
 
     state: Int

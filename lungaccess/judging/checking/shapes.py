@@ -33,14 +33,10 @@ class Piece:
 class Curve:
     """Frames along a curve, S + 1 of them, at most `STEP_MM` apart.
 
-    Parameters
-    ----------
-    frames : (S + 1, 4, 4) float64
-        `lps_from_frame`, +z along the curve.
-    arc_mm : (S + 1,) float64
-        Arc length of each frame.
-    sagitta_mm : (S,) float64
-        Largest distance between the true curve and the chord of each step.
+    Args:
+        frames ((S + 1, 4, 4) float64): `lps_from_frame`, +z along the curve.
+        arc_mm ((S + 1,) float64): Arc length of each frame.
+        sagitta_mm ((S,) float64): Largest distance between the true curve and the chord of each step.
     """
 
     frames: Float

@@ -81,9 +81,8 @@ def window_of(lung: Lung, low: Int, high: Int) -> Labels:
 class Region:
     """The part of a lung around some points, OUTSIDE beyond the lung's grid.
 
-    Parameters
-    ----------
-    labels : (ni, nj, nk) uint16
+    Args:
+        labels: (ni, nj, nk) uint16.
     """
 
     grid: Grid

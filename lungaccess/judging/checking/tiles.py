@@ -34,16 +34,11 @@ NOT_LUMEN = -1
 class Cluster:
     """Surface voxels of one structure in one tile, of one branch if it is an airway.
 
-    Parameters
-    ----------
-    voxels : (K, 3) int64
-        Indices in the lung's grid, K >= 1.
-    centres_mm : (K, 3) float64
-        Index times spacing.
-    half_mm : (3,) float64
-        Half of a voxel.
-    branch : int
-        -1 if it is no airway.
+    Args:
+        voxels ((K, 3) int64): Indices in the lung's grid, K >= 1.
+        centres_mm ((K, 3) float64): Index times spacing.
+        half_mm ((3,) float64): Half of a voxel.
+        branch: -1 if it is no airway.
     """
 
     voxels: Int

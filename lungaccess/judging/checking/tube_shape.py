@@ -31,14 +31,10 @@ SPACING_MM = 0.5
 def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
     """Record everything about the shape of the tubes; None if they snap.
 
-    Parameters
-    ----------
-    curve : Curve
-        The stated arcs.
+    Args:
+        curve: The stated arcs.
 
-    Returns
-    -------
-    float or None
+    Returns:
         What has to be free beside radius and margins: the sweep, and how far the arcs are from the tubes, mm.
     """
     tube, tubes, shape = plan.tube, plan.system.tubes, plan.tube.shape

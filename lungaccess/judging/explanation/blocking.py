@@ -25,16 +25,11 @@ NEAR_MM = 5.0
 class Structure:
     """Something that devices must not touch, at one place.
 
-    Parameters
-    ----------
-    kind : str
-        "a vessel", "the pleura", "a fissure" or "an airway".
-    name : str
-        What is known of it besides: the branch of an airway, the side of the lung.
-    lps_mm : (3,) float64, LPS mm
-        Where it is met.
-    from_target_mm : float
-        How far that is from the target.
+    Args:
+        kind: "a vessel", "the pleura", "a fissure" or "an airway".
+        name: What is known of it besides: the branch of an airway, the side of the lung.
+        lps_mm ((3,) float64, LPS mm): Where it is met.
+        from_target_mm: How far that is from the target.
     """
 
     kind: str
@@ -54,12 +49,10 @@ class Structure:
 class Blocking:
     """How many of the direct arcs one kind of structure stops first, and where most of them are stopped.
 
-    Parameters
-    ----------
-    place : Structure
-        The place at which it stops most of them.
-    arcs, arcs_at_place, of : int
-        Arcs that it stops; those within `NEAR_MM` of the place; arcs that were looked along in all.
+    Args:
+        place: The place at which it stops most of them.
+        arcs, arcs_at_place, of: Arcs that it stops; those within `NEAR_MM` of the place; arcs that were
+            looked along in all.
     """
 
     place: Structure
@@ -72,16 +65,13 @@ class Blocking:
 class BlockedArc:
     """The direct arc to the target, within the needle's limits, that violates least.
 
-    Parameters
-    ----------
-    points_lps : (N, 3) float64, LPS mm
-        From the tip of the tubes to the target; where the clearance was looked up.
-    length_mm, blocked_mm : float
-        Length of the arc, and of those parts of it that are too near to something.
-    required_mm, shortfall_mm : float
-        Clearance that the needle's axis must keep, and how much of it is lacking at the worst place.
-    structure : Structure
-        What it is too near to, at the first such place.
+    Args:
+        points_lps ((N, 3) float64, LPS mm): From the tip of the tubes to the target; where the clearance was
+            looked up.
+        length_mm, blocked_mm: Length of the arc, and of those parts of it that are too near to something.
+        required_mm, shortfall_mm: Clearance that the needle's axis must keep, and how much of it is lacking
+            at the worst place.
+        structure: What it is too near to, at the first such place.
     """
 
     points_lps: Float
@@ -104,13 +94,10 @@ class BlockedArc:
 class ArcBeyondLimits:
     """The direct arc to the target that exceeds the needle's limits least; obstacles are not looked at.
 
-    Parameters
-    ----------
-    points_lps : (N, 3) float64, LPS mm
-    radius_mm, length_mm, turn_deg : float
-        Radius of curvature, length and turning that it needs.
-    least_radius_mm, most_length_mm, most_turn_deg : float
-        What the needle can do.
+    Args:
+        points_lps: (N, 3) float64, LPS mm.
+        radius_mm, length_mm, turn_deg: Radius of curvature, length and turning that it needs.
+        least_radius_mm, most_length_mm, most_turn_deg: What the needle can do.
     """
 
     points_lps: Float

@@ -71,25 +71,18 @@ def explain_no_plan(
     Each part does the same whenever it is done, so that the same input gives the same explanation as far as
     the time goes.  Parts that were not done are named in `Explanation.parts`.
 
-    Parameters
-    ----------
-    failure : NoPlan
-        What the search with this system raised.
-    atlas : Atlas, optional
-        The system's; made here if None.
-    objective, seed
-        As for `lungaccess.planning.one_system.run`.
-    time_s : float, optional
-        No part begins after so many seconds of processor time, and long ones end; None for no limit.  Getting
-        kernels does not count, and one preset is tried even if no time is left.
-    atlas_of : callable, optional
-        Returns the atlas of a system, and tells a function the share of it made; `build_atlas` if None.
-    is_kept : callable, optional
-        Tells whether `atlas_of` need not make the atlas of a system, as
-        `lungaccess.planning.coupled.atlas_is_kept`
-        does: such presets are tried first.  None is taken to be kept if it is not given.
-    on_part : callable, optional
-        Told the name of each part as it begins.
+    Args:
+        failure: What the search with this system raised.
+        atlas: The system's; made here if None.
+        objective, seed: As for `lungaccess.planning.one_system.run`.
+        time_s: No part begins after so many seconds of processor time, and long ones end; None for no limit.
+            Getting kernels does not count, and one preset is tried even if no time is left.
+        atlas_of: Returns the atlas of a system, and tells a function the share of it made; `build_atlas` if
+            None.
+        is_kept: Tells whether `atlas_of` need not make the atlas of a system, as
+            `lungaccess.planning.coupled.atlas_is_kept` does: such presets are tried first.  None is taken to
+            be kept if it is not given.
+        on_part: Told the name of each part as it begins.
     """
     own = atlas or build_atlas(lung, system)
     task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective), seed=seed)
@@ -104,10 +97,8 @@ def explain_no_plan(
 class Explainer:
     """Does the parts of one explanation, and keeps the time.
 
-    Parameters
-    ----------
-    task : Task
-        What was not achieved.
+    Args:
+        task: What was not achieved.
     """
 
     def __init__(

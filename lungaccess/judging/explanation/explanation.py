@@ -45,42 +45,25 @@ class Explanation:
 
     What is None or empty was looked for and not found, or was not tried: `parts` tells which.
 
-    Parameters
-    ----------
-    with_fissures : bool
-        Whether fissures are obstacles.
-    failure : NoPlan
-        The answer of the search, with its reasons counted.
-    starts : StartMap or None
-        Where needles can start, and why each start fails.
-    blocking : tuple of Blocking
-        What stops the direct arcs, most first.
-    blocked_arc : BlockedArc or None
-        The arc to the target that violates least, of those within the needle's limits.
-    arc_beyond_limits : ArcBeyondLimits or None
-        Where there is no such arc: the one that exceeds the limits least.
-    neighbour : Neighbour or None
-        The nearest point to the target that was found to be reached, with its plan.
-    attempts : tuple of Attempt
-        The presets that were tried, the least invasive first.
-    untried : tuple of str
-        Presets that were not tried.
-    changes : tuple of Change
-        Changes of one device parameter that reach the target, the smallest first.
-    through_fissures : bool or None
-        Whether a single arc reaches the target if fissures may be crossed; None if they may be or there are
-        none.
-    shares : tuple of ReachedShare
-        How much of the surroundings is reached.
-    chances : mapping of str to Share
-        How many of the simulated procedures succeed with each of `plans`, by the names of their files, under
-        the default errors.
-    verdict : ReachVerdict or None
-        Whether the target is proved unreachable.
-    parts : tuple of Part
-        What was done and what was not, in the order of doing.
-    time_s : float
-        Seconds of processor time that it took, without getting kernels.
+    Args:
+        with_fissures: Whether fissures are obstacles.
+        failure: The answer of the search, with its reasons counted.
+        starts: Where needles can start, and why each start fails.
+        blocking: What stops the direct arcs, most first.
+        blocked_arc: The arc to the target that violates least, of those within the needle's limits.
+        arc_beyond_limits: Where there is no such arc: the one that exceeds the limits least.
+        neighbour: The nearest point to the target that was found to be reached, with its plan.
+        attempts: The presets that were tried, the least invasive first.
+        untried: Presets that were not tried.
+        changes: Changes of one device parameter that reach the target, the smallest first.
+        through_fissures: Whether a single arc reaches the target if fissures may be crossed; None if they may
+            be or there are none.
+        shares: How much of the surroundings is reached.
+        chances: How many of the simulated procedures succeed with each of `plans`, by the names of their
+            files, under the default errors.
+        verdict: Whether the target is proved unreachable.
+        parts: What was done and what was not, in the order of doing.
+        time_s: Seconds of processor time that it took, without getting kernels.
     """
 
     patient_name: str

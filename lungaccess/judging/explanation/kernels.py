@@ -28,15 +28,13 @@ STEP_MM = 0.5
 def look_along_arcs(obstacles, limits, positions, tangents, branches, target, found, labels):
     """Look along the single arc from each pose to the target, in steps of STEP_MM: no proof.
 
-    Parameters
-    ----------
-    positions, tangents : (N, 3) float64
-    branches : (N,) int64
-    target : tuple of 3 floats
-    found : (N, N_COLUMNS) float64
-        Receives the columns above; a shortfall of -1 where no arc keeps the needle's limits.
-    labels : (N, 2) int64
-        Receives the labels of the structures; 0 where nothing is too near.
+    Args:
+        positions, tangents: (N, 3) float64.
+        branches: (N,) int64.
+        target: tuple of 3 floats.
+        found ((N, N_COLUMNS) float64): Receives the columns above; a shortfall of -1 where no arc keeps the
+            needle's limits.
+        labels ((N, 2) int64): Receives the labels of the structures; 0 where nothing is too near.
     """
     for n in range(positions.shape[0]):
         pose = (

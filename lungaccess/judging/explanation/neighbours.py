@@ -35,12 +35,9 @@ ORDER_SEED = 7
 class Neighbour:
     """The nearest point to the target that was found to be reached.
 
-    Parameters
-    ----------
-    plan : Plan
-        To that point.
-    from_target_mm : float
-        How far it is from the target.
+    Args:
+        plan: To that point.
+        from_target_mm: How far it is from the target.
     """
 
     plan: Plan
@@ -82,10 +79,8 @@ class Surroundings:
         Points on spheres around the target are tried, the smaller sphere first; from the first that is
         reached the distance is halved towards the target.  A nearer point may exist between those tried.
 
-        Parameters
-        ----------
-        alive : callable
-            Called before each point; it raises to end the search.
+        Args:
+            alive: Called before each point; it raises to end the search.
         """
         target = self._task.target.lps_mm
         before = 0.0

@@ -21,10 +21,8 @@ FILE = "no_plan.json"
 def save_explanation(explanation: Explanation, folder: str | os.PathLike[str]) -> tuple[str, ...]:
     """Write `no_plan.json` and the plans to a folder that exists, and return the names of the files.
 
-    Raises
-    ------
-    FileError
-        If a file cannot be written.
+    Raises:
+        FileError: If a file cannot be written.
     """
     for name, plan in explanation.plans.items():
         plan.save(Path(folder) / name)

@@ -32,14 +32,10 @@ FAILS = MappingProxyType(
 class StartMap:
     """Where a needle can start, cell by cell, and why it does not reach the target from there.
 
-    Parameters
-    ----------
-    points_lps : (C, 3) float64, LPS mm
-        The middle of the starts of a cell.
-    why : (C,) int64
-        Index into `FAILS` of the best of the starts of a cell.
-    counts : mapping of str to int
-        How many starts fail for each reason of `FAILS`, all starts counted.
+    Args:
+        points_lps ((C, 3) float64, LPS mm): The middle of the starts of a cell.
+        why ((C,) int64): Index into `FAILS` of the best of the starts of a cell.
+        counts: How many starts fail for each reason of `FAILS`, all starts counted.
     """
 
     points_lps: Float

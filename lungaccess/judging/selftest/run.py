@@ -32,14 +32,11 @@ PACKAGES = Path(__file__).resolve().parents[3]
 class Kind(NamedTuple):
     """One kind of proof.
 
-    Parameters
-    ----------
-    proves : str
-        What a case looks at, in words.
-    draw : callable
-        Draws a case and has the kernels answer it.
-    seeds : tuple of int
-        Of the cases: those in which bounds are close to the truth, and that take little time in Python.
+    Args:
+        proves: What a case looks at, in words.
+        draw: Draws a case and has the kernels answer it.
+        seeds: Of the cases: those in which bounds are close to the truth, and that take little time in
+            Python.
     """
 
     proves: str
@@ -96,14 +93,11 @@ class Failure:
 class Outcome:
     """What became of the cases of one kind.
 
-    Parameters
-    ----------
-    differences : tuple of Failure
-        Cases in which compiled kernels and plain Python differ; None if kernels were not compiled here.
-    contradictions : tuple of Failure
-        Cases in which the answers contradict the truth.
-    seconds : float
-        For the compiled answers and the truth.
+    Args:
+        differences: Cases in which compiled kernels and plain Python differ; None if kernels were not
+            compiled here.
+        contradictions: Cases in which the answers contradict the truth.
+        seconds: For the compiled answers and the truth.
     """
 
     kind: str
@@ -126,17 +120,12 @@ def self_test(
 
     Where NUMBA_DISABLE_JIT is set nothing is compiled, and the truth alone is compared.
 
-    Parameters
-    ----------
-    kinds : sequence of str
-        Names of `KINDS`; all of them if empty.
-    progress : callable, optional
-        Told the kind that is computed now.
+    Args:
+        kinds: Names of `KINDS`; all of them if empty.
+        progress: Told the kind that is computed now.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such kind.
+    Raises:
+        SettingsError: If there is no such kind.
     """
     import numba
 

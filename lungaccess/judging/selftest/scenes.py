@@ -27,12 +27,10 @@ ROUNDING_MM = 1e-7
 class Case:
     """One drawn case of a proof.
 
-    Parameters
-    ----------
-    answers : (N,) float64
-        What the kernels answered.
-    contradiction : callable
-        Compares the answers with the truth; returns "" or what contradicts it, with both numbers.
+    Args:
+        answers ((N,) float64): What the kernels answered.
+        contradiction: Compares the answers with the truth; returns "" or what contradicts it, with both
+            numbers.
     """
 
     answers: Float

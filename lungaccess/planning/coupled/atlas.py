@@ -34,18 +34,12 @@ TURNED_COARSER = 2
 class Atlas:
     """All accepted deployments of a system in a lung; independent of any target and of the needle.
 
-    Parameters
-    ----------
-    with_fissures : bool
-        Whether fissures are obstacles.
-    motions : ScopeMotions
-        Every scope tip with the proved motion that brings the device there.
-    deployments : Deployments
-        `deployments.site` indexes the tips of `motions`.
-    index : StartIndex
-        Made from the deployments: finds those with a target in the needle's workspace, for any needle.
-    build_s : float
-        Seconds it took.
+    Args:
+        with_fissures: Whether fissures are obstacles.
+        motions: Every scope tip with the proved motion that brings the device there.
+        deployments: `deployments.site` indexes the tips of `motions`.
+        index: Made from the deployments: finds those with a target in the needle's workspace, for any needle.
+        build_s: Seconds it took.
     """
 
     lung: Lung
@@ -108,14 +102,10 @@ def build_atlas(
 ) -> Atlas:
     """Find the motions of the scope, enumerate rotations and insertions at their tips, and keep what is safe.
 
-    Parameters
-    ----------
-    rotations : int
-        Evenly spaced rotations of the tubes, and further ones where tube or exit is near a limit.
-    stop_spacing_mm, site_spacing_mm : float
-        Spacing of insertions and of scope tips along the airway.
-    progress : callable, optional
-        Called with the share of the work done.
+    Args:
+        rotations: Evenly spaced rotations of the tubes, and further ones where tube or exit is near a limit.
+        stop_spacing_mm, site_spacing_mm: Spacing of insertions and of scope tips along the airway.
+        progress: Called with the share of the work done.
     """
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)

@@ -68,18 +68,12 @@ class CostBound:
     of the tubes, and for every path of the needle from there to the target.  Of other scope tips, which the
     planner tries along the motions between those of the atlas, it says nothing.
 
-    Parameters
-    ----------
-    task : Task
-    atlas : Atlas
-    beside_mm : float
-        How far beside the target the needle may end.
+    Args:
+        beside_mm: How far beside the target the needle may end.
 
-    Raises
-    ------
-    SettingsError
-        If the tubes are not planar, there is no needle, or it is longer than half a circle of its greatest
-        curvature.
+    Raises:
+        SettingsError: If the tubes are not planar, there is no needle, or it is longer than half a circle of
+            its greatest curvature.
     """
 
     def __init__(self, task: Task, atlas: Atlas, *, beside_mm: float = 0.0) -> None:
@@ -128,11 +122,9 @@ class CostBound:
     def start(self, cost: float, boxes: int) -> None:
         """Begin to divide so many boxes in other threads; `finish` waits for them.
 
-        Parameters
-        ----------
-        cost : float
-            That of a plan: deployments that cost as much need not be told apart.  The first calls only begin
-            with the boxes of some scope tips each.
+        Args:
+            cost: That of a plan: deployments that cost as much need not be told apart.  The first calls only
+                begin with the boxes of some scope tips each.
         """
         self.finish()
         if self.settled:
@@ -175,11 +167,8 @@ class CostBound:
 class BoxQueue:
     """The boxes of some scope tips, the lowest first.
 
-    Parameters
-    ----------
-    about : tuple
-        What `begin_queue` and `divide` take first: environment, tubes, insertions, tips and target.
-    most_boxes : int
+    Args:
+        about: What `begin_queue` and `divide` take first: environment, tubes, insertions, tips and target.
     """
 
     def __init__(self, about: tuple[Any, ...], most_boxes: int) -> None:
@@ -253,16 +242,11 @@ def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Ite
 class GapGoal:
     """The goal that a plan costs at most so much more than the best possible, proved.
 
-    Parameters
-    ----------
-    bound : LowerBound
-    gap : float
-        Share of the best possible cost.
+    Args:
+        gap: Share of the best possible cost.
 
-    Raises
-    ------
-    SettingsError
-        If the gap is negative or not finite.
+    Raises:
+        SettingsError: If the gap is negative or not finite.
     """
 
     def __init__(self, bound: LowerBound, gap: float) -> None:
@@ -311,15 +295,11 @@ def bound_environment(
 ) -> BoundEnvironment:
     """Return what the bounds look at.
 
-    Parameters
-    ----------
-    weights : tuple of 2 float
-        Those of a path's integral of 1 / clearance, and of its length.
-    target_lps : (3,) float64
-    tips : (S, 9) float64
-        Scope tips, LPS mm.
-    limit : float
-        A cost that no path need be told to exceed.
+    Args:
+        weights (tuple of 2 float): Those of a path's integral of 1 / clearance, and of its length.
+        target_lps: (3,) float64.
+        tips ((S, 9) float64): Scope tips, LPS mm.
+        limit: A cost that no path need be told to exceed.
     """
     x, y, z = target_lps.tolist()
     return BoundEnvironment(

@@ -40,20 +40,13 @@ def cost_to_go(
 ) -> CostToGo:
     """Return lower bounds of what paths to a target still cost.
 
-    Parameters
-    ----------
-    field, geometry
-        Corner field of the distance to all obstacles.
-    limits : Limits
-        Of a needle no longer than half a circle of its greatest curvature.
-    weights : tuple of 2 float
-        Of the integral of 1 / clearance, and of the length in mm.
-    target_lps : tuple of 3 float
-        LPS mm.
-    places : (N, 3) float64
-        Where needles start, about; LPS mm.  The window looks at those that are near.
-    limit : float
-        Costs above are not told apart.
+    Args:
+        field, geometry: Corner field of the distance to all obstacles.
+        limits: Of a needle no longer than half a circle of its greatest curvature.
+        weights (tuple of 2 float): Of the integral of 1 / clearance, and of the length in mm.
+        target_lps (tuple of 3 float): LPS mm.
+        places ((N, 3) float64): Where needles start, about; LPS mm.  The window looks at those that are near.
+        limit: Costs above are not told apart.
     """
     kappa = limits.kappa
     cell = 0.25 * kappa * SHELL_MM * SPREAD

@@ -41,14 +41,10 @@ _THIN: WeakKeyDictionary[Atlas, Atlas] = WeakKeyDictionary()
 class Counterfactual:
     """A change of one device parameter with which the target is reached.
 
-    Parameters
-    ----------
-    parameter : str
-        The parameter in words.
-    present, needed : float
-        Its value, and the nearest one found with which a plan exists; mm.
-    plan : Plan
-        A plan with that change alone.
+    Args:
+        parameter: The parameter in words.
+        present, needed: Its value, and the nearest one found with which a plan exists; mm.
+        plan: A plan with that change alone.
     """
 
     parameter: str
@@ -132,10 +128,8 @@ def scope_changes(
 ) -> Iterator[Counterfactual]:
     """Enumerate what the thinnest scope could do; where it reaches the target, find how thick it may be.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Told the share of the enumeration done, which takes seconds; it may raise to end it.
+    Args:
+        progress: Told the share of the enumeration done, which takes seconds; it may raise to end it.
     """
     scope = task.system.scope
     thin_atlas = _with_the_thinnest_scope(atlas, progress)

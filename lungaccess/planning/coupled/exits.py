@@ -39,22 +39,16 @@ class FeasibleExits:
     with its arc becomes a plan is proved when it is planned.  Without a needle the deployments are those from
     which the tubes were aimed at the target, and what is said of arcs holds for the tubes in tissue.
 
-    Parameters
-    ----------
-    entries : (C,) int64
-        Numbers of the deployments in the atlas, the least costly of each place first.
-    place : (C,) int64
-        Place of exit of each, from 0 by the least cost of the place.
-    cost, length_mm : (C,) float64
-        Estimated cost under the objective, and length, of the arc.
-    exit_lps, clearance_mm : (P, 3) and (P,) float64
-        Of the least costly deployment of each place: where its axis leaves the lumen, LPS mm, and a lower
-        bound of the distance of its arc from every obstacle, beyond the exempt length in the pierced wall.
-    in_workspace, tried : int
-        Deployments with the target in the needle's workspace, or from which tubes are aimed at it, and how
-        many of them this answer is of.
-    blocked : mapping of str to int
-        How many arcs were stopped, by what stopped them.
+    Args:
+        entries ((C,) int64): Numbers of the deployments in the atlas, the least costly of each place first.
+        place ((C,) int64): Place of exit of each, from 0 by the least cost of the place.
+        cost, length_mm ((C,) float64): Estimated cost under the objective, and length, of the arc.
+        exit_lps, clearance_mm ((P, 3) and (P,) float64): Of the least costly deployment of each place: where
+            its axis leaves the lumen, LPS mm, and a lower bound of the distance of its arc from every
+            obstacle, beyond the exempt length in the pierced wall.
+        in_workspace, tried: Deployments with the target in the needle's workspace, or from which tubes are
+            aimed at it, and how many of them this answer is of.
+        blocked: How many arcs were stopped, by what stopped them.
     """
 
     entries: Int
@@ -102,21 +96,14 @@ def feasible_exits(
     Deployments are tried place by place in turn, the nearest of each scope tip first, so that an early
     answer shows most places already.  The same input gives the same answers.
 
-    Parameters
-    ----------
-    atlas : Atlas
-        The deployments, made for this lung, scope and tubes.
-    objective : str or Objective
-        By which the arcs are put in order, as for `lungaccess.planning.searches.CostFinder`.
-    scope_tips : (T,) int64, optional
-        Only exits from these tips of the atlas.
+    Args:
+        atlas: The deployments, made for this lung, scope and tubes.
+        objective: By which the arcs are put in order, as for `lungaccess.planning.searches.CostFinder`.
+        scope_tips ((T,) int64): Only exits from these tips of the atlas.
 
-    Raises
-    ------
-    SettingsError
-        If the atlas belongs to another lung or system.
-    TargetError
-        If the target lies outside the lung or inside an obstacle.
+    Raises:
+        SettingsError: If the atlas belongs to another lung or system.
+        TargetError: If the target lies outside the lung or inside an obstacle.
     """
     require_same(atlas, lung, system)
     task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective))

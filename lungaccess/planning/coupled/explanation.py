@@ -18,14 +18,10 @@ def explain(
 ) -> NoPlan:
     """Return the `NoPlan` of a search that ended without a plan.
 
-    Parameters
-    ----------
-    blocked : Counter of str
-        How many direct arcs were stopped in the search, by what stopped them.
-    iterations : int
-        How many the search had.
-    counterfactuals : bool
-        Whether changes of the device are looked for; without them the advice is empty.
+    Args:
+        blocked: How many direct arcs were stopped in the search, by what stopped them.
+        iterations: How many the search had.
+        counterfactuals: Whether changes of the device are looked for; without them the advice is empty.
     """
     if task.system.needle is None:
         return _explain_tubes(AimedTubes(task, atlas), blocked, iterations, counterfactuals)

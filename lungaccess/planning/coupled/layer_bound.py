@@ -35,12 +35,8 @@ class LayerBound:
     the layers are spheres about the target from as far as the tubes come; it holds for scope tips up to
     SHIFTED_MM beside those of the atlas, and is 0 where the tubes are long enough to reach the target.
 
-    Parameters
-    ----------
-    task : Task
-    atlas : Atlas
-    beside_mm : float
-        How far beside the target the devices may end.
+    Args:
+        beside_mm: How far beside the target the devices may end.
     """
 
     lowest: tuple[tuple[int, float, float, float], ...] = ()
@@ -105,10 +101,8 @@ class LayerBound:
     def _over(self, window: tuple[slice, ...], low: Float, high: Float, begin: float, end: float) -> float:
         """Return the integral of the least cost of a mm on layers from one value to another.
 
-        Parameters
-        ----------
-        low, high : (ni, nj, nk) float64
-            The least and greatest value in each voxel of a window.
+        Args:
+            low, high ((ni, nj, nk) float64): The least and greatest value in each voxel of a window.
         """
         count = math.ceil((end - begin) / LAYER_MM)
         if count < 1:
@@ -152,12 +146,9 @@ def cost_bound(task: Task, atlas: Atlas, beside_mm: float = 0.0) -> LowerBound:
 def beside_in_window_mm(task: Task, phases: tuple[float, float]) -> float:
     """Return how far beside the target devices may end that are near it in phases of the breath.
 
-    Raises
-    ------
-    AnatomyError
-        If the patient has no motion.
-    SettingsError
-        If the masks do not show one of these phases.
+    Raises:
+        AnatomyError: If the patient has no motion.
+        SettingsError: If the masks do not show one of these phases.
     """
     shown = require_motion(task.lung).masks_phase
     if not phases[0] <= shown <= phases[1]:

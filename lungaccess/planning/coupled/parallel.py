@@ -21,10 +21,8 @@ def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
     best of all goes into the next round.  So the same seed, number of processes and iterations give the same
     plans, whatever the machine's load.
 
-    Raises
-    ------
-    SettingsError
-        If there are fewer than two processes, or this system cannot fork.
+    Raises:
+        SettingsError: If there are fewer than two processes, or this system cannot fork.
     """
     if processes < 2 or not can_fork():
         raise SettingsError(

@@ -28,11 +28,8 @@ TRIES = 400
 class ScopeReplanner:
     """Plans tubes and needle from one tip of the scope after another; see `replan_from_scope`.
 
-    Parameters
-    ----------
-    task : Task
-    tries, searches : int
-        As those of `replan_from_scope`.
+    Args:
+        tries, searches: As those of `replan_from_scope`.
     """
 
     def __init__(self, task: Task, *, tries: int = TRIES, searches: int = SEARCHED) -> None:

@@ -39,21 +39,14 @@ WALL_MM = 3.0
 class NeedleAnswer(PathSearch):
     """What a planner found, and what it was asked.
 
-    Parameters
-    ----------
-    branches : tuple of int
-        Branches of the airway tree whose wall the start is taken to have pierced, the nearest first; none if
-        no airway is near.
-    at_wall : bool
-        Whether the needle begins so near to the lumen that it pierces the wall itself.
-    lobe : str
-        Where what stands in the way lies; "" if the lobes are not known.
-    environment : NeedleEnvironment
-        What the planner looked at.
-    query : Query
-        What it was asked.
-    objective : Objective
-        What it was asked to make small; planners of OMPL look at none.
+    Args:
+        branches: Branches of the airway tree whose wall the start is taken to have pierced, the nearest
+            first; none if no airway is near.
+        at_wall: Whether the needle begins so near to the lumen that it pierces the wall itself.
+        lobe: Where what stands in the way lies; "" if the lobes are not known.
+        environment: What the planner looked at.
+        query: What it was asked.
+        objective: What it was asked to make small; planners of OMPL look at none.
     """
 
     branches: tuple[int, ...]
@@ -128,25 +121,18 @@ def plan_needle(
 ) -> NeedleAnswer:
     """Plan the needle of a system, with its margins, from a pose to a target.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-        +z is the direction of insertion.
-    planner : str
-        One of `stages.needle.NEEDLE_PLANNERS`.  Those of OMPL look at no objective, end by time alone, and
-        can be seeded once in a process, so each call needs a process of its own.
-    objective : str or Objective
-        What is made small; see `stages.needle.objective.Objective.of`.
-    iterations, time_s : optional
-        The search ends by whichever comes first, or by itself.  At least one is needed.
+    Args:
+        lps_from_start ((4, 4) float64): +z is the direction of insertion.
+        planner: One of `stages.needle.NEEDLE_PLANNERS`.  Those of OMPL look at no objective, end by time
+            alone, and can be seeded once in a process, so each call needs a process of its own.
+        objective: What is made small; see `stages.needle.objective.Objective.of`.
+        iterations, time_s (optional): The search ends by whichever comes first, or by itself.  At least one
+            is needed.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such planner or objective, no limit, or a cost map is missing; if OMPL has been used
-        in this process.
-    TargetError
-        If the start lies outside the images, or the target is its point.
+    Raises:
+        SettingsError: If there is no such planner or objective, no limit, or a cost map is missing; if OMPL
+            has been used in this process.
+        TargetError: If the start lies outside the images, or the target is its point.
     """
     weighed = Objective.of(objective)
     require_planner(planner)
@@ -193,15 +179,12 @@ class NeedleQuestion:
 def needle_question(lung: Organ, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
     """Ask for a path of a system's needle, with its margins, and the exemption that its start has.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-    target_lps : (3,) float64, LPS mm
+    Args:
+        lps_from_start: (4, 4) float64.
+        target_lps: (3,) float64, LPS mm.
 
-    Raises
-    ------
-    TargetError
-        If the target is the point of the start.
+    Raises:
+        TargetError: If the target is the point of the start.
     """
     # The searches take no shorter arc.
     if np.linalg.norm(lps_from_start[:3, 3] - target_lps) < 1e-6:

@@ -30,20 +30,15 @@ SLICE = 500
 class PathSearch:
     """What one search found.
 
-    Parameters
-    ----------
-    outcome : str
-        "path"; "no path", if there is a proof; a search's own words for its end; else "nothing found".
-    path, first_path : ArcPath or None
-        The best path and the first one: proved clear and within all limits.
-    cost : float
-        Of the path under the objective, as estimated within the search.
-    first_path_s : float or None
-        Time to the first path, by the clock of the search.
-    obstruction : Obstruction or None
-        What stands in the way, if there is no path.
-    open_passage : Passage or None
-        Where a path would have to pass, if neither a path was found nor a proof that there is none.
+    Args:
+        outcome: "path"; "no path", if there is a proof; a search's own words for its end; else "nothing
+            found".
+        path, first_path: The best path and the first one: proved clear and within all limits.
+        cost: Of the path under the objective, as estimated within the search.
+        first_path_s: Time to the first path, by the clock of the search.
+        obstruction: What stands in the way, if there is no path.
+        open_passage: Where a path would have to pass, if neither a path was found nor a proof that there is
+            none.
     """
 
     outcome: str
@@ -74,18 +69,12 @@ def search_path(
 ) -> PathSearch:
     """Search a path; what is proved to have none at reach, start or target is not searched.
 
-    Parameters
-    ----------
-    planner : str
-        One of `stages.needle.NEEDLE_PLANNERS`; those of OMPL end by time alone.
-    seed : int or None
-        OMPL can be seeded once in a process; without a seed, its planners draw anew at each call.
-    iterations, time_s : optional
-        The search ends by whichever comes first, or by itself.
-    clock : callable
-        Returns seconds: of the wall without compilation of kernels, or of this process.
-    portion : int
-        Iterations between two looks at the clock.
+    Args:
+        planner: One of `stages.needle.NEEDLE_PLANNERS`; those of OMPL end by time alone.
+        seed: OMPL can be seeded once in a process; without a seed, its planners draw anew at each call.
+        iterations, time_s (optional): The search ends by whichever comes first, or by itself.
+        clock: Returns seconds: of the wall without compilation of kernels, or of this process.
+        portion: Iterations between two looks at the clock.
     """
     blocked = find_obstruction(environment, query)
     if blocked is not None and blocked.proved:

@@ -52,23 +52,17 @@ def replan_from_scope(
     finds, and a local search improves it.  Without a needle the tubes are aimed at the target.  The same
     input and seed give the same answer.
 
-    Parameters
-    ----------
-    lps_from_scope_tip : (4, 4) float64
-        The pose as measured: +z forward, +x the way a positive bend turns the tip, up in the picture.
-    tries : int
-        Variations of rotation, insertions and needle that improve the first answer; 0 for a faster one.
-    searches : int
-        Deployments from which the needle's own search starts where no direct arc is clear.
+    Args:
+        lps_from_scope_tip ((4, 4) float64): The pose as measured: +z forward, +x the way a positive bend
+            turns the tip, up in the picture.
+        tries: Variations of rotation, insertions and needle that improve the first answer; 0 for a faster
+            one.
+        searches: Deployments from which the needle's own search starts where no direct arc is clear.
 
-    Raises
-    ------
-    NoPlan
-        If there is none; counts the reasons.
-    FrameError
-        If the pose is not one, within SKEW.
-    TargetError
-        If pose or target lie outside the images, or the target in an obstacle.
+    Raises:
+        NoPlan: If there is none; counts the reasons.
+        FrameError: If the pose is not one, within SKEW.
+        TargetError: If pose or target lie outside the images, or the target in an obstacle.
     """
     frame = measured_pose(lung, lps_from_scope_tip, "scope")
     task = _task(lung, system, target, objective, seed)
@@ -91,12 +85,9 @@ def replan_from_tube(
 
     A tip near an airway is taken to have pierced its wall, as `plan_needle` does.
 
-    Parameters
-    ----------
-    lps_from_tip : (4, 4) float64
-        The pose as measured; +z is the direction of insertion.
-    iterations : int
-        Of the needle's search, which begins with the direct arc.
+    Args:
+        lps_from_tip ((4, 4) float64): The pose as measured; +z is the direction of insertion.
+        iterations: Of the needle's search, which begins with the direct arc.
     """
     frame = measured_pose(lung, lps_from_tip, "tube")
     task = _task(lung, system, target, objective, seed)
@@ -132,12 +123,9 @@ def _task(lung: Lung, system: System, target: Target, objective: str | Objective
 def measured_pose(lung: Lung, pose: ArrayLike, what: str) -> Float:
     """Return the nearest rigid pose `(4, 4)` to a measured one, LPS mm; `what` device it is of, for messages.
 
-    Raises
-    ------
-    FrameError
-        If it is not a rigid pose within SKEW.
-    TargetError
-        If it lies outside the images.
+    Raises:
+        FrameError: If it is not a rigid pose within SKEW.
+        TargetError: If it lies outside the images.
     """
     matrix = np.array(pose, dtype=np.float64)
     good = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all())

@@ -23,18 +23,13 @@ from stages.tube import Deployment
 class RestOfPlan:
     """What is left to do from a measured pose: proved clear and within all limits.
 
-    Parameters
-    ----------
-    task : Task
-        What was asked.
-    lps_from_measured : (4, 4) float64
-        The pose as it was taken: that of the scope's tip, or of the tube's tip where there is no deployment.
-    deployment : Deployment or None
-        Of the tubes, where they are left to do.
-    path : ArcPath
-        Of the needle, or without one of the tubes in tissue.
-    branch : int
-        Branch whose wall is exempt at the exit; -1 for none.
+    Args:
+        task: What was asked.
+        lps_from_measured ((4, 4) float64): The pose as it was taken: that of the scope's tip, or of the
+            tube's tip where there is no deployment.
+        deployment: Of the tubes, where they are left to do.
+        path: Of the needle, or without one of the tubes in tissue.
+        branch: Branch whose wall is exempt at the exit; -1 for none.
     """
 
     task: Task

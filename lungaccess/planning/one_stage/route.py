@@ -38,10 +38,8 @@ class RouteSource:
 
         The lumen is at least `needed_mm` deep there, if it is so anywhere.
 
-        Raises
-        ------
-        FrameError
-            If the text is neither a name nor a point with its frame.
+        Raises:
+            FrameError: If the text is neither a name nor a point with its frame.
         """
         named = {name.lower(): point for name, point in self.places.items()}
         if text.lower() not in named:
@@ -62,25 +60,16 @@ def open_source(
 ) -> RouteSource:
     """Return the centreline of a patient folder, a centreline file, a mask of vessels or a drawing.
 
-    Parameters
-    ----------
-    lumen : str, optional
-        Which vessel of a liver, a key of `anatomy.io.liver.LUMENS`; needed for one.
-    frame : str, optional
-        Frame of a centreline file or mask that states none.
-    pixel_mm : float, optional
-        Size of a pixel of a drawing; needed for one.
-    cache : path, optional
-        Where prepared patients are kept.
-    accept : collection of str
-        Checks of a patient's masks whose failure is accepted.
+    Args:
+        lumen: Which vessel of a liver, a key of `anatomy.io.liver.LUMENS`; needed for one.
+        frame: Frame of a centreline file or mask that states none.
+        pixel_mm: Size of a pixel of a drawing; needed for one.
+        cache: Where prepared patients are kept.
+        accept (collection of str): Checks of a patient's masks whose failure is accepted.
 
-    Raises
-    ------
-    SettingsError
-        If a drawing has no pixel size, or a liver is given and no vessel.
-    LungaccessError
-        If the source cannot be read or holds no tubes.
+    Raises:
+        SettingsError: If a drawing has no pixel size, or a liver is given and no vessel.
+        LungaccessError: If the source cannot be read or holds no tubes.
     """
     from stages.scope.route import from_graph, from_image, from_lung, from_mask
 
@@ -148,10 +137,8 @@ def read_drawing(path: Path) -> Any:
 
     Where more than half of it would be vessel, the picture is taken for a bright drawing on dark ground.
 
-    Raises
-    ------
-    FileError
-        If it cannot be read.
+    Raises:
+        FileError: If it cannot be read.
     """
     from skimage.io import imread
 

@@ -31,16 +31,11 @@ ADVICE_FILE, CAMERA_FILE = "advice.json", "camera.mrk.json"
 class ScopeAdvice:
     """The path of a scope to a lesion, with instructions.
 
-    Parameters
-    ----------
-    path : ScopePath
-        To the goal or to the nearest point that was reached.
-    instructions : tuple of Instruction
-        What to do, branch by branch.
-    why_stopped : str
-        Why it ends before the goal; "" if it does not.
-    thinner : tuple of ThinnerScope
-        What thinner scopes would reach; empty if this one reaches the goal.
+    Args:
+        path: To the goal or to the nearest point that was reached.
+        instructions: What to do, branch by branch.
+        why_stopped: Why it ends before the goal; "" if it does not.
+        thinner: What thinner scopes would reach; empty if this one reaches the goal.
     """
 
     path: ScopePath
@@ -83,19 +78,13 @@ def advise_scope(
     The goal is the lumen voxel nearest to the lesion's centre, if possible one in the lesion where the scope
     fits.
 
-    Parameters
-    ----------
-    system : System
-        Its scope is used.
-    lesion_lps : (3,) float64, LPS mm
-        Centre of the lesion, anywhere.
+    Args:
+        system: Its scope is used.
+        lesion_lps ((3,) float64, LPS mm): Centre of the lesion, anywhere.
 
-    Raises
-    ------
-    AnatomyError
-        If the scope fits nowhere in the trachea.
-    TargetError
-        If the lesion is no sphere.
+    Raises:
+        AnatomyError: If the scope fits nowhere in the trachea.
+        TargetError: If the lesion is no sphere.
     """
     lumen, model = lumen_of_lung(lung), model_of(system.scope)
     start = start_state(lumen, lung.tree, model)
@@ -115,10 +104,8 @@ def advise_scope(
 def save_advice(advice: ScopeAdvice, folder: Path) -> None:
     """Write the advice, and the camera's flight as a curve for 3D Slicer, into a folder.
 
-    Raises
-    ------
-    FileError
-        If the folder is missing or not writable.
+    Raises:
+        FileError: If the folder is missing or not writable.
     """
     contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: camera_flight(advice.path).markups()}
     for name, content in contents.items():

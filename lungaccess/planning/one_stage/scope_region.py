@@ -26,12 +26,9 @@ WORDS = {words: kind for kind, words in KINDS.items()}
 class ScopeRegion:
     """Poses of the scope's tip that were tried: whether tubes and needle reach the target from there.
 
-    Parameters
-    ----------
-    lps_from_scope_tip : (4, 4) float64
-        As planned.
-    tried : TriedStarts
-        A start too near to an obstacle is a tip that does not fit into the airway.
+    Args:
+        lps_from_scope_tip ((4, 4) float64): As planned.
+        tried: A start too near to an obstacle is a tip that does not fit into the airway.
     """
 
     lps_from_scope_tip: Float
@@ -76,21 +73,14 @@ def safe_scope_region(
     tip where that is less.  What is found is proved clear, exactly to the target; what is not found proves
     nothing.  The same input and seed give the same answer.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient that the plan was made for.
-    offset_mm, tilt_deg : float
-        Largest distance and angle from the planned tip.
-    poses : int
-        About how many are tried.
+    Args:
+        lung: The patient that the plan was made for.
+        offset_mm, tilt_deg: Largest distance and angle from the planned tip.
+        poses: About how many are tried.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another lung.
-    SettingsError
-        If a number is out of its range.
+    Raises:
+        PlanFileError: If the plan was made for another lung.
+        SettingsError: If a number is out of its range.
     """
     plan.require_lung(lung)
     frame = np.asarray(plan.scope.lps_from_scope_tip)

@@ -17,17 +17,12 @@ from stages.tube import ShapeLimits, TubeShapes, open_shapes
 def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None) -> TubeShapes:
     """Return the shapes of a design, from the cache if they are there.
 
-    Parameters
-    ----------
-    device : System or BareTubes
-        The limits are those of the system; bare tubes have those of `ShapeLimits()`.
-    cache : path, optional
-        Folder of the cache.
+    Args:
+        device: The limits are those of the system; bare tubes have those of `ShapeLimits()`.
+        cache: Folder of the cache.
 
-    Raises
-    ------
-    SettingsError, FileError
-        As `stages.tube.open_shapes`.
+    Raises:
+        SettingsError, FileError: As `stages.tube.open_shapes`.
     """
     limits, needle = ShapeLimits(), None
     if isinstance(device, System):
@@ -71,10 +66,8 @@ def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:
 def save_shapes(shapes: TubeShapes, path: Path) -> None:
     """Write a table of all shapes as CSV: insertions and rotations from the innermost tube, tip, and costs.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     n = len(shapes.tubes)
     columns = {

@@ -60,16 +60,11 @@ class BareTubes:
 class TubeAnswer:
     """A deployment as in [Kuntz2015], and what it does.
 
-    Parameters
-    ----------
-    system : System or None
-        None for bare tubes.
-    outer_mm, inner_mm, rotation_rad, relative_rad : float
-        What was asked for.
-    final : Equilibrium
-        The deployed tubes; if they snap before, an equilibrium that this sequence does not reach.
-    deployed : DeployedSequence or None
-        All steps; None if the tubes snap.
+    Args:
+        system: None for bare tubes.
+        outer_mm, inner_mm, rotation_rad, relative_rad: What was asked for.
+        final: The deployed tubes; if they snap before, an equilibrium that this sequence does not reach.
+        deployed: All steps; None if the tubes snap.
     """
 
     name: str
@@ -113,10 +108,8 @@ class TubeAnswer:
 def load_tubes(name_or_path: str | os.PathLike[str]) -> System | BareTubes:
     """Read a system, or a TOML file that holds just a name and tables `[[tubes]]`, the innermost first.
 
-    Raises
-    ------
-    SettingsError, FileError
-        As `lungaccess.problem.system.load_system`.
+    Raises:
+        SettingsError, FileError: As `lungaccess.problem.system.load_system`.
     """
     given = os.fspath(name_or_path)
     if given.endswith(".toml"):
@@ -136,19 +129,13 @@ def deploy_tubes(
 ) -> TubeAnswer:
     """Turn, insert both tubes, insert the inner one, and look at every step.
 
-    Parameters
-    ----------
-    outer_mm, inner_mm : float
-        How far the tubes come out of the scope.
-    rotation_rad : float
-        Direction of the inner tube's bend about +z of the scope tip, from its +x, as in a plan.
-    relative_rad : float
-        How much farther the base of the outer tube is turned.
+    Args:
+        outer_mm, inner_mm: How far the tubes come out of the scope.
+        rotation_rad: Direction of the inner tube's bend about +z of the scope tip, from its +x, as in a plan.
+        relative_rad: How much farther the base of the outer tube is turned.
 
-    Raises
-    ------
-    SettingsError
-        If the insertions are impossible, nothing comes out, or an angle is more than a turn.
+    Raises:
+        SettingsError: If the insertions are impossible, nothing comes out, or an angle is more than a turn.
     """
     tubes = tubes_of(device)
     if len(tubes) != 2:
@@ -207,10 +194,8 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
     Of each length it is the design with the least sweep that reaches about as far to the side as the present
     one, or else the one that reaches farthest.  None sweeps more than the system allows.
 
-    Raises
-    ------
-    SettingsError
-        If the tubes are no system: its limits are needed.
+    Raises:
+        SettingsError: If the tubes are no system: its limits are needed.
     """
     system = answer.system
     if system is None:

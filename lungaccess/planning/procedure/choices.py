@@ -38,12 +38,10 @@ _SEED = 1
 class Offer:
     """Deployments to choose from, the planned one first.
 
-    Parameters
-    ----------
-    choices : Choices
-        As the kernels take them.
-    deployed : tuple of (float, int)
-        Rotation and shape of each but the planned one, see `DeploymentValidator.choose`.
+    Args:
+        choices: As the kernels take them.
+        deployed (tuple of (float, int)): Rotation and shape of each but the planned one, see
+            `DeploymentValidator.choose`.
     """
 
     choices: Choices

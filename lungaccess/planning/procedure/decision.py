@@ -41,15 +41,12 @@ class Poses(NamedTuple):
 class Measurements:
     """What was measured since the scope was placed last; poses are 4x4, LPS mm, +z forward.
 
-    Parameters
-    ----------
-    scope, tubes, needle : tuple of poses
-        Of the tips, each as often as it was measured where it stood; the mean of several is taken.  A new
-        deployment or another place of the needle begins a new record of its stage.
-    target_lps : tuple of 3 floats or None
-        The target as an image shows it before the needle starts.
-    placements : int
-        How often the scope has been placed, this time included.
+    Args:
+        scope, tubes, needle (tuple of poses): Of the tips, each as often as it was measured where it stood;
+            the mean of several is taken.  A new deployment or another place of the needle begins a new record
+            of its stage.
+        target_lps (tuple of 3 floats or None): The target as an image shows it before the needle starts.
+        placements: How often the scope has been placed, this time included.
     """
 
     scope: tuple[Pose, ...] = ()
@@ -96,21 +93,13 @@ class Measurements:
 class Decision:
     """What to do next.
 
-    Parameters
-    ----------
-    action : Action
-    chance : float
-        Estimated chance of success of the best way to go on, which is `tube` and `needle`.
-    again : float
-        Chance that placing the scope again promises; 0 where it may not be.
-    lps_from_device : (4, 4) float64
-        Where the tip that was measured last most likely is, LPS mm.
-    tube : TubeDeployment or None
-        How the tubes are to be deployed; None where they are out.
-    needle : NeedlePath or None
-        Where the needle is to go; None without one.
-    branch : int
-        The branch that is pierced.
+    Args:
+        chance: Estimated chance of success of the best way to go on, which is `tube` and `needle`.
+        again: Chance that placing the scope again promises; 0 where it may not be.
+        lps_from_device ((4, 4) float64): Where the tip that was measured last most likely is, LPS mm.
+        tube: How the tubes are to be deployed; None where they are out.
+        needle: Where the needle is to go; None without one.
+        branch: The branch that is pierced.
     """
 
     action: Action

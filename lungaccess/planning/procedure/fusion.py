@@ -29,10 +29,8 @@ def scope_moves(expected: Float, position_mm: float, direction_rad: float) -> Fl
 def tip_moves(lps_from_scope_tip: Float, expected: Float, left: Residuals, bend_per_mm: float) -> Float:
     """Return what one standard deviation of each error moves the pose of the tubes' tip by, see `fused`.
 
-    Parameters
-    ----------
-    bend_per_mm : float
-        Curvature with which the tubes bend on as they go farther out.
+    Args:
+        bend_per_mm: Curvature with which the tubes bend on as they go farther out.
     """
     axes, ahead = np.moveaxis(lps_from_scope_tip[..., :3, :3], -1, 0), expected[..., :3, 2]
     arm = expected[..., :3, 3] - lps_from_scope_tip[..., :3, 3]
@@ -51,13 +49,12 @@ def tip_moves(lps_from_scope_tip: Float, expected: Float, left: Residuals, bend_
 def fused(expected: Float, errors: Float, measured: Float, position_mm: float, direction_rad: float) -> Float:
     """Return the most likely poses of tips, with the roll of the measured ones.
 
-    Parameters
-    ----------
-    expected, measured : (..., 4, 4) float64
-    errors : (..., 6, E) float64
-        What one standard deviation of each of E errors moves the expected pose by: mm, and rotation vector.
-    position_mm, direction_rad : float
-        Standard deviations of the measurement, along each axis and about each of two axes.
+    Args:
+        expected, measured: (..., 4, 4) float64.
+        errors ((..., 6, E) float64): What one standard deviation of each of E errors moves the expected pose
+            by: mm, and rotation vector.
+        position_mm, direction_rad: Standard deviations of the measurement, along each axis and about each of
+            two axes.
     """
     if position_mm <= LEAST and direction_rad <= LEAST:
         return measured

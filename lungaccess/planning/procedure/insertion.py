@@ -76,24 +76,14 @@ class Outcome(StrEnum):
 class Insertion:
     """What happened to one needle.
 
-    Parameters
-    ----------
-    lps_from_tip : (N, 4, 4) float64
-        Where the tip really was, the start first.
-    inserted_mm : (N,) float64
-        Length of needle at each of these poses.
-    outcome : Outcome
-    touched : tuple of str
-        Names of the forbidden structures that tubes or needle touch.
-    target_lps : (3,) float64, LPS mm
-        Where the target really is.
-    tip_error_mm : float
-        Distance from the tip to it, wherever the insertion ended.
-    factor : float
-        True curvature over the commanded one.
-    believed_factor : float
-        What is believed of it in the end; nan of a needle that nobody watched.
-    replans : tuple of Replan
+    Args:
+        lps_from_tip ((N, 4, 4) float64): Where the tip really was, the start first.
+        inserted_mm ((N,) float64): Length of needle at each of these poses.
+        touched: Names of the forbidden structures that tubes or needle touch.
+        target_lps ((3,) float64, LPS mm): Where the target really is.
+        tip_error_mm: Distance from the tip to it, wherever the insertion ended.
+        factor: True curvature over the commanded one.
+        believed_factor: What is believed of it in the end; nan of a needle that nobody watched.
     """
 
     lps_from_tip: Float
@@ -147,17 +137,10 @@ class Summary:
 class InsertionStudy:
     """What came of the same needles, inserted blindly and with the tracker.
 
-    Parameters
-    ----------
-    steering : NeedleSteering
-    errors : ErrorModel
-        Of needle and target alone.
-    seed : int
-    tolerance_mm : float
-        A tip that ends no farther from the target has reached it.
-    query, path
-        What was inserted.
-    open_loop, closed_loop : Summary
+    Args:
+        errors: Of needle and target alone.
+        tolerance_mm: A tip that ends no farther from the target has reached it.
+        query, path: What was inserted.
     """
 
     steering: NeedleSteering
@@ -202,20 +185,13 @@ def insert_plan(
     them, and judged by its kernel.  Scope and tubes stand as planned: their errors belong to
     `lungaccess.simulate_procedure`.
 
-    Parameters
-    ----------
-    errors : ErrorModel, optional
-        The preset `breath-hold` if None; only what concerns needle and target counts.
-    believed : ErrorModel, optional
-        What the errors are taken to be when measurements are weighed, if that is something else.
-    samples, seed : int
+    Args:
+        errors: The preset `breath-hold` if None; only what concerns needle and target counts.
+        believed: What the errors are taken to be when measurements are weighed, if that is something else.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another patient.
-    SettingsError
-        If the plan has no needle, or a number is out of its range.
+    Raises:
+        PlanFileError: If the plan was made for another patient.
+        SettingsError: If the plan has no needle, or a number is out of its range.
     """
     plan.system.require_needle("A simulated insertion")
     model = model_for(errors or load_errors(), plan, lung)

@@ -85,12 +85,9 @@ _SEED = 2
 class Placed(NamedTuple):
     """Where N tips of the scope are that were measured.
 
-    Parameters
-    ----------
-    frames : (N, 4, 4) float64
-        Their most likely poses.
-    drawn : (N, DRAWS, 3) float64
-        Places where each may be.
+    Args:
+        frames ((N, 4, 4) float64): Their most likely poses.
+        drawn ((N, DRAWS, 3) float64): Places where each may be.
     """
 
     frames: Float
@@ -101,23 +98,15 @@ class Placed(NamedTuple):
 class Chosen:
     """What was chosen in N procedures.
 
-    Parameters
-    ----------
-    frames : (N, 4, 4) float64
-        Most likely poses of the scope's tip.
-    tips : (N, 4, 4) float64
-        Where the needle is expected to start.
-    found : (N, 3) int64
-        Number of the deployment, arcs of the needle's path, and pierced branch.
-    chances : (N,) float64
-    arcs : (N, A, 3) float64
-        Paths of the needle.
-    changed : (N,) bool
-        Whether the path is another one than was planned before.
-    tubes : (N, 11) float64
-        Planar tubes as kernels take them; none of others.
-    deployed : tuple of TubeDeployment
-        Of each procedure, where the system has no needle or its tubes are not planar; else empty.
+    Args:
+        frames ((N, 4, 4) float64): Most likely poses of the scope's tip.
+        tips ((N, 4, 4) float64): Where the needle is expected to start.
+        found ((N, 3) int64): Number of the deployment, arcs of the needle's path, and pierced branch.
+        chances: (N,) float64.
+        arcs ((N, A, 3) float64): Paths of the needle.
+        changed ((N,) bool): Whether the path is another one than was planned before.
+        tubes ((N, 11) float64): Planar tubes as kernels take them; none of others.
+        deployed: Of each procedure, where the system has no needle or its tubes are not planar; else empty.
     """
 
     frames: Float
@@ -140,16 +129,11 @@ class Chosen:
 class OnTheWay(NamedTuple):
     """A needle on its way.
 
-    Parameters
-    ----------
-    rest : (A, 3) float64
-        Arcs that were to follow.
-    inserted_mm, turned_rad : float
-        What lies behind, from the tip of the tubes.
-    reference : (3,) float64
-        Direction of the needle at that tip.
-    branch : int
-        The pierced branch.
+    Args:
+        rest ((A, 3) float64): Arcs that were to follow.
+        inserted_mm, turned_rad: What lies behind, from the tip of the tubes.
+        reference ((3,) float64): Direction of the needle at that tip.
+        branch: The pierced branch.
     """
 
     rest: Float
@@ -162,30 +146,18 @@ class OnTheWay(NamedTuple):
 class Policy:
     """Tells what to do next in a procedure that carries out a plan; what it prepares serves all answers.
 
-    Attributes
-    ----------
-    plan, lung
-    assessor : RiskAssessor
-        Of the plan.
-    errors : ErrorModel
-        By which measurements are weighed against what was expected.
-    procedure : Procedure
+    Attributes:
+        assessor: Of the plan.
+        errors: By which measurements are weighed against what was expected.
 
-    Parameters
-    ----------
-    plan, lung
-        The plan, and the patient that it is for.
-    errors : ErrorModel, optional
-        The preset `breath-hold` if None.
-    procedure : Procedure, optional
-        The preset `open-loop` if None: then nothing is measured, and nothing to decide.
-    radius_mm : float, optional
-        Radius of the goal; see `RiskAssessor`.
+    Args:
+        plan, lung: The plan, and the patient that it is for.
+        errors: The preset `breath-hold` if None.
+        procedure: The preset `open-loop` if None: then nothing is measured, and nothing to decide.
+        radius_mm: Radius of the goal; see `RiskAssessor`.
 
-    Raises
-    ------
-    PlanFileError, SettingsError
-        See `RiskAssessor`.
+    Raises:
+        PlanFileError, SettingsError: See `RiskAssessor`.
     """
 
     def __init__(
@@ -343,13 +315,10 @@ class Policy:
     def goes_on(self, chances: Float, left: int, *, tubes_out: bool = False) -> Bool:
         """Tell which procedures go on with what was chosen: the others place the scope again, or stop.
 
-        Parameters
-        ----------
-        chances : (N,) float64
-        left : int
-            How often the scope may be placed again.
-        tubes_out : bool
-            Whether the tubes are out already.
+        Args:
+            chances: (N,) float64.
+            left: How often the scope may be placed again.
+            tubes_out: Whether the tubes are out already.
         """
         # Tubes that are out are drawn back only where another placement promises so many times as much, since
         # each leaves a channel in tissue.
@@ -435,15 +404,11 @@ class Policy:
     ) -> tuple[Float, float, bool]:
         """Return the arcs `(A, 3)` left for a needle on its way, their chance, and if any path is proved.
 
-        Parameters
-        ----------
-        way : OnTheWay
-            What has been done and was to follow.
-        lps_from_tip : (4, 4) float64
-            Where the needle's tip is taken to be.
-        target : (3,) float64, LPS mm
-        curvature_share : float
-            Share of its largest curvature that the needle reaches in this tissue.
+        Args:
+            way: What has been done and was to follow.
+            lps_from_tip ((4, 4) float64): Where the needle's tip is taken to be.
+            target: (3,) float64, LPS mm.
+            curvature_share: Share of its largest curvature that the needle reaches in this tissue.
         """
         limits, count, steering = self._scene.limits, len(way.rest), self.procedure.needle
         turned = math.acos(min(max(float(way.reference @ lps_from_tip[:3, 2]), -1.0), 1.0))
@@ -475,12 +440,9 @@ class Policy:
         The same measurements give the same decision.  A stage that the procedure does not measure may be left
         out; one that it measures may not.
 
-        Raises
-        ------
-        SettingsError
-            If nothing was measured that the procedure decides by.
-        FrameError, TargetError
-            If a pose is not rigid, or a point lies outside the images.
+        Raises:
+            SettingsError: If nothing was measured that the procedure decides by.
+            FrameError, TargetError: If a pose is not rigid, or a point lies outside the images.
         """
         procedure, poses = self.procedure, measured.poses(self.lung)
         if procedure.scope.measured and not len(poses.scope):

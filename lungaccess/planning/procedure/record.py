@@ -23,12 +23,9 @@ from lungaccess.problem.procedures import Procedure
 class ProcedureRecord:
     """What was measured and decided in one procedure, in its order.
 
-    Attributes
-    ----------
-    policy : Policy
-        What decides.
-    steps : list of dict
-        Of each step what was measured and what was decided, plain JSON values.
+    Attributes:
+        policy: What decides.
+        steps: Of each step what was measured and what was decided, plain JSON values.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -55,12 +52,10 @@ class ProcedureRecord:
     def load(cls, path: str | os.PathLike[str], plan: Plan, lung: Lung) -> ProcedureRecord:
         """Read a record of the procedure of a plan, and play it again.
 
-        Raises
-        ------
-        FileError
-            If the file cannot be read.
-        PlanFileError
-            If it is no record, one of another plan, or the same measurements lead to other decisions.
+        Raises:
+            FileError: If the file cannot be read.
+            PlanFileError: If it is no record, one of another plan, or the same measurements lead to other
+                decisions.
         """
         try:
             stored = json.loads(read_text(Path(path)))

@@ -14,17 +14,12 @@ NO_PATH = "no path left"
 class StageReport:
     """What planning again after one stage did.
 
-    Parameters
-    ----------
-    stage : str
-        "scope", "tube" or "needle": what was measured.
-    replans : int
-        How often the rest was planned again.
-    without_path : Share
-        Of these, how many found none.
-    corrected_mm : float
-        Median distance from the target at which the plan so far would have ended if it had gone on from the
-        pose as measured; nan where the stage was not measured.
+    Args:
+        stage: "scope", "tube" or "needle": what was measured.
+        replans: How often the rest was planned again.
+        without_path: Of these, how many found none.
+        corrected_mm: Median distance from the target at which the plan so far would have ended if it had gone
+            on from the pose as measured; nan where the stage was not measured.
     """
 
     stage: str
@@ -37,15 +32,11 @@ class StageReport:
 class ProcedureReport(DrawnReport):
     """What came of many simulated procedures; `touches` counts those in any attempt.
 
-    Parameters
-    ----------
-    ends : mapping of str to Share
-        Every procedure once: "success", or the first that holds of pleura, vessel, airway, fissure, "stays
-        in the airway", `NO_PATH`, and "misses the goal".
-    placements : float
-        Mean number of times that the bronchoscope was placed.
-    stages : tuple of StageReport
-        What was measured, in its order.
+    Args:
+        ends: Every procedure once: "success", or the first that holds of pleura, vessel, airway, fissure,
+            "stays in the airway", `NO_PATH`, and "misses the goal".
+        placements: Mean number of times that the bronchoscope was placed.
+        stages: What was measured, in its order.
     """
 
     procedure: Procedure

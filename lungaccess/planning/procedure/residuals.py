@@ -13,18 +13,15 @@ from lungaccess.problem.procedures import Procedure
 class Residuals:
     """Sizes of what a procedure leaves of the errors by measuring, mm and rad; a bias counts as spread.
 
-    Parameters
-    ----------
-    scope_mm, scope_rad : float
-        Of the scope's tip when the tubes are planned; see `fused_size` where it is measured.
-    rotation_rad, insertion_mm : float
-        Of the tubes.
-    tip_mm, tip_rad : float or None
-        Of the tip of the tubes when the needle is planned; None where it follows from scope and tubes.
-    curvature, roll_rad, stop_mm : float
-        Of the needle: the logarithm of its curvature's factor, roll and insertion.
-    target_mm, foot_mm : float
-        Of the target, along each axis, and beside that of the target towards the feet.
+    Args:
+        scope_mm, scope_rad: Of the scope's tip when the tubes are planned; see `fused_size` where it is
+            measured.
+        rotation_rad, insertion_mm: Of the tubes.
+        tip_mm, tip_rad: Of the tip of the tubes when the needle is planned; None where it follows from scope
+            and tubes.
+        curvature, roll_rad, stop_mm: Of the needle: the logarithm of its curvature's factor, roll and
+            insertion.
+        target_mm, foot_mm: Of the target, along each axis, and beside that of the target towards the feet.
     """
 
     scope_mm: float

@@ -89,24 +89,16 @@ def simulate_procedure(
     What the devices then really did is looked at by the kernel of `assess`.  The same seed gives the same
     report, whatever the number of processes; without measuring it is that of `assess` with these draws.
 
-    Parameters
-    ----------
-    plan, lung
-        The plan, and the patient that it is for.
-    errors : ErrorModel, optional
-        The preset `breath-hold` if None.
-    procedure : Procedure, optional
-        The preset `open-loop` if None.
-    samples, seed : int
-    radius_mm : float, optional
-        Radius of the goal; see `RiskAssessor`.
-    processes : int
-        How many processes share the work; one does all where the system cannot fork, as on Windows.
+    Args:
+        plan, lung: The plan, and the patient that it is for.
+        errors: The preset `breath-hold` if None.
+        procedure: The preset `open-loop` if None.
+        radius_mm: Radius of the goal; see `RiskAssessor`.
+        processes: How many processes share the work; one does all where the system cannot fork, as on
+            Windows.
 
-    Raises
-    ------
-    PlanFileError, SettingsError
-        See `RiskAssessor`; also if there are no samples or processes.
+    Raises:
+        PlanFileError, SettingsError: See `RiskAssessor`; also if there are no samples or processes.
     """
     return simulated(Policy(plan, lung, errors, procedure, radius_mm=radius_mm), samples, seed, processes)
 

@@ -30,14 +30,10 @@ class Spread:
 
     Without a needle the tubes end at the target, where a needle of no length shows what the errors do.
 
-    Parameters
-    ----------
-    tips : (N, 9) float64
-        Point, direction and +x of the scope tip of each deployment, LPS mm.
-    deployments : Deployments
-        N of them.
-    radius_mm : float
-        Radius of the goal.
+    Args:
+        tips ((N, 9) float64): Point, direction and +x of the scope tip of each deployment, LPS mm.
+        deployments: N of them.
+        radius_mm: Radius of the goal.
     """
 
     def __init__(

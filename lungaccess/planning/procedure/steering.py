@@ -11,11 +11,8 @@ from stages.needle import ArcPath, Query, Replan, Replanner, ReplanSettings
 class PolicyReplanner(Replanner):
     """Goes on by what the policy chooses; it searches where no path is proved, for one that ends nearer.
 
-    Parameters
-    ----------
-    policy : Policy
-    query, plan
-        As those of `Replanner`.
+    Args:
+        query, plan: As those of `Replanner`.
     """
 
     def __init__(self, policy: Policy, query: Query, plan: ArcPath) -> None:
@@ -66,14 +63,10 @@ def steered(
 ) -> Steered:
     """Return what comes of a needle that is measured on its way.
 
-    Parameters
-    ----------
-    path : ArcPath
-        What it begins with.
-    true_tip : (4, 4) float64
-        Where it truly starts.
-    doubt : (6, 6) float64
-        Covariance of where it is taken to start, see `stages.needle.Unknown`.
+    Args:
+        path: What it begins with.
+        true_tip ((4, 4) float64): Where it truly starts.
+        doubt ((6, 6) float64): Covariance of where it is taken to start, see `stages.needle.Unknown`.
     """
     steering = policy.procedure.needle
     query = Query(lps_from_start=path.lps_from_start, target=target, branch=branch)

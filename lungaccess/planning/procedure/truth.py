@@ -117,12 +117,8 @@ def needles_carried_out(arcs: Float, counts: Int, errors: Deviations, longest_mm
 class SteeredTruth:
     """What really happens to a needle that is steered, under the errors of one attempt, and what is measured.
 
-    Parameters
-    ----------
-    attempt : Attempt
-    steering : NeedleSteering
-    rng : numpy.random.Generator
-        Of the tracker's noise.
+    Args:
+        rng: Of the tracker's noise.
     """
 
     def __init__(self, attempt: Attempt, steering: NeedleSteering, rng: np.random.Generator) -> None:
@@ -155,10 +151,8 @@ class SteeredTruth:
 def unknown_of(errors: ErrorModel, steering: NeedleSteering, start: Float) -> Unknown:
     """Return what is not known of a needle under an error model, watched by a tracker.
 
-    Parameters
-    ----------
-    start : (6, 6) float64
-        Covariance of the pose in which it begins, see `Unknown`.
+    Args:
+        start ((6, 6) float64): Covariance of the pose in which it begins, see `Unknown`.
     """
     factor = errors.needle_curvature
     return Unknown(
@@ -173,15 +167,10 @@ def unknown_of(errors: ErrorModel, steering: NeedleSteering, start: Float) -> Un
 class Steered:
     """What came of one needle that was measured and planned again on its way.
 
-    Parameters
-    ----------
-    arcs : (A, 3) float64
-        True arcs from the true tip of the tubes.
-    replans : tuple of Replan
-    stopped : Failure or None
-        Why it stopped before its end.
-    factor : float
-        What is believed in the end of the true curvature over the commanded one.
+    Args:
+        arcs ((A, 3) float64): True arcs from the true tip of the tubes.
+        stopped: Why it stopped before its end.
+        factor: What is believed in the end of the true curvature over the commanded one.
     """
 
     arcs: Float
@@ -203,15 +192,10 @@ def insert_needle(
 ) -> Steered:
     """Insert a needle from a true tip of the tubes, watched by a tracker and planned again on its way.
 
-    Parameters
-    ----------
-    environment : NeedleEnvironment
-        In which the needle goes on without a new path as long as the old one is clear.
-    query, path
-        What is planned for, from where the tip is taken to be, and the path to follow first.
-    replanner : Replanner
-    attempt, true_tip, steering, unknown, rng
-        See `SteeredTruth` and `Belief`.
+    Args:
+        environment: In which the needle goes on without a new path as long as the old one is clear.
+        query, path: What is planned for, from where the tip is taken to be, and the path to follow first.
+        attempt, true_tip, steering, unknown, rng: See `SteeredTruth` and `Belief`.
     """
     needle = TrueNeedle(SteeredTruth(attempt, steering, rng), true_tip, 0.0)
     belief = Belief(query, unknown, steering.latency_mm)

@@ -29,19 +29,13 @@ TASKS_AT_ONCE = 8
 class DeploymentSpace:
     """Boxes that hold all deployments of a system in a lung, M of P pieces of the airway.
 
-    Parameters
-    ----------
-    pieces : tuple of PlacePiece
-    arrays : Pieces
-        The same, as the kernels take them.
-    boxes : (M, BOX_COLUMNS) float64
-        See `lungaccess.planning.reachability.kernels.deployment_boxes`.
-    owners : (M,) int32
-        The piece of each.
-    measures : (M,) float64
-        Of each: mm^3 of places x rad^2 of directions x rad of rotations x mm^2 of insertions.
-    looked : int
-        Boxes looked at to make it.
+    Args:
+        arrays: The same, as the kernels take them.
+        boxes ((M, BOX_COLUMNS) float64): See `lungaccess.planning.reachability.kernels.deployment_boxes`.
+        owners ((M,) int32): The piece of each.
+        measures ((M,) float64): Of each: mm^3 of places x rad^2 of directions x rad of rotations x mm^2 of
+            insertions.
+        looked: Boxes looked at to make it.
     """
 
     pieces: tuple[PlacePiece, ...]
@@ -62,14 +56,10 @@ def divided_space(
 ) -> DeploymentSpace:
     """Halve the boxes of all pieces, the largest first, and drop those that hold no deployment.
 
-    Parameters
-    ----------
-    environment
-        Its `passable` does not count.
-    insertions : (N,) float64
-        See `greatest_insertions`.
-    between : callable, optional
-        Called now and then.
+    Args:
+        environment: Its `passable` does not count.
+        insertions ((N,) float64): See `greatest_insertions`.
+        between: Called now and then.
     """
     arrays = _as_arrays(pieces)
     boxes, owners = _first_boxes(tubes, float(insertions.max()), pieces)

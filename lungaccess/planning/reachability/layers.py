@@ -45,23 +45,16 @@ def scan_layers(
 ) -> tuple[Float32, Int32, int]:
     """Try the points of all layers, slab by slab.
 
-    Parameters
-    ----------
-    counted : (ni, nj, nk) bool
-        Voxels whose centres are tried.
-    store : LayerStore or None
-        Where finished slabs are kept; emptied at the end.
-    progress : callable or None
-        Told the share of the layers done.
+    Args:
+        counted ((ni, nj, nk) bool): Voxels whose centres are tried.
+        store: Where finished slabs are kept; emptied at the end.
+        progress: Told the share of the layers done.
 
-    Returns
-    -------
-    found : (4, ni, nj, nk) float32
-        Kind, cost, clearance and share of the breath, see `stages.needle.reach.Reached`.
-    entries : (ni, nj, nk) int32
-        Start pose of what is reached, else -1.
-    resumed : int
-        Layers taken from the store.
+    Returns:
+        - found ((4, ni, nj, nk) float32) - Kind, cost, clearance and share of the breath, see
+          `stages.needle.reach.Reached`.
+        - entries ((ni, nj, nk) int32) - Start pose of what is reached, else -1.
+        - resumed - Layers taken from the store.
     """
     found = np.zeros((4, *grid.shape), dtype=np.float32)
     entries = np.full(grid.shape, -1, dtype=np.int32)

@@ -18,22 +18,14 @@ TOGETHER_MM = 12.0
 class OpenPlace:
     """A stretch of an airway branch from which deployments could not be ruled out.
 
-    Parameters
-    ----------
-    branch, generation : int
-        See `anatomy.airway_tree.AirwayTree`.
-    name : str
-        The number of the branch, with its lobe if that is known.
-    points_lps : (N, 3) float64
-        Its tree points, LPS mm.
-    tip_lps : (3,) float64
-        Place of the scope tip, LPS mm, in the middle of a part that was left.
-    insertions_mm : tuple of float
-        Of the outer and the inner tube there.
-    share : float
-        Of the deployment space that is open here.
-    narrowest : bool
-        Whether such a part was too small to halve; else the budget ended before.
+    Args:
+        branch, generation: See `anatomy.airway_tree.AirwayTree`.
+        name: The number of the branch, with its lobe if that is known.
+        points_lps ((N, 3) float64): Its tree points, LPS mm.
+        tip_lps ((3,) float64): Place of the scope tip, LPS mm, in the middle of a part that was left.
+        insertions_mm: Of the outer and the inner tube there.
+        share: Of the deployment space that is open here.
+        narrowest: Whether such a part was too small to halve; else the budget ended before.
     """
 
     branch: int

@@ -51,14 +51,10 @@ STATES: dict[str, tuple[str, ...]] = {
 class RegionReach:
     """How much of a region a system reaches.
 
-    Parameters
-    ----------
-    volume_ml : float
-        Lung tissue that is no obstacle.
-    shares : tuple of float
-        Its shares by the order of `KINDS`; all 0 if there is no such tissue.
-    median_cost, median_clearance_mm : float
-        Of what is reached; nan if nothing is.
+    Args:
+        volume_ml: Lung tissue that is no obstacle.
+        shares: Its shares by the order of `KINDS`; all 0 if there is no such tissue.
+        median_cost, median_clearance_mm: Of what is reached; nan if nothing is.
     """
 
     name: str
@@ -85,31 +81,22 @@ class RegionReach:
 class ReachMap:
     """What a system reaches in a lung.
 
-    Parameters
-    ----------
-    with_fissures : bool
-        Whether fissures are obstacles.
-    kinds : Volume of uint8
-        `NOT_COUNTED` or one of `KINDS` at each voxel, classified by its centre.
-    cost, clearance_mm : Volume of float32
-        Estimated integral of 1 / clearance of the best path found, and the clearance that it keeps
-        beyond the exempt length of the needle; 0 where there is none.
-    deployment : Volume of int32
-        Number of the deployment of the atlas from which that path starts; -1 where there is none.
-    regions : Regions
-        Side and lobe of each voxel, on the same grid.
-    entries : int
-        Deployments of the atlas.
-    trees : int
-        Random trees for each point, see `map_reach`.
-    resumed_layers : int
-        Layers of voxels that an earlier run had finished.
-    scan_s, atlas_s : float
-        Seconds that the map and the atlas took.
-    phases : tuple of 2 floats or None
-        Phases of the breath in all of which voxels count as reached; None for the masks' alone.
-    window_share : Volume of float32 or None
-        With phases, the share of the breath in which the path found is proved; 0 where there is none.
+    Args:
+        with_fissures: Whether fissures are obstacles.
+        kinds (Volume of uint8): `NOT_COUNTED` or one of `KINDS` at each voxel, classified by its centre.
+        cost, clearance_mm (Volume of float32): Estimated integral of 1 / clearance of the best path found,
+            and the clearance that it keeps beyond the exempt length of the needle; 0 where there is none.
+        deployment (Volume of int32): Number of the deployment of the atlas from which that path starts; -1
+            where there is none.
+        regions: Side and lobe of each voxel, on the same grid.
+        entries: Deployments of the atlas.
+        trees: Random trees for each point, see `map_reach`.
+        resumed_layers: Layers of voxels that an earlier run had finished.
+        scan_s, atlas_s: Seconds that the map and the atlas took.
+        phases (tuple of 2 floats or None): Phases of the breath in all of which voxels count as reached; None
+            for the masks' alone.
+        window_share (Volume of float32 or None): With phases, the share of the breath in which the path found
+            is proved; 0 where there is none.
     """
 
     patient_name: str
@@ -162,10 +149,8 @@ class ReachMap:
     def gained_and_lost_ml(self, other: ReachMap) -> tuple[float, float]:
         """Return the volume that this map reaches and another does not, and the reverse.
 
-        Raises
-        ------
-        GridMismatchError
-            If the maps are not on the same grid.
+        Raises:
+            GridMismatchError: If the maps are not on the same grid.
         """
         self.kinds.grid.require_same(other.kinds.grid, "the other map")
         ml = self.kinds.grid.voxel_volume_mm3 / 1000.0
@@ -191,10 +176,8 @@ class ReachMap:
         `STEM.nrrd` holds the kinds as labels, `STEM-cost.nrrd`, `STEM-clearance.nrrd` and
         `STEM-deployment.nrrd` the rest, `STEM-window.nrrd` the share of the breath.
 
-        Raises
-        ------
-        FileError
-            If the folder cannot be written to.
+        Raises:
+            FileError: If the folder cannot be written to.
         """
         place = require_writable_folder(Path(folder))
         volumes = {"": self.kinds, "-cost": self.cost, "-clearance": self.clearance_mm}
@@ -209,10 +192,8 @@ class ReachMap:
 def reach_grid(lung: Lung, spacing_mm: float) -> Grid:
     """Return the grid of cubes of `spacing_mm` along the axes of a lung's grid that covers it.
 
-    Raises
-    ------
-    SettingsError
-        If the spacing is not between 0.5 and 50 mm.
+    Raises:
+        SettingsError: If the spacing is not between 0.5 and 50 mm.
     """
     if not 0.5 <= spacing_mm <= 50.0:
         raise SettingsError(
@@ -247,30 +228,20 @@ def map_reach(
     paths of several arcs.  Without a needle the tubes are aimed at it.  The same inputs give the same map,
     resumed or not.
 
-    Parameters
-    ----------
-    spacing_mm : float
-        Side of the map's voxels.
-    arcs, trees : int
-        See `stages.needle.reach.ReachScan`.
-    phases : tuple of 2 floats, optional
-        Phases of the breath in all of which a voxel has to be reached, by single arcs; a voxel takes a
-        hundred times as long, so that a spacing of 10 mm is apt.
-    atlas : Atlas, optional
-        Made with `build_atlas` beforehand; made here if None.
-    work : path, optional
-        Folder where finished layers are kept, so that a later call with the same inputs goes on from there.
-        Emptied of them when the map is complete.
-    progress : callable, optional
-        Told the share of the layers done.
+    Args:
+        spacing_mm: Side of the map's voxels.
+        arcs, trees: See `stages.needle.reach.ReachScan`.
+        phases (tuple of 2 floats): Phases of the breath in all of which a voxel has to be reached, by single
+            arcs; a voxel takes a hundred times as long, so that a spacing of 10 mm is apt.
+        atlas: Made with `build_atlas` beforehand; made here if None.
+        work: Folder where finished layers are kept, so that a later call with the same inputs goes on from
+            there.  Emptied of them when the map is complete.
+        progress: Told the share of the layers done.
 
-    Raises
-    ------
-    SettingsError
-        If spacing, arcs or trees are out of range, trees are asked for without a needle, or the atlas belongs
-        to another lung or system.
-    FileError
-        If the folder cannot be written to.
+    Raises:
+        SettingsError: If spacing, arcs or trees are out of range, trees are asked for without a needle, or
+            the atlas belongs to another lung or system.
+        FileError: If the folder cannot be written to.
     """
     grid = reach_grid(lung, spacing_mm)
     if atlas is not None and (atlas.lung.key != lung.key or atlas.system != system):
@@ -321,12 +292,9 @@ def compare_reach(
 ) -> tuple[ReachMap, ...]:
     """Return the maps of several systems, all on the same grid.
 
-    Parameters
-    ----------
-    lung, spacing_mm, arcs, trees, phases, work
-        See `map_reach`.
-    progress : callable, optional
-        Told the name of the system and the share of its layers done.
+    Args:
+        lung, spacing_mm, arcs, trees, phases, work: See `map_reach`.
+        progress: Told the name of the system and the share of its layers done.
     """
     maps = []
     for system in systems:

@@ -25,16 +25,11 @@ FIRST_POINTS, MOST_POINTS = 32, 256
 class ReachPart:
     """What became of N points of a grid.
 
-    Parameters
-    ----------
-    voxels : (N,) int64
-        Numbers of the voxels in the grid, C order.
-    kinds : (N,) uint8
-        One of `lungaccess.planning.reachability.KINDS`.
-    entries : (N,) int64
-        The deployment of the atlas whose arc is proved clear; -1 where there is none.
-    share : float
-        Share of the grid's counted voxels that is known with this part.
+    Args:
+        voxels ((N,) int64): Numbers of the voxels in the grid, C order.
+        kinds ((N,) uint8): One of `lungaccess.planning.reachability.KINDS`.
+        entries ((N,) int64): The deployment of the atlas whose arc is proved clear; -1 where there is none.
+        share: Share of the grid's counted voxels that is known with this part.
     """
 
     voxels: Int
@@ -46,21 +41,14 @@ class ReachPart:
 class ReachStream:
     """Tells which points of a coarse grid a system reaches by single arcs, part by part.
 
-    Parameters
-    ----------
-    atlas : Atlas
-        The deployments, made for this lung, scope and tubes.
+    Args:
+        atlas: The deployments, made for this lung, scope and tubes.
 
-    Attributes
-    ----------
-    grid : Grid
-    counted : (M,) int64
-        Numbers of the voxels whose centre lies in lung tissue that is no obstacle.
+    Attributes:
+        counted ((M,) int64): Numbers of the voxels whose centre lies in lung tissue that is no obstacle.
 
-    Raises
-    ------
-    SettingsError
-        If the atlas belongs to another lung or system.
+    Raises:
+        SettingsError: If the atlas belongs to another lung or system.
     """
 
     def __init__(self, lung: Lung, system: System, atlas: Atlas) -> None:
@@ -75,11 +63,10 @@ class ReachStream:
 
         What neighbouring points have in common is found once, so that parts become larger.
 
-        Parameters
-        ----------
-        known : (V,) int64, optional
-            A deployment for each voxel of the grid, -1 for none, from which another needle reached it: where
-            its arc is clear for this needle, too, the voxel is in the first part.
+        Args:
+            known ((V,) int64): A deployment for each voxel of the grid, -1 for none, from which another
+                needle reached it: where its arc is clear for this needle, too, the voxel is in the first
+                part.
         """
         points = self.grid.lps(np.stack(np.unravel_index(self.counted, self.grid.shape), axis=1))
         order = np.argsort(np.linalg.norm(points - np.asarray(around_lps), axis=1), kind="stable")

@@ -43,17 +43,12 @@ class PlacePiece:
 def places_of_tips(lung: Lung, not_lumen: Array, least_depth_mm: float) -> tuple[Mask, Float]:
     """Return where the tip of a scope may be: on the way from the trachea, in a lumen so deep.
 
-    Parameters
-    ----------
-    not_lumen : (ni, nj, nk) uint8
-        1 outside the lumen, on the lung's grid.
+    Args:
+        not_lumen ((ni, nj, nk) uint8): 1 outside the lumen, on the lung's grid.
 
-    Returns
-    -------
-    mask : bool, on the lattice of the lumen's depth
-        Which voxels may hold a tip.
-    centres : (C, 3) float64, LPS mm
-        Of the parts of these voxels, PARTS to a side, that may hold one.
+    Returns:
+        - mask (bool, on the lattice of the lumen's depth) - Which voxels may hold a tip.
+        - centres ((C, 3) float64, LPS mm) - Of the parts of these voxels, PARTS to a side, that may hold one.
     """
     from scipy import ndimage
 

@@ -53,20 +53,15 @@ NO_NEEDLE = Limits(**dict.fromkeys(Limits._fields, 0.0) | {"kappa": 1.0})
 class ReachVerdict:
     """Whether a target is proved unreachable, and what is left if not.
 
-    Parameters
-    ----------
-    proved : bool
-        If not, nothing is known of the target.
-    boxes : int
-        Boxes of deployments that were looked at.
-    share_ruled_out : float
-        Share of the deployment space that is proved not to reach the target; 1 if all of it is.
-    finished : bool
-        Whether every box is ruled out or has a part that is too small to halve; else the budget was used up.
-    open_places : tuple of OpenPlace
-        Where the deployments start that could not be ruled out, the largest share first.
-    rests_on : str
-        On which masks a proof rests, and what of them is in doubt.
+    Args:
+        proved: If not, nothing is known of the target.
+        boxes: Boxes of deployments that were looked at.
+        share_ruled_out: Share of the deployment space that is proved not to reach the target; 1 if all of it
+            is.
+        finished: Whether every box is ruled out or has a part that is too small to halve; else the budget was
+            used up.
+        open_places: Where the deployments start that could not be ruled out, the largest share first.
+        rests_on: On which masks a proof rests, and what of them is in doubt.
     """
 
     proved: bool
@@ -94,15 +89,12 @@ class UnreachableProof:
 
     Deployments that no target needs to look at are ruled out once, with the first target.
 
-    Parameters
-    ----------
-    between : callable, optional
-        Called between the steps of the preparation, in patients tens of seconds; it may raise to end it.
+    Args:
+        between: Called between the steps of the preparation, in patients tens of seconds; it may raise to end
+            it.
 
-    Raises
-    ------
-    SettingsError
-        If the tubes are not planar.
+    Raises:
+        SettingsError: If the tubes are not planar.
     """
 
     def __init__(
@@ -171,25 +163,14 @@ class UnreachableProof:
         The places nearest to the target are looked at first.  After one that is left open the search goes on
         with the others, then with what else can be ruled out around the open ones.
 
-        Parameters
-        ----------
-        target_lps : (3,) float64
-            LPS mm.
-        most_boxes : int
-            To look at, about.
-        time_s : float, optional
-            After so much time nothing more is begun; the same time need not give the same verdict.
-        progress : callable, optional
-            Told the share of the deployment space that is ruled out.
+        Args:
+            target_lps ((3,) float64): LPS mm.
+            most_boxes: To look at, about.
+            time_s: After so much time nothing more is begun; the same time need not give the same verdict.
+            progress: Told the share of the deployment space that is ruled out.
 
-        Returns
-        -------
-        ReachVerdict
-
-        Raises
-        ------
-        TargetError
-            If the target is not a finite point of the image.
+        Raises:
+            TargetError: If the target is not a finite point of the image.
         """
         target = np.asarray(target_lps, dtype=np.float64)
         environment = self._environment(target)

@@ -43,10 +43,8 @@ def clearance_box(lung: Lung, points: Float, margin_mm: float, *, with_fissures:
 def spared_box(lung: Lung, points: Float, margin_mm: float, *, bits: int, branch: int) -> FieldBox:
     """Return the clearance in mm from all but the airway of a branch; what lies outside does not count.
 
-    Parameters
-    ----------
-    bits : int
-        Structures that are obstacles.
+    Args:
+        bits: Structures that are obstacles.
     """
     geometry = corner_geometry(lung.grid)
     low, high = _range(geometry, lung.labels.shape, points, margin_mm)
@@ -60,10 +58,8 @@ def spared_box(lung: Lung, points: Float, margin_mm: float, *, bits: int, branch
 def wall_box(lung: Lung, points: Float, margin_mm: float, *, with_fissures: bool, kept_mm: float) -> FieldBox:
     """Return how thick a tube may be around points: as the lumen is deep, or else clear of all but airway.
 
-    Parameters
-    ----------
-    kept_mm : float
-        Margins kept beyond the tube's surface where it touches the wall.
+    Args:
+        kept_mm: Margins kept beyond the tube's surface where it touches the wall.
     """
     fields = [lung.fields[name] for name in ("vessel", "pleura")]
     if with_fissures and lung.has_fissures:

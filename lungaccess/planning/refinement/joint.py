@@ -35,17 +35,12 @@ def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) ->
     that it refuses.  Called again with what it returned, it may find more.  It is not for several threads at
     a time.
 
-    Parameters
-    ----------
-    candidate : Candidate
-        Proved by the evaluator.
-    iterations : int
-        Most steps of the program's solver, each time it runs (two or three times a call).  For each number a
-        program is built at the first call, which takes a second or two.
+    Args:
+        candidate: Proved by the evaluator.
+        iterations: Most steps of the program's solver, each time it runs (two or three times a call).  For
+            each number a program is built at the first call, which takes a second or two.
 
-    Returns
-    -------
-    Candidate or None
+    Returns:
         Cheaper than the one given by BETTER or more, or None; always None for an objective that the program
         cannot express: see `lungaccess.planning.refinement.problem.program_weights`.
     """
@@ -85,12 +80,9 @@ def _refined(
 class Placement:
     """Proved scope and tubes, and the program's variables there.
 
-    Parameters
-    ----------
-    share : float
-        Share of the step from the candidate (0) to what the program found (1).
-    x : (n,) float64
-        The site counts from `tip`.
+    Args:
+        share: Share of the step from the candidate (0) to what the program found (1).
+        x ((n,) float64): The site counts from `tip`.
     """
 
     share: float

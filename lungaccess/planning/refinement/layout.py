@@ -26,18 +26,13 @@ N_FEATURES = 3 * (CURVE_DEGREE + 1) + 10
 class Layout:
     """The shape of a program.
 
-    Parameters
-    ----------
-    arcs : int
-        Arcs of the needle.
-    with_map : bool
-        Whether the objective looks at a cost map.
-    tubes, turned : int
-        How many tubes there are, and how many of them are turned against the others.
-    weighs_tubes : bool
-        Whether the objective looks at the tubes, too.
-    zone_points, tube_points, wall_points : int
-        Samples of the needle's exempt length, and of the tubes behind and before the exit.
+    Args:
+        arcs: Arcs of the needle.
+        with_map: Whether the objective looks at a cost map.
+        tubes, turned: How many tubes there are, and how many of them are turned against the others.
+        weighs_tubes: Whether the objective looks at the tubes, too.
+        zone_points, tube_points, wall_points: Samples of the needle's exempt length, and of the tubes behind
+            and before the exit.
     """
 
     arcs: int
@@ -175,13 +170,10 @@ def _end(places: dict[str, slice]) -> int:
 class Numbers:
     """The numbers of one call of a program.
 
-    Parameters
-    ----------
-    parameters : (P,) float64
-    lower, upper : (n,) float64
-        Bounds of the variables.
-    least, most : (m,) float64
-        Bounds of the constraints.
+    Args:
+        parameters: (P,) float64.
+        lower, upper ((n,) float64): Bounds of the variables.
+        least, most ((m,) float64): Bounds of the constraints.
     """
 
     parameters: Float

@@ -86,21 +86,12 @@ def program_weights(task: Task) -> Weights | None:
 class Problem:
     """The program's numbers for one candidate.
 
-    Parameters
-    ----------
-    candidate : Candidate
-        With at most as many arcs as the last of ARC_COUNTS.
-    weights : Weights
-        See `program_weights`.
+    Args:
+        candidate: With at most as many arcs as the last of ARC_COUNTS.
+        weights: See `program_weights`.
 
-    Attributes
-    ----------
-    layout : Layout
-    start : (n,) float64
-        The candidate as variables.
-    numbers : Numbers
-    boxes : tuple of FieldBox
-    axis : LocalAxis
+    Attributes:
+        start ((n,) float64): The candidate as variables.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, candidate: Candidate, weights: Weights) -> None:
@@ -301,12 +292,11 @@ class Problem:
 class LocalAxis:
     """The way of a scope's tip as its base goes on or stops earlier, AXIS_SCALE_MM each way.
 
-    Attributes
-    ----------
-    low_mm, high_mm : float
-        How far the base can be moved, back (negative) and on, with a proved motion everywhere between.
-    points, tangents : (3, AXIS_DEGREE + 1) float64
-        Coefficients of the tip's point and direction, LPS mm, in powers of the shift by AXIS_SCALE_MM.
+    Attributes:
+        low_mm, high_mm: How far the base can be moved, back (negative) and on, with a proved motion
+            everywhere between.
+        points, tangents ((3, AXIS_DEGREE + 1) float64): Coefficients of the tip's point and direction, LPS
+            mm, in powers of the shift by AXIS_SCALE_MM.
     """
 
     def __init__(self, rows: TipRows, tip: ScopeTip) -> None:

@@ -97,10 +97,8 @@ def _quadratic(places: Any, seen: Any) -> list[Any]:
 class Program:
     """The program for needles of one number of arcs.
 
-    Parameters
-    ----------
-    iterations : int
-        Most steps of IPOPT.
+    Args:
+        iterations: Most steps of IPOPT.
     """
 
     def __init__(self, layout: Layout, iterations: int) -> None:

@@ -35,23 +35,16 @@ class ShapeModel:
     Features are the Chebyshev coefficients of the curve by its share of the length, point, direction and +x
     of the tip, all in the frame of the scope tip, and what has to be free beside the tubes.
 
-    Parameters
-    ----------
-    design : DesignArrays
-    shape : TubeShape
-        The one about which the polynomials are made.
-    most_mm : float
-        No tube is inserted farther.
-    constant : bool
-        Whether only that shape is asked for.
+    Args:
+        shape: The one about which the polynomials are made.
+        most_mm: No tube is inserted farther.
+        constant: Whether only that shape is asked for.
 
-    Attributes
-    ----------
-    centre, lower, upper : (m,) float64
-        The joints of the shape and how far they may be moved: all insertions, the outermost tube first, in
-        mm, then the rotations of the tubes whose turn changes the shape, in rad.
-    matrix : (N_FEATURES, 1 + m + m (m + 1) / 2) float64
-        Of the terms of `terms`.
+    Attributes:
+        centre, lower, upper ((m,) float64): The joints of the shape and how far they may be moved: all
+            insertions, the outermost tube first, in mm, then the rotations of the tubes whose turn changes
+            the shape, in rad.
+        matrix ((N_FEATURES, 1 + m + m (m + 1) / 2) float64): Of the terms of `terms`.
     """
 
     def __init__(

@@ -55,16 +55,11 @@ STEPS = 20
 class Contender:
     """A candidate in the contest.
 
-    Parameters
-    ----------
-    plan : Plan
-        For chances, without what takes long to state: clearances and costs are those of another plan.
-    gained, draws
-        What it has gained in all batches so far: successes, or the value of a function.
-    shrunken : float
-        Its successes with smaller errors, by which the first rounds go where successes are rare.
-    stays : bool
-        Whether it takes part to the end.
+    Args:
+        plan: For chances, without what takes long to state: clearances and costs are those of another plan.
+        gained, draws: What it has gained in all batches so far: successes, or the value of a function.
+        shrunken: Its successes with smaller errors, by which the first rounds go where successes are rare.
+        stays: Whether it takes part to the end.
     """
 
     candidate: Candidate

@@ -38,18 +38,12 @@ size."""
 class Rounds:
     """Successive halving: how many candidates take part, and with how many draws [Jamieson2016].
 
-    Parameters
-    ----------
-    pool : int
-        Candidates that it begins with.
-    of_a_tip : int
-        So many of one scope tip: its deployments are alike, and other tips fail otherwise.
-    draws : tuple of int
-        Draws that each round adds.
-    kept : tuple of int
-        Contenders that are left after each round but the last.
-    fresh : int
-        Draws of the estimate that a plan states, which decide nothing in the search.
+    Args:
+        pool: Candidates that it begins with.
+        of_a_tip: So many of one scope tip: its deployments are alike, and other tips fail otherwise.
+        draws: Draws that each round adds.
+        kept: Contenders that are left after each round but the last.
+        fresh: Draws of the estimate that a plan states, which decide nothing in the search.
     """
 
     pool: int
@@ -89,10 +83,9 @@ class Rating(Protocol):
 class ChanceRating:
     """Counts successes under errors and a procedure.
 
-    Parameters
-    ----------
-    open_loop : bool
-        Whether the request's procedure is left out, and only few draws are made, to find who takes part.
+    Args:
+        open_loop: Whether the request's procedure is left out, and only few draws are made, to find who takes
+            part.
     """
 
     def __init__(self, request: Request, *, open_loop: bool = False) -> None:

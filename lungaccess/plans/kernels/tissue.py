@@ -16,28 +16,20 @@ from anatomy.kernels.compiling import borrowing_kernel, kernel
 class Wanted(NamedTuple):
     """What of a nodule has to be in a tool.
 
-    Parameters
-    ----------
-    target : (3,) float64, LPS mm
-    points : (K, 3) float64
-        Of the tool, in the frame of the last tip, +z ahead; one at its origin where the tip itself counts.
-    weight : float
-        What each of the points stands for, in the unit of `least`.
-    tissue : (X, Y, Z) uint8
-        1 in the nodule; empty where the nodule is a ball about the target.
-    geometry : (3, 4) float64
-        From LPS mm to voxels of it, of which number i spans i to i + 1.
-    inner_mm, outer_mm : float
-        Distances from the target between which a ball counts.
-    covered : (M, 3) float64
-        Points of the nodule, LPS mm from the target, where its share in the tool counts; each then stands for
-        `weight`.  Else there are none.
-    beyond_mm, half_mm, radius_mm : float
-        How far the tip lies beyond the middle of the tool, half its length, and its radius.
-    tapers : bool
-        Whether the tool is an ellipsoid.
-    least : float
-        So much is enough.
+    Args:
+        target: (3,) float64, LPS mm.
+        points ((K, 3) float64): Of the tool, in the frame of the last tip, +z ahead; one at its origin where
+            the tip itself counts.
+        weight: What each of the points stands for, in the unit of `least`.
+        tissue ((X, Y, Z) uint8): 1 in the nodule; empty where the nodule is a ball about the target.
+        geometry ((3, 4) float64): From LPS mm to voxels of it, of which number i spans i to i + 1.
+        inner_mm, outer_mm: Distances from the target between which a ball counts.
+        covered ((M, 3) float64): Points of the nodule, LPS mm from the target, where its share in the tool
+            counts; each then stands for `weight`.  Else there are none.
+        beyond_mm, half_mm, radius_mm: How far the tip lies beyond the middle of the tool, half its length,
+            and its radius.
+        tapers: Whether the tool is an ellipsoid.
+        least: So much is enough.
     """
 
     target: Float

@@ -50,10 +50,9 @@ NO_STARTS = "no query: the patient came without start poses"
 class PublishedQuery:
     """One start pose and one target of a patient, both counted from 1.
 
-    Parameters
-    ----------
-    lps_from_start : (4, 4) float64
-    target_lps : (3,) float64, LPS mm
+    Args:
+        lps_from_start: (4, 4) float64.
+        target_lps: (3,) float64, LPS mm.
     """
 
     patient: str
@@ -92,10 +91,8 @@ def why_no_query(patient: PatientImages | LiverImages | Organ) -> str:
 def patients_of(folder: Path) -> list[Path]:
     """Return the patients that a folder holds, or itself if it is one, in the order of their numbers.
 
-    Raises
-    ------
-    FileError
-        If the folder is not there, or is no patient and holds none.
+    Raises:
+        FileError: If the folder is not there, or is no patient and holds none.
     """
     from anatomy.io.images import image_suffix
 
@@ -151,12 +148,10 @@ class UncObstacles:
     ) -> NeedleEnvironment:
         """Return the labels in a box about start and target, less the exempt ball, as an environment.
 
-        Parameters
-        ----------
-        lps_from_start : (4, 4) float64
-        target_lps : (3,) float64, LPS mm
-        exempt_mm : float
-            Obstacle voxels whose centres lie so near to the start do not count.
+        Args:
+            lps_from_start: (4, 4) float64.
+            target_lps: (3,) float64, LPS mm.
+            exempt_mm: Obstacle voxels whose centres lie so near to the start do not count.
         """
         ends = np.stack([lps_from_start[:3, 3], target_lps])
         border = BORDER_MM + 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
@@ -198,16 +193,11 @@ def unc_obstacles(images: PatientImages | LiverImages) -> UncObstacles:
 class PeerResult:
     """What was recorded for one query: the kind of run that solved it most often, and then soonest.
 
-    Parameters
-    ----------
-    planner : str
-    runs, solved : int
-        Of this kind.
-    first_cpu_ms, length_mm : float or None
-        Medians of its solved runs: processor time to the first path, and the length of the last one with the
-        distance that it leaves to the target.
-    refused : bool
-        Whether the peer refused the query before planning: no run was made.
+    Args:
+        runs, solved: Of this kind.
+        first_cpu_ms, length_mm: Medians of its solved runs: processor time to the first path, and the length
+            of the last one with the distance that it leaves to the target.
+        refused: Whether the peer refused the query before planning: no run was made.
     """
 
     planner: str
@@ -221,10 +211,8 @@ class PeerResult:
 def read_peer(path: Path) -> Mapping[Key, PeerResult]:
     """Read recorded results: runs of one thread that ignore obstacles within 3 mm of the start.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read or holds something else.
+    Raises:
+        FileError: If the file cannot be read or holds something else.
     """
     try:
         runs = json.loads(path.read_text(encoding="utf-8"))["runs"]

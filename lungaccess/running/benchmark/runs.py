@@ -42,27 +42,18 @@ THERE_IS_ONE = "nothing found in the time given, though another planner found a 
 class BenchmarkRow:
     """One run of one planner on one query, or what keeps all of them from running.
 
-    Parameters
-    ----------
-    start, target : int or None
-        Numbers of the published start and target, from 1; None for a patient without queries.
-    radius_mm : float or None
-        Least radius of curvature of the needle.
-    planner : str
-        "" if the query is ruled out, by proof, before any planner begins.
-    first_cpu_ms : float or None
-        Processor time to the first path, without compilation.
-    first_length_mm, length_mm : float or None
-        Of the first and the last path, with the distance left to the target.
-    clearance_mm, needed_clearance_mm : float or None
-        Least distance from the path's axis to obstacles, where the exit is not exempt, and what it must be.
-    proved : bool
-        Whether it is proved that no path exists.
-    reason : str
-        Why there is no path; "" if there is one.
-    arcs : tuple of mapping
-        The last path from the published start: "length_mm", "roll_rad" and "curvature_per_mm" of each arc, as
-        `stages.needle.ArcPath` has them; no arcs if there is none.
+    Args:
+        start, target: Numbers of the published start and target, from 1; None for a patient without queries.
+        radius_mm: Least radius of curvature of the needle.
+        planner: "" if the query is ruled out, by proof, before any planner begins.
+        first_cpu_ms: Processor time to the first path, without compilation.
+        first_length_mm, length_mm: Of the first and the last path, with the distance left to the target.
+        clearance_mm, needed_clearance_mm: Least distance from the path's axis to obstacles, where the exit is
+            not exempt, and what it must be.
+        proved: Whether it is proved that no path exists.
+        reason: Why there is no path; "" if there is one.
+        arcs: The last path from the published start: "length_mm", "roll_rad" and "curvature_per_mm" of each
+            arc, as `stages.needle.ArcPath` has them; no arcs if there is none.
     """
 
     patient: str
@@ -96,12 +87,9 @@ def run_query(
 
     `environment` and `query` are the published query with a radius, by the rules in force.
 
-    Parameters
-    ----------
-    seeds : iterable of int
-        One run each; the resolution search draws nothing at random, so it runs once.
-    time_s : float
-        Processor time of a run.
+    Args:
+        seeds: One run each; the resolution search draws nothing at random, so it runs once.
+        time_s: Processor time of a run.
     """
     rows = list(_runs(environment, query, published, radius_mm, tuple(planners), tuple(seeds), time_s))
     known = any(row.solved for row in rows)
@@ -230,10 +218,8 @@ def require_table_file(path: Path) -> None:
 def write_rows(rows: Iterable[BenchmarkRow], path: Path) -> None:
     """Write the rows by the suffix of the file; what is not known stays empty, or null; a table has no arcs.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written, or ends in something else.
+    Raises:
+        FileError: If the file cannot be written, or ends in something else.
     """
     require_table_file(path)
     records = [asdict(row) for row in rows]

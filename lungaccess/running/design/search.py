@@ -28,16 +28,13 @@ FROM runs r LEFT JOIN plans p ON p.runid = r.id WHERE r.key = ?"""
 class DesignFound:
     """What a search found.
 
-    Parameters
-    ----------
-    counted : tuple of Contender
-        The devices that were tried on every target, the one that the search began with first.
-    front : tuple of Contender
-        Those of them that no other surpasses; the first, which has most of the first criterion, is the best.
-    tried : int
-        Devices that were tried on some targets.
-    refused : mapping of str to (int, str)
-        How many the validator of devices refused, and its words, by the key that it objects to.
+    Args:
+        counted: The devices that were tried on every target, the one that the search began with first.
+        front: Those of them that no other surpasses; the first, which has most of the first criterion, is the
+            best.
+        tried: Devices that were tried on some targets.
+        refused (mapping of str to (int, str)): How many the validator of devices refused, and its words, by
+            the key that it objects to.
     """
 
     design: Design
@@ -90,12 +87,9 @@ def run_design(
     search finds the same, whatever ended it on the way and however many workers it has.  Parameters and
     errors are those of `lungaccess.running.study.run_study`, and moreover:
 
-    Raises
-    ------
-    SettingsError
-        If the validator refuses every device.
-    StudyError
-        If a run could not be made.
+    Raises:
+        SettingsError: If the validator refuses every device.
+        StudyError: If a run could not be made.
     """
     front = require_writable_folder(Path(folder) / "front")
     say = progress or (lambda _words, _share: None)

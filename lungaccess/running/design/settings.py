@@ -37,15 +37,11 @@ _OF_ONE_NUMBER = frozenset({"range", "one_of", "also"})
 class Number:
     """A number, or another value, of the device that may change.
 
-    Parameters
-    ----------
-    key : str
-        Dotted path in the system's file; entries of arrays by their number from 0, such as
-        "tubes.inner.slotted_segments.0.stiffness_factor".
-    one_of : tuple
-        The values to choose from, instead of a range: numbers, texts, arrays or whole tables.
-    also : tuple of str
-        Further keys that always have the same value.
+    Args:
+        key: Dotted path in the system's file; entries of arrays by their number from 0, such as
+            "tubes.inner.slotted_segments.0.stiffness_factor".
+        one_of: The values to choose from, instead of a range: numbers, texts, arrays or whole tables.
+        also: Further keys that always have the same value.
     """
 
     key: Annotated[str, text("key of the system's file")]
@@ -70,20 +66,14 @@ class Number:
 class Design:
     """A search over devices.
 
-    Parameters
-    ----------
-    study : Study
-        The cohort: cases with one system, one planner, one seed, and a budget of iterations.
-    make_large : tuple of str
-        One or two of `CRITERIA`: the best device has most of the first, and of two the front is searched.
-    designs : int
-        How many devices a round begins with.
-    rounds : int
-        The first covers the ranges evenly; each further one lies closer around the best so far.
-    reduction : int
-        One of so many devices goes on to so many times the targets, until all are counted.
-    seed : int
-        Seed of the devices and of the order of the targets.
+    Args:
+        study: The cohort: cases with one system, one planner, one seed, and a budget of iterations.
+        make_large: One or two of `CRITERIA`: the best device has most of the first, and of two the front is
+            searched.
+        designs: How many devices a round begins with.
+        rounds: The first covers the ranges evenly; each further one lies closer around the best so far.
+        reduction: One of so many devices goes on to so many times the targets, until all are counted.
+        seed: Seed of the devices and of the order of the targets.
     """
 
     study: Study
@@ -121,12 +111,9 @@ class Design:
 def read_design(path: str | os.PathLike[str]) -> Design:
     """Read a search over devices from a TOML file.
 
-    Raises
-    ------
-    SettingsError
-        If the file is not TOML, or a key is unknown, missing or wrong.
-    FileError
-        If the file cannot be read.
+    Raises:
+        SettingsError: If the file is not TOML, or a key is unknown, missing or wrong.
+        FileError: If the file cannot be read.
     """
     path = Path(path)
     return design_of(read_toml(path, remedy=_REMEDY), path.name, str(path.parent))
@@ -135,10 +122,8 @@ def read_design(path: str | os.PathLike[str]) -> Design:
 def design_of(content: Mapping[str, Any], where: str = "design", folder: str = ".") -> Design:
     """Return the search that plain values describe: those of a study, and a table `design`.
 
-    Raises
-    ------
-    SettingsError
-        If a key is unknown, missing or wrong.
+    Raises:
+        SettingsError: If a key is unknown, missing or wrong.
     """
     values = {"planner": [{"name": "atlas"}], **content}
     own = values.pop("design", None)
@@ -188,10 +173,8 @@ def near(system: System, numbers: Sequence[Number], even: Sequence[float], radiu
 def device(base: System, numbers: Sequence[Number], point: Sequence[float]) -> System:
     """Return the system at a point of the cube, named by what it changes, which its sources call assumed.
 
-    Raises
-    ------
-    SettingsError
-        If the validator of devices refuses it.
+    Raises:
+        SettingsError: If the validator of devices refuses it.
     """
     changes: dict[str, Any] = {}
     for number, x in zip(numbers, point, strict=True):
@@ -232,12 +215,10 @@ def value_at(system: System, path: str) -> Any:
 class Contender:
     """A device, for each target counted whether the check accepts a plan, and what is made large.
 
-    Parameters
-    ----------
-    chances : tuple of float
-        For each target, the chance of success of its plan; 0 without one, or where no errors are stated.
-    values : tuple of float
-        The criteria of the search, in their order.
+    Args:
+        chances: For each target, the chance of success of its plan; 0 without one, or where no errors are
+            stated.
+        values: The criteria of the search, in their order.
     """
 
     system: System

@@ -25,12 +25,9 @@ UNKNOWN, INVALID_GOAL, TIMEOUT, EXACT, CRASH = 0, 2, 4, 6, 7
 class Improvement:
     """A plan that is better than those before.
 
-    Parameters
-    ----------
-    time_s : float
-        Planning time.
-    cost : float
-        Under the run's objective.
+    Args:
+        time_s: Planning time.
+        cost: Under the run's objective.
     """
 
     time_s: float
@@ -42,39 +39,24 @@ class Improvement:
 class Answer:
     """What a run ended with.
 
-    Parameters
-    ----------
-    key : str
-        That of the run.
-    outcome : str
-        `PLAN`, `PATH`, `NO_PLAN`, or the class of the error that ended the run.
-    status : int
-        Number of OMPL's word for it in `STATUS`.
-    kernels : str
-        Digest of the kernels of the process that made the run.
-    failed : bool
-        Whether the run could not be made: a file was missing, the machine had no memory, a worker was lost.
-        Such a run is made again when the study is started the next time.
-    message, advice : str
-        Why there is no plan, and what would help.
-    time_s, cpu_s : float
-        Of the whole run, without opening the patient.
-    memory_mb : float
-        Resident memory of the process after the run, MiB.
-    iterations : int
-        At the best plan.
-    accepted : bool
-        Whether the independent check accepts the plan; for a needle path, whether nothing objects to it.
-    costs : mapping of str to float
-        By the keys of `stages.needle.TERMS`.
-    findings : tuple of mapping
-        What the check looked at; see `lungaccess.judging.checking.findings.Finding.to_mapping`.
-    rejections : mapping of str to int
-        The reasons of `NoPlan`, counted.
-    plan : str
-        JSON of the plan or of the needle's path; "" if there is none.
-    digest : str
-        Hash of the plan without its times.
+    Args:
+        key: That of the run.
+        outcome: `PLAN`, `PATH`, `NO_PLAN`, or the class of the error that ended the run.
+        status: Number of OMPL's word for it in `STATUS`.
+        kernels: Digest of the kernels of the process that made the run.
+        failed: Whether the run could not be made: a file was missing, the machine had no memory, a worker was
+            lost.  Such a run is made again when the study is started the next time.
+        message, advice: Why there is no plan, and what would help.
+        time_s, cpu_s: Of the whole run, without opening the patient.
+        memory_mb: Resident memory of the process after the run, MiB.
+        iterations: At the best plan.
+        accepted: Whether the independent check accepts the plan; for a needle path, whether nothing objects
+            to it.
+        costs: By the keys of `stages.needle.TERMS`.
+        findings: What the check looked at; see `lungaccess.judging.checking.findings.Finding.to_mapping`.
+        rejections: The reasons of `NoPlan`, counted.
+        plan: JSON of the plan or of the needle's path; "" if there is none.
+        digest: Hash of the plan without its times.
     """
 
     key: str

@@ -132,20 +132,14 @@ def each_done(
 
     Only a few pieces wait at the scheduler at any time.
 
-    Parameters
-    ----------
-    work : callable
-        Receives a piece and `more`, on a worker.
+    Args:
+        work: Receives a piece and `more`, on a worker.
 
-    Yields
-    ------
-    tuple
+    Yields:
         The piece with what `work` returned for it, or the error that it raised at every try.
 
-    Raises
-    ------
-    StudyError
-        If the scheduler is lost.
+    Raises:
+        StudyError: If the scheduler is lost.
     """
     from distributed import as_completed
 

@@ -57,28 +57,18 @@ def run_study(
 
     The results file is made if it is not there.
 
-    Parameters
-    ----------
-    scheduler : str, optional
-        Address of a running dask scheduler; processes on this machine if None.
-    workers : int, optional
-        How many processes on this machine; as many as there are cores if None.
-    cache : Path, optional
-        Folder of prepared anatomies and atlases, on every machine; the usual one if None.
-    progress : callable, optional
-        Receives what is being done, and the share of the missing runs that is done.
+    Args:
+        scheduler: Address of a running dask scheduler; processes on this machine if None.
+        workers: How many processes on this machine; as many as there are cores if None.
+        cache: Folder of prepared anatomies and atlases, on every machine; the usual one if None.
+        progress: Receives what is being done, and the share of the missing runs that is done.
 
-    Raises
-    ------
-    SettingsError
-        If both a scheduler and a number of workers are given.
-    StudyError
-        If dask is not installed, or the scheduler does not answer.
-    FileError
-        If the results file cannot be read or written, or another process adds to it; what is stored by then
-        stays.
-    LungaccessError
-        If a patient, a system or a target of the study cannot be read.
+    Raises:
+        SettingsError: If both a scheduler and a number of workers are given.
+        StudyError: If dask is not installed, or the scheduler does not answer.
+        FileError: If the results file cannot be read or written, or another process adds to it; what is
+            stored by then stays.
+        LungaccessError: If a patient, a system or a target of the study cannot be read.
     """
     say = progress or (lambda _words, _share: None)
     with open_results(path, scheduler=scheduler, workers=workers, cache=cache) as maker:

@@ -62,15 +62,12 @@ class Opened(NamedTuple):
 def answer(run: Run, cache: Path | None = None) -> answers.Answer:
     """Make a run and return what it ended with.
 
-    Parameters
-    ----------
-    cache : Path, optional
-        Folder of prepared anatomies and atlases; `anatomy.base.cache.default_cache()` if None.
+    Args:
+        cache: Folder of prepared anatomies and atlases; `anatomy.base.cache.default_cache()` if None.
 
-    Raises
-    ------
-    FileError
-        If a file cannot be read or written here; whatever else is not the run's own answer is raised, too.
+    Raises:
+        FileError: If a file cannot be read or written here; whatever else is not the run's own answer is
+            raised, too.
     """
     if run.planner.own_process or run.planner.is_of_ompl:
         return _in_own_process(run, cache)
@@ -80,10 +77,8 @@ def answer(run: Run, cache: Path | None = None) -> answers.Answer:
 def prepare(problem: Problem, cache: Path | None = None) -> None:
     """Make sure that the cache has the patient and the atlas of a problem, unless its device allows none.
 
-    Raises
-    ------
-    LungaccessError
-        If the patient cannot be read or the cache cannot be written.
+    Raises:
+        LungaccessError: If the patient cannot be read or the cache cannot be written.
     """
     with _one_at_a_time:
         numba.set_num_threads(1)
@@ -239,12 +234,9 @@ def main(words: list[str]) -> int:
 def needle_answer(run: Run, lung: Lung) -> answers.Answer:
     """Search for a needle path and let `stages.needle.path.violation` look at it.
 
-    Raises
-    ------
-    SettingsError
-        If the patient came with no such start pose.
-    TargetError
-        If the target is not in free lung tissue.
+    Raises:
+        SettingsError: If the patient came with no such start pose.
+        TargetError: If the target is not in free lung tissue.
     """
     problem = run.problem
     if not 1 <= problem.start <= len(lung.starts):

@@ -15,14 +15,10 @@ from lungaccess.running.study.settings import PHANTOM, Case, PhantomPatient
 class Patient:
     """A patient by content, and where to read it where no cache holds it.
 
-    Parameters
-    ----------
-    anatomy : str
-        "phantom", or an absolute folder.
-    spacing_mm : float or None
-        Of the synthetic patient.
-    sources : tuple of (str, str)
-        Name and SHA-256 of every input.
+    Args:
+        anatomy: "phantom", or an absolute folder.
+        spacing_mm: Of the synthetic patient.
+        sources (tuple of (str, str)): Name and SHA-256 of every input.
     """
 
     anatomy: str
@@ -40,10 +36,8 @@ class Patient:
 def patient_of(case: Case, folder: Path, cache: Path | None = None) -> Patient:
     """Return the patient of a case; a relative folder is relative to `folder`.
 
-    Raises
-    ------
-    LungaccessError
-        If the patient cannot be read.
+    Raises:
+        LungaccessError: If the patient cannot be read.
     """
     from anatomy.io.inputs import input_hashes
 
@@ -65,12 +59,9 @@ def patient_of(case: Case, folder: Path, cache: Path | None = None) -> Patient:
 def open_patient(patient: Patient, cache: Path | None = None) -> Lung:
     """Return the lung of a patient, from the cache or newly built.
 
-    Raises
-    ------
-    FileError
-        If what is read is not what the study was set up with.
-    LungaccessError
-        If the patient cannot be read.
+    Raises:
+        FileError: If what is read is not what the study was set up with.
+        LungaccessError: If the patient cannot be read.
     """
     from anatomy.store import open_lung
 

@@ -23,15 +23,12 @@ class ResultsFile:
 
     Several processes may have the same file open.
 
-    Parameters
-    ----------
-    create : bool
-        Whether a file that is not there is made.
+    Args:
+        create: Whether a file that is not there is made.
 
-    Raises
-    ------
-    FileError
-        If the file is not there, cannot be written, is damaged, or is not a results file of this format.
+    Raises:
+        FileError: If the file is not there, cannot be written, is damaged, or is not a results file of this
+            format.
     """
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
@@ -98,10 +95,8 @@ class ResultsFile:
     def rows(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query.
 
-        Raises
-        ------
-        FileError
-            If the file cannot be read.
+        Raises:
+            FileError: If the file cannot be read.
         """
         with file_errors(self.path):
             cursor = self._connection.execute(query, values)
@@ -115,10 +110,8 @@ class ResultsFile:
     def columns(self, query: str) -> tuple[str, ...]:
         """Return the names of the columns of a query.
 
-        Raises
-        ------
-        FileError
-            If the file cannot be read.
+        Raises:
+            FileError: If the file cannot be read.
         """
         with file_errors(self.path):
             found = self._connection.execute(f"SELECT * FROM ({query}) LIMIT 0").description
@@ -140,10 +133,8 @@ class ResultsFile:
 
         A run that is there already stays as it is, unless it failed.
 
-        Raises
-        ------
-        FileError
-            If the disk is full, another program holds the file for too long, or it is damaged.
+        Raises:
+            FileError: If the disk is full, another program holds the file for too long, or it is damaged.
         """
         with file_errors(self.path), self._transaction() as connection:
             connection.execute(

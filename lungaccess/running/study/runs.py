@@ -36,26 +36,16 @@ RUN_FORMAT = 1
 class Problem:
     """What is asked of the planners: everything but planner and seed.
 
-    Parameters
-    ----------
-    target : int
-        Number of the target in its case, from 1.
-    target_lps : tuple of 3 float
-        LPS mm.
-    origin : str
-        Where the target came from.
-    start : int
-        Number of the needle's start pose, 0 for none.
-    stop_spacing_mm, site_spacing_mm : float
-        Of the deployment atlas.
-    time_s : float or None
-        The budget.
-    first_plan : bool
-        Whether a run ends with its first plan.
-    errors : ErrorModel or None
-        Under which the chance of success of a plan is counted; None for not at all.
-    procedure : Procedure
-        By which it is counted.
+    Args:
+        target: Number of the target in its case, from 1.
+        target_lps (tuple of 3 float): LPS mm.
+        origin: Where the target came from.
+        start: Number of the needle's start pose, 0 for none.
+        stop_spacing_mm, site_spacing_mm: Of the deployment atlas.
+        time_s: The budget.
+        first_plan: Whether a run ends with its first plan.
+        errors: Under which the chance of success of a plan is counted; None for not at all.
+        procedure: By which it is counted.
     """
 
     case: str
@@ -163,11 +153,9 @@ def runs_of(
 ) -> Iterator[Run]:
     """Yield the runs of a study, case by case; each patient is opened once to find the targets.
 
-    Raises
-    ------
-    LungaccessError
-        If a patient or a system cannot be read, a target cannot be understood, there is no such nodule, or a
-        planner needs a needle that a system does not have.
+    Raises:
+        LungaccessError: If a patient or a system cannot be read, a target cannot be understood, there is no
+            such nodule, or a planner needs a needle that a system does not have.
     """
     for case in study.case:
         (progress or (lambda _words: None))(f"targets of {case.name}")

@@ -49,27 +49,19 @@ class Peripheral:
 class Case:
     """A patient, a system and targets.
 
-    Parameters
-    ----------
-    anatomy : str
-        "phantom", or a patient's folder; a relative one is relative to the study's file.
-    phantom : PhantomPatient
-        Which one, for the anatomy "phantom".
-    system : str
-        Preset, or TOML file relative to the study's file.
-    fissures_allowed : bool or None
-        Whether fissures may be crossed; None for what the system says.
-    objective : str
-        What plans are made good at, unless a planner states a goal; see `lungaccess.problem.request.goal_of`.
-    errors, procedure : str
-        Error model and procedure under which the chance of success of each plan is counted: presets, or TOML
-        files relative to the study's file.  Without errors no chance is counted.
-    targets : tuple of str
-        "ras:x,y,z", "lps:x,y,z", "nodule" or "nodule N".
-    peripheral : Peripheral
-        Random targets, after those that are stated.
-    starts : tuple of int
-        For needle planners: numbers of the start poses that came with the patient.
+    Args:
+        anatomy: "phantom", or a patient's folder; a relative one is relative to the study's file.
+        phantom: Which one, for the anatomy "phantom".
+        system: Preset, or TOML file relative to the study's file.
+        fissures_allowed: Whether fissures may be crossed; None for what the system says.
+        objective: What plans are made good at, unless a planner states a goal; see
+            `lungaccess.problem.request.goal_of`.
+        errors, procedure: Error model and procedure under which the chance of success of each plan is
+            counted: presets, or TOML files relative to the study's file.  Without errors no chance is
+            counted.
+        targets: "ras:x,y,z", "lps:x,y,z", "nodule" or "nodule N".
+        peripheral: Random targets, after those that are stated.
+        starts: For needle planners: numbers of the start poses that came with the patient.
     """
 
     name: Annotated[str, text("name of the case")]
@@ -97,23 +89,16 @@ class Case:
 class PlannerChoice:
     """A planner of the study, and how tables call it.
 
-    Parameters
-    ----------
-    kind : str
-        "plan" for all three stages, "needle" for the needle alone from the case's start poses.
-    method : str
-        One of `lungaccess.planning.searches.planners`; for the needle, one of
-        `stages.needle.NEEDLE_PLANNERS`.
-    goal : str
-        For "plan", what plans are made good at instead of the case's objective, such as "success".
-    needle_planner : str
-        For "plan", one of the latter instead of the method's own.
-    iterations : int or None
-        Instead of those of the budget.
-    own_process : bool
-        Whether each run has a fresh process; OMPL's planners have one in any case.
-    without_counterfactuals : bool
-        Whether a run of "plan" that finds nothing goes without the search for a device that would.
+    Args:
+        kind: "plan" for all three stages, "needle" for the needle alone from the case's start poses.
+        method: One of `lungaccess.planning.searches.planners`; for the needle, one of
+            `stages.needle.NEEDLE_PLANNERS`.
+        goal: For "plan", what plans are made good at instead of the case's objective, such as "success".
+        needle_planner: For "plan", one of the latter instead of the method's own.
+        iterations: Instead of those of the budget.
+        own_process: Whether each run has a fresh process; OMPL's planners have one in any case.
+        without_counterfactuals: Whether a run of "plan" that finds nothing goes without the search for a
+            device that would.
     """
 
     name: Annotated[str, text("name of the planner in tables")]
@@ -191,10 +176,8 @@ class AtlasGrid:
 class Study:
     """Every case with every planner and every seed.
 
-    Parameters
-    ----------
-    folder : str
-        What relative paths are relative to; that of the file if it was read from one.
+    Args:
+        folder: What relative paths are relative to; that of the file if it was read from one.
     """
 
     name: Annotated[str, text("name of the study")]
@@ -235,12 +218,9 @@ def methods(kind: str) -> tuple[str, ...]:
 def read_study(path: str | os.PathLike[str]) -> Study:
     """Read a study from a TOML file.
 
-    Raises
-    ------
-    SettingsError
-        If the file is not TOML, or a key is unknown, missing or wrong.
-    FileError
-        If the file cannot be read.
+    Raises:
+        SettingsError: If the file is not TOML, or a key is unknown, missing or wrong.
+        FileError: If the file cannot be read.
     """
     path = Path(path)
     return study_of(read_toml(path, remedy=_REMEDY), path.name, str(path.parent))
@@ -249,10 +229,8 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 def study_of(content: Mapping[str, Any], where: str = "study", folder: str = ".") -> Study:
     """Return the study that plain values describe, as those of a TOML file.
 
-    Raises
-    ------
-    SettingsError
-        If a key is unknown, missing or wrong.
+    Raises:
+        SettingsError: If a key is unknown, missing or wrong.
     """
     values = dict(content)
     if "folder" in values:

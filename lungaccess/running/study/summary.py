@@ -20,22 +20,14 @@ ORDER BY p.case_name, p.objective, c.name, r.key"""
 class Group:
     """The runs of one case with one planner.
 
-    Parameters
-    ----------
-    failed : int
-        Of the runs, those that could not be made and will be made again; they count nowhere else.
-    solved_share : float
-        Share of the runs with a plan.
-    accepted_share : float
-        Share of the plans that the check accepts; 0 if there is none.
-    first_plan_s : tuple of float or None
-        Median and largest planning time of the first plan.
-    run_s : float
-        Median time of a run.
-    cost : float or None
-        Median cost of the best plans.
-    success : float or None
-        Median chance of success of the best plans; None where the study counts none.
+    Args:
+        failed: Of the runs, those that could not be made and will be made again; they count nowhere else.
+        solved_share: Share of the runs with a plan.
+        accepted_share: Share of the plans that the check accepts; 0 if there is none.
+        first_plan_s: Median and largest planning time of the first plan.
+        run_s: Median time of a run.
+        cost: Median cost of the best plans.
+        success: Median chance of success of the best plans; None where the study counts none.
     """
 
     case: str
@@ -54,10 +46,8 @@ class Group:
 def summarise(path: Path) -> list[Group]:
     """Summarise a results file by case, objective and planner.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
+    Raises:
+        FileError: If the file cannot be read.
     """
     groups: dict[tuple[str, str, str], list[tuple[Any, ...]]] = {}
     with ResultsFile(path) as results:

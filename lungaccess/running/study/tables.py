@@ -95,10 +95,8 @@ class Table(NamedTuple):
 def table(results: ResultsFile, name: str) -> Table:
     """Return one of the tables of `QUERIES`.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
+    Raises:
+        FileError: If the file cannot be read.
     """
     columns = results.columns(QUERIES[name])
     return Table(columns, results.rows(QUERIES[name]))
@@ -110,15 +108,11 @@ def differences(first: Path, second: Path) -> list[str]:
     Runs, costs over iterations, findings, rejections and plans are compared value by value; a number must be
     the same to the last bit.
 
-    Returns
-    -------
-    list of str
+    Returns:
         What differs, in words, at most `MOST`; empty if nothing does.
 
-    Raises
-    ------
-    FileError
-        If a file cannot be read.
+    Raises:
+        FileError: If a file cannot be read.
     """
     found: list[str] = []
     with ResultsFile(first) as one, ResultsFile(second) as two:
@@ -154,22 +148,15 @@ def _short(row: tuple[Any, ...]) -> str:
 def export_csv(path: Path, folder: Path) -> list[Path]:
     """Write the tables of a results file as CSV with a heading; numbers are written without loss.
 
-    Parameters
-    ----------
-    path : Path
-        Results file.
-    folder : Path
-        Made if it is not there.
+    Args:
+        path: Results file.
+        folder: Made if it is not there.
 
-    Returns
-    -------
-    list of Path
+    Returns:
         The files written.
 
-    Raises
-    ------
-    FileError
-        If the results cannot be read or the folder cannot be written.
+    Raises:
+        FileError: If the results cannot be read or the folder cannot be written.
     """
     require_writable_folder(folder)
     written = []
@@ -191,10 +178,8 @@ def export_csv(path: Path, folder: Path) -> list[Path]:
 def export_parquet(path: Path, folder: Path) -> list[Path]:
     """Write the tables of a results file as Parquet; parameters and errors as those of `export_csv`.
 
-    Raises
-    ------
-    StudyError
-        If pyarrow is not installed.
+    Raises:
+        StudyError: If pyarrow is not installed.
     """
     try:
         import pyarrow.parquet  # noqa: F401

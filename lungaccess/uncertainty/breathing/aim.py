@@ -32,18 +32,12 @@ USED = 0.999
 class Aim:
     """Where the needle has to end from one place of the scope's tip, and for which phases.
 
-    Parameters
-    ----------
-    point_lps : tuple of 3 floats
-        LPS mm in the masks' phase.
-    phases : tuple of 2 floats
-        First and last phase that it is made for.
-    least_miss_mm : float
-        No end of the devices comes nearer to the target in all of them.
-    allowed_mm : float
-        No end of the devices may miss the target by more: the tolerance, less what tissue strays.
-    most_share : float
-        No end of the devices has the target within the tolerance in more of the breath.
+    Args:
+        point_lps (tuple of 3 floats): LPS mm in the masks' phase.
+        phases (tuple of 2 floats): First and last phase that it is made for.
+        least_miss_mm: No end of the devices comes nearer to the target in all of them.
+        allowed_mm: No end of the devices may miss the target by more: the tolerance, less what tissue strays.
+        most_share: No end of the devices has the target within the tolerance in more of the breath.
     """
 
     point_lps: tuple[float, float, float]
@@ -56,17 +50,11 @@ class Aim:
 class MovingTarget:
     """A target and its motion, as the devices see it.
 
-    Parameters
-    ----------
-    motion : Motion
-    target_lps : (3,) float64, LPS mm
-        Place of the masks.
-    phases : tuple of 2 floats, optional
-        Phases that every aim is made for.
-    widened : bool
-        Whether aims are made for more phases about these, as many as the tolerance allows.
-    middle : float, optional
-        The phase about which they are made where none are given, the masks' if None.
+    Args:
+        target_lps ((3,) float64, LPS mm): Place of the masks.
+        phases (tuple of 2 floats): Phases that every aim is made for.
+        widened: Whether aims are made for more phases about these, as many as the tolerance allows.
+        middle: The phase about which they are made where none are given, the masks' if None.
     """
 
     def __init__(

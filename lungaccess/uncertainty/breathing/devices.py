@@ -29,20 +29,16 @@ SHORTEST_MM = 1e-9
 class DevicePoints:
     """The devices in the frame of the plan.
 
-    Parameters
-    ----------
-    points : (N, 3) float64, LPS mm
-        From the tip of the scope to the end of the needle; where two sections meet, a point is there twice.
-    arc_mm : (N,) float64
-        Length from the tip of the scope.
-    sections : (S, 5) float64
-        First and last point, rule, required clearance and radius in mm, see `kernels.rules`.
-    tube_mm : float
-        Length of the tubes.
-    hole_lps : (3,) float64, LPS mm
-        Where the tubes pierce the wall.
-    hole_mm : float
-        How far that place of the wall may shift: the radius of the tube there, so that it stays in its body.
+    Args:
+        points ((N, 3) float64, LPS mm): From the tip of the scope to the end of the needle; where two
+            sections meet, a point is there twice.
+        arc_mm ((N,) float64): Length from the tip of the scope.
+        sections ((S, 5) float64): First and last point, rule, required clearance and radius in mm, see
+            `kernels.rules`.
+        tube_mm: Length of the tubes.
+        hole_lps ((3,) float64, LPS mm): Where the tubes pierce the wall.
+        hole_mm: How far that place of the wall may shift: the radius of the tube there, so that it stays in
+            its body.
     """
 
     points: Float

@@ -24,19 +24,14 @@ class CarriedNeedle:
 
     All are the worst over the phases of insertion and of the breath that were looked at.
 
-    Parameters
-    ----------
-    end_miss_mm : float
-        Distance of its end from the moving target.
-    shift_at_tubes_mm : float
-        How far tissue moves the needle's begin from the end of the tubes, which the scope carries.
-    bend_at_tubes_deg : float
-        Angle between the needle's begin and the end of the tubes.
-    least_radius_mm : float
-        Smallest radius of curvature of the needle, over 10 mm.
-    length_factor : float
-        Length of its way through tissue by that at insertion, the one farthest from 1: the needle itself does
-        not stretch, and slides by the rest.
+    Args:
+        end_miss_mm: Distance of its end from the moving target.
+        shift_at_tubes_mm: How far tissue moves the needle's begin from the end of the tubes, which the scope
+            carries.
+        bend_at_tubes_deg: Angle between the needle's begin and the end of the tubes.
+        least_radius_mm: Smallest radius of curvature of the needle, over 10 mm.
+        length_factor: Length of its way through tissue by that at insertion, the one farthest from 1: the
+            needle itself does not stretch, and slides by the rest.
     """
 
     end_miss_mm: float
@@ -49,12 +44,9 @@ class CarriedNeedle:
 def carried_needle(plan: Plan, lung: Lung, window: BreathingWindow) -> CarriedNeedle:
     """Return what the breath does to the needle of a plan that tissue carries from its insertion on.
 
-    Raises
-    ------
-    SettingsError
-        If the plan has no needle, or its window no phase to insert it in.
-    AnatomyError
-        If the patient has no motion.
+    Raises:
+        SettingsError: If the plan has no needle, or its window no phase to insert it in.
+        AnatomyError: If the patient has no motion.
     """
     if plan.needle is None or not len(window.phases):
         raise SettingsError(

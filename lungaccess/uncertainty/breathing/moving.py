@@ -21,12 +21,9 @@ class Moving:
     The lung of the target moves as the plan's window has it.  The other lung has its own displacement, which
     takes over smoothly beyond the middle, so that a picture of both has no tear.
 
-    Parameters
-    ----------
-    tissue : Motion
-        With that one displacement for both lungs.
-    rigid : Rigid
-        What carries the tubes and the needle.
+    Args:
+        tissue: With that one displacement for both lungs.
+        rigid: What carries the tubes and the needle.
     """
 
     tissue: Motion
@@ -36,10 +33,8 @@ class Moving:
     def of(cls, plan: Plan, lung: Lung) -> Self:
         """Return what moves with the breathing of the patient of a plan.
 
-        Raises
-        ------
-        AnatomyError
-            If the patient has no motion.
+        Raises:
+            AnatomyError: If the patient has no motion.
         """
         motion = require_motion(lung)
         side = motion.side_of(plan.target_lps)

@@ -32,22 +32,14 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
     The tip of the scope goes along with the airway around it, tubes and needle are rigid from there;
     `docs/explanation/breathing.md` says what moves with what.
 
-    Parameters
-    ----------
-    plan : Plan
-    lung : Lung
-        The patient of the plan, with a motion.
-    tolerance_mm : float
-        How far from the moving target the devices may end, at most 2 mm.
+    Args:
+        lung: The patient of the plan, with a motion.
+        tolerance_mm: How far from the moving target the devices may end, at most 2 mm.
 
-    Raises
-    ------
-    AnatomyError
-        If the patient has no motion.
-    PlanFileError
-        If the plan was made for another patient.
-    SettingsError
-        If the tolerance is not from 0 to 2 mm.
+    Raises:
+        AnatomyError: If the patient has no motion.
+        PlanFileError: If the plan was made for another patient.
+        SettingsError: If the tolerance is not from 0 to 2 mm.
     """
     plan.require_lung(lung)
     motion = require_motion(lung)

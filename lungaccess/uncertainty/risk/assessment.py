@@ -32,22 +32,17 @@ or with too little of the nodule in the tool."""
 class DrawnReport:
     """What came of a plan in many draws of an error model.
 
-    Parameters
-    ----------
-    radius_mm, radius_origin : float, str
-        Radius of the goal about the target, and where the radius came from; of a tool, which nodule counts.
-    succeeds : Share
-        Ends within the radius, or with enough of the nodule in the tool, leaves the airway, and touches
-        nothing that is forbidden.
-    touches : mapping of str to Share
-        By the names of `STRUCTURES`; a fissure only where there is a mask of them.
-    miss_mm : mapping of float to float
-        Distance of the tip, or of the middle of its tool, from the target that a share of the needles does
-        not exceed, by the share.
-    tissue : str
-        What has to be in the tool in words; empty without a tool: then the tip ends within the radius.
-    with_needle : bool
-        Whether the plan has a needle; its tubes end at the target where it has none.
+    Args:
+        radius_mm, radius_origin: Radius of the goal about the target, and where the radius came from; of a
+            tool, which nodule counts.
+        succeeds: Ends within the radius, or with enough of the nodule in the tool, leaves the airway, and
+            touches nothing that is forbidden.
+        touches: By the names of `STRUCTURES`; a fissure only where there is a mask of them.
+        miss_mm: Distance of the tip, or of the middle of its tool, from the target that a share of the
+            needles does not exceed, by the share.
+        tissue: What has to be in the tool in words; empty without a tool: then the tip ends within the
+            radius.
+        with_needle: Whether the plan has a needle; its tubes end at the target where it has none.
     """
 
     model: ErrorModel
@@ -66,19 +61,14 @@ class DrawnReport:
 class RiskReport(DrawnReport):
     """The risk of one plan that is carried out as it stands.
 
-    Parameters
-    ----------
-    reaches : Share
-        Ends within the radius, or with enough of the nodule in the tool, whatever it touches.
-    forbidden : tuple of str
-        The names of `touches` that a success must not have.
-    alone : mapping of str to Share
-        Successes if there were errors of one kind only, by kind; empty if that was not asked for.
-    sensitivity : tuple of Sensitivity
-        What each kind of error does to success, the greatest first; empty if that was not asked for.
-    rare : mapping of str to RareShare
-        Touches that happened in less than `RARE` of the draws, estimated with weights, where that is exact
-        enough; empty if that was not asked for.
+    Args:
+        reaches: Ends within the radius, or with enough of the nodule in the tool, whatever it touches.
+        forbidden: The names of `touches` that a success must not have.
+        alone: Successes if there were errors of one kind only, by kind; empty if that was not asked for.
+        sensitivity: What each kind of error does to success, the greatest first; empty if that was not asked
+            for.
+        rare: Touches that happened in less than `RARE` of the draws, estimated with weights, where that is
+            exact enough; empty if that was not asked for.
     """
 
     reaches: Share
@@ -109,25 +99,17 @@ def assess(
 
     The plan's own system is deployed, in the lung that the plan was made for.
 
-    Parameters
-    ----------
-    model : ErrorModel, optional
-        The preset `breath-hold` if None.  Where the patient's own breathing is known, it is that which is
-        drawn: `lungaccess.uncertainty.risk.breathing.model_for` says how.
-    samples : int
-        Number of deviated plans.
-    seed : int
-        The same seed gives the same report.
-    radius_mm : float, optional
-        Radius of the goal; see `RiskAssessor`.
-    each_kind : bool
-        Whether success under errors of one kind only, sensitivities and rare touches are estimated, too:
-        some thirty times the work.
+    Args:
+        model: The preset `breath-hold` if None.  Where the patient's own breathing is known, it is that which
+            is drawn: `lungaccess.uncertainty.risk.breathing.model_for` says how.
+        samples: Number of deviated plans.
+        seed: The same seed gives the same report.
+        radius_mm: Radius of the goal; see `RiskAssessor`.
+        each_kind: Whether success under errors of one kind only, sensitivities and rare touches are
+            estimated, too: some thirty times the work.
 
-    Raises
-    ------
-    PlanFileError, SettingsError
-        See `RiskAssessor`; also if there are no samples.
+    Raises:
+        PlanFileError, SettingsError: See `RiskAssessor`; also if there are no samples.
     """
     stated = model_for(model or load_errors(), plan, lung)
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
@@ -162,10 +144,8 @@ def rare_touch(
 ) -> RareShare:
     """Return how likely a structure is touched, a name of `STRUCTURES`, by importance sampling.
 
-    Raises
-    ------
-    SettingsError
-        If there are no samples.
+    Raises:
+        SettingsError: If there are no samples.
     """
     flag = assessor.structures[structure]
     luck = Luck(lambda count: assessor.draws(count, seed), model)

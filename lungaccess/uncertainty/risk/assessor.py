@@ -54,28 +54,19 @@ class Outcomes:
 class RiskAssessor:
     """A plan in its lung, ready to be deviated from.
 
-    Attributes
-    ----------
-    kinds : tuple of str
-        The kinds of error that the devices of the plan can have, and that of the target.
-    stretch : float
-        See `Draws`.
-    radius_mm, radius_origin, tissue : float, str, str
-        See `DrawnReport`.
+    Attributes:
+        kinds: The kinds of error that the devices of the plan can have, and that of the target.
+        stretch: See `Draws`.
+        radius_mm, radius_origin, tissue: See `DrawnReport`.
 
-    Parameters
-    ----------
-    radius_mm : float, optional
-        Radius of the goal; by default that of a ball of the volume of the target's nodule, or 5 mm if the
-        target lies in no nodule of the mask.  A tool of the system takes tissue of that ball if a radius is
-        given or there is no mask, else of the nodule.
+    Args:
+        radius_mm: Radius of the goal; by default that of a ball of the volume of the target's nodule, or 5 mm
+            if the target lies in no nodule of the mask.  A tool of the system takes tissue of that ball if a
+            radius is given or there is no mask, else of the nodule.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another lung.
-    SettingsError
-        If the radius is not above 0 and finite, or the needle of the plan has no arc.
+    Raises:
+        PlanFileError: If the plan was made for another lung.
+        SettingsError: If the radius is not above 0 and finite, or the needle of the plan has no arc.
     """
 
     def __init__(self, plan: Plan, lung: Lung, *, radius_mm: float | None = None) -> None:
@@ -174,14 +165,10 @@ class RiskAssessor:
     def clear(self, devices: Devices, errors: Float, least_depth_mm: float) -> Bool:
         """Tell which `(N,)` of deviated devices touch nothing forbidden, wherever they end.
 
-        Parameters
-        ----------
-        devices : Devices
-            In place of those of the plan.
-        errors : (N, E) float64
-            See `in_rows`.
-        least_depth_mm : float
-            See `Judging`.
+        Args:
+            devices: In place of those of the plan.
+            errors ((N, E) float64): See `in_rows`.
+            least_depth_mm: See `Judging`.
         """
         done, which = np.zeros(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
         judged = self._judging._replace(least_depth_mm=least_depth_mm)

@@ -39,10 +39,8 @@ def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     A model of free breathing keeps any phase of the breath, one without breathing is taken to insert in the
     plan's window, each with the patient's motion and the spread of amplitudes over breaths.
 
-    Raises
-    ------
-    SettingsError
-        If the errors depend on the lobe and the patient came without lobes.
+    Raises:
+        SettingsError: If the errors depend on the lobe and the patient came without lobes.
     """
     model = about_resting_tip(_at_place(model, plan, lung), plan, lung)
     motion, window, stated = lung.motion, plan.window, model.breathing
@@ -82,13 +80,7 @@ def _size_mm(motion: Motion, plan: Plan) -> float:
 
 
 class PatientMotion:
-    """How the target of a plan moves against its devices, by the motion of the patient.
-
-    Parameters
-    ----------
-    plan : Plan
-    motion : Motion
-    """
+    """How the target of a plan moves against its devices, by the motion of the patient."""
 
     def __init__(self, plan: Plan, motion: Motion) -> None:
         side = motion.side_of(plan.target_lps)
@@ -106,14 +98,10 @@ class PatientMotion:
     def shifts_mm(self, motion_mm: Float, luck: Float, *, in_window: bool) -> Float:
         """Return the shifts of the target `(N, 3)` as the devices see it, LPS mm in the masks' frame.
 
-        Parameters
-        ----------
-        motion_mm : (N,) float64
-            Motion of 95 % of the lung's points in each breath.
-        luck : (N,) float64
-            From 0 to 1: the share of the cycle's time, or of the window's phases.
-        in_window : bool
-            Whether the phase is one of the plan's window.
+        Args:
+            motion_mm ((N,) float64): Motion of 95 % of the lung's points in each breath.
+            luck ((N,) float64): From 0 to 1: the share of the cycle's time, or of the window's phases.
+            in_window: Whether the phase is one of the plan's window.
         """
         motion, rigid = self._motion, self._rigid
         at = _in_stretches(self._phases, luck) if in_window else phase(luck)

@@ -34,24 +34,19 @@ COLUMNS = (
 class Deviations:
     """N sets of errors of a plan whose needle has A arcs, 0 where there is none.
 
-    Parameters
-    ----------
-    scope_mm : (N, 3) float64, LPS mm
-        Shift of the scope tip.
-    tilt_rad : (N, 2) float64
-        Rotation vector of the scope tip's tilt, along +x and +y of its frame.
-    rotation_rad : (N,) float64
-        Added to the rotation of all tubes; it leaves the roll of the needle where it is.
-    relative_rad : (N, n) float64
-        Added to the rotation of each of n tubes that are not planar, the outermost first; n is 0 for planar.
-    insertion_mm : (N, 2 or n) float64
-        Added to the insertions of outer and inner tube, or of n tubes that are not planar.
-    factor : (N,) float64
-        Multiplies the curvature of all arcs.
-    roll_rad, stop_mm : (N, A) float64
-        Added to the needle's angle in each arc, and to its insertion where the arc ends.
-    target_mm : (N, 3) float64, LPS mm
-        Shift of the target.
+    Args:
+        scope_mm ((N, 3) float64, LPS mm): Shift of the scope tip.
+        tilt_rad ((N, 2) float64): Rotation vector of the scope tip's tilt, along +x and +y of its frame.
+        rotation_rad ((N,) float64): Added to the rotation of all tubes; it leaves the roll of the needle
+            where it is.
+        relative_rad ((N, n) float64): Added to the rotation of each of n tubes that are not planar, the
+            outermost first; n is 0 for planar.
+        insertion_mm ((N, 2 or n) float64): Added to the insertions of outer and inner tube, or of n tubes
+            that are not planar.
+        factor ((N,) float64): Multiplies the curvature of all arcs.
+        roll_rad, stop_mm ((N, A) float64): Added to the needle's angle in each arc, and to its insertion
+            where the arc ends.
+        target_mm ((N, 3) float64, LPS mm): Shift of the target.
     """
 
     scope_mm: Float
@@ -73,10 +68,8 @@ class Deviations:
 def no_deviations(count: int, n_arcs: int, n_twisted: int = 0) -> dict[str, Float]:
     """Return the fields of `Deviations` for `count` sets without any error.
 
-    Parameters
-    ----------
-    n_twisted : int
-        Number of tubes if they are not planar, else 0.
+    Args:
+        n_twisted: Number of tubes if they are not planar, else 0.
     """
     return {
         "scope_mm": np.zeros((count, 3)),
@@ -182,10 +175,9 @@ def tubes_alone(
 ) -> Devices:
     """Return planar tubes without a needle as kernels take them.
 
-    Parameters
-    ----------
-    choice : (float, float, float)
-        Rotation in rad and insertions of outer and inner tube in mm; nothing is swept sideways.
+    Args:
+        choice ((float, float, float)): Rotation in rad and insertions of outer and inner tube in mm; nothing
+            is swept sideways.
     """
     turned, outer, inner = choice
     tube = Deployed(turned, 0.0 if tubes.outer is None else outer, inner, 0.0)

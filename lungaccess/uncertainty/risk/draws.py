@@ -25,28 +25,20 @@ class Draws:
     that neither the model nor what was asked before changes a number.  Errors of the needle that are drawn
     for each patient are the same in all its arcs.
 
-    Parameters
-    ----------
-    count, n_arcs : int
-        N and A of `Deviations`.
-    seed : int
-        The same seed gives the same numbers.
-    n_twisted : int
-        See `no_deviations`.
-    stretch : float
-        By how much of the patient's motion by breathing the target moves farther than the scope's tip, where
-        the patient's own motion is not known.
-    motion : PatientMotion, optional
-        The patient's own.
-    attempt : int
-        Number of the attempt on the same N patients: what is drawn for each attempt has other numbers.
-    lps_from_scope_tip : (4, 4) float64, optional
-        The axes along which a bias of the scope's position is stated; by default those of LPS.
+    Args:
+        count, n_arcs: N and A of `Deviations`.
+        seed: The same seed gives the same numbers.
+        n_twisted: See `no_deviations`.
+        stretch: By how much of the patient's motion by breathing the target moves farther than the scope's
+            tip, where the patient's own motion is not known.
+        motion: The patient's own.
+        attempt: Number of the attempt on the same N patients: what is drawn for each attempt has other
+            numbers.
+        lps_from_scope_tip ((4, 4) float64): The axes along which a bias of the scope's position is stated; by
+            default those of LPS.
 
-    Raises
-    ------
-    SettingsError
-        If there are to be none.
+    Raises:
+        SettingsError: If there are to be none.
     """
 
     def __init__(

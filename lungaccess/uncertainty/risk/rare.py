@@ -44,18 +44,12 @@ HALVINGS = 12
 class RareShare:
     """A probability estimated with weights.
 
-    Parameters
-    ----------
-    value : float
-    interval : (float, float)
-        95 % by the normal approximation of the mean of the weights.
-    effective_samples : float
-        So many equal weights are as exact: the squared sum of the weights of the events over the sum of their
-        squares [Kong1992].
-    samples : int
-        Draws, those in which the centres were looked for not counted.
-    centres : int
-        Of the mixture; with 0 nothing was found, and all draws are plain.
+    Args:
+        interval ((float, float)): 95 % by the normal approximation of the mean of the weights.
+        effective_samples: So many equal weights are as exact: the squared sum of the weights of the events
+            over the sum of their squares [Kong1992].
+        samples: Draws, those in which the centres were looked for not counted.
+        centres: Of the mixture; with 0 nothing was found, and all draws are plain.
     """
 
     value: float
@@ -73,14 +67,10 @@ class RareShare:
 def rare_share(happens: Callable[[Float], Bool], dimensions: int, samples: int, seed: int) -> RareShare:
     """Return the probability of an event of standard normal numbers.
 
-    Parameters
-    ----------
-    happens : callable
-        Takes `(N, dimensions)` float64 and tells in which rows it happens, `(N,)`.
-    samples : int
-        Draws from the mixture, and as many to look for centres with each of `SPREADS`.
-    seed : int
-        The same seed gives the same estimate.
+    Args:
+        happens: Takes `(N, dimensions)` float64 and tells in which rows it happens, `(N,)`.
+        samples: Draws from the mixture, and as many to look for centres with each of `SPREADS`.
+        seed: The same seed gives the same estimate.
     """
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, 2])))
     centres = _centres(happens, dimensions, samples, rng)

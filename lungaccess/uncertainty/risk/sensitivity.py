@@ -16,20 +16,14 @@ from lungaccess.uncertainty.risk.statistics import Share, share_of
 class Sensitivity:
     """What one kind of error does to the success of a plan.
 
-    Parameters
-    ----------
-    kind : str
-        See `lungaccess.problem.errors.UNITS`.
-    alone : Share
-        Successes with errors of this kind only.
-    first_order : float
-        Share of the variance of success that this kind explains by itself [Saltelli2010]; near 0 it may come
-        out below 0.
-    total : float
-        Share of the variance that goes with this kind, together with all others [Jansen1999].
-    changes : Share
-        Draws whose outcome changes if this kind alone is drawn again: `total` is this share over twice the
-        variance.
+    Args:
+        kind: See `lungaccess.problem.errors.UNITS`.
+        alone: Successes with errors of this kind only.
+        first_order: Share of the variance of success that this kind explains by itself [Saltelli2010]; near 0
+            it may come out below 0.
+        total: Share of the variance that goes with this kind, together with all others [Jansen1999].
+        changes: Draws whose outcome changes if this kind alone is drawn again: `total` is this share over
+            twice the variance.
     """
 
     kind: str

@@ -40,26 +40,17 @@ def safe_start_region(
     proved holds for every pose of a ball of places times a cone of directions.  The same input and seed give
     the same region.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient that the plan was made for.
-    radius_mm : float, optional
-        How far from the target a path may end; by default the radius of the goal of `assess`, 0 for exactly
-        at the target.
-    offset_mm, tilt_deg : float
-        Largest distance and angle from the planned start of the poses that are tried.
-    poses : int
-        About how many are tried.
-    iterations : int
-        Of the search from a pose from which no simple path is clear.
+    Args:
+        lung: The patient that the plan was made for.
+        radius_mm: How far from the target a path may end; by default the radius of the goal of `assess`, 0
+            for exactly at the target.
+        offset_mm, tilt_deg: Largest distance and angle from the planned start of the poses that are tried.
+        poses: About how many are tried.
+        iterations: Of the search from a pose from which no simple path is clear.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another lung.
-    SettingsError
-        If the plan has no needle, a number is out of its range, or a cost map forbids voxels.
+    Raises:
+        PlanFileError: If the plan was made for another lung.
+        SettingsError: If the plan has no needle, a number is out of its range, or a cost map forbids voxels.
     """
     plan.require_lung(lung)
     needle = plan.system.require_needle("A safe start region")

@@ -39,21 +39,16 @@ AZIMUTHS = 16
 class Tolerance:
     """How large errors of one kind may be, all others being 0.
 
-    Parameters
-    ----------
-    kind, unit : str
-        See `lungaccess.problem.errors.UNITS`.
-    stated : float
-        The size in the error model, of patient and attempt together; see
-        `lungaccess.problem.errors.Term`.
-    largest : float
-        The largest size at which successes are that probable, at most `LARGEST`; 0 if none was found.
-    margin : (float, float)
-        Errors up to this size never fail: (below 0, above 0) for errors with a sign, the same twice for
-        errors with directions; factors for the curvature.  Tried at steps and in some directions, not
-        proved.
-    alone : Share
-        Successes at the stated size.
+    Args:
+        kind, unit: See `lungaccess.problem.errors.UNITS`.
+        stated: The size in the error model, of patient and attempt together; see
+            `lungaccess.problem.errors.Term`.
+        largest: The largest size at which successes are that probable, at most `LARGEST`; 0 if none was
+            found.
+        margin ((float, float)): Errors up to this size never fail: (below 0, above 0) for errors with a sign,
+            the same twice for errors with directions; factors for the curvature.  Tried at steps and in some
+            directions, not proved.
+        alone: Successes at the stated size.
     """
 
     kind: str
@@ -80,21 +75,14 @@ def find_tolerances(
     The largest size is found by bisection over a scale, every size with the same draws.  Breathing is left
     out: it is an error of the target in one direction.
 
-    Parameters
-    ----------
-    plan, lung, radius_mm
-        See `RiskAssessor`.
-    model : ErrorModel, optional
-        States the sizes to compare with.
-    probability : float
-        Probability of success that is asked for, above 0 and below 1.
-    samples, seed : int
-        Draws for each size.
+    Args:
+        plan, lung, radius_mm: See `RiskAssessor`.
+        model: States the sizes to compare with.
+        probability: Probability of success that is asked for, above 0 and below 1.
+        samples, seed: Draws for each size.
 
-    Raises
-    ------
-    PlanFileError, SettingsError
-        See `RiskAssessor`; also if the probability is not between 0 and 1.
+    Raises:
+        PlanFileError, SettingsError: See `RiskAssessor`; also if the probability is not between 0 and 1.
     """
     if not 0.0 < probability < 1.0:
         raise SettingsError(

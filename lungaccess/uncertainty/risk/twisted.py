@@ -17,13 +17,11 @@ def twisted_shapes(plan: Plan, insertion_mm: Float, relative_rad: Float) -> tupl
     tip, nor behind one around it, nor so far that its rear end passes that of one around it.  Where tubes
     snap they have no length, so that they stay in the airway.
 
-    Returns
-    -------
-    shapes : (S, T, 4) float64
-        As the first pieces of a chain, see `lungaccess.uncertainty.risk.kernels.deviation`.
-    rolled_rad : (S,) float64
-        By how much too far the end of the tubes is rolled.
-    which : (N,) int64
+    Returns:
+        - shapes ((S, T, 4) float64) - As the first pieces of a chain, see
+          `lungaccess.uncertainty.risk.kernels.deviation`.
+        - rolled_rad ((S,) float64) - By how much too far the end of the tubes is rolled.
+        - which ((N,) int64)
     """
     tube, tubes = plan.tube, plan.system.tubes
     turned, inserted = np.array(tube.rotations_rad(tubes)), np.array(tube.insertions_mm(tubes))

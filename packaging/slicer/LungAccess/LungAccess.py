@@ -123,12 +123,9 @@ class LungAccessWidget(ScriptedLoadableModuleWidget):
 class LungAccessLogic(ScriptedLoadableModuleLogic):
     """What the panel does, without the panel.
 
-    Parameters
-    ----------
-    scene : vtkMRMLScene, optional
-        The scene that results are added to; the open one if not given.
-    folder : path, optional
-        Where patients and plans are kept; a temporary folder of this session if not given.
+    Args:
+        scene (vtkMRMLScene): The scene that results are added to; the open one if not given.
+        folder: Where patients and plans are kept; a temporary folder of this session if not given.
     """
 
     def __init__(self, scene: Any = None, folder: Path | None = None) -> None:
@@ -157,22 +154,16 @@ class LungAccessLogic(ScriptedLoadableModuleLogic):
     ) -> str:
         """Plan to the first point of a list, add the plan to the scene, and return chance, verdict and steps.
 
-        Parameters
-        ----------
-        volume : vtkMRMLScalarVolumeNode or None
-            The CT; without a segmentation it is segmented first.
-        segmentation : vtkMRMLSegmentationNode or None
-            Masks by the names of their segments, see `SEGMENTS`.
-        target : vtkMRMLMarkupsFiducialNode
-        device : str
-            A preset, or the path of a device file.
+        Args:
+            volume (vtkMRMLScalarVolumeNode or None): The CT; without a segmentation it is segmented first.
+            segmentation (vtkMRMLSegmentationNode or None): Masks by the names of their segments, see
+                `SEGMENTS`.
+            target: vtkMRMLMarkupsFiducialNode.
+            device: A preset, or the path of a device file.
 
-        Raises
-        ------
-        ValueError
-            If something is not chosen.
-        RuntimeError
-            If lungaccess refuses, with its words.
+        Raises:
+            ValueError: If something is not chosen.
+            RuntimeError: If lungaccess refuses, with its words.
         """
         if target is None or not target.GetNumberOfControlPoints():
             raise ValueError("Choose a list with a point in the nodule")

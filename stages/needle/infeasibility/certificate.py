@@ -54,33 +54,23 @@ class _TooMuchError(Exception):
 class NoPathProof:
     """Tries to prove that no path leads from a start to within the goal tolerance of a target.
 
-    Parameters
-    ----------
-    max_bytes : int
-        Most memory for states and tables.
+    Args:
+        max_bytes: Most memory for states and tables.
 
-    Attributes
-    ----------
-    outcome : str
-        "running", "no path" (proved) or "undecided" (paths may exist).
-    reason : str
-        What proves it, or why the end is undecided.
-    cell_mm, slope_cell : float
-        Sides of the cells of the present level: of position in mm, and of direction as a slope (1 is 45
-        degrees).
-    passage : Passage or None
-        What the last finished level left; None before the first, and where the proof succeeds.
+    Attributes:
+        outcome: "running", "no path" (proved) or "undecided" (paths may exist).
+        reason: What proves it, or why the end is undecided.
+        cell_mm, slope_cell: Sides of the cells of the present level: of position in mm, and of direction as a
+            slope (1 is 45 degrees).
+        passage: What the last finished level left; None before the first, and where the proof succeeds.
 
-    Raises
-    ------
-    SettingsError
-        If `max_bytes` is not positive.
+    Raises:
+        SettingsError: If `max_bytes` is not positive.
 
-    Notes
-    -----
-    Among the limits, those of curvature and of the angle from the reference count; those of length and of
-    accumulated turn count only in so far as together they forbid turning by more than 180 degrees in all.
-    Without that, nothing is proved.
+    Notes:
+        Among the limits, those of curvature and of the angle from the reference count; those of length and of
+        accumulated turn count only in so far as together they forbid turning by more than 180 degrees in all.
+        Without that, nothing is proved.
     """
 
     def __init__(self, environment: NeedleEnvironment, query: Query, *, max_bytes: int = MAX_BYTES) -> None:

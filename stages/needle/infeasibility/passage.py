@@ -32,17 +32,12 @@ class Passage:
 
     It is the plane whose states are the narrowest beside what is wide enough for all paths without obstacles.
 
-    Parameters
-    ----------
-    point_lps : (3,) tuple of float
-        Its middle, LPS mm.
-    width_mm : float
-        Diameter of a disc of its area; the area is taken too large, by the cells along its edge.
-    from_start_mm : float
-        Distance of its plane from the start.
-    cell_mm, slope_cell : float
-        Resolution at which the query is open: sides of the cells of position in mm, and of direction as a
-        slope (1 is 45 degrees).
+    Args:
+        point_lps ((3,) tuple of float): Its middle, LPS mm.
+        width_mm: Diameter of a disc of its area; the area is taken too large, by the cells along its edge.
+        from_start_mm: Distance of its plane from the start.
+        cell_mm, slope_cell: Resolution at which the query is open: sides of the cells of position in mm, and
+            of direction as a slope (1 is 45 degrees).
     """
 
     point_lps: tuple[float, float, float]
@@ -62,16 +57,12 @@ def tightest(
 ) -> Passage | None:
     """Return the plane on which the states are narrowest for where it lies; None if all are near an end.
 
-    Parameters
-    ----------
-    depth_mm : float
-        Distance of the planes.
-    paths : PathBounds
-        Where paths can be without obstacles.
-    kappa : float
-        Greatest curvature, 1/mm.
-    line : tuple of arrays
-        The start (3,), what a mm of depth moves the first cell (3,), and the axes of cells (2, 3), LPS mm.
+    Args:
+        depth_mm: Distance of the planes.
+        paths: Where paths can be without obstacles.
+        kappa: Greatest curvature, 1/mm.
+        line (tuple of arrays): The start (3,), what a mm of depth moves the first cell (3,), and the axes of
+            cells (2, 3), LPS mm.
     """
     least, found = math.inf, None
     for number, plane in enumerate(planes):
@@ -105,14 +96,11 @@ def backward_reach(
     What is left out holds no point of a path that keeps its clearance from there to the target.  A needle
     that is longer than half a circle of its least radius may come from everywhere.
 
-    Parameters
-    ----------
-    target_lps : (3,) float64
-        LPS mm.
-    middle : (3,) float64
-        Direction from the target to where needles start; directions far from it are not looked at.
-    cell : float
-        Side of a cell of the plane of directions, half an angle in rad.
+    Args:
+        target_lps ((3,) float64): LPS mm.
+        middle ((3,) float64): Direction from the target to where needles start; directions far from it are
+            not looked at.
+        cell: Side of a cell of the plane of directions, half an angle in rad.
     """
     limits = environment.limits
     if limits.max_length_mm * limits.kappa > math.pi:

@@ -41,12 +41,9 @@ class Plane:
     def refined(self, *, directions: bool, require: Callable[[int], None]) -> Plane:
         """Return the same states in cells of half the side.
 
-        Parameters
-        ----------
-        directions : bool
-            Whether to halve the cells of directions too.
-        require : callable
-            Called with the number of bytes that this takes, before it does.
+        Args:
+            directions: Whether to halve the cells of directions too.
+            require: Called with the number of bytes that this takes, before it does.
         """
         halved = np.array([directions, directions, True, True])
         shape = np.where(halved, 2 * np.array(self.bits.shape) + 1, self.bits.shape)
@@ -65,15 +62,12 @@ class Plane:
     def probed_cells(self, moves: Float) -> tuple[Int, Int]:
         """Return which cells of position the tangents of the states can meet at some depths.
 
-        Parameters
-        ----------
-        moves : (D,) float64
-            Cells of position by which a tangent moves up to each depth, for each cell of direction.
+        Args:
+            moves ((D,) float64): Cells of position by which a tangent moves up to each depth, for each cell
+                of direction.
 
-        Returns
-        -------
-        corners, shape : (D, 2) int64
-            Numbers (y, x) of the first cells, and how many there are.
+        Returns:
+            corners, shape ((D, 2) int64): Numbers (y, x) of the first cells, and how many there are.
         """
         low, high = self.window, self.ends
         corners = np.zeros((len(moves), 2), dtype=np.int64)
@@ -89,14 +83,11 @@ class Plane:
 class PathBounds:
     """Bounds of the places and directions of all paths.
 
-    Parameters
-    ----------
-    ends : (ENDS_SIZE,) float64
-        See `stages.needle.infeasibility.kernels.bounds`.
-    steepest : float
-        Largest sine of the angle between a path and the line from start to target.
-    aside_mm, before_mm : float
-        How far aside of that line, and how far before the start or behind the target, a path can go.
+    Args:
+        ends ((ENDS_SIZE,) float64): See `stages.needle.infeasibility.kernels.bounds`.
+        steepest: Largest sine of the angle between a path and the line from start to target.
+        aside_mm, before_mm: How far aside of that line, and how far before the start or behind the target, a
+            path can go.
     """
 
     ends: Float
@@ -108,14 +99,10 @@ class PathBounds:
     def of(cls, total_mm: float, tolerance_mm: float, kappa: float, length_mm: float) -> PathBounds:
         """Return the bounds for a target `total_mm` from the start.
 
-        Parameters
-        ----------
-        total_mm, tolerance_mm : float
-            Distance from start to target, and how far from the target a path may end.
-        kappa : float
-            Greatest curvature, 1/mm.
-        length_mm : float
-            Greatest length of a path.
+        Args:
+            total_mm, tolerance_mm: Distance from start to target, and how far from the target a path may end.
+            kappa: Greatest curvature, 1/mm.
+            length_mm: Greatest length of a path.
         """
         radius, widest = 1.0 / kappa, total_mm + tolerance_mm
         ends = np.zeros(bounds.ENDS_SIZE)

@@ -27,20 +27,13 @@ OFF_GRID = -1
 class ObjectiveArrays(NamedTuple):
     """The weights of the costs of a path, and the cost map.
 
-    Parameters
-    ----------
-    inverse_clearance : float
-        Weight of the integral of 1 / clearance.
-    map_integral : float
-        Weight of the line integral of the cost map, 1/mm.
-    length : float
-        Weight of length, 1/mm.
-    voxel_sum : float
-        Weight of the sum of the cost map over the set of voxels crossed.
-    least_rate : float
-        Least cost of a mm anywhere.
-    cost_map : (ni, nj, nk) float32
-        Infinite is an obstacle.
+    Args:
+        inverse_clearance: Weight of the integral of 1 / clearance.
+        map_integral: Weight of the line integral of the cost map, 1/mm.
+        length: Weight of length, 1/mm.
+        voxel_sum: Weight of the sum of the cost map over the set of voxels crossed.
+        least_rate: Least cost of a mm anywhere.
+        cost_map ((ni, nj, nk) float32): Infinite is an obstacle.
     """
 
     inverse_clearance: float
@@ -147,14 +140,10 @@ def voxels_on_arc(shape, geometry, pose, bend, length):
     They are those that hold one of its ends or more than 1e-9 mm of it.  An end on a face lies in the voxel
     of the higher index.
 
-    Returns
-    -------
-    voxels : (N,) int64
-        Their numbers, the first index running fastest; OFF_GRID beyond the grid.
-    lengths : (N,) float64
-        Length of arc in each, mm.
-    pieces : int
-        If 1, no voxel is met twice.
+    Returns:
+        - voxels ((N,) int64) - Their numbers, the first index running fastest; OFF_GRID beyond the grid.
+        - lengths ((N,) float64) - Length of arc in each, mm.
+        - pieces (int) - If 1, no voxel is met twice.
     """
     kappa = bend[0]
     most = _most_voxels(geometry, bend, length)

@@ -57,15 +57,12 @@ def least_length(rho, h, limits, cosine, turn_left):
     lean from the tip by more than 90 degrees: else a tilted tip can wind around the reference, and reaches
     farther than by one arc.  The turn that is left counts up to 180 degrees.
 
-    Parameters
-    ----------
-    rho, h : float
-        How far the goal is aside and ahead, mm.
-    limits : Limits
-    cosine : float
-        Cosine of the angle between the tip and the direction from which the limit of the angle counts.
-    turn_left : float
-        What is left of the accumulated turn, rad.
+    Args:
+        rho, h (float): How far the goal is aside and ahead, mm.
+        limits: Limits.
+        cosine (float): Cosine of the angle between the tip and the direction from which the limit of the
+            angle counts.
+        turn_left (float): What is left of the accumulated turn, rad.
     """
     tolerance = limits.goal_tolerance_mm
     kappa = limits.kappa

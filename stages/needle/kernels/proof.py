@@ -30,16 +30,11 @@ _LUMEN = np.int64(LUMEN)
 class Obstacles(NamedTuple):
     """What a needle collides with, see `anatomy.kernels.field`.
 
-    Parameters
-    ----------
-    clearance : (ni + 1, nj + 1, nk + 1) uint16
-        Clearance field at the corners of the voxels.
-    labels : (ni, nj, nk) uint16
-        See `anatomy.structures`.
-    geometry : (3, 6) float64
-        See `anatomy.fields.corner_geometry`.
-    bits : int
-        Structures that are obstacles.
+    Args:
+        clearance ((ni + 1, nj + 1, nk + 1) uint16): Clearance field at the corners of the voxels.
+        labels ((ni, nj, nk) uint16): See `anatomy.structures`.
+        geometry ((3, 6) float64): See `anatomy.fields.corner_geometry`.
+        bits: Structures that are obstacles.
     """
 
     clearance: UInt16
@@ -103,14 +98,11 @@ def exact_gap(obstacles, limits, inserted, x, y, z, branch):
     WALL_ZONE_MM the lumen of the pierced branch does not count either; from there on the axis is outside, and
     the distance kept grows by `leaving_sine` a mm, up to the radius.
 
-    Returns
-    -------
-    gap : float
-        The next `gap` mm are clear, as far as the rule stays the same; negative if the point is not.
-    label : int
-        Of the voxel that limits it, 0 for none near.
-    distance, needed : float
-        From that voxel, mm.
+    Returns:
+        - gap (float) - The next `gap` mm are clear, as far as the rule stays the same; negative if the point
+          is not.
+        - label (int) - Of the voxel that limits it, 0 for none near.
+        - distance, needed (float) - From that voxel, mm.
     """
     _clearance, labels, geometry, bits = obstacles
     reach = limits.required_mm + EXACT_REACH_MM
@@ -167,31 +159,21 @@ def blocker_on_arc(obstacles, limits, pose, bend, length, s0, branch):
 class Limits(NamedTuple):
     """What a needle keeps, and how finely its paths are looked at.
 
-    Parameters
-    ----------
-    kappa : float
-        Greatest curvature, 1/mm.
-    max_angle_rad : float
-        Greatest angle between the tip and its direction at the start.
-    max_turn_rad : float
-        Greatest sum of all turning.
-    required_mm : float
-        Clearance that the needle's axis keeps.
-    radius_mm : float
-        Radius of the needle.
-    exempt_mm : float
-        First length of the needle that may touch the wall of the pierced branch.
-    max_step_mm : float
-        Longest arc of a tree.
-    cost_step_mm : float
-        Longest step of integrals of 1 / clearance.
-    goal_tolerance_mm : float
-        How far from the target a path may end.
-    leaving_sine : float
-        0: the needle begins in tissue.  More: it begins at the wall of the pierced branch, in or beside its
-        lumen, and leaves it at this sine of an angle or more, see `stages.needle.kernels.proof.exact_gap`.
-    lookup_step_mm : float
-        0: arcs are proved clear.  More: voxels are looked up at steps of so many mm, which proves nothing.
+    Args:
+        kappa: Greatest curvature, 1/mm.
+        max_angle_rad: Greatest angle between the tip and its direction at the start.
+        max_turn_rad: Greatest sum of all turning.
+        required_mm: Clearance that the needle's axis keeps.
+        radius_mm: Radius of the needle.
+        exempt_mm: First length of the needle that may touch the wall of the pierced branch.
+        max_step_mm: Longest arc of a tree.
+        cost_step_mm: Longest step of integrals of 1 / clearance.
+        goal_tolerance_mm: How far from the target a path may end.
+        leaving_sine: 0: the needle begins in tissue.  More: it begins at the wall of the pierced branch, in
+            or beside its lumen, and leaves it at this sine of an angle or more, see
+            `stages.needle.kernels.proof.exact_gap`.
+        lookup_step_mm: 0: arcs are proved clear.  More: voxels are looked up at steps of so many mm, which
+            proves nothing.
     """
 
     kappa: float

@@ -111,10 +111,8 @@ def _extend(obstacles, limits, starts, order, mixed, q, radius, marks, hints, ch
     `chosen` receives their numbers and `near` the poses, in the mixed order; `count` are there already, from
     the first `scanned` of all.
 
-    Returns
-    -------
-    count, scanned : int
-        Both grown; `count` is not if no more poses come into question.
+    Returns:
+        count, scanned (int): Both grown; `count` is not if no more poses come into question.
     """
     total, before = mixed.shape[1], count
     while scanned < total and count == before:
@@ -202,28 +200,20 @@ def reach_by_arcs(
     as far as they are asked for: those whose arcs to all of the points are blocked at one place are passed
     over.
 
-    Parameters
-    ----------
-    obstacles, limits : Obstacles, Limits
-    starts, branches, order, mixed
-        See the module.
-    points : (N, 3) float64, LPS mm
-    visits : (N,) int64
-        The points in the order in which they are tried.
-    blocks : (B + 1,) int64
-        Where in that order the points of each block begin, and N; those of a block should be close.
-    near : (N, K) int64
-        Points near each; -1 for none.  Those that are tried later do not count.
-    wanted : int
-        At least 1.
-    hints : (E,) float64
-        Scratch; starts at 0, and says how far from its start each arc was blocked the last time, mm.
-    kinds : (N,) int64
-        Receives DIRECT, UNREACHED or NO_CLEARANCE.
-    found : (N, 2) float64
-        Receives cost and least clearance of what is reached.
-    entries : (N,) int64
-        Receives the start pose of what is reached, else -1.
+    Args:
+        obstacles, limits: Obstacles, Limits.
+        starts, branches, order, mixed: See the module.
+        points: (N, 3) float64, LPS mm.
+        visits ((N,) int64): The points in the order in which they are tried.
+        blocks ((B + 1,) int64): Where in that order the points of each block begin, and N; those of a block
+            should be close.
+        near ((N, K) int64): Points near each; -1 for none.  Those that are tried later do not count.
+        wanted (int): At least 1.
+        hints ((E,) float64): Scratch; starts at 0, and says how far from its start each arc was blocked the
+            last time, mm.
+        kinds ((N,) int64): Receives DIRECT, UNREACHED or NO_CLEARANCE.
+        found ((N, 2) float64): Receives cost and least clearance of what is reached.
+        entries ((N,) int64): Receives the start pose of what is reached, else -1.
     """
     bits = obstacles.bits
     marks = np.zeros(BLOCK, dtype=np.uint8)

@@ -95,10 +95,8 @@ def blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
     A place is its distance from the start, as is `hint`.  Looked at are places from `begin` to `end`; no arc
     is exempt there, since none is shorter than its chord.
 
-    Returns
-    -------
-    float
-        The place, -1 if none was met.
+    Returns:
+        float: The place, -1 if none was met.
     """
     if hint >= begin and hint < end and _is_blocked_at(obstacles, limits, start, aside, spread, hint):
         return hint

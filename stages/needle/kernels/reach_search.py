@@ -57,23 +57,17 @@ def reach_by_search(
     From every start pose with the point in its workspace, the shortest path is tried; if none is clear, an
     RRT from the first `trees` of them in the mixed order.
 
-    Parameters
-    ----------
-    obstacles, limits, objective, starts, branches, order, points
-        See `reach_arcs.reach_by_arcs` and `cost`.
-    trees, iterations, share : int, int, float
-        Trees for each point, and iterations and share of random arcs of each.
-    seeds : (N,) uint64
-        Seed of each point, so that points may be searched in any order.
-    nodes, parents, picked : arrays
-        Scratch: a tree, and `trees` int64.
-    kinds, found, entries : arrays
-        As `reach_arcs.reach_by_arcs` left them; points found become SEARCHED.
+    Args:
+        obstacles, limits, objective, starts, branches, order, points: See `reach_arcs.reach_by_arcs` and
+            `cost`.
+        trees, iterations, share (int, int, float): Trees for each point, and iterations and share of random
+            arcs of each.
+        seeds ((N,) uint64): Seed of each point, so that points may be searched in any order.
+        nodes, parents, picked (arrays): Scratch: a tree, and `trees` int64.
+        kinds, found, entries (arrays): As `reach_arcs.reach_by_arcs` left them; points found become SEARCHED.
 
-    Returns
-    -------
-    int
-        The row of `nodes` at the last point that was searched, 0 if it was not found.
+    Returns:
+        int: The row of `nodes` at the last point that was searched, 0 if it was not found.
     """
     state = seeds[:1].copy()
     last = 0

@@ -109,27 +109,21 @@ def grow_rrt(
     From the root and after every new node, the goal is tried.  A goal nearer than MIN_ARC_MM to the start
     is no problem to solve: nothing is grown.
 
-    Parameters
-    ----------
-    obstacles, limits, objective : Obstacles, Limits, ObjectiveArrays
-    branch : int
-        Pierced branch, whose wall is exempt at the exit; -1 for none.
-    goal : (3,) float64, LPS mm
-    nodes : (M, NODE_COLUMNS) float64, parents : (M,) int64
-        The tree; row 0 is the start pose, `count` rows are in use.
-    iterations : int
-    random_share : float
-        Share of the iterations that extend a random node by a random arc, so that every path has a
-        chance; the others draw a point, and extend the node nearest to it.
-    state : (1,) uint64
-        Random state.
-    best : float
-        Paths that cost as much are not looked for.
+    Args:
+        obstacles, limits, objective: Obstacles, Limits, ObjectiveArrays.
+        branch (int): Pierced branch, whose wall is exempt at the exit; -1 for none.
+        goal: (3,) float64, LPS mm.
+        nodes ((M, NODE_COLUMNS) float64, parents : (M,) int64): The tree; row 0 is the start pose, `count`
+            rows are in use.
+        iterations: int.
+        random_share (float): Share of the iterations that extend a random node by a random arc, so that every
+            path has a chance; the others draw a point, and extend the node nearest to it.
+        state ((1,) uint64): Random state.
+        best (float): Paths that cost as much are not looked for.
 
-    Returns
-    -------
-    count, used, solved : int, int, bool
-        Rows in use, iterations spent, and whether the last row is at the goal.
+    Returns:
+        count, used, solved (int, int, bool): Rows in use, iterations spent, and whether the last row is at
+            the goal.
     """
     start = tree.pose_of(nodes[0])
     count, ends, solved = goal_from_root(

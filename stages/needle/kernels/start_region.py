@@ -37,18 +37,14 @@ _LUMEN = np.int64(LUMEN)
 def lay_stations(obstacles, limits, branch, start, points, arcs, stations):
     """Lay single arcs from a start through points and cut them into cells.
 
-    Parameters
-    ----------
-    start : (6,) float64, points : (K, 3) float64
-    arcs : (K, ARC_COLUMNS) float64, stations : (MOST_STATIONS, STATION_COLUMNS) float64
-        Receive the arcs and the cells.
+    Args:
+        start: (6,) float64, points : (K, 3) float64.
+        arcs ((K, ARC_COLUMNS) float64, stations : (MOST_STATIONS, STATION_COLUMNS) float64): Receive the arcs
+            and the cells.
 
-    Returns
-    -------
-    count : int
-        Of cells, 0 if an arc is missing or there are too many.
-    angle : float
-        Largest angle to the direction at the start, rad.
+    Returns:
+        - count (int) - Of cells, 0 if an arc is missing or there are too many.
+        - angle (float) - Largest angle to the direction at the start, rad.
     """
     count = 0
     least = 1.0

@@ -50,18 +50,13 @@ def try_starts(
     Before the via points comes the shortest path in free space; through each leads a single arc, and from
     there an arc or the shortest path.
 
-    Parameters
-    ----------
-    positions, tangents : (N, 3) float64
-    vias : (V, 3) float64, LPS mm
-    iterations, share : int, float
-        Of the RRT, see `grow_rrt`; 0 iterations for none.
-    seed : int
-        Of the random numbers; each pose has its own.
-    nodes, parents : arrays
-        Scratch: a tree.
-    kinds : (N,) uint8
-        Receives NO_PATH, DIRECT, VIA, SEARCHED, START_BLOCKED or OUT_OF_REACH.
+    Args:
+        positions, tangents: (N, 3) float64.
+        vias: (V, 3) float64, LPS mm.
+        iterations, share (int, float): Of the RRT, see `grow_rrt`; 0 iterations for none.
+        seed (int): Of the random numbers; each pose has its own.
+        nodes, parents (arrays): Scratch: a tree.
+        kinds ((N,) uint8): Receives NO_PATH, DIRECT, VIA, SEARCHED, START_BLOCKED or OUT_OF_REACH.
     """
     state = np.zeros(1, dtype=np.uint64)
     for n in range(positions.shape[0]):

@@ -42,12 +42,9 @@ class Question:
 class NeedleGoal(base.GoalSampleableRegion):
     """The tip is at the target; its orientation is free.
 
-    Parameters
-    ----------
-    si : control.SpaceInformation
-    target : (3,) float64, LPS mm
-    tolerance_mm : float
-        How far from the target a path may end.
+    Args:
+        target: (3,) float64, LPS mm.
+        tolerance_mm: How far from the target a path may end.
     """
 
     def __init__(self, si: Any, target: Float, tolerance_mm: float = 0.0) -> None:
@@ -81,13 +78,9 @@ class NeedlePlanner(base.Planner):
     iterations are spent; without `anytime` it stops at the first path.  Each better path replaces the one
     before in the problem definition, which would rank by the number of arcs, not by cost.
 
-    Parameters
-    ----------
-    si : control.SpaceInformation
-    make_search : callable
-        Makes a search of a query and a seed.
-    question : Question
-        Where the query stands when `solve` is called.
+    Args:
+        make_search: Makes a search of a query and a seed.
+        question: Where the query stands when `solve` is called.
     """
 
     def __init__(

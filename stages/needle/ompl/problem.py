@@ -53,21 +53,15 @@ there, and it comes there within hundreds of iterations, to 1 mm within many tho
 class NeedleProblem:
     """Plans needle paths among obstacles with OMPL; made once, asked many times.
 
-    Parameters
-    ----------
-    searches : mapping of names to callables, optional
-        Each makes a search of an environment, a query and a seed.  The first is the default; without any,
-        all of `stages.needle.search.planners`.
-    objective : Objective, optional
-        What those make small, the patient's cost map included; the planners of OMPL look at no objective,
-        but enter no voxel of infinite cost.
+    Args:
+        searches (mapping of names to callables): Each makes a search of an environment, a query and a seed.
+            The first is the default; without any, all of `stages.needle.search.planners`.
+        objective: What those make small, the patient's cost map included; the planners of OMPL look at no
+            objective, but enter no voxel of infinite cost.
 
-    Attributes
-    ----------
-    setup : control.SimpleSetup
-        The question of `pose`, for OMPL's own tools.
-    planner : NeedlePlanner
-        The planner installed in `setup`: the default search, which may also be `anytime`.
+    Attributes:
+        setup: The question of `pose`, for OMPL's own tools.
+        planner: The planner installed in `setup`: the default search, which may also be `anytime`.
     """
 
     def __init__(
@@ -120,10 +114,8 @@ class NeedleProblem:
     def own(self, method: str | None = None) -> Any:
         """Return the planner that `plan` uses, made once for each name of `planners`.
 
-        Raises
-        ------
-        SettingsError
-            If there is no such planner.
+        Raises:
+            SettingsError: If there is no such planner.
         """
         name = self.default if method is None else method
         if name not in self._own:
@@ -149,23 +141,15 @@ class NeedleProblem:
         A planner of OMPL ends with its first path, within BESIDE_TARGET_MM of the target; one arc in place of
         its last ones then brings the path to the target itself, with as few arcs in all as are proved.
 
-        Parameters
-        ----------
-        seed, iterations : int
-            The same pair gives the same path, if the time does not run out first.  The planners of OMPL take
-            their random numbers from `seed_ompl` instead.
-        time_s : float
-            Stop after this time.
-        method : str, optional
-            Name of the planner, one of `planners`.
-        anytime : bool
-            Go on to better paths until time, iterations or search are at their end.
-        cost_limit : float
-            What a path of our searches must cost less than, under the objective.
+        Args:
+            seed, iterations: The same pair gives the same path, if the time does not run out first.  The
+                planners of OMPL take their random numbers from `seed_ompl` instead.
+            time_s: Stop after this time.
+            method: Name of the planner, one of `planners`.
+            anytime: Go on to better paths until time, iterations or search are at their end.
+            cost_limit: What a path of our searches must cost less than, under the objective.
 
-        Returns
-        -------
-        ArcPath or None
+        Returns:
             A path proved clear and within all limits; None if none was found.
         """
         planner = self.own(method)
@@ -205,11 +189,10 @@ class NeedleProblem:
 
         `plan` asks its own query; pose again before `setup` is used after it.
 
-        Parameters
-        ----------
-        goal_tolerance_mm : float
-            How far from the target a path may end, where the environment's own tolerance is smaller.  OMPL's
-            planners steer by chance and need about 1 mm; ours aim at what the environment allows.
+        Args:
+            goal_tolerance_mm: How far from the target a path may end, where the environment's own tolerance
+                is smaller.  OMPL's planners steer by chance and need about 1 mm; ours aim at what the
+                environment allows.
         """
         self.setup.clear()
         self.setup.setGoal(self._ask(query, goal_tolerance_mm))
@@ -253,11 +236,9 @@ _seeds: list[int] = []
 def seed_ompl(seed: int) -> None:
     """Make OMPL's own planners repeatable; call it before anything else is made with OMPL.
 
-    Raises
-    ------
-    SettingsError
-        If OMPL has been seeded or has drawn random numbers in this process already, or the seed is less
-        than 1.
+    Raises:
+        SettingsError: If OMPL has been seeded or has drawn random numbers in this process already, or the
+            seed is less than 1.
     """
     level = util.getLogLevel()
     util.setLogLevel(util.LogLevel.LOG_NONE)

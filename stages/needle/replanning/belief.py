@@ -28,19 +28,15 @@ PLACE, TURN, BEND = slice(0, 3), slice(3, 6), 6
 class Unknown:
     """What is not known of a needle, and how exactly it is measured, all as standard deviations.
 
-    Parameters
-    ----------
-    start : (6, 6) float64
-        Covariance of the pose at the start, mm, and rad as a rotation vector, LPS; the roll is set from
-        outside, so that its part does not count.
-    factor, factor_ln : float
-        Median of the true curvature over the commanded one, and spread of its logarithm; 0 if it is known.
-    roll_rad : float
-        Of the direction of the bevel each time that it is rolled.
-    target_mm : float
-        Of the target along each axis.
-    tip_mm, tip_rad, seen_target_mm : float
-        Of a measured tip along each axis and about each of two axes, and of a measured target.
+    Args:
+        start ((6, 6) float64): Covariance of the pose at the start, mm, and rad as a rotation vector, LPS;
+            the roll is set from outside, so that its part does not count.
+        factor, factor_ln: Median of the true curvature over the commanded one, and spread of its logarithm; 0
+            if it is known.
+        roll_rad: Of the direction of the bevel each time that it is rolled.
+        target_mm: Of the target along each axis.
+        tip_mm, tip_rad, seen_target_mm: Of a measured tip along each axis and about each of two axes, and of
+            a measured target.
     """
 
     start: Float = field(default_factory=lambda: np.zeros((6, 6)))
@@ -63,21 +59,14 @@ def tilt(angle: float, towards: float) -> Float:
 class Belief:
     """What is believed of a needle that is inserted: dead reckoning, corrected by each measurement.
 
-    Attributes
-    ----------
-    frame : (4, 4) float64
-        Most likely pose of the tip, +x towards the bend.
-    target : (3,) float64, LPS mm
-    lag_rad : float
-        By how much the bevel is most likely turned farther than commanded.
+    Attributes:
+        frame ((4, 4) float64): Most likely pose of the tip, +x towards the bend.
+        target: (3,) float64, LPS mm.
+        lag_rad: By how much the bevel is most likely turned farther than commanded.
 
-    Parameters
-    ----------
-    query : Query
-        Pose and target as they are taken to be at the start.
-    unknown : Unknown
-    latency_mm : float
-        Insertion between a measurement and its use; what was commanded meanwhile is added to it.
+    Args:
+        query: Pose and target as they are taken to be at the start.
+        latency_mm: Insertion between a measurement and its use; what was commanded meanwhile is added to it.
     """
 
     def __init__(self, query: Query, unknown: Unknown, latency_mm: float = 0.0) -> None:

@@ -33,14 +33,10 @@ def blocker_at(
 ) -> int:
     """Return the label of what a point of the needle is too near to, 0 if it is clear.
 
-    Parameters
-    ----------
-    pose : (6,) floats
-        See `anatomy.kernels.arcs`.
-    inserted_mm : float
-        Length of needle up to the point, for the exemption at the exit.
-    branch : int
-        Pierced branch; -1 for none.
+    Args:
+        pose ((6,) floats): See `anatomy.kernels.arcs`.
+        inserted_mm: Length of needle up to the point, for the exemption at the exit.
+        branch: Pierced branch; -1 for none.
     """
     straight = (0.0, 1.0, 0.0, 0.0)
     return int(
@@ -75,12 +71,9 @@ def roots_of_tip(
     lead back to it; on them the axis comes no nearer to an obstacle than the tip is, but for a little
     slack, and never nearer than the needle's radius.
 
-    Parameters
-    ----------
-    query : Query
-        From the tip.
-    longest_mm : float
-        Longest arc.
+    Args:
+        query: From the tip.
+        longest_mm: Longest arc.
     """
     required = environment.required_clearance_mm
     pose = pose_at(query.lps_from_start)

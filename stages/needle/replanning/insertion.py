@@ -35,13 +35,11 @@ class Truth(Protocol):
 class TrueNeedle:
     """The true needle: where its tip is, and how it came there.
 
-    Attributes
-    ----------
-    frame : (4, 4) float64
-    inserted_mm : float
-        Length of needle from its first start to the tip.
-    arcs : list of (float, float, float)
-        Length, roll and curvature of all arcs so far, as those of an `ArcPath`.
+    Attributes:
+        frame: (4, 4) float64.
+        inserted_mm: Length of needle from its first start to the tip.
+        arcs (list of (float, float, float)): Length, roll and curvature of all arcs so far, as those of an
+            `ArcPath`.
     """
 
     def __init__(self, truth: Truth, lps_from_tip: Float, inserted_mm: float) -> None:
@@ -86,10 +84,8 @@ class Commands:
     A needle that bends more than it is told is told to bend less, as by spinning it for a part of the time;
     one that bends less is told to bend more, as far as it can.
 
-    Parameters
-    ----------
-    most_per_mm : float
-        Greatest curvature that can be commanded.
+    Args:
+        most_per_mm: Greatest curvature that can be commanded.
     """
 
     def __init__(self, plan: ArcPath, most_per_mm: float) -> None:
@@ -150,16 +146,11 @@ def steer(
     needle is believed to reach.  If that finds no path, the needle goes on by the old one as long as this,
     moved to where the tip is taken to be, is proved clear; otherwise it stops.
 
-    Parameters
-    ----------
-    branch : int
-        Pierced branch, see `Query`.
-    step_mm : float
-        Piece of needle within which the errors are constant.
-    measure_every_mm : float
-        Insertion between two measurements; infinite for open loop.
-    replan_every_mm : float
-        Least insertion between two replans.
+    Args:
+        branch: Pierced branch, see `Query`.
+        step_mm: Piece of needle within which the errors are constant.
+        measure_every_mm: Insertion between two measurements; infinite for open loop.
+        replan_every_mm: Least insertion between two replans.
     """
     most_per_mm = environment.limits.kappa
     commands = Commands(plan, most_per_mm)

@@ -72,17 +72,13 @@ def root_after(query: Query, path: ArcPath, cost: float) -> Root:
 def plan_ahead(plan: ArcPath, begin_mm: float) -> tuple[float, list[Ahead], list[Ahead]]:
     """Return what a plan says from a length on.
 
-    Parameters
-    ----------
-    begin_mm : float
-        How much of the plan lies behind.
+    Args:
+        begin_mm: How much of the plan lies behind.
 
-    Returns
-    -------
-    turned_rad : float
-        Turn of that part.
-    corners, meetings : list of (float, (3,) float64)
-        Ends of arcs beyond it but for the last, where the target was, and points at the look-aheads.
+    Returns:
+        - turned_rad - Turn of that part.
+        - corners, meetings (list of (float, (3,) float64)) - Ends of arcs beyond it but for the last, where
+          the target was, and points at the look-aheads.
     """
     turned, at = 0.0, 0.0
     corners, meetings = [], []
@@ -123,18 +119,12 @@ def pose_at(frame: Float) -> tuple[float, ...]:
 class Attempts:
     """Paths that were tried from one root; the cheapest is kept.
 
-    Parameters
-    ----------
-    most_points : int
-        Most points to pass on a path.
+    Args:
+        most_points: Most points to pass on a path.
 
-    Attributes
-    ----------
-    path : ArcPath or None
-        From the root, proved clear and within all limits.
-    cost : float
-        Of the path, as estimated within the searches; infinite without one.
-    source : Source
+    Attributes:
+        path: From the root, proved clear and within all limits.
+        cost: Of the path, as estimated within the searches; infinite without one.
     """
 
     def __init__(

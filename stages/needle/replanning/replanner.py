@@ -81,24 +81,16 @@ DEFAULT_SETTINGS = ReplanSettings()
 class Replan:
     """What came of replanning from one pose.
 
-    Parameters
-    ----------
-    path : ArcPath or None
-        From the pose to the target, proved clear and within all limits counted from the needle's first
-        start; without arcs if the tip is there already.
-    cost : float
-        Cost of the path under the objective, as estimated within the searches; infinite without a path.
-    source : Source or None
-        What the path was made of.
-    why : str
-        The failure in a sentence, with numbers.
-    reserve_spent : bool
-        Whether an arc bends more than the reserve leaves.
-    miss_mm : float
-        Distance from the end of the path to the target.
-    relaxed_mm, relaxed_clearance_mm : float
-        Length of path for which only this clearance of the axis is proved, because the tip had lost the
-        required one; both 0 otherwise.
+    Args:
+        path: From the pose to the target, proved clear and within all limits counted from the needle's first
+            start; without arcs if the tip is there already.
+        cost: Cost of the path under the objective, as estimated within the searches; infinite without a path.
+        source: What the path was made of.
+        why: The failure in a sentence, with numbers.
+        reserve_spent: Whether an arc bends more than the reserve leaves.
+        miss_mm: Distance from the end of the path to the target.
+        relaxed_mm, relaxed_clearance_mm: Length of path for which only this clearance of the axis is proved,
+            because the tip had lost the required one; both 0 otherwise.
     """
 
     path: ArcPath | None
@@ -115,15 +107,11 @@ class Replan:
 def with_reserve(environment: NeedleEnvironment, reserve: float) -> NeedleEnvironment:
     """Return an environment whose needle bends less by a share of its largest curvature.
 
-    Parameters
-    ----------
-    reserve : float
-        At least 0, less than 1.
+    Args:
+        reserve: At least 0, less than 1.
 
-    Raises
-    ------
-    SettingsError
-        If the share is outside its range.
+    Raises:
+        SettingsError: If the share is outside its range.
     """
     if not 0.0 <= reserve < 1.0:
         raise SettingsError(f"The curvature reserve is {reserve}", expected="a share of at least 0, below 1")
@@ -147,21 +135,14 @@ class Replanner:
     Limits count from the needle's first start: length and turn behind the tip, the exemption at the exit,
     and the angle, which is measured from the first direction.
 
-    Parameters
-    ----------
-    query : Query
-        What the plan was made for.
-    plan : ArcPath
-        From the query's start.
-    iterations : int
-        Of the search, for each replan.
-    seed : int
-        The same seed and the same sequence of calls give the same replans.
+    Args:
+        query: What the plan was made for.
+        plan: From the query's start.
+        iterations: Of the search, for each replan.
+        seed: The same seed and the same sequence of calls give the same replans.
 
-    Raises
-    ------
-    SettingsError
-        If `iterations` is negative.
+    Raises:
+        SettingsError: If `iterations` is negative.
     """
 
     def __init__(
@@ -203,22 +184,15 @@ class Replanner:
     ) -> Replan:
         """Plan from the pose that the tip is in; a path that is found becomes the plan.
 
-        Parameters
-        ----------
-        lps_from_tip : (4, 4) float64
-            +z is the direction of insertion.
-        target : (3,) float64, LPS mm
-        inserted_mm : float
-            Length of needle from its first start to the tip.
-        turned_rad : float, optional
-            Turn accumulated on this length; by default what the plans so far say.
+        Args:
+            lps_from_tip ((4, 4) float64): +z is the direction of insertion.
+            target: (3,) float64, LPS mm.
+            inserted_mm: Length of needle from its first start to the tip.
+            turned_rad: Turn accumulated on this length; by default what the plans so far say.
 
-        Raises
-        ------
-        FrameError
-            If pose or target are not finite numbers or the pose is not rigid.
-        SettingsError
-            If length or turn are negative or not finite.
+        Raises:
+            FrameError: If pose or target are not finite numbers or the pose is not rigid.
+            SettingsError: If length or turn are negative or not finite.
         """
         turned, corners, meetings = plan_ahead(self.plan, inserted_mm - self._begin_mm)
         reference = self._query.reference

@@ -26,15 +26,11 @@ RESTART_ITERATIONS = 200
 class Search(Protocol):
     """What every search can do.
 
-    Attributes
-    ----------
-    path : ArcPath or None
-        The best path so far, proved clear and within all limits.
-    cost : float
-        Its cost under the objective, as estimated within the search.  Without a path it is what a path must
-        cost less than: infinite unless the caller sets it before the first `advance`.
-    finished : bool
-        Nothing is left to be found.
+    Attributes:
+        path: The best path so far, proved clear and within all limits.
+        cost: Its cost under the objective, as estimated within the search.  Without a path it is what a path
+            must cost less than: infinite unless the caller sets it before the first `advance`.
+        finished: Nothing is left to be found.
     """
 
     path: ArcPath | None
@@ -62,12 +58,9 @@ def in_slices(
 ) -> Iterator[tuple[int, ArcPath | None]]:
     """Advance a search; yield after each slice the iterations spent, and the path if it is a better one.
 
-    Parameters
-    ----------
-    iterations : int
-        Most to be spent.  One slice is begun in any case.
-    ended : callable, optional
-        Asked before each slice whether that is enough.
+    Args:
+        iterations: Most to be spent.  One slice is begun in any case.
+        ended: Asked before each slice whether that is enough.
     """
     used = 0
     while not (ended() or search.finished):

@@ -41,11 +41,9 @@ class Decision:
     the proof succeeds.  A proof by planes may come sooner on a faster machine; the searches wait for a plane
     that has taken as many iterations as it should, so that the proof goes on where there is only one core.
 
-    Attributes
-    ----------
-    outcome : str
-        "running", "path", "no path" (proved) or "undecided" (the proof has come to its end without a
-        result; the search for a path can go on).
+    Attributes:
+        outcome: "running", "path", "no path" (proved) or "undecided" (the proof has come to its end without a
+            result; the search for a path can go on).
     """
 
     def __init__(

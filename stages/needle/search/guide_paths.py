@@ -41,10 +41,8 @@ Work = tuple[int, bool]
 class GuidePathFinder:
     """Finds guide paths for the searches of a portfolio.
 
-    Parameters
-    ----------
-    seed : int
-        Of how lattices are turned.
+    Args:
+        seed: Of how lattices are turned.
     """
 
     def __init__(
@@ -139,16 +137,12 @@ SAMPLE_MM = 0.05
 class GuidePath:
     """The cheapest path through a state lattice of L layers, if there is one.
 
-    Parameters
-    ----------
-    controls : (L + 2, 3) float64, LPS mm
-        Start, control points of a quadratic spline, and target; None if there is no path.
-    cost : float
-        Cost of the arcs along it, infinite without a path.
-    arcs : int
-        Arcs that were tried, a measure of the work.
-    is_whole : bool
-        False if the lattice had too many states: then there is no path.
+    Args:
+        controls ((L + 2, 3) float64, LPS mm): Start, control points of a quadratic spline, and target; None
+            if there is no path.
+        cost: Cost of the arcs along it, infinite without a path.
+        arcs: Arcs that were tried, a measure of the work.
+        is_whole: False if the lattice had too many states: then there is no path.
     """
 
     controls: Float | None
@@ -185,12 +179,9 @@ class StateLatticeSearch:
     def everywhere(self, layers: int, *, skew: int = 0) -> GuidePath:
         """Return the cheapest guide path anywhere.
 
-        Parameters
-        ----------
-        layers : int
-            More are finer, and take time by about the 7th power.
-        skew : int
-            Turns the lattice, less than SKEWS.
+        Args:
+            layers: More are finer, and take time by about the 7th power.
+            skew: Turns the lattice, less than SKEWS.
         """
         base, axes, goal_cells = self._straight(layers, skew)
         # No lattice over all of the space has as many cells.
@@ -199,14 +190,10 @@ class StateLatticeSearch:
     def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> GuidePath:
         """Return the cheapest guide path near another one, if it costs less than `bound`.
 
-        Parameters
-        ----------
-        controls : (L + 2, 3) float64, LPS mm
-            As those of `GuidePath`.
-        cells : float
-            Size of a cell, as a share of what the greatest curvature allows.
-        turn_rad : float
-            Of the lattice about the line to the target.
+        Args:
+            controls ((L + 2, 3) float64, LPS mm): As those of `GuidePath`.
+            cells: Size of a cell, as a share of what the greatest curvature allows.
+            turn_rad: Of the lattice about the line to the target.
         """
         axes = self._axes(cells * self._largest_cell(len(controls) - 2), _beside(self._axis), turn_rad)
         # How many cells from a guide path the lattice around it goes.

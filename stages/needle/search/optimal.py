@@ -60,10 +60,9 @@ class OptimalSearch(RestartingRRT):
     def follow(self, points: Float) -> bool:
         """Go on from a path through via points if there is one that is cheaper; return whether there is.
 
-        Parameters
-        ----------
-        points : (V, 3) float64, LPS mm
-            Ends of its arcs; nothing is followed whose last one lies beyond the goal tolerance.
+        Args:
+            points ((V, 3) float64, LPS mm): Ends of its arcs; nothing is followed whose last one lies beyond
+                the goal tolerance.
         """
         missing = float(np.linalg.norm(points[-1] - self.query.target))
         if len(points) > MAX_VIAS or missing > self.environment.limits.goal_tolerance_mm + index.TINY:

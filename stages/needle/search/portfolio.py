@@ -43,10 +43,8 @@ class PortfolioSearch:
     guide paths on state lattices, and those that go on take the cheapest guide path near their own, see
     `search.guide_paths`.  Where no lattice has a guide path, the free rounds have all the time.
 
-    Parameters
-    ----------
-    seed : int
-        Of the first search; it is alone until it has found a path.
+    Args:
+        seed: Of the first search; it is alone until it has found a path.
     """
 
     def __init__(
@@ -243,18 +241,13 @@ def successive_halving(
     The caller does the work before it asks for the next rung.  The cheapest candidates go on to that, the
     cheapest first, for twice the work each.
 
-    Parameters
-    ----------
-    candidates : list
-        Those of the first rung.
-    cost : callable
-        Returns what a candidate costs after the work so far; infinite ones go no further.
-    work : int
-        Work for each candidate on the first rung, in a unit of the caller's.
-    survivors : callable
-        Returns how many candidates go on, given how many a rung had and how many of them have a finite cost.
-    rungs : int, optional
-        Number of rungs; by default the last rung is the first that has no more than one candidate.
+    Args:
+        candidates: Those of the first rung.
+        cost: Returns what a candidate costs after the work so far; infinite ones go no further.
+        work: Work for each candidate on the first rung, in a unit of the caller's.
+        survivors: Returns how many candidates go on, given how many a rung had and how many of them have a
+            finite cost.
+        rungs: Number of rungs; by default the last rung is the first that has no more than one candidate.
     """
     for rung in count() if rungs is None else range(rungs):
         yield candidates, work << rung

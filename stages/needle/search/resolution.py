@@ -53,17 +53,13 @@ class Outcome(StrEnum):
 class Resolution:
     """The words of a search: pieces of whole steps, in equally spaced directions of bending.
 
-    Parameters
-    ----------
-    coarse_mm, fine_mm : float
-        Length of the longest piece, which is tried first, and of the step, down to which it is halved.
-    coarse_rolls, fine_rolls : int
-        Number of directions of bending that are tried first, and of all.
+    Args:
+        coarse_mm, fine_mm: Length of the longest piece, which is tried first, and of the step, down to which
+            it is halved.
+        coarse_rolls, fine_rolls: Number of directions of bending that are tried first, and of all.
 
-    Raises
-    ------
-    SettingsError
-        If a number is out of range, or coarse and fine do not differ by a power of two.
+    Raises:
+        SettingsError: If a number is out of range, or coarse and fine do not differ by a power of two.
     """
 
     coarse_mm: float = 16.0
@@ -120,17 +116,12 @@ class Cells:
     What a search with cells says holds up to them: a path that was not looked for leaves a cell in which
     a pose that costs no more was followed, in place of its own.
 
-    Parameters
-    ----------
-    position_mm : float
-        Side of a cell, mm.
-    angle_deg : float
-        Side in each component of the tip's direction, as the angle at its centre, degrees.
+    Args:
+        position_mm: Side of a cell, mm.
+        angle_deg: Side in each component of the tip's direction, as the angle at its centre, degrees.
 
-    Raises
-    ------
-    SettingsError
-        If a size is not positive and finite.
+    Raises:
+        SettingsError: If a size is not positive and finite.
     """
 
     position_mm: float = 0.5
@@ -145,18 +136,12 @@ class Cells:
 class Counts:
     """What a search has done.
 
-    Parameters
-    ----------
-    pops : int
-        Entries taken off the queue.
-    nodes : int
-        Poses reached by words that are proved clear.
-    duplicates : int
-        Words dropped because another one ends there at no greater cost.
-    pruned : int
-        Words dropped because no path within the limits leads on to the goal for less than the best.
-    refused : int
-        Words dropped because their last piece is not proved clear.
+    Args:
+        pops: Entries taken off the queue.
+        nodes: Poses reached by words that are proved clear.
+        duplicates: Words dropped because another one ends there at no greater cost.
+        pruned: Words dropped because no path within the limits leads on to the goal for less than the best.
+        refused: Words dropped because their last piece is not proved clear.
     """
 
     pops: int
@@ -172,25 +157,17 @@ class ResolutionSearch:
     It is a `stages.needle.search.base.Search`, and nothing in it is random;
     docs/explanation/needle.md says how it works.
 
-    Parameters
-    ----------
-    query : Query
-        The directions of bending count from +x of the start pose.
-    duplicates : Cells, optional
-        Poses that count as one; by default only those that are equal up to rounding, so that nothing is lost.
-    max_memory_mb : float
-        The search ends before its arrays take more.
+    Args:
+        query: The directions of bending count from +x of the start pose.
+        duplicates: Poses that count as one; by default only those that are equal up to rounding, so that
+            nothing is lost.
+        max_memory_mb: The search ends before its arrays take more.
 
-    Raises
-    ------
-    SettingsError
-        If the environment is one in which arcs are looked up instead of proved.
+    Raises:
+        SettingsError: If the environment is one in which arcs are looked up instead of proved.
 
-    Attributes
-    ----------
-    path, cost, finished
-        See `Search`.
-    outcome : Outcome
+    Attributes:
+        path, cost, finished: See `Search`.
     """
 
     def __init__(

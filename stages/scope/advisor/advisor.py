@@ -29,20 +29,13 @@ THINNEST_MM = 0.5
 class Advice:
     """What the user is advised to do.
 
-    Parameters
-    ----------
-    action : str
-        "advance"; "pull back" where no motion leads on; "arrived" in the goal voxel.
-    motion : Motion or None
-        The best motion; None if the tip has arrived.
-    cost : float
-        Eq. 9 of the best motion; 0 if there is none.
-    candidates : Candidates
-        All that were evaluated.
-    own : MotionEvaluation or None
-        The evaluation of the user's own motion.
-    distance_mm : float
-        From the tip to the centre of the goal voxel, straight.
+    Args:
+        action: "advance"; "pull back" where no motion leads on; "arrived" in the goal voxel.
+        motion: The best motion; None if the tip has arrived.
+        cost: Eq. 9 of the best motion; 0 if there is none.
+        candidates: All that were evaluated.
+        own: The evaluation of the user's own motion.
+        distance_mm: From the tip to the centre of the goal voxel, straight.
     """
 
     action: Action
@@ -57,10 +50,8 @@ class Advice:
 class ThinnerScope:
     """What a thinner scope of the same bends would reach.
 
-    Parameters
-    ----------
-    distance_mm : float
-        Left to the centre of the goal voxel.
+    Args:
+        distance_mm: Left to the centre of the goal voxel.
     """
 
     radius_mm: float
@@ -71,11 +62,9 @@ class ThinnerScope:
 class Advisor:
     """Guides a scope through a lumen to a goal.
 
-    Parameters
-    ----------
-    reproduction : bool, optional
-        Eqs. 1 and 3 as printed, potential in steps of voxels, no halved look-ahead, no retreat [Rosell2012].
-        What comes of it may touch the wall and must not feed a plan.
+    Args:
+        reproduction: Eqs. 1 and 3 as printed, potential in steps of voxels, no halved look-ahead, no retreat
+            [Rosell2012].  What comes of it may touch the wall and must not feed a plan.
     """
 
     def __init__(
@@ -103,15 +92,12 @@ class Advisor:
         Where no candidate is valid the look-ahead is halved, down to the smallest voxel side (not in
         reproduction); where none is valid even then, the advice is to pull back as the scope came.
 
-        Parameters
-        ----------
-        own : Motion, optional
-            A motion that the user is about to make, evaluated at its own advance, at most the look-ahead.
+        Args:
+            own: A motion that the user is about to make, evaluated at its own advance, at most the
+                look-ahead.
 
-        Raises
-        ------
-        AnatomyError
-            If the tip is not in the lumen.
+        Raises:
+            AnatomyError: If the tip is not in the lumen.
         """
         tip = tip_frames(self.environment.model, state.array)[0][:3, 3]
         voxel = self.environment.lumen.voxel_at(tip)
@@ -190,10 +176,8 @@ def start_state(lumen: Lumen, tree: AirwayTree, model: ScopeModel) -> ScopeState
     Twist 0 and a positive bend turn the tip anteriorly, or superiorly where the trachea is parallel to that
     axis.
 
-    Raises
-    ------
-    AnatomyError
-        If the scope fits nowhere in the trachea.
+    Raises:
+        AnatomyError: If the scope fits nowhere in the trachea.
     """
     field = navigation_field(lumen, lumen.nearest_voxel(tree.carina_lps)[0])
     environment = ScopeEnvironment(model=model, field=field)
@@ -215,12 +199,9 @@ def start_state(lumen: Lumen, tree: AirwayTree, model: ScopeModel) -> ScopeState
 def why_stopped(path: ScopePath, field: NavigationField, tree: AirwayTree) -> str:
     """Say in one sentence where and why a path ended; "" if it reached the goal.
 
-    Parameters
-    ----------
-    field : NavigationField
-        Of the path's goal.
-    tree : AirwayTree
-        Tells generations and distances from the carina.
+    Args:
+        field: Of the path's goal.
+        tree: Tells generations and distances from the carina.
     """
     if path.reached:
         return ""

@@ -49,12 +49,9 @@ class Weights:
 class Motion:
     """Advance with a twist and a bend.
 
-    Parameters
-    ----------
-    advance_mm : float
-        Negative: pull back.
-    twist_rad, bend_rad : float
-        Alpha and beta when the advance is done.
+    Args:
+        advance_mm: Negative: pull back.
+        twist_rad, bend_rad: Alpha and beta when the advance is done.
     """
 
     advance_mm: float
@@ -66,21 +63,15 @@ class Motion:
 class Candidates:
     """The candidates of a motion and what they cost; C = 121 rows, twist by twist.
 
-    Parameters
-    ----------
-    best : int
-        Row of least cost, -1 if none is valid.
-    twist_rad, bend_rad : (C,) float64
-    verdict : (C,) int64
-        Index into `VERDICTS`.  Only what leads on is tried for collision.
-    potential : (C,) float64
-        At the voxel of the tip; infinity in the wall.
-    k_nf1, k_clearance, k_twist : (C,) float64
-        Eqs. 4, 7 and 8, in [0, 1]; 0 for candidates that are not valid.
-    cost : (C,) float64
-        Eq. 9; infinity for candidates that are not valid.
-    look_at_lps : (C, 3) float64, LPS mm
-        Where the tip would be (fig. 5).
+    Args:
+        best: Row of least cost, -1 if none is valid.
+        twist_rad, bend_rad: (C,) float64.
+        verdict ((C,) int64): Index into `VERDICTS`.  Only what leads on is tried for collision.
+        potential ((C,) float64): At the voxel of the tip; infinity in the wall.
+        k_nf1, k_clearance, k_twist ((C,) float64): Eqs. 4, 7 and 8, in [0, 1]; 0 for candidates that are not
+            valid.
+        cost ((C,) float64): Eq. 9; infinity for candidates that are not valid.
+        look_at_lps ((C, 3) float64, LPS mm): Where the tip would be (fig. 5).
     """
 
     advance_mm: float
@@ -108,12 +99,10 @@ class Candidates:
 class MotionEvaluation:
     """The evaluation of the user's own motion beside the candidates.
 
-    Parameters
-    ----------
-    verdict : str
-        One of `VERDICTS`.
-    cost : float
-        Eq. 9 with the extremes of the candidates, terms held to [0, 1]; infinity if the motion is not valid.
+    Args:
+        verdict: One of `VERDICTS`.
+        cost: Eq. 9 with the extremes of the candidates, terms held to [0, 1]; infinity if the motion is not
+            valid.
     """
 
     verdict: str
@@ -138,17 +127,12 @@ def evaluate_motions(
 ) -> tuple[Candidates, MotionEvaluation | None]:
     """Evaluate all candidates from a state (eqs. 3 to 9), and the user's own motion if there is one.
 
-    Parameters
-    ----------
-    state : ScopeState
-        Its tip lies in the lumen.
-    advance_mm : float
-        Look-ahead of the candidates.
-    rng : numpy Generator, optional
-        Moves all candidates but the middle one at random within their spacing (fig. 5b); they stay on the
-        grid of eq. 3 if None.
-    own : Motion, optional
-        A motion of the user, evaluated with the candidates' look-ahead.
+    Args:
+        state: Its tip lies in the lumen.
+        advance_mm: Look-ahead of the candidates.
+        rng (numpy Generator): Moves all candidates but the middle one at random within their spacing (fig.
+            5b); they stay on the grid of eq. 3 if None.
+        own: A motion of the user, evaluated with the candidates' look-ahead.
     """
     table = np.zeros((CANDIDATES + (own is not None), kernel.COLUMNS))
     if own is not None:

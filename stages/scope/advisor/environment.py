@@ -21,12 +21,10 @@ from stages.scope.advisor.nf1 import NavigationField
 class ScopeEnvironment:
     """A scope in a lumen with a goal: what the scope collides with, and where it is to go.
 
-    Parameters
-    ----------
-    reproduction : bool
-        Eq. 1 decides about collisions and eq. 3 about twists as printed: i times a tenth of the range, held
-        within the range.  Otherwise the scope's radius is kept along its whole body, and the twists cover
-        their whole range.  What eq. 1 allows must not feed a plan.
+    Args:
+        reproduction: Eq. 1 decides about collisions and eq. 3 about twists as printed: i times a tenth of the
+            range, held within the range.  Otherwise the scope's radius is kept along its whole body, and the
+            twists cover their whole range.  What eq. 1 allows must not feed a plan.
     """
 
     model: ScopeModel

@@ -26,26 +26,17 @@ LOOK_MM = 10.0
 class Instruction:
     """One stretch of a path: into a branch and along it.
 
-    Parameters
-    ----------
-    branch : int
-        Of the airway tree.
-    generation : int
-        0 is the trachea.
-    from_carina_mm : float
-        Where the branch begins, along the tree; negative above the carina.
-    heading : str
-        Side of the patient on which the branch lies, beside what else goes on there; "" for the first one.
-    rotate_deg : float
-        Change of the twist since the last instruction.
-    twist_deg, bend_deg : float
-        Twist and bend as the tip enters the branch.
-    largest_bend_deg : float
-        Bend of largest size while the tip is in the branch.
-    advance_mm : float
-        Advance while the tip is in the branch.
-    tip_from_carina_mm : float
-        How far along the tree the tip then is.
+    Args:
+        branch: Of the airway tree.
+        generation: 0 is the trachea.
+        from_carina_mm: Where the branch begins, along the tree; negative above the carina.
+        heading: Side of the patient on which the branch lies, beside what else goes on there; "" for the
+            first one.
+        rotate_deg: Change of the twist since the last instruction.
+        twist_deg, bend_deg: Twist and bend as the tip enters the branch.
+        largest_bend_deg: Bend of largest size while the tip is in the branch.
+        advance_mm: Advance while the tip is in the branch.
+        tip_from_carina_mm: How far along the tree the tip then is.
     """
 
     branch: int

@@ -31,10 +31,8 @@ class ScopeModel:
     n l is the length of the bending tip.  The ranges of the twist alpha and of the bend beta, which is that
     of all links together, hold 0; `bend_step_deg` is the spacing of the candidates' bends (eq. 3).
 
-    Raises
-    ------
-    SettingsError
-        If a value is absurd, or one joint would bend by 90 degrees or more.
+    Raises:
+        SettingsError: If a value is absurd, or one joint would bend by 90 degrees or more.
     """
 
     links: Annotated[int, Field(description="links with coupled joints", strict=True, ge=1, le=200)] = 10
@@ -83,15 +81,11 @@ def model_of(scope: Bronchoscope, *, links: int = 10) -> ScopeModel:
 class ScopeState:
     """Where the scope is: the base of its bending tip, and how the tip is turned.
 
-    Parameters
-    ----------
-    lps_from_base : (4, 4) float64
-        The scope points along -z; a positive bend at twist 0 turns it towards +y.  The base never rolls
-        about its axis.
-    twist_rad : float
-        Alpha.
-    bend_rad : float
-        Beta.
+    Args:
+        lps_from_base ((4, 4) float64): The scope points along -z; a positive bend at twist 0 turns it towards
+            +y.  The base never rolls about its axis.
+        twist_rad: Alpha.
+        bend_rad: Beta.
     """
 
     lps_from_base: Float
@@ -135,10 +129,8 @@ def advanced(
 
     A negative distance with the present twist and bend takes an advance back exactly.
 
-    Raises
-    ------
-    SettingsError
-        If a value is not finite, or a joint would bend by 180 degrees or more.
+    Raises:
+        SettingsError: If a value is not finite, or a joint would bend by 180 degrees or more.
     """
     values = (distance_mm, twist_rad, bend_rad)
     if not np.isfinite(values).all() or abs(bend_rad) >= math.pi * model.links:

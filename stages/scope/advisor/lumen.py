@@ -28,20 +28,13 @@ class Lumen:
 
     Make it with `lumen_of_lung` or `lumen_of_mask`.
 
-    Parameters
-    ----------
-    grid : Grid
-        The box of the piece and one voxel more all around.
-    index : (ni, nj, nk) int32
-        Number of each interior voxel, -1 elsewhere.
-    voxels : (N, 3) int32
-        Their indices in `grid`, in raster order.
-    neighbours : (N, 6) int32
-        The voxels before and after along i, j and k, -1 for the wall.
-    depth : DistanceField
-        Distance to the nearest voxel that is not lumen, as a solid box.
-    voxels_dropped : int
-        Lumen voxels that do not hang together with the piece.
+    Args:
+        grid: The box of the piece and one voxel more all around.
+        index ((ni, nj, nk) int32): Number of each interior voxel, -1 elsewhere.
+        voxels ((N, 3) int32): Their indices in `grid`, in raster order.
+        neighbours ((N, 6) int32): The voxels before and after along i, j and k, -1 for the wall.
+        depth: Distance to the nearest voxel that is not lumen, as a solid box.
+        voxels_dropped: Lumen voxels that do not hang together with the piece.
     """
 
     grid: Grid
@@ -127,10 +120,8 @@ class Lumen:
 def lumen_of_lung(lung: Lung) -> Lumen:
     """Return the lumen that hangs together with the root of a lung's airway tree.
 
-    Raises
-    ------
-    AnatomyError
-        If the lung has no lumen.
+    Raises:
+        AnatomyError: If the lung has no lumen.
     """
     mask = lung.mask("lumen")
     return _lumen(mask, lung.tree.points_lps[0], lung.lumen_depth)
@@ -139,10 +130,8 @@ def lumen_of_lung(lung: Lung) -> Lumen:
 def lumen_of_mask(mask: Volume, root_lps: ArrayLike) -> Lumen:
     """Return the piece of a bool mask nearest to a point `(3,)` LPS mm.
 
-    Raises
-    ------
-    AnatomyError
-        If the mask is empty.
+    Raises:
+        AnatomyError: If the mask is empty.
     """
     return _lumen(mask, root_lps, None)
 

@@ -29,18 +29,12 @@ LEAST = 0.1
 class Goal:
     """The voxel where the tip has to end.
 
-    Parameters
-    ----------
-    voxel : int
-        Number of the interior voxel.
-    centre_lps : (3,) float64, LPS mm
-        Its centre.
-    lesion_lps : (3,) float64, LPS mm
-        Centre of the lesion.
-    distance_mm : float
-        From the centre of the lesion to that of the voxel.
-    in_lesion : bool
-        Whether the voxel lies in the lesion; if not, it is the lumen voxel nearest to it.
+    Args:
+        voxel: Number of the interior voxel.
+        centre_lps ((3,) float64, LPS mm): Its centre.
+        lesion_lps ((3,) float64, LPS mm): Centre of the lesion.
+        distance_mm: From the centre of the lesion to that of the voxel.
+        in_lesion: Whether the voxel lies in the lesion; if not, it is the lumen voxel nearest to it.
     """
 
     voxel: int
@@ -56,16 +50,13 @@ def goal_at(
 ) -> Goal:
     """Return the goal for a lesion, a sphere: the interior voxel nearest to its centre [Rosell2012, IV-B].
 
-    Parameters
-    ----------
-    lesion_lps : (3,) float64, LPS mm
-    preferred : (N,) bool, optional
-        Voxels of the lesion that come before all others, such as those where a scope fits.
+    Args:
+        lesion_lps: (3,) float64, LPS mm.
+        preferred ((N,) bool): Voxels of the lesion that come before all others, such as those where a scope
+            fits.
 
-    Raises
-    ------
-    TargetError
-        If centre or radius are not finite, or the radius is negative.
+    Raises:
+        TargetError: If centre or radius are not finite, or the radius is negative.
     """
     lesion = np.array(lesion_lps, dtype=np.float64)
     if lesion.shape != (3,) or not np.isfinite(lesion).all() or not 0.0 <= lesion_radius_mm < np.inf:
@@ -94,19 +85,13 @@ def goal_at(
 class NavigationField:
     """Potential of every interior voxel, 0 at the goal and without any other local minimum.
 
-    Parameters
-    ----------
-    goal : int
-        Number of the goal voxel.
-    kind : str
-        "clearance": NF1 lowered where there is clearance (eq. 2); "plain": NF1.
-    metric : str
-        What a step counts: its length ("mm", right for any voxel size) or 1 ("voxels", the paper's).
-    clearance : (N,) float64
-        L1 distance to the wall in this metric.
-    largest_clearance : float
-        C_max of eq. 2: half the largest clearance in the lumen.
-    potential : (N,) float64
+    Args:
+        goal: Number of the goal voxel.
+        kind: "clearance": NF1 lowered where there is clearance (eq. 2); "plain": NF1.
+        metric: What a step counts: its length ("mm", right for any voxel size) or 1 ("voxels", the paper's).
+        clearance ((N,) float64): L1 distance to the wall in this metric.
+        largest_clearance: C_max of eq. 2: half the largest clearance in the lumen.
+        potential: (N,) float64.
     """
 
     lumen: Lumen
@@ -132,12 +117,9 @@ def navigation_field(
 ) -> NavigationField:
     """Compute NF1, or the clearance-based NF1 [Rosell2012, eq. 2], from a goal voxel.
 
-    Parameters
-    ----------
-    goal : int
-        Number of an interior voxel.
-    kind, metric : str
-        See `NavigationField`.
+    Args:
+        goal: Number of an interior voxel.
+        kind, metric: See `NavigationField`.
     """
     if not 0 <= goal < lumen.count:
         raise TargetError(

@@ -23,24 +23,15 @@ MARKUPS_SCHEMA = (
 class ScopePath:
     """A path of Algorithm 2 [Rosell2012]; M states.
 
-    Parameters
-    ----------
-    states : (M, 14) float64
-        See `ScopeState.of_array`.
-    steps_mm : (M,) float64
-        Advance of the base from the state before, 0 at the first.
-    costs : (M,) float64
-        Eq. 9 of the motion that led to the state, 0 at the first.
-    potentials : (M,) float64
-        Of the navigation field at the tip.
-    reached : bool
-        Whether the tip ends in the goal voxel.
-    nearest : int
-        The first state of least potential: the last one, except in reproduction.
-    retreats : int
-        How often the scope was pulled back and tried again.
-    reproduction : bool
-        Whether eq. 1 decided about collisions: then the path must not feed a plan.
+    Args:
+        states ((M, 14) float64): See `ScopeState.of_array`.
+        steps_mm ((M,) float64): Advance of the base from the state before, 0 at the first.
+        costs ((M,) float64): Eq. 9 of the motion that led to the state, 0 at the first.
+        potentials ((M,) float64): Of the navigation field at the tip.
+        reached: Whether the tip ends in the goal voxel.
+        nearest: The first state of least potential: the last one, except in reproduction.
+        retreats: How often the scope was pulled back and tried again.
+        reproduction: Whether eq. 1 decided about collisions: then the path must not feed a plan.
     """
 
     model: ScopeModel
@@ -125,12 +116,9 @@ class ScopePath:
 class FlyThrough:
     """Camera poses along a path; F poses.
 
-    Parameters
-    ----------
-    lps_from_camera : (F, 4, 4) float64
-        The camera looks along +z.
-    inserted_mm : (F,) float64
-        How far the scope is advanced at each pose.
+    Args:
+        lps_from_camera ((F, 4, 4) float64): The camera looks along +z.
+        inserted_mm ((F,) float64): How far the scope is advanced at each pose.
     """
 
     lps_from_camera: Float
@@ -162,10 +150,8 @@ def camera_flight(
     Between two states base, twist and bend move evenly; there are so many poses that the camera neither
     moves nor turns farther than stated from one to the next.
 
-    Raises
-    ------
-    SettingsError
-        If a limit is not above 0.
+    Raises:
+        SettingsError: If a limit is not above 0.
     """
     if not (spacing_mm > 0.0 and turn_rad > 0.0):
         raise SettingsError(

@@ -55,12 +55,9 @@ LOOKS_PER_MM = 4
 class PathSearch:
     """Algorithm 2 from a state, repeated with retreats until the goal is reached.
 
-    Parameters
-    ----------
-    goal : Goal
-        Of the environment's field.
-    options : PathSettings
-        In reproduction the look-ahead is never shortened and nothing is retried.
+    Args:
+        goal: Of the environment's field.
+        options: In reproduction the look-ahead is never shortened and nothing is retried.
     """
 
     def __init__(self, environment: ScopeEnvironment, goal: Goal, options: PathSettings, seed: int) -> None:

@@ -336,19 +336,15 @@ def _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature):
 def bring_to_rest(lumen, shaft, entry, curvature, pull, frames, enough, most_steps):
     """Bring a shaft to rest: `curvature` (N, 2) becomes that of a shape of least energy.
 
-    Parameters
-    ----------
-    entry : (12,) float64
-        Frame in which the shaft begins.
-    pull : (N, 3) float64
-        Forces on the ends of the arcs, N, which do not change with the shape.
-    frames : (N + 1, 12) float64
-        Becomes the frames of the entry and of the ends of all arcs.
-    enough : float
-        A step that is expected to lower the energy by less than this, N mm, is not taken any more.
-    most_steps : int
-
     Returns the energy in N mm, what the next step is expected to be worth in N mm, and the number of steps.
+
+    Args:
+        entry ((12,) float64): Frame in which the shaft begins.
+        pull ((N, 3) float64): Forces on the ends of the arcs, N, which do not change with the shape.
+        frames ((N + 1, 12) float64): Becomes the frames of the entry and of the ends of all arcs.
+        enough (float): A step that is expected to lower the energy by less than this, N mm, is not taken any
+            more.
+        most_steps: int.
     """
     count = curvature.shape[0]
     work, slope = np.zeros((10, 6)), np.zeros(WORK)

@@ -34,18 +34,13 @@ class Centreline:
     The lumen is the union of round cones along the edges: all balls with a centre on an edge and the radius
     interpolated between its ends.  With `from_lung` and `from_mask` that union is proved to lie in the mask.
 
-    Parameters
-    ----------
-    nodes_mm : (N, 3) float64
-        LPS mm; for a drawing, z = 0.
-    radius_mm : (N,) float64
-    edges : (E, 2) int64
-        Pairs of nodes that follow each other along a tube.
+    Args:
+        nodes_mm ((N, 3) float64): LPS mm; for a drawing, z = 0.
+        radius_mm: (N,) float64.
+        edges ((E, 2) int64): Pairs of nodes that follow each other along a tube.
 
-    Raises
-    ------
-    AnatomyError
-        If there are no edges, or the arrays do not fit together or hold no finite numbers.
+    Raises:
+        AnatomyError: If there are no edges, or the arrays do not fit together or hold no finite numbers.
     """
 
     nodes_mm: Float
@@ -149,11 +144,10 @@ def from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) ->
     Points that coincide to 0.001 mm become one, with the larger radius: files often begin each branch with a
     copy of the point that it hangs on.
 
-    Parameters
-    ----------
-    points_lps : (N, 3) float64, LPS mm
-    radius_mm : (N,) float64
-    edges : (E, 2) int64
+    Args:
+        points_lps: (N, 3) float64, LPS mm.
+        radius_mm: (N,) float64.
+        edges: (E, 2) int64.
     """
     points, radius = np.asarray(points_lps, dtype=np.float64), np.asarray(radius_mm, dtype=np.float64)
     _same, first, merged = np.unique(
@@ -180,15 +174,11 @@ def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
     The skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels as
     solid boxes).
 
-    Parameters
-    ----------
-    mask : Volume
-        Non-zero inside the tube.
+    Args:
+        mask: Non-zero inside the tube.
 
-    Raises
-    ------
-    AnatomyError
-        If the mask is empty, or too small for a line.
+    Raises:
+        AnatomyError: If the mask is empty, or too small for a line.
     """
     from anatomy.tree.lumen import prepare_lumen
     from anatomy.tree.skeleton import prune, spanning_tree, thin
@@ -215,17 +205,12 @@ def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
 def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
     """Return the centreline of a drawing of vessels, in the plane z = 0.
 
-    Parameters
-    ----------
-    drawing : (rows, columns) bool
-        True inside a vessel.
-    pixel_mm : float
-        Size of a pixel; the pixel in row i and column j is centred at x = j, y = i times that.
+    Args:
+        drawing ((rows, columns) bool): True inside a vessel.
+        pixel_mm: Size of a pixel; the pixel in row i and column j is centred at x = j, y = i times that.
 
-    Raises
-    ------
-    AnatomyError
-        If the drawing is empty or not two-dimensional.
+    Raises:
+        AnatomyError: If the drawing is empty or not two-dimensional.
     """
     picture = np.asarray(drawing, dtype=bool)
     if picture.ndim != 2 or not picture.any():
@@ -332,13 +317,10 @@ def _proved(nodes: Float, edges: Int, walls: _Walls) -> Centreline:
 class _Walls:
     """The distance to the voxels that are not lumen: exact in thin tubes, a lower bound in thick ones.
 
-    Parameters
-    ----------
-    lumen : bool array
-        With at least one layer that is not lumen all around.
-    half_voxels : float
-        Whether walls are solid boxes, or the centres of their voxels; then half of the smallest voxel edge
-        is taken off, so that a flat wall stays where it is and only steps are rounded.
+    Args:
+        lumen (bool array): With at least one layer that is not lumen all around.
+        half_voxels: Whether walls are solid boxes, or the centres of their voxels; then half of the smallest
+            voxel edge is taken off, so that a flat wall stays where it is and only steps are rounded.
     """
 
     def __init__(

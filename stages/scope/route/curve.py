@@ -17,16 +17,12 @@ DEGREE = 3
 class Curve:
     """A clamped cubic B-spline; n control points, M = n - 3 spans, twice continuously differentiable.
 
-    Parameters
-    ----------
-    control_mm : (n, 3) float64, LPS mm
-    knots : (n + 4,) float64
-        About arc length in mm; four equal ones at each end, simple ones between.
+    Args:
+        control_mm: (n, 3) float64, LPS mm.
+        knots ((n + 4,) float64): About arc length in mm; four equal ones at each end, simple ones between.
 
-    Raises
-    ------
-    SettingsError
-        If the arrays do not make such a spline.
+    Raises:
+        SettingsError: If the arrays do not make such a spline.
     """
 
     control_mm: Float
@@ -95,16 +91,12 @@ class Curve:
 def interpolate(points_mm: ArrayLike) -> Curve:
     """Return the cubic spline through points, with the length of the polyline as its parameter.
 
-    Parameters
-    ----------
-    points_mm : (n, 3) float64
-        At least two; points closer than 1e-6 mm to the one before are left out, and midpoints are added to
-        fewer than four.
+    Args:
+        points_mm ((n, 3) float64): At least two; points closer than 1e-6 mm to the one before are left out,
+            and midpoints are added to fewer than four.
 
-    Raises
-    ------
-    SettingsError
-        If fewer than two different points are given.
+    Raises:
+        SettingsError: If fewer than two different points are given.
     """
     from scipy.interpolate import make_interp_spline
 

@@ -64,14 +64,10 @@ work: the quick ones first."""
 class Level:
     """At how many samples the program holds, and how much stricter it is than the limits.
 
-    Parameters
-    ----------
-    per_span : int
-        Samples a span; the first is the knot, where the curvature can peak.
-    spare_curvature : float
-        Share of the limit.
-    spare_mm : float
-        Depth.
+    Args:
+        per_span: Samples a span; the first is the knot, where the curvature can peak.
+        spare_curvature: Share of the limit.
+        spare_mm: Depth.
     """
 
     per_span: int
@@ -90,10 +86,8 @@ LEVELS = (
 class Problem:
     """What a route has to keep to.
 
-    Parameters
-    ----------
-    guide : GuidePath
-        What it follows; its ends are the wanted ones.
+    Args:
+        guide: What it follows; its ends are the wanted ones.
     """
 
     guide: GuidePath
@@ -115,18 +109,14 @@ def repaired(
 ) -> tuple[Curve, float]:
     """Move the control points `free[0]` to `free[1] - 1` of a curve until it keeps to its limits.
 
-    Parameters
-    ----------
-    free : (int, int)
-        The other control points stay, and with them the curve three spans away and its smoothness.
-    start : sequence of Stage
-        What to solve before, as `SMOOTH`.
+    Args:
+        free ((int, int)): The other control points stay, and with them the curve three spans away and its
+            smoothness.
+        start: What to solve before, as `SMOOTH`.
 
-    Returns
-    -------
-    (Curve, float)
-        The new curve, and the largest violation of the stricter limits: a share of the limit of curvature,
-        or of the local radius.
+    Returns:
+        (Curve, float): The new curve, and the largest violation of the stricter limits: a share of the limit
+            of curvature, or of the local radius.
     """
     low, high = free
     guide, lumen, limits = problem.guide, problem.centreline, problem.limits
@@ -152,12 +142,9 @@ def repaired(
 def segments(proof: Proof, n_control: int, margin: int, *, ends_free: bool) -> list[tuple[int, int]]:
     """Return the ranges of control points to free for the spans that are not proved, widened and merged.
 
-    Parameters
-    ----------
-    margin : int
-        Spans added on both sides.
-    ends_free : bool
-        Whether the first and last control points may move.
+    Args:
+        margin: Spans added on both sides.
+        ends_free: Whether the first and last control points may move.
     """
     lowest, highest = (0, n_control) if ends_free else (1, n_control - 1)
     found: list[tuple[int, int]] = []
@@ -173,17 +160,13 @@ def segments(proof: Proof, n_control: int, margin: int, *, ends_free: bool) -> l
 def repair_exact(tentative: Curve, problem: Problem, executor: Executor | None = None) -> tuple[Curve, Proof]:
     """Return a curve that is proved to keep its limits, if the program finds one.
 
-    Parameters
-    ----------
-    tentative : Curve
-        Spline through points of the guide path.
-    executor : concurrent.futures.Executor, optional
-        Repairs the segments of a round side by side; threads are enough, the program runs without the lock.
+    Args:
+        tentative: Spline through points of the guide path.
+        executor: Repairs the segments of a round side by side; threads are enough, the program runs without
+            the lock.
 
-    Returns
-    -------
-    (Curve, Proof)
-        If nothing worked, the curve with the fewest spans that fail.
+    Returns:
+        (Curve, Proof): If nothing worked, the curve with the fewest spans that fail.
     """
     # Share of all spans by which a segment is widened on both sides, as in [Li2021].
     curve, proof = _by_segments(tentative, problem, 0.05, SMOOTH, executor)

@@ -55,16 +55,13 @@ class GeneticSettings:
 class Segment:
     """A part of the path that bends too much; n points.
 
-    Parameters
-    ----------
-    points_mm : (n, 3) float64
-    begin : int
-        Index of its first point on the path.
-    held : (bool, bool)
-        Whether its first and last point join other parts of the path.
-    nodes_mm : (N, 3) float64
-        Nodes of the centreline around it; few, since a segment may be sent to another process.
-    radius_mm : (N,) float64
+    Args:
+        points_mm: (n, 3) float64.
+        begin: Index of its first point on the path.
+        held ((bool, bool)): Whether its first and last point join other parts of the path.
+        nodes_mm ((N, 3) float64): Nodes of the centreline around it; few, since a segment may be sent to
+            another process.
+        radius_mm: (N,) float64.
     """
 
     points_mm: Float
@@ -86,12 +83,9 @@ def repair_genetic(
 
     Those tests look at the path points alone; prove the curve to know.
 
-    Parameters
-    ----------
-    seed : int
-        The same seed gives the same curve, with or without an executor.
-    executor : concurrent.futures.Executor, optional
-        Searches the segments side by side.
+    Args:
+        seed: The same seed gives the same curve, with or without an executor.
+        executor: Searches the segments side by side.
     """
     chosen = GeneticSettings()
     points, parts = cut_segments(tentative, centreline, limits, chosen.margin_share)

@@ -21,10 +21,9 @@ WAYPOINT_SPACING_MM = 3.0
 class GuidePath:
     """P points from start to goal, of which no two neighbours coincide, with the radius of the lumen.
 
-    Parameters
-    ----------
-    points_mm : (P, 3) float64, LPS mm
-    radius_mm : (P,) float64
+    Args:
+        points_mm: (P, 3) float64, LPS mm.
+        radius_mm: (P,) float64.
     """
 
     points_mm: Float
@@ -45,10 +44,8 @@ class GuidePath:
     def curve(self, spacing_mm: float = WAYPOINT_SPACING_MM) -> Curve:
         """Return the tentative curve: the cubic B-spline through points of the guide path.
 
-        Parameters
-        ----------
-        spacing_mm : float
-            Distance of the points along the guide path, about; 0 for every point, as in [Li2021].
+        Args:
+            spacing_mm: Distance of the points along the guide path, about; 0 for every point, as in [Li2021].
         """
         along = self.along_mm
         if spacing_mm <= 0.0:
@@ -63,10 +60,8 @@ def guide_path_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_m
 
     Start and goal take the place of the nodes nearest to them.
 
-    Raises
-    ------
-    SettingsError
-        If start and goal are the same point.
+    Raises:
+        SettingsError: If start and goal are the same point.
     """
     inner = nodes[1:-1]
     points = np.vstack((start_mm, centreline.nodes_mm[inner], goal_mm))
@@ -96,12 +91,9 @@ class NoRouteError(LungaccessError):
 class Links:
     """Which nodes the search may go to from a node, as a compressed list.
 
-    Parameters
-    ----------
-    start : (N + 1,) int64
-        The links of node n are `nodes[start[n]:start[n + 1]]`.
-    nodes : (L,) int64
-        Nearest first.
+    Args:
+        start ((N + 1,) int64): The links of node n are `nodes[start[n]:start[n + 1]]`.
+        nodes ((L,) int64): Nearest first.
     """
 
     start: Int
@@ -114,15 +106,11 @@ def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) 
     A nearest node counts only if the balls around both overlap: otherwise it may lie behind a wall, in a
     tube that runs past.
 
-    Parameters
-    ----------
-    neighbours : int
-        Number of nearest nodes, k of [Li2021].
+    Args:
+        neighbours: Number of nearest nodes, k of [Li2021].
 
-    Raises
-    ------
-    SettingsError
-        If `neighbours` is less than 1.
+    Raises:
+        SettingsError: If `neighbours` is less than 1.
     """
     from scipy.spatial import KDTree
 
@@ -147,10 +135,8 @@ def fewest_hops(links: Links, source: int, goal: int) -> Int:
 
     The path with the fewest hops is not always the shortest.
 
-    Raises
-    ------
-    NoRouteError
-        If no chain of links joins them.
+    Raises:
+        NoRouteError: If no chain of links joins them.
     """
     path: Int = breadth_first(links.start, links.nodes, source, goal)
     if not len(path):

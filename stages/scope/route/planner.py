@@ -33,22 +33,14 @@ Repair = Literal["exact", "ga", "none"]
 class Route:
     """A route from start to goal.
 
-    Parameters
-    ----------
-    nodes : (K,) int64
-        Nodes of the centreline that the search found.
-    guide : GuidePath
-        These nodes, with start and goal.
-    tentative : Curve
-        The spline through points of the guide path.
-    curve : Curve
-        The route.
-    proof : Proof
-        Of `curve`.
-    repair : str
-        "exact", "ga" or "none".
-    claimed : bool
-        Whether the repair itself believes that the limits are kept: `ga` looks at path points alone.
+    Args:
+        nodes ((K,) int64): Nodes of the centreline that the search found.
+        guide: These nodes, with start and goal.
+        tentative: The spline through points of the guide path.
+        curve: The route.
+        proof: Of `curve`.
+        repair: "exact", "ga" or "none".
+        claimed: Whether the repair itself believes that the limits are kept: `ga` looks at path points alone.
     """
 
     nodes: Int
@@ -92,29 +84,18 @@ def plan_route(
     Breadth-first search over centreline nodes, a cubic B-spline through points of the guide path, and a
     repair of the segments that bend too much or come too near to the wall [Li2021].
 
-    Parameters
-    ----------
-    start_mm, goal_mm : (3,) float64
-        In the frame of the centreline (LPS mm), inside the lumen.
-    repair : str
-        "exact": a nonlinear program; "ga": the genetic search of the paper; "none".
-    links : Links, optional
-        Made with `nearest_links` beforehand, where many routes are planned on one centreline.
-    seed : int
-        Of the genetic search.
-    executor : concurrent.futures.Executor, optional
-        Repairs segments side by side.
-    require_proof : bool
-        Whether a curve that cannot be proved is refused; else `Route.proved` tells.
+    Args:
+        start_mm, goal_mm ((3,) float64): In the frame of the centreline (LPS mm), inside the lumen.
+        repair: "exact": a nonlinear program; "ga": the genetic search of the paper; "none".
+        links: Made with `nearest_links` beforehand, where many routes are planned on one centreline.
+        seed: Of the genetic search.
+        executor: Repairs segments side by side.
+        require_proof: Whether a curve that cannot be proved is refused; else `Route.proved` tells.
 
-    Raises
-    ------
-    NoRouteError
-        If start and goal are not joined, or no curve was found that can be proved.
-    TargetError
-        If start or goal lies too near to the wall, or outside.
-    SettingsError
-        If there is no such repair, or start and goal coincide.
+    Raises:
+        NoRouteError: If start and goal are not joined, or no curve was found that can be proved.
+        TargetError: If start or goal lies too near to the wall, or outside.
+        SettingsError: If there is no such repair, or start and goal coincide.
     """
     start, goal = (np.array(point, dtype=np.float64).reshape(3) for point in (start_mm, goal_mm))
     if repair not in REPAIRS:
@@ -189,15 +170,12 @@ class Replanner:
 
     What does not change while tubes move is kept: which nodes the route passes, and which tubes are near.
 
-    Parameters
-    ----------
-    route : Route
-        The route for the centreline as it was.
+    Args:
+        route: The route for the centreline as it was.
 
-    Examples
-    --------
-    >>> replanner = Replanner(centreline, route)            # doctest: +SKIP
-    >>> moved = replanner.replan(breathing(centreline.nodes_mm))   # doctest: +SKIP
+    Examples:
+        >>> replanner = Replanner(centreline, route)            # doctest: +SKIP
+        >>> moved = replanner.replan(breathing(centreline.nodes_mm))   # doctest: +SKIP
     """
 
     def __init__(self, centreline: Centreline, route: Route) -> None:
@@ -218,19 +196,14 @@ class Replanner:
     ) -> Route:
         """Return the route for the centreline with its nodes at new places.
 
-        Parameters
-        ----------
-        nodes_mm : (N, 3) float64
-            All nodes of the centreline, in its order, LPS mm.
-        radius_mm : (N,) float64, optional
-            New radii; the old ones if None.
-        start_mm, goal_mm : (3,) float64, optional
-            Where the tip is, and the goal; the old ones, moved along with the nearest node, if None.
+        Args:
+            nodes_mm ((N, 3) float64): All nodes of the centreline, in its order, LPS mm.
+            radius_mm ((N,) float64): New radii; the old ones if None.
+            start_mm, goal_mm ((3,) float64): Where the tip is, and the goal; the old ones, moved along with
+                the nearest node, if None.
 
-        Raises
-        ------
-        NoRouteError, TargetError
-            As `plan_route`.
+        Raises:
+            NoRouteError, TargetError: As `plan_route`.
         """
         old = self._centreline
         moved = np.asarray(nodes_mm, dtype=np.float64)

@@ -20,14 +20,12 @@ REASONS = {
 class Proof:
     """What was proved of a curve with M spans.
 
-    Parameters
-    ----------
-    verdicts : (M,) int64
-        0 where all of a span keeps both limits; 1, too curved; 2, too near the wall; 3, undecided.
-    points_mm : (M, 3) float64
-        A point that breaks a limit, for the spans where there is one.
-    curvature_bound_per_mm, depth_bound_mm : float
-        No point of the proved spans is more curved, or less deep in the lumen.  Not sharp.
+    Args:
+        verdicts ((M,) int64): 0 where all of a span keeps both limits; 1, too curved; 2, too near the wall;
+            3, undecided.
+        points_mm ((M, 3) float64): A point that breaks a limit, for the spans where there is one.
+        curvature_bound_per_mm, depth_bound_mm: No point of the proved spans is more curved, or less deep in
+            the lumen.  Not sharp.
     """
 
     verdicts: Int
@@ -61,10 +59,8 @@ def prove(curve: Curve, centreline: Centreline, *, max_curvature_per_mm: float, 
     bounds its norm from below, that of the cross product from above, and the depth in the lumen cannot
     change by more than the distance.  A span that is not decided after ten halvings counts as failed.
 
-    Parameters
-    ----------
-    needed_mm : float
-        Depth in the lumen that every point of the curve must have.
+    Args:
+        needed_mm: Depth in the lumen that every point of the curve must have.
     """
     verdicts = np.zeros(curve.n_spans, dtype=np.int64)
     points = np.zeros((curve.n_spans, 3))

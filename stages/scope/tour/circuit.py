@@ -23,16 +23,12 @@ SAME_RESISTANCE = 1e-9
 class Circuits:
     """The circuits of all combinations of exits; C combinations, M lesions.
 
-    Parameters
-    ----------
-    first : (M + 1,) int64
-        The exits of lesion m are `first[m]` to `first[m + 1] - 1`.
-    printed : (C,) float64
-        Resistance by the steps of section II-C and algorithm 1: resistors in as many loops are summed, even
-        if they lie in different branches.
-    reduced : (C,) float64
-        Resistance by merging layer by layer from the ends, as the last lines of section II-D have it: the
-        true resistance of the tree.
+    Args:
+        first ((M + 1,) int64): The exits of lesion m are `first[m]` to `first[m + 1] - 1`.
+        printed ((C,) float64): Resistance by the steps of section II-C and algorithm 1: resistors in as many
+            loops are summed, even if they lie in different branches.
+        reduced ((C,) float64): Resistance by merging layer by layer from the ends, as the last lines of
+            section II-D have it: the true resistance of the tree.
     """
 
     first: Int
@@ -78,10 +74,8 @@ MOST_COMBINATIONS = 5_000_000
 def circuits(subtree: Subtree) -> Circuits:
     """Compute the resistances of all combinations of exits.
 
-    Raises
-    ------
-    SettingsError
-        If there are more than 5 million combinations.
+    Raises:
+        SettingsError: If there are more than 5 million combinations.
     """
     sizes = np.bincount(subtree.exit_lesion, minlength=subtree.n_lesions)
     count = combinations(subtree)

@@ -40,16 +40,11 @@ class ExitRule:
 class Exit:
     """A point of the airway from where a lesion is taken.
 
-    Parameters
-    ----------
-    roles : tuple of str
-        Which of "P1", "P2", "P3" it is; "inside" for a lesion in the airway.
-    distance_mm : float
-        To the lesion.
-    angle_rad : float
-        Between the airway, away from its root, and the line to the lesion.
-    weighted : float
-        Eq. 1 with both terms as shares of their largest value; 0 inside.
+    Args:
+        roles: Which of "P1", "P2", "P3" it is; "inside" for a lesion in the airway.
+        distance_mm: To the lesion.
+        angle_rad: Between the airway, away from its root, and the line to the lesion.
+        weighted: Eq. 1 with both terms as shares of their largest value; 0 inside.
     """
 
     lesion: int
@@ -69,16 +64,12 @@ def find_exits(
     says largest, which would be the worst point.  Where two are the same point, it is listed once.  A lesion
     whose centre lies in the lumen has one exit, the nearest point.
 
-    Parameters
-    ----------
-    lesions_lps : (M, 3) float64, LPS mm
-    accepts : callable, optional
-        Tree points that it refuses are no candidates.
+    Args:
+        lesions_lps: (M, 3) float64, LPS mm.
+        accepts: Tree points that it refuses are no candidates.
 
-    Raises
-    ------
-    TargetError
-        If a lesion has no candidate within reach.
+    Raises:
+        TargetError: If a lesion has no candidate within reach.
     """
     chosen = rule or ExitRule()
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)

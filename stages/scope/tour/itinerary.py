@@ -16,22 +16,15 @@ from stages.scope.tour.subtree import Subtree
 class Itinerary:
     """A tour through the airway that takes every lesion at one exit; K stretches of its `Subtree`.
 
-    Parameters
-    ----------
-    chosen : tuple of int
-        The exit of each lesion, an index into `subtree.exits`.
-    order : tuple of int
-        Lesions in the order of visits.
-    closed : bool
-        Whether the tour returns to the root.
-    passes : (K,) int64
-        How often the stretch to each vertex is passed, in either direction: at most twice.
-    loops : (K,) int64
-        How many lesions lie beyond each stretch: what the paper's Table I counts.
-    length_mm : float
-        Length of the tour.
-    cost_mm : float
-        Length of the tour and the costs of its exits.
+    Args:
+        chosen: The exit of each lesion, an index into `subtree.exits`.
+        order: Lesions in the order of visits.
+        closed: Whether the tour returns to the root.
+        passes ((K,) int64): How often the stretch to each vertex is passed, in either direction: at most
+            twice.
+        loops ((K,) int64): How many lesions lie beyond each stretch: what the paper's Table I counts.
+        length_mm: Length of the tour.
+        cost_mm: Length of the tour and the costs of its exits.
     """
 
     subtree: Subtree
@@ -67,17 +60,12 @@ def plan_itinerary(subtree: Subtree, chosen: Sequence[int], *, closed: bool = Fa
     deepest.  Of the branches at a fork, the one with the last exit comes last, the others in the order of
     their lesions.
 
-    Parameters
-    ----------
-    chosen : sequence of int
-        For each lesion, the index of one of its exits.
-    closed : bool
-        Whether to return to the root.
+    Args:
+        chosen: For each lesion, the index of one of its exits.
+        closed: Whether to return to the root.
 
-    Raises
-    ------
-    SettingsError
-        If an exit belongs to another lesion.
+    Raises:
+        SettingsError: If an exit belongs to another lesion.
     """
     if [subtree.exits[x].lesion for x in chosen] != list(range(subtree.n_lesions)):
         raise SettingsError("The chosen exits do not belong to the lesions", expected="one exit for each")
@@ -113,11 +101,8 @@ def plan_itinerary(subtree: Subtree, chosen: Sequence[int], *, closed: bool = Fa
 def one_by_one_mm(subtree: Subtree, chosen: Sequence[int], *, closed: bool = False) -> float:
     """Return the length of a tour in which the scope returns to the root between any two lesions.
 
-    Parameters
-    ----------
-    chosen : sequence of int
-    closed : bool
-        Whether it also returns after the last, the farthest one.
+    Args:
+        closed: Whether it also returns after the last, the farthest one.
     """
     depth = subtree.depth_mm[subtree.exit_vertex[list(chosen)]]
     return float(2.0 * depth.sum() - (0.0 if closed else depth.max()))

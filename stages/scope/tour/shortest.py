@@ -21,10 +21,8 @@ def shortest_tour(subtree: Subtree, *, closed: bool = False) -> Itinerary:
     The dynamic program is exact.  Its work grows with the number of lesions that have exits on both sides
     of a fork; where that is large, an integer program takes its place, which is exact too.
 
-    Parameters
-    ----------
-    closed : bool
-        Whether the tour returns to the root.
+    Args:
+        closed: Whether the tour returns to the root.
     """
     nodes = _binary(subtree)
     taken = _by_program(nodes, closed) if nodes.work <= MOST_WORK else _by_integers(subtree, closed)

@@ -30,23 +30,16 @@ class Subtree:
     paths part, the vertex has more than two children; that is the same as a chain of binary forks with
     stretches of no length and no resistance between them.
 
-    Parameters
-    ----------
-    tree_point : (K,) int64
-        Index into the airway tree.
-    parent : (K,) int64
-        -1 for the root.
-    length_mm, resistance : (K,) float64
-        Of the stretch from the parent; 0 for the root.
-    side : (K,) int64
-        Of the stretch: 0 above the carina, 1 left, 2 right.
-    exits : tuple of X Exit
-        Ordered by lesion.
-    exit_vertex : (X,) int64
-    exit_resistance : (X,) float64
-        Of lesion and needle: eta inside the airway, eta and the weighted sum outside.
-    exit_cost_mm : (X,) float64
-        What taking this exit costs besides the length of the tour, as a length.
+    Args:
+        tree_point ((K,) int64): Index into the airway tree.
+        parent ((K,) int64): -1 for the root.
+        length_mm, resistance ((K,) float64): Of the stretch from the parent; 0 for the root.
+        side ((K,) int64): Of the stretch: 0 above the carina, 1 left, 2 right.
+        exits: Ordered by lesion.
+        exit_vertex: (X,) int64.
+        exit_resistance ((X,) float64): Of lesion and needle: eta inside the airway, eta and the weighted sum
+            outside.
+        exit_cost_mm ((X,) float64): What taking this exit costs besides the length of the tour, as a length.
     """
 
     tree_point: Int
@@ -92,17 +85,12 @@ def subtree_to(
 ) -> Subtree:
     """Return the part of a tree that leads from the root to all exits.
 
-    Parameters
-    ----------
-    exits : sequence of sequences of Exit
-        For each lesion, as `find_exits` returns them.
-    exit_cost_mm : sequence of sequences of float, optional
-        For each exit, not negative; 0 if None.
+    Args:
+        exits: For each lesion, as `find_exits` returns them.
+        exit_cost_mm: For each exit, not negative; 0 if None.
 
-    Raises
-    ------
-    SettingsError
-        If there are no lesions, one without exits, or more than 62.
+    Raises:
+        SettingsError: If there are no lesions, one without exits, or more than 62.
     """
     if not exits or not all(len(of_one) for of_one in exits) or len(exits) > MOST_LESIONS:
         raise SettingsError(

@@ -101,21 +101,15 @@ def aim_shape(design, near, shape, base, target):
     Newton's method with the least change of the joints in each step, from the shape `near`, which is changed.
     Then the whole way is followed.
 
-    Parameters
-    ----------
-    design : DesignArrays
-    near, shape : ShapeArrays
-        The second receives the shape.
-    base : (9,) float64
-        Scope tip: point, tangent, and +x, from which the rotation counts.
-    target : tuple of 3 floats
+    Args:
+        design: DesignArrays.
+        near, shape (ShapeArrays): The second receives the shape.
+        base ((9,) float64): Scope tip: point, tangent, and +x, from which the rotation counts.
+        target: tuple of 3 floats.
 
-    Returns
-    -------
-    rotation, miss : float
-        Of all tubes together in rad; the distance of the tip from the point in mm.
-    allowed : bool
-        Whether the way to the shape keeps all limits of the design.
+    Returns:
+        - rotation, miss (float) - Of all tubes together in rad; the distance of the tip from the point in mm.
+        - allowed (bool) - Whether the way to the shape keeps all limits of the design.
     """
     n = design.radii.shape[0]
     want_aside, want_ahead, towards = _seen_from(base, target)

@@ -61,17 +61,14 @@ def cut(design, beta, step, pieces, moments, directions):
 
     The last piece ends where the last tube does, even if a straight body goes on.
 
-    Parameters
-    ----------
-    design, beta
-        See the module.
-    step : float
-        Largest angle, in rad of the fastest torsional oscillation of a piece, that one step may span.
-    pieces : (1 + b + 2 m, PIECE_COLUMNS + b) float64
-        Is filled, the nearest piece first.
-    moments, directions : (1 + b + 2 m, n) float64
-        Are filled: bending stiffness times precurvature in N mm of each tube in each piece, 0 where it is
-        straight or not there, and the direction of the precurvature in rad.
+    Args:
+        design, beta: See the module.
+        step (float): Largest angle, in rad of the fastest torsional oscillation of a piece, that one step may
+            span.
+        pieces ((1 + b + 2 m, PIECE_COLUMNS + b) float64): Is filled, the nearest piece first.
+        moments, directions ((1 + b + 2 m, n) float64): Are filled: bending stiffness times precurvature in N
+            mm of each tube in each piece, 0 where it is straight or not there, and the direction of the
+            precurvature in rad.
     """
     stiffness, lengths, bends = design
     found = np.zeros((1 + lengths.shape[0] + 2 * bends.shape[0], 2))

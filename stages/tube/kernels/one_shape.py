@@ -42,17 +42,14 @@ rear end at which the tube bends towards +x of the scope tip, and what is kept."
 class DesignArrays(NamedTuple):
     """A design of n tubes for the kernels, the innermost first.
 
-    Parameters
-    ----------
-    stiffness, lengths, bends
-        See `assembly`; a body after the tubes is a straight needle, whose tip is that of the innermost tube.
-    radii, strained : (n,) float64
-        See `shapes.follow_all`.
-    turned : (n,) bool
-        Whether the shape changes as the tube is turned against the others.
-    limits : (N_LIMITS,) float64
-    planar : (N_TUBES,) float64
-        The numbers of `planar` where the tubes are, of which the sweep is then exact; else empty.
+    Args:
+        stiffness, lengths, bends: See `assembly`; a body after the tubes is a straight needle, whose tip is
+            that of the innermost tube.
+        radii, strained ((n,) float64): See `shapes.follow_all`.
+        turned ((n,) bool): Whether the shape changes as the tube is turned against the others.
+        limits: (N_LIMITS,) float64.
+        planar ((N_TUBES,) float64): The numbers of `planar` where the tubes are, of which the sweep is then
+            exact; else empty.
     """
 
     stiffness: Float
@@ -68,15 +65,12 @@ class DesignArrays(NamedTuple):
 class ShapeArrays(NamedTuple):
     """One deployment for the kernels, to be filled by them.
 
-    Parameters
-    ----------
-    joints : (2 n,) float64
-    tips : (n,) float64
-        Angles at the tubes' own ends.
-    result : (SHAPE_COLUMNS,) float64
-    arcs : (rows, ARC_COLUMNS) float64
-    number : (1,) int64
-        How many of the rows are in use.
+    Args:
+        joints: (2 n,) float64.
+        tips ((n,) float64): Angles at the tubes' own ends.
+        result: (SHAPE_COLUMNS,) float64.
+        arcs: (rows, ARC_COLUMNS) float64.
+        number ((1,) int64): How many of the rows are in use.
     """
 
     joints: Float
@@ -89,12 +83,10 @@ class ShapeArrays(NamedTuple):
 class ManyShapes(NamedTuple):
     """S proved deployments for the kernels.
 
-    Parameters
-    ----------
-    joints, tips, results : (S, 2 n), (S, n), (S, SHAPE_COLUMNS) float64
-    arcs : (A, ARC_COLUMNS) float64
-    first_arc : (S + 1,) int64
-        Where the arcs of each begin.
+    Args:
+        joints, tips, results: (S, 2 n), (S, n), (S, SHAPE_COLUMNS) float64.
+        arcs: (A, ARC_COLUMNS) float64.
+        first_arc ((S + 1,) int64): Where the arcs of each begin.
     """
 
     joints: Float

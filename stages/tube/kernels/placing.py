@@ -25,17 +25,13 @@ PLACED_SHAPE, PLACED_BRANCH, PLACED_EXIT, PLACED_ANGLE, PLACED_RUN, PLACED_COLUM
 def cut_at_stops(arcs, stop, stretches, ends, middles, radii):
     """Cut one shape into stretches between stops; return how many stretches there are.
 
-    Parameters
-    ----------
-    arcs : (a, ARC_COLUMNS) float64
-    stop : float
-        Spacing of the stops, mm.
-    stretches : (rows, STRETCH_COLUMNS) float64
-        Is filled; a stop may have several.
-    ends, middles : (K + 1, 3) float64
-        Are filled: where the stretch before each stop ends, and its middle.
-    radii : (K + 1,) float64
-        Is filled: the outermost radius of the stretch before each stop.
+    Args:
+        arcs: (a, ARC_COLUMNS) float64.
+        stop (float): Spacing of the stops, mm.
+        stretches ((rows, STRETCH_COLUMNS) float64): Is filled; a stop may have several.
+        ends, middles ((K + 1, 3) float64): Are filled: where the stretch before each stop ends, and its
+            middle.
+        radii ((K + 1,) float64): Is filled: the outermost radius of the stretch before each stop.
     """
     pose, across = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
     rows, at, place = 0, 0.0, 1
@@ -92,27 +88,18 @@ def _off(ends, middles, one, other, place):
 def grow(places, groups, ends, middles, radii, tolerance, nodes, errors, leaf):
     """Sort shapes into a tree of stretches that they share within a tolerance.
 
-    Parameters
-    ----------
-    places : (S,) int64
-        At which stop each shape ends, 1 or more.
-    groups : (S,) int64
-        Shapes of different groups share nothing.
-    ends, middles, radii : (S, K + 1, 3), (S, K + 1, 3), (S, K + 1) float64
-        See `cut_at_stops`.
-    tolerance : float
-        mm.
-    nodes : (N, 4) int64
-        Is filled: parent, stop at its end, first shape, the next one with the same parent; N nodes at most.
-    errors : (N,) float64
-        Is filled: how far others are from the first shape.
-    leaf : (S,) int64
-        Is filled: the node at which each shape ends.
+    Args:
+        places ((S,) int64): At which stop each shape ends, 1 or more.
+        groups ((S,) int64): Shapes of different groups share nothing.
+        ends, middles, radii ((S, K + 1, 3), (S, K + 1, 3), (S, K + 1) float64): See `cut_at_stops`.
+        tolerance (float): mm.
+        nodes ((N, 4) int64): Is filled: parent, stop at its end, first shape, the next one with the same
+            parent; N nodes at most.
+        errors ((N,) float64): Is filled: how far others are from the first shape.
+        leaf ((S,) int64): Is filled: the node at which each shape ends.
 
-    Returns
-    -------
-    int
-        Number of nodes, -1 if there is no room.
+    Returns:
+        int: Number of nodes, -1 if there is no room.
     """
     count = 0
     youngest = np.full(nodes.shape[0] + 1, -1)  # of the root first, then of each node
@@ -212,28 +199,19 @@ def _place_turned(environment, tubes, frame, tree, wanted, reasons, traces, plac
 def place_tree(environment, tubes, frames, tree, wanted, reasons, traces, placed, counts):
     """Follow shapes from one scope tip with T rotations of all tubes together.
 
-    Parameters
-    ----------
-    environment : TubeEnvironment
-    tubes : (N_TUBES,) float64
-        Only the limits at the wall are looked at.
-    frames : (T, 4, 4) float64
-        The scope tip, with +x where the tubes are turned to.
-    tree : tuple
-        Nodes in the order in which they are followed, M of them: `depth` (M,) int64 from 1 on, `skip` (M,)
-        int64 the node to go on with if this one is refused, `first` (M + 1,) int64 where its `stretches` (R,
-        STRETCH_COLUMNS) begin, `radius` and `clearance` (M,) float64, `first_shape` (M + 1,) int64 where the
-        `shapes` (S,) int64 begin that end there.
-    wanted : (T, S) bool
-        Which shapes are looked at.
-    reasons : (N_REASONS,) int64
-        Counts refused shapes by reason.
-    traces : (depths + 1, N_TRACE) float64
-        Scratch.
-    placed : (T S, PLACED_COLUMNS) float64
-        Receives the shapes that fit, one rotation after the other.
-    counts : (T,) int64
-        Receives how many fit with each rotation.
+    Args:
+        environment: TubeEnvironment.
+        tubes ((N_TUBES,) float64): Only the limits at the wall are looked at.
+        frames ((T, 4, 4) float64): The scope tip, with +x where the tubes are turned to.
+        tree (tuple): Nodes in the order in which they are followed, M of them: `depth` (M,) int64 from 1 on,
+            `skip` (M,) int64 the node to go on with if this one is refused, `first` (M + 1,) int64 where its
+            `stretches` (R, STRETCH_COLUMNS) begin, `radius` and `clearance` (M,) float64, `first_shape` (M +
+            1,) int64 where the `shapes` (S,) int64 begin that end there.
+        wanted ((T, S) bool): Which shapes are looked at.
+        reasons ((N_REASONS,) int64): Counts refused shapes by reason.
+        traces ((depths + 1, N_TRACE) float64): Scratch.
+        placed ((T S, PLACED_COLUMNS) float64): Receives the shapes that fit, one rotation after the other.
+        counts ((T,) int64): Receives how many fit with each rotation.
     """
     total = 0
     for t in range(frames.shape[0]):

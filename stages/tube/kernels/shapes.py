@@ -295,35 +295,24 @@ def follow_all(
 ):
     """Follow all deployments with given rotations of the rear ends.
 
-    Parameters
-    ----------
-    design : tuple
-        See `assembly`.
-    radii, strained : (n,) float64
-        Outer radius of each tube, and its strain for each 1/mm of change of curvature, mm.
-    base_angles : (n,) float64
-        Rotation of the rear ends, rad.
-    stops : (K,) float64
-        Insertions, rising from 0, mm.
-    states : (S, n) int64
-        Deployments as indices of stops, not rising from the innermost tube on; the first is all 0.
-    parents : (S,) int64
-        Of each the deployment one stop before, -1 for the first; it is listed before.
-    step : float
-        See `assembly.cut`.
-    tips : (S, n) float64
-        Is filled with the angles at the tubes' own ends, rad.
-    results : (S, SHAPE_COLUMNS) float64
-        Is filled; a least determinant of 0 or less says that the tubes snap on the way.
-    first : (S + 1,) int64
-        Is filled: where the arcs of each deployment begin in `arcs`.
-    arcs : (rows, ARC_COLUMNS) float64
-        Is filled.
+    Args:
+        design (tuple): See `assembly`.
+        radii, strained ((n,) float64): Outer radius of each tube, and its strain for each 1/mm of change of
+            curvature, mm.
+        base_angles ((n,) float64): Rotation of the rear ends, rad.
+        stops ((K,) float64): Insertions, rising from 0, mm.
+        states ((S, n) int64): Deployments as indices of stops, not rising from the innermost tube on; the
+            first is all 0.
+        parents ((S,) int64): Of each the deployment one stop before, -1 for the first; it is listed before.
+        step (float): See `assembly.cut`.
+        tips ((S, n) float64): Is filled with the angles at the tubes' own ends, rad.
+        results ((S, SHAPE_COLUMNS) float64): Is filled; a least determinant of 0 or less says that the tubes
+            snap on the way.
+        first ((S + 1,) int64): Is filled: where the arcs of each deployment begin in `arcs`.
+        arcs ((rows, ARC_COLUMNS) float64): Is filled.
 
-    Returns
-    -------
-    int
-        Number of arcs, -1 if there is no room for them.
+    Returns:
+        int: Number of arcs, -1 if there is no room for them.
     """
     n_states, n = states.shape
     n_stops = stops.shape[0]
@@ -383,26 +372,18 @@ def follow_all(
 def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, arcs):
     """Lay the arcs of any joint values, reached straight from a deployment nearby.
 
-    Parameters
-    ----------
-    design, radii, step
-        See `follow_all`.
-    base, tip_angles : (n,) float64
-        Rotation of the rear ends and angles at the own ends of the deployment nearby; the last are changed to
-        those of the new one.
-    beta, end : (b,) float64
-        Where the rear ends are, and where they are then.
-    turn : (n,) float64
-        By how much the rear ends turn on.
-    result : (SHAPE_COLUMNS,) float64
-        Is filled: the least determinant from there on, the error of the arcs, the length and the tip.
-    arcs : (rows, ARC_COLUMNS) float64
-        Is filled.
+    Args:
+        design, radii, step: See `follow_all`.
+        base, tip_angles ((n,) float64): Rotation of the rear ends and angles at the own ends of the
+            deployment nearby; the last are changed to those of the new one.
+        beta, end ((b,) float64): Where the rear ends are, and where they are then.
+        turn ((n,) float64): By how much the rear ends turn on.
+        result ((SHAPE_COLUMNS,) float64): Is filled: the least determinant from there on, the error of the
+            arcs, the length and the tip.
+        arcs ((rows, ARC_COLUMNS) float64): Is filled.
 
-    Returns
-    -------
-    int
-        Number of arcs, 0 if the tubes snap on the way, -1 if there is no room.
+    Returns:
+        int: Number of arcs, 0 if the tubes snap on the way, -1 if there is no room.
     """
     n = base.shape[0]
     least, cutting, nodes, steps = reach(design, base, turn, beta, end, step, tip_angles)

@@ -161,21 +161,16 @@ def _any_stretch(owners):
 def twist(design, cutting, tip_angles, owners, nodes, steps):
     """Integrate torsion from the tip to the front plate.
 
-    Parameters
-    ----------
-    design : tuple
-        See `assembly`.
-    cutting : tuple
-        pieces, moments, directions, and the number of pieces, as `assembly.cut` fills them.
-    tip_angles : (n,) float64
-        psi_i at the end of each tube, rad.
-    owners : (m,) int64
-        Derivatives wanted: that by the tip angle of tube c is -1 - c, that by its shift is c.
-    nodes : tuple
-        s (N + 1,), psi and u in rad and rad/mm (N + 1, n), their derivatives (N + 1, m, n); node 0 is at
-        the front plate, node N at the tip.  Is filled.
-    steps : tuple
-        Length in mm (N,), its derivatives (N, m), and the piece (N,) int64 of each step.  Is filled.
+    Args:
+        design (tuple): See `assembly`.
+        cutting (tuple): pieces, moments, directions, and the number of pieces, as `assembly.cut` fills them.
+        tip_angles ((n,) float64): psi_i at the end of each tube, rad.
+        owners ((m,) int64): Derivatives wanted: that by the tip angle of tube c is -1 - c, that by its shift
+            is c.
+        nodes (tuple): s (N + 1,), psi and u in rad and rad/mm (N + 1, n), their derivatives (N + 1, m, n);
+            node 0 is at the front plate, node N at the tip.  Is filled.
+        steps (tuple): Length in mm (N,), its derivatives (N, m), and the piece (N,) int64 of each step.  Is
+            filled.
     """
     pieces, moments, directions, count = cutting
     s, psi, rate, dpsi, drate = nodes

@@ -34,18 +34,14 @@ BENT_THROUGHOUT, STRAIGHT_FIRST, OUTER_STRAIGHT, MIXED = range(4)
 class BoxTubes(NamedTuple):
     """The tubes of a box: the middle ones, and how the others differ.
 
-    Parameters
-    ----------
-    base, forward, normal : tuple of 3 float
-        The scope tip, LPS mm, its direction, and the direction in which the tubes bend.
-    place, tilt, roll : float
-        How far the place (mm), the direction and the rotation (rad) may be from these.
-    sharing, first_outer : float
-        What the outer insertion changes of the heading, rad, beyond an arc length, mm.
-    opening : float
-        What the inner insertion changes of it, rad a mm, where the tubes go straight first.
-    outer, inner : float
-        Insertions of the middle tubes, mm; the inner one is the longest where all are bent throughout.
+    Args:
+        base, forward, normal (tuple of 3 float): The scope tip, LPS mm, its direction, and the direction in
+            which the tubes bend.
+        place, tilt, roll: How far the place (mm), the direction and the rotation (rad) may be from these.
+        sharing, first_outer: What the outer insertion changes of the heading, rad, beyond an arc length, mm.
+        opening: What the inner insertion changes of it, rad a mm, where the tubes go straight first.
+        outer, inner: Insertions of the middle tubes, mm; the inner one is the longest where all are bent
+            throughout.
     """
 
     base: Vector
@@ -64,22 +60,16 @@ class BoxTubes(NamedTuple):
 class Seen(NamedTuple):
     """The target as the tips of a box see it; see `seen_target`.
 
-    Parameters
-    ----------
-    from_tip : tuple of 3 float
-        From the middle tip to the target, mm.
-    aside, ahead : float
-        Of the target there, mm.
-    line : tuple of 3 float
-        Unit vector to the target from the centre of the tightest circle in the plane of tip and target.
-    size : float
-        How far the target is from that centre, mm.
-    moved, second : float
-        The greatest displacement of the target, and its remainder of second order, mm.
-    by_rotation, by_outer, by_inner : tuple of 3 float
-        The displacement of first order by each half width, mm; 0 where insertions count by their rates.
-    rate_outer, rate_inner : float
-        What they count then, mm; else 0.
+    Args:
+        from_tip (tuple of 3 float): From the middle tip to the target, mm.
+        aside, ahead: Of the target there, mm.
+        line (tuple of 3 float): Unit vector to the target from the centre of the tightest circle in the plane
+            of tip and target.
+        size: How far the target is from that centre, mm.
+        moved, second: The greatest displacement of the target, and its remainder of second order, mm.
+        by_rotation, by_outer, by_inner (tuple of 3 float): The displacement of first order by each half
+            width, mm; 0 where insertions count by their rates.
+        rate_outer, rate_inner: What they count then, mm; else 0.
     """
 
     from_tip: Vector
@@ -252,22 +242,15 @@ def seen_target(tubes, kappa, target, family, tip, tangent, box):
     remainder of second order of a chain is the sum over pairs of what the outer motion turns of what the
     inner has moved, and half the square of each.
 
-    Parameters
-    ----------
-    tubes, kappa
-        kappa in 1/mm.
-    target : tuple of 3 float
-        LPS mm.
-    family : BoxTubes
-    tip, tangent : tuple of 3 float
-        Those of `tip_of`.
-    box
-        See the module.
+    Args:
+        tubes, kappa: kappa in 1/mm.
+        target (tuple of 3 float): LPS mm.
+        family: BoxTubes.
+        tip, tangent (tuple of 3 float): Those of `tip_of`.
+        box: See the module.
 
-    Returns
-    -------
-    Seen
-        The displacement of first order by places and directions is for the caller to find.
+    Returns:
+        Seen: The displacement of first order by places and directions is for the caller to find.
     """
     outer, inner = box[OUTER], box[INNER]
     half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]

@@ -73,22 +73,16 @@ def begin_queue(environment, tubes, insertions, tips, target, longest, limit, fi
 
     Boxes of more than BEGUN_MM are divided at once, depth first.
 
-    Parameters
-    ----------
-    environment, tubes, insertions, tips, target
-        Those of `bound_box`.
-    longest : float
-        Greatest insertion, mm.
-    limit : float
-    first, last : int
-        Rows of tips, without the last; those of the first call begin with 0.
-    state : tuple of arrays
-        Boxes (N, BOX_COLUMNS) float64, heap (N,) and unused rows (N,) int64, and numbers (2,) int64.
+    Args:
+        environment, tubes, insertions, tips, target: Those of `bound_box`.
+        longest (float): Greatest insertion, mm.
+        limit: float.
+        first, last (int): Rows of tips, without the last; those of the first call begin with 0.
+        state (tuple of arrays): Boxes (N, BOX_COLUMNS) float64, heap (N,) and unused rows (N,) int64, and
+            numbers (2,) int64.
 
-    Returns
-    -------
-    bool
-        False if there was no room for all.
+    Returns:
+        bool: False if there was no room for all.
     """
     boxes, heap, unused, numbers = state
     if first == 0:
@@ -128,21 +122,14 @@ def begin_queue(environment, tubes, insertions, tips, target, longest, limit, fi
 def divide(environment, tubes, insertions, tips, target, most, limit, state):
     """Divide the box of the lowest bound, and so on.
 
-    Parameters
-    ----------
-    environment, tubes, insertions, tips, target
-        Those of `bound_box`.
-    most : int
-        Boxes to divide.
-    limit : float
-        Boxes whose bounds are as high are left out; it ends once there is no other.
-    state
-        See `begin_queue`.
+    Args:
+        environment, tubes, insertions, tips, target: Those of `bound_box`.
+        most (int): Boxes to divide.
+        limit (float): Boxes whose bounds are as high are left out; it ends once there is no other.
+        state: See `begin_queue`.
 
-    Returns
-    -------
-    tuple of (int, int)
-        ENDED, EMPTY, FULL or WHOLE, and how many were divided.
+    Returns:
+        tuple of (int, int): ENDED, EMPTY, FULL or WHOLE, and how many were divided.
     """
     boxes, heap, unused, numbers = state
     for done in range(most):

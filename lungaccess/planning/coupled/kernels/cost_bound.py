@@ -61,20 +61,14 @@ FOLLOWED_MM = 8.0
 class BoundEnvironment(NamedTuple):
     """What the bounds look at.
 
-    Parameters
-    ----------
-    obstacles : (ni + 1, nj + 1, nk + 1) uint16
-        Corner field of the distance to all obstacles.
-    geometry : (3, 6) float64
-    surroundings : TubeSurroundings
-    kappa, max_length_mm, goal_tolerance_mm : float
-        Limits of the needle; `max_length_mm` is no more than half a circle of the curvature `kappa`.
-    per_clearance, per_mm : float
-        The objective: weight of 1 / clearance, and least cost of a mm by all else.
-    required_mm, exempt_mm : float
-        Clearance that the needle keeps, beyond so much of its length.
-    togo : CostToGo
-        What paths still cost.
+    Args:
+        obstacles ((ni + 1, nj + 1, nk + 1) uint16): Corner field of the distance to all obstacles.
+        geometry: (3, 6) float64.
+        kappa, max_length_mm, goal_tolerance_mm: Limits of the needle; `max_length_mm` is no more than half a
+            circle of the curvature `kappa`.
+        per_clearance, per_mm: The objective: weight of 1 / clearance, and least cost of a mm by all else.
+        required_mm, exempt_mm: Clearance that the needle keeps, beyond so much of its length.
+        togo: What paths still cost.
     """
 
     obstacles: np.ndarray
@@ -94,12 +88,9 @@ class BoundEnvironment(NamedTuple):
 def between(environment, begin, end, begin_off, end_off):
     """Bound the cost of every path from near one point to near another from below.
 
-    Parameters
-    ----------
-    begin, end : tuple of 3 float
-        LPS mm.
-    begin_off, end_off : float
-        How far the path may begin and end from them, mm.
+    Args:
+        begin, end (tuple of 3 float): LPS mm.
+        begin_off, end_off (float): How far the path may begin and end from them, mm.
     """
     far = math.sqrt((end[0] - begin[0]) ** 2 + (end[1] - begin[1]) ** 2 + (end[2] - begin[2]) ** 2)
     return as_far_as(environment, begin, end, begin_off, end_off, far - begin_off - end_off)
@@ -150,21 +141,14 @@ def as_far_as(environment, begin, end, begin_off, end_off, least):
 def along_tangent(environment, tip, tangent, swing, away, far, limit):
     """Bound the cost of every path from near a tip, which follows its direction at first, then any way.
 
-    Parameters
-    ----------
-    tip, tangent : tuple of 3 float
-        LPS mm, and a unit vector.
-    swing, away : float
-        How well direction (rad) and place (mm) are known.
-    far : float
-        Every path is at least so long, mm.
-    limit : float
-        It ends early once the bound is as high.
+    Args:
+        tip, tangent (tuple of 3 float): LPS mm, and a unit vector.
+        swing, away (float): How well direction (rad) and place (mm) are known.
+        far (float): Every path is at least so long, mm.
+        limit (float): It ends early once the bound is as high.
 
-    Returns
-    -------
-    float
-        inf if there is no path.
+    Returns:
+        float: inf if there is no path.
     """
     kappa, exempt = environment.kappa, environment.exempt_mm
     x, y, z = tip
@@ -207,21 +191,16 @@ def bound_box(environment, tubes, insertions, tips, target, limit, box, same_tub
 
     Tubes are not looked at where the bound is `limit` or more without.
 
-    Parameters
-    ----------
-    environment : BoundEnvironment
-    tubes : (N_TUBES,) float64
-    insertions : (N,) float64
-        See `stages.tube.kernels.greatest_insertions`.
-    tips : (S, 9) float64
-        Scope tips, LPS mm.
-    target : tuple of 3 float
-    limit : float
-    box : (BOX_COLUMNS,) float64
-        AWAY, WIDE and LOSS are filled.
-    same_tubes : bool
-        Whether a box with the same tubes was looked at before, whose bound counts as well: then this is that
-        of the paths alone.
+    Args:
+        environment: BoundEnvironment.
+        tubes: (N_TUBES,) float64.
+        insertions ((N,) float64): See `stages.tube.kernels.greatest_insertions`.
+        tips ((S, 9) float64): Scope tips, LPS mm.
+        target: tuple of 3 float.
+        limit: float.
+        box ((BOX_COLUMNS,) float64): AWAY, WIDE and LOSS are filled.
+        same_tubes (bool): Whether a box with the same tubes was looked at before, whose bound counts as well:
+            then this is that of the paths alone.
     """
     kappa = environment.kappa
     if not has_insertions(tubes, insertions, box):
@@ -304,13 +283,10 @@ def least_distance(kappa, seen, off):
     middle tip, and from the centre of the tightest circle there, change with each in proportion.  The least
     distance with the target outside of that circle is that of a linear program with one condition.
 
-    Parameters
-    ----------
-    kappa : float
-    seen : Seen
-        Of a box with one scope tip.
-    off : float
-        How far beside the target a needle may end, mm.
+    Args:
+        kappa: float.
+        seen (Seen): Of a box with one scope tip.
+        off (float): How far beside the target a needle may end, mm.
     """
     far = math.hypot(seen.aside, seen.ahead)
     if min(far, seen.size) < CORNER_MM:

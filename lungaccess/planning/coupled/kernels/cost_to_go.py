@@ -33,17 +33,15 @@ HALF_DIAGONAL = 0.7072
 class CostToGo(NamedTuple):
     """Lower bounds of what paths to a target still cost, on K shells.
 
-    Parameters
-    ----------
-    frame : (4, 3) float64
-        Two axes and the middle direction, unit vectors across each other, and the target in LPS mm.
-    numbers : (7,) float64
-        Side of a cell of the plane of directions; distance from shell to shell, mm; greatest curvature, 1/mm;
-        cost of a unit; least cost of a mm anywhere; clearance that a needle keeps beyond its exempt length,
-        mm; and the last shell that counts.
-    levels : tuple of (K + 1, N, N) uint16
-        Least cost on shell k, k times that distance from the target, from anywhere in a cell, in units and
-        rounded down, or BEYOND; then that from anywhere in a square of 2, 4, ... cells a side.
+    Args:
+        frame ((4, 3) float64): Two axes and the middle direction, unit vectors across each other, and the
+            target in LPS mm.
+        numbers ((7,) float64): Side of a cell of the plane of directions; distance from shell to shell, mm;
+            greatest curvature, 1/mm; cost of a unit; least cost of a mm anywhere; clearance that a needle
+            keeps beyond its exempt length, mm; and the last shell that counts.
+        levels (tuple of (K + 1, N, N) uint16): Least cost on shell k, k times that distance from the target,
+            from anywhere in a cell, in units and rounded down, or BEYOND; then that from anywhere in a square
+            of 2, 4, ... cells a side.
     """
 
     frame: np.ndarray
@@ -89,28 +87,19 @@ def _reduce(levels, shell):
 def fill_shell(field, geometry, weights, off, limit, togo, k, behind, beyond, part, parts):
     """Fill each `parts`-th row of cells of a shell of a `CostToGo`, when the shells before it are filled.
 
-    Parameters
-    ----------
-    field, geometry
-        Corner field of the distance to all obstacles.
-    weights : tuple of 2 float
-        Of the integral of 1 / clearance, and of the length in mm.
-    off : float
-        How far from the target a path may end, mm.
-    limit : float
-        Costs above are not told apart.
-    togo : CostToGo
-    k : int
-        The shell.
-    behind, beyond : (N, N) float64
-        The cost from half a shell beyond the last one, and the same for this one, whose rows are filled.
-    part, parts : int
-        Rows part, part + parts, ...
+    Args:
+        field, geometry: Corner field of the distance to all obstacles.
+        weights (tuple of 2 float): Of the integral of 1 / clearance, and of the length in mm.
+        off (float): How far from the target a path may end, mm.
+        limit (float): Costs above are not told apart.
+        togo: CostToGo.
+        k (int): The shell.
+        behind, beyond ((N, N) float64): The cost from half a shell beyond the last one, and the same for this
+            one, whose rows are filled.
+        part, parts (int): Rows part, part + parts, ...
 
-    Returns
-    -------
-    bool
-        Whether paths from some cell cost less than `limit`.
+    Returns:
+        bool: Whether paths from some cell cost less than `limit`.
     """
     frame, numbers, levels = togo
     cell, shell, kappa, unit = numbers[CELL], numbers[SHELL], numbers[KAPPA], numbers[UNIT]

@@ -68,18 +68,13 @@ NONE, SEVERAL = -2, -3
 class TubeSurroundings(NamedTuple):
     """What tubes are kept clear of.
 
-    Parameters
-    ----------
-    clearance : (ni + 1, nj + 1, nk + 1) uint16
-        Corner field of the distance to all obstacles.
-    labels : (ni, nj, nk) uint16
-    geometry : (3, 6) float64
-    depth, depth_geometry
-        Corner field of the depth in the lumen.
-    bits, hazard_bits : int
-        Structures that are obstacles: all, and those other than airways.
-    mediastinal : (B,) bool
-        Airway branches that must not be left.
+    Args:
+        clearance ((ni + 1, nj + 1, nk + 1) uint16): Corner field of the distance to all obstacles.
+        labels: (ni, nj, nk) uint16.
+        geometry: (3, 6) float64.
+        depth, depth_geometry: Corner field of the depth in the lumen.
+        bits, hazard_bits: Structures that are obstacles: all, and those other than airways.
+        mediastinal ((B,) bool): Airway branches that must not be left.
     """
 
     clearance: np.ndarray
@@ -194,13 +189,11 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
     A hazard also refuses tubes that leave beyond it and touch the wall from there on: see
     `docs/theory/cost_bound.md`.
 
-    Parameters
-    ----------
-    surroundings : TubeSurroundings
-    tubes : (N_TUBES,) float64
-    family : BoxTubes
-    sweep : float
-        No tube of the box sweeps sideways by less, mm.
+    Args:
+        surroundings: TubeSurroundings.
+        tubes: (N_TUBES,) float64.
+        family: BoxTubes.
+        sweep (float): No tube of the box sweeps sideways by less, mm.
     """
     first_outer, longer = box[OUTER] - box[HALF + OUTER], 2.0 * box[HALF + INNER]
     shortest = max(box[INNER] - box[HALF + INNER], 0.0)

@@ -36,10 +36,8 @@ def _cost_bound(needle, begin_mm, end_mm, length):
 
     Clearance is 1-Lipschitz: `s` mm from an end of the path it is at most that at the end and `s` more.
 
-    Parameters
-    ----------
-    begin_mm, end_mm : float
-        Clearance at the two ends, or more.
+    Args:
+        begin_mm, end_mm (float): Clearance at the two ends, or more.
     """
     objective = needle.objective
     cost = objective.length * length
@@ -66,25 +64,20 @@ def cost_bounds(needle, positions, lengths, target, bounds):
 def evaluate_arcs(needle, positions, tangents, branches, before, target, slack, best, blockers, costs):
     """Evaluate the single arc from each pose to the target, and prove those whose cost is low enough.
 
-    Parameters
-    ----------
-    positions, tangents : (N, 3) float64
-    branches : (N,) int64
-    before : (N,) float64
-        What the tubes cost before the arc.
-    target : tuple of 3 floats
-    slack, best : float
-        Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not tested.
-    blockers : (N,) int64
-        Receives 0 for arcs that are proved clear, the label that blocks, -1 where no arc keeps the
-        needle's limits, or PRUNED_BY_BOUND.
-    costs : (N,) float64
-        Receives estimated costs with those of the tubes, infinite where a lower bound was enough.
+    Args:
+        positions, tangents: (N, 3) float64.
+        branches: (N,) int64.
+        before ((N,) float64): What the tubes cost before the arc.
+        target: tuple of 3 floats.
+        slack, best (float): Arcs that cost more than `slack` times the cheapest so far, at first `best`, are
+            not tested.
+        blockers ((N,) int64): Receives 0 for arcs that are proved clear, the label that blocks, -1 where no
+            arc keeps the needle's limits, or PRUNED_BY_BOUND.
+        costs ((N,) float64): Receives estimated costs with those of the tubes, infinite where a lower bound
+            was enough.
 
-    Returns
-    -------
-    float
-        The cost of the cheapest clear arc, or `best`.
+    Returns:
+        float: The cost of the cheapest clear arc, or `best`.
     """
     obstacles, objective, limits = needle.obstacles, needle.objective, needle.limits
     end = _clearance_bound(needle, target[0], target[1], target[2])
@@ -135,19 +128,14 @@ def choose_separated(lines, order, separation_mm, chosen):
 
     Two lines are separated if some point of either is `separation_mm` or more from all points of the other.
 
-    Parameters
-    ----------
-    lines : (N, M, 3) float64, mm
-    order : (K,) int64
-        Which lines to look at, the best first.
-    separation_mm : float
-    chosen : (C,) int64
-        Receives at most C of them.
+    Args:
+        lines: (N, M, 3) float64, mm.
+        order ((K,) int64): Which lines to look at, the best first.
+        separation_mm: float.
+        chosen ((C,) int64): Receives at most C of them.
 
-    Returns
-    -------
-    int
-        How many were chosen.
+    Returns:
+        int: How many were chosen.
     """
     square = separation_mm * separation_mm
     count = 0

@@ -111,28 +111,19 @@ def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, s
     A choice is kept only if it is proved: the tubes by their whole way and `validate_arcs`, the needle by
     `blocker_on_arc`.  The shape nearby in `tube` becomes that of the choice.
 
-    Parameters
-    ----------
-    scope_poses : (K, 9) float64
-    allowed : (K,) bool
-        Which of these poses the scope can take.
-    x : (c,) float64
-    vias : (MAX_VIAS, 3) float64
-        Both receive the best choice.
-    count : int
-        Number of vias in use.
-    target : tuple of 3 floats
-    tries : int
-        How many variations are evaluated.
-    state : (1,) uint64
-        State of the random numbers.
+    Args:
+        scope_poses: (K, 9) float64.
+        allowed ((K,) bool): Which of these poses the scope can take.
+        x: (c,) float64.
+        vias ((MAX_VIAS, 3) float64): Both receive the best choice.
+        count (int): Number of vias in use.
+        target: tuple of 3 floats.
+        tries (int): How many variations are evaluated.
+        state ((1,) uint64): State of the random numbers.
 
-    Returns
-    -------
-    count : int
-        Number of vias of the best choice.
-    cost : float
-        Its estimated cost; infinite if the choice given was refused, and all others too.
+    Returns:
+        - count (int) - Number of vias of the best choice.
+        - cost (float) - Its estimated cost; infinite if the choice given was refused, and all others too.
     """
     _environment, _constants, design, near, shape = tube
     trace = np.zeros(N_TRACE)
@@ -199,33 +190,21 @@ def sample_deployments(
 ):
     """Sample deployments near given ones, each with a single arc to the target, and keep the cheapest.
 
-    Parameters
-    ----------
-    scope_poses : (K, 9) float64
-        Poses that the scope can take.
-    pose_of : (N,) int64
-        The row of `scope_poses` of each deployment.
-    rotations : (N,) float64
-        Rotation of each, rad.
-    shapes : ManyShapes
-        The shape of each.
-    spreads : (2,) float64
-        The largest change of rotations in rad and of insertions in mm.
-    target : tuple of 3 floats
-    tries : int
-    cost_limit : float
-        Choices that cost as much or more are dropped.
-    state : (1,) uint64
-        State of the random numbers.
-    best : (c,) float64
-        Receives the cheapest choice.
-    best_shape : ShapeArrays
-        Receives its shape.
+    Args:
+        scope_poses ((K, 9) float64): Poses that the scope can take.
+        pose_of ((N,) int64): The row of `scope_poses` of each deployment.
+        rotations ((N,) float64): Rotation of each, rad.
+        shapes (ManyShapes): The shape of each.
+        spreads ((2,) float64): The largest change of rotations in rad and of insertions in mm.
+        target: tuple of 3 floats.
+        tries: int.
+        cost_limit (float): Choices that cost as much or more are dropped.
+        state ((1,) uint64): State of the random numbers.
+        best ((c,) float64): Receives the cheapest choice.
+        best_shape (ShapeArrays): Receives its shape.
 
-    Returns
-    -------
-    float
-        Its estimated cost, or `cost_limit` if there is none.
+    Returns:
+        float: Its estimated cost, or `cost_limit` if there is none.
     """
     _environment, _constants, design, near, shape = tube
     trace = np.zeros(N_TRACE)

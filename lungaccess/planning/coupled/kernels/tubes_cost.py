@@ -60,16 +60,12 @@ def cost_in_tissue(obstacles, of_tubes, base, normal, arcs, behind):
 def costs_in_tissue(obstacles, of_tubes, tips, deployed, shape, arcs, first_arc, costs):
     """Fill `costs` (N,) with what the tubes of many deployments cost by their width, beyond the wall.
 
-    Parameters
-    ----------
-    tips : (N, 9) float64
-        The scope tip of each.
-    deployed : (N, 2) float64
-        Rotation in rad, and arc length behind the wall, mm.
-    shape : (N,) int64
-    arcs : (A, ARC_COLUMNS) float64
-    first_arc : (S + 1,) int64
-        The arcs of all shapes, and where those of each begin.
+    Args:
+        tips ((N, 9) float64): The scope tip of each.
+        deployed ((N, 2) float64): Rotation in rad, and arc length behind the wall, mm.
+        shape: (N,) int64.
+        arcs: (A, ARC_COLUMNS) float64.
+        first_arc ((S + 1,) int64): The arcs of all shapes, and where those of each begin.
     """
     for n in range(costs.shape[0]):
         rotation, behind = deployed[n]

@@ -99,10 +99,8 @@ class Tree:
 class NeedleRRT:
     """Grows one tree per start pose until it meets the goal or its budget is spent.
 
-    Parameters
-    ----------
-    required_mm : float
-        Distance that the needle's axis keeps from obstacles.
+    Args:
+        required_mm: Distance that the needle's axis keeps from obstacles.
     """
 
     def __init__(self, needle: Needle, required_mm: float, obstacles: Obstacles) -> None:
@@ -125,16 +123,12 @@ class NeedleRRT:
     ) -> ArcPath | None:
         """Return a path from a start pose to the goal, or None when the budget is spent.
 
-        Parameters
-        ----------
-        lps_from_start : (4, 4) float64
-        goal_lps : (3,) float64, LPS mm
-        branch : int
-            Branch that the tube pierced.
-        iterations : int, optional
-            Samples drawn; each is followed by one step towards the goal.
-        time_s : float, optional
-            Processor time of this thread.
+        Args:
+            lps_from_start: (4, 4) float64.
+            goal_lps: (3,) float64, LPS mm.
+            branch: Branch that the tube pierced.
+            iterations: Samples drawn; each is followed by one step towards the goal.
+            time_s: Processor time of this thread.
         """
         tree = Tree(lps_from_start)
         deadline = math.inf if time_s is None else time.thread_time() + time_s

@@ -26,12 +26,10 @@ def chord_mm(curvature_per_mm: float) -> float:
 class Solid:
     """Some voxels of a lung as solid boxes.
 
-    Parameters
-    ----------
-    holds : callable
-        Tells from labels `(...,)` uint16 which voxels belong to it.
-    low, high : (3,) int64, optional
-        Window of voxels; the solid is known in it only.  By default the whole grid, and OUTSIDE beyond it.
+    Args:
+        holds: Tells from labels `(...,)` uint16 which voxels belong to it.
+        low, high ((3,) int64): Window of voxels; the solid is known in it only.  By default the whole grid,
+            and OUTSIDE beyond it.
     """
 
     def __init__(
@@ -50,9 +48,8 @@ class Solid:
 
         A line that does not touch the surface lies on one side of it.
 
-        Parameters
-        ----------
-        line_lps : (N, 3) float64, LPS mm
+        Args:
+            line_lps: (N, 3) float64, LPS mm.
         """
         if self._holds(self._lung.grid.values_at(self._lung.labels, line_lps, OUTSIDE)).any():
             return True
@@ -74,12 +71,9 @@ class Solid:
 class Obstacles:
     """The solids of one lung, each made when it is first asked for.
 
-    Parameters
-    ----------
-    with_fissures : bool
-        Whether fissures are obstacles.
-    reach_mm : float
-        `other_airways` is exact within this distance of the pierced branch.
+    Args:
+        with_fissures: Whether fissures are obstacles.
+        reach_mm: `other_airways` is exact within this distance of the pierced branch.
     """
 
     def __init__(self, lung: Lung, *, with_fissures: bool, reach_mm: float) -> None:

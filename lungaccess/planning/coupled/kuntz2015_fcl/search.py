@@ -46,30 +46,21 @@ class ReferenceSearch(SearchInParts):
     where it fits and an airway in lung tissue lies ahead, as in `KuntzSearch`; after line 8 the tubes are
     validated too.  A path that is found is yielded only if the planner's proof accepts it.
 
-    Parameters
-    ----------
-    task, atlas, rejects
-        See `lungaccess.planning.coupled.search.kuntz2015.KuntzSearch`.
-    rrt_iterations : int
-        Samples of each RRT: the same seed then gives the same plans.
-    rrt_time_s : float, optional
-        Processor time of each RRT instead, 0.05 in the paper.  Such a run cannot be repeated exactly.
-    obstacles : Obstacles, optional
-        Those of another search in the same lung; its meshes, which take long to make, are then shared.
+    Args:
+        task, atlas, rejects: See `lungaccess.planning.coupled.search.kuntz2015.KuntzSearch`.
+        rrt_iterations: Samples of each RRT: the same seed then gives the same plans.
+        rrt_time_s: Processor time of each RRT instead, 0.05 in the paper.  Such a run cannot be repeated
+            exactly.
+        obstacles: Those of another search in the same lung; its meshes, which take long to make, are then
+            shared.
 
-    Attributes
-    ----------
-    counts : Counter
-        What became of the placements: `FOUND`, or why none was.
-    spent_s : dict of str to float
-        Processor time by part: "placement", "tubes", "needle", "proof".
-    refused_by_proof : list of Refusal
-        Paths that were found and are not yielded.
+    Attributes:
+        counts: What became of the placements: `FOUND`, or why none was.
+        spent_s: Processor time by part: "placement", "tubes", "needle", "proof".
+        refused_by_proof: Paths that were found and are not yielded.
 
-    Raises
-    ------
-    SettingsError
-        If an RRT has no budget.
+    Raises:
+        SettingsError: If an RRT has no budget.
     """
 
     def __init__(

@@ -63,10 +63,8 @@ def aim_starts(tubes: ConcentricTubes, joints: Float, count: int) -> ManyShapes 
 class TubeAiming:
     """Aims the tubes of a system at points in a lung.
 
-    Parameters
-    ----------
-    objective : Objective
-        By which deployments are cheap.
+    Args:
+        objective: By which deployments are cheap.
     """
 
     def __init__(self, lung: Lung, system: System, objective: Objective, *, with_fissures: bool) -> None:
@@ -87,26 +85,19 @@ class TubeAiming:
     ) -> tuple[Float, Int]:
         """Aim the tubes at a point from scope tips, or from each at its own.
 
-        Parameters
-        ----------
-        ends : (3,) or (K, 3) float64, LPS mm
-            Where they are to end.
-        tips : (K, 9) float64
-        allowed : (K,) bool
-            Which of them the scope can take.
-        row_of : (N,) int64
-            The tip of each attempt.
-        starts : ManyShapes
-            From which each begins.
-        enough : int
-            So many deployments end the attempts; 0 to make all of them.
+        Args:
+            ends ((3,) or (K, 3) float64, LPS mm): Where they are to end.
+            tips: (K, 9) float64.
+            allowed ((K,) bool): Which of them the scope can take.
+            row_of ((N,) int64): The tip of each attempt.
+            starts: From which each begins.
+            enough: So many deployments end the attempts; 0 to make all of them.
 
-        Returns
-        -------
-        found : (N, JOINTS + 2 n) float64
-            Rotation in rad, estimated cost, which is infinite where there is nothing, and all joints.
-        why : (N,) int64
-            0 for a deployment that ends at the point, MISSES, SPOILT_WAY, NOT_TRIED, or why tubes refuse it.
+        Returns:
+            - found ((N, JOINTS + 2 n) float64) - Rotation in rad, estimated cost, which is infinite where
+              there is nothing, and all joints.
+            - why ((N,) int64) - 0 for a deployment that ends at the point, MISSES, SPOILT_WAY, NOT_TRIED, or
+              why tubes refuse it.
         """
         scratch = shape_arrays(self._design), shape_arrays(self._design)
         found = np.zeros((len(row_of), JOINTS + len(scratch[0].joints)))
@@ -153,12 +144,9 @@ def tips_of(atlas: Atlas, entries: Int) -> tuple[Int, Float, Int]:
 class AimedFromPose:
     """The tubes aimed at the target of a task from one pose of the scope.
 
-    Attributes
-    ----------
-    reasons : dict of str to int
-        How many attempts each reason refused.
-    why : str
-        What prevents a plan, in words.
+    Attributes:
+        reasons: How many attempts each reason refused.
+        why: What prevents a plan, in words.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, lps_from_scope_tip: Float) -> None:
@@ -220,22 +208,16 @@ def reasons_of(why: Int) -> dict[str, int]:
 class AimedTubes:
     """The deployments, from the scope tips of an atlas, that end at the target of a task or beside it.
 
-    Parameters
-    ----------
-    task : Task
-    atlas : Atlas
-    evaluator : CandidateEvaluator, optional
-        Made of the task if None.
-    aims : (S, 3) float64, optional
-        Where the tubes from each scope tip end, LPS mm, nan for none; at the target if None.
+    Args:
+        evaluator: Made of the task if None.
+        aims ((S, 3) float64): Where the tubes from each scope tip end, LPS mm, nan for none; at the target if
+            None.
 
-    Attributes
-    ----------
-    evaluator : CandidateEvaluator
-    promising : (N,) int64
-        Entries of the atlas from which the tubes are aimed, one for each scope tip, the nearest first.
-    nearest_mm : float
-        Distance of the target from the nearest tip of the tubes in the atlas; infinite if there is none.
+    Attributes:
+        promising ((N,) int64): Entries of the atlas from which the tubes are aimed, one for each scope tip,
+            the nearest first.
+        nearest_mm: Distance of the target from the nearest tip of the tubes in the atlas; infinite if there
+            is none.
     """
 
     def __init__(

@@ -96,12 +96,9 @@ class LocalSearchRounds:
 class AtlasSearch(SearchInParts):
     """Direct arcs from the whole atlas, then rounds of local search, sampling, needle search and refinement.
 
-    Attributes
-    ----------
-    arcs : DirectArcs
-        The direct arcs from the atlas, with the evaluator of candidates.
-    incumbent : Incumbent
-        The best candidate so far.
+    Attributes:
+        arcs: The direct arcs from the atlas, with the evaluator of candidates.
+        incumbent: The best candidate so far.
     """
 
     def __init__(

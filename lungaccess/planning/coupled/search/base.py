@@ -20,16 +20,11 @@ from lungaccess.problem.task import Task
 class Step:
     """One step of a search.
 
-    Parameters
-    ----------
-    iteration : int
-        0 for what comes before the iterations, then counted from 1.
-    phase : str
-        What the search did, in words for the user.
-    candidate : Candidate or None
-        A proved candidate, if the step found one.
-    cost : float
-        Its cost under the task's objective; infinite without a candidate.
+    Args:
+        iteration: 0 for what comes before the iterations, then counted from 1.
+        phase: What the search did, in words for the user.
+        candidate: A proved candidate, if the step found one.
+        cost: Its cost under the task's objective; infinite without a candidate.
     """
 
     iteration: int
@@ -44,11 +39,9 @@ class PlanSearch(Protocol):
     A search is made from a `Task` and an `Atlas`.  Its name in
     `lungaccess.planning.searches.planners` is the `method` of the planner and of the command line.
 
-    Attributes
-    ----------
-    blocked : Counter of str
-        How many direct arcs were stopped, by what stopped them, for the reasons of a `NoPlan`.  It may stay
-        empty.
+    Attributes:
+        blocked: How many direct arcs were stopped, by what stopped them, for the reasons of a `NoPlan`.  It
+            may stay empty.
     """
 
     blocked: Counter[str]
@@ -63,12 +56,7 @@ class PlanSearch(Protocol):
 
 @runtime_checkable
 class AtlasBound(PlanSearch, Protocol):
-    """A search that begins with the simplest ways from all entries of an atlas.
-
-    Attributes
-    ----------
-    arcs : lungaccess.planning.coupled.search.direct_candidates.DirectCandidates
-    """
+    """A search that begins with the simplest ways from all entries of an atlas."""
 
     arcs: Any
 
@@ -77,10 +65,8 @@ class AtlasBound(PlanSearch, Protocol):
 class ParallelSearch(PlanSearch, Protocol):
     """A search that can be continued in several processes; see `lungaccess.planning.coupled.parallel`.
 
-    Attributes
-    ----------
-    incumbent : Incumbent
-        The best candidate so far, shared between rounds.
+    Attributes:
+        incumbent: The best candidate so far, shared between rounds.
     """
 
     incumbent: Incumbent
@@ -101,10 +87,8 @@ class ParallelSearch(PlanSearch, Protocol):
 class DirectSearch(Protocol):
     """What looks at the simplest ways from the entries of an atlas before a search goes on from the best.
 
-    Attributes
-    ----------
-    clear : (C,) int64
-        After its steps the entries with a clear way, the best first.
+    Attributes:
+        clear ((C,) int64): After its steps the entries with a clear way, the best first.
     """
 
     clear: Int
@@ -149,11 +133,8 @@ class Incumbent:
 class SearchInParts(ABC):
     """What all searches have in common that can be continued in several processes: a `ParallelSearch`.
 
-    Attributes
-    ----------
-    incumbent : Incumbent
-    share : tuple of 2 int
-        The part of the work that it does, and of how many.
+    Attributes:
+        share (tuple of 2 int): The part of the work that it does, and of how many.
     """
 
     def __init__(self, blocked: Counter[str]) -> None:

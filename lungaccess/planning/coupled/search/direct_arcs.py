@@ -27,20 +27,14 @@ FINALISTS = 3
 class DirectArcs:
     """The single arcs of a needle from the deployments of an atlas to a target, or to aims beside it.
 
-    Parameters
-    ----------
-    task : Task
-    atlas : Atlas
-    evaluator : CandidateEvaluator, optional
-        Made of the task if None.
-    aims : (S, 3) float64, optional
-        Where arcs from each scope tip end, LPS mm, nan for none; at the target if None.
+    Args:
+        evaluator: Made of the task if None.
+        aims ((S, 3) float64): Where arcs from each scope tip end, LPS mm, nan for none; at the target if
+            None.
 
-    Attributes
-    ----------
-    evaluator : CandidateEvaluator
-    in_workspace : (N,) int64
-        The deployments whose workspace of the needle holds the target, the nearest first.
+    Attributes:
+        in_workspace ((N,) int64): The deployments whose workspace of the needle holds the target, the nearest
+            first.
     """
 
     def __init__(
@@ -78,17 +72,14 @@ class DirectArcs:
     def blockers(self, chosen: Int, environment: NeedleEnvironment | None = None) -> tuple[Int, Float, Float]:
         """Return what blocks the arcs from deployments, their lengths and their integrals of 1 / clearance.
 
-        Parameters
-        ----------
-        chosen : (N,) int64
-        environment : NeedleEnvironment, optional
-            Another one than the task's.
+        Args:
+            chosen: (N,) int64.
+            environment: Another one than the task's.
 
-        Returns
-        -------
-        blockers : (N,) int64
-            0 for arcs that are proved clear, -1 where no arc keeps the needle's limits, else a voxel label.
-        lengths, inverse_clearance : (N,) float64
+        Returns:
+            - blockers ((N,) int64) - 0 for arcs that are proved clear, -1 where no arc keeps the needle's
+              limits, else a voxel label.
+            - lengths, inverse_clearance ((N,) float64)
         """
         entries = self.atlas.deployments
         found = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen)), np.zeros(len(chosen))
@@ -177,20 +168,15 @@ class DirectArcs:
     def evaluate(self, chosen: Int, slack: float, best: float = math.inf) -> tuple[Int, Float, float]:
         """Evaluate the arcs from deployments, less and less of them as cheap ones are found.
 
-        Parameters
-        ----------
-        chosen : (N,) int64
-        slack, best : float
-            Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not tested.
+        Args:
+            chosen: (N,) int64.
+            slack, best: Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not
+                tested.
 
-        Returns
-        -------
-        blockers : (N,) int64
-            As those of the method `blockers`, or PRUNED_BY_BOUND.
-        costs : (N,) float64
-            Estimated costs, infinite where a lower bound was enough.
-        best : float
-            Cost of the cheapest clear arc, or `best`.
+        Returns:
+            - blockers ((N,) int64) - As those of the method `blockers`, or PRUNED_BY_BOUND.
+            - costs ((N,) float64) - Estimated costs, infinite where a lower bound was enough.
+            - best - Cost of the cheapest clear arc, or `best`.
         """
         entries = self.atlas.deployments
         blockers, costs = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen))
@@ -216,10 +202,8 @@ class DirectArcs:
 def costs_of_tubes(evaluator: CandidateEvaluator, tips: Float, entries: Deployments) -> Float:
     """Return what the tubes of N deployments cost `(N,)`: 0 under an objective of the needle alone.
 
-    Parameters
-    ----------
-    tips : (N, 9) float64
-        The scope tip of each; see `lungaccess.planning.coupled.kernels.candidate`.
+    Args:
+        tips ((N, 9) float64): The scope tip of each; see `lungaccess.planning.coupled.kernels.candidate`.
     """
     costs = np.zeros(entries.count)
     if evaluator.objective.tissue == 0.0:
@@ -237,10 +221,8 @@ def costs_of_tubes(evaluator: CandidateEvaluator, tips: Float, entries: Deployme
 class DirectArcSearch:
     """Evaluates the direct arcs of an atlas chunk by chunk, the nearest deployments first.
 
-    Attributes
-    ----------
-    clear : (C,) int64
-        After the search the deployments with a clear arc, the cheapest first.
+    Attributes:
+        clear ((C,) int64): After the search the deployments with a clear arc, the cheapest first.
     """
 
     phase = "direct arcs"

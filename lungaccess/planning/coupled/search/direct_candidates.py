@@ -49,12 +49,10 @@ def direct_candidates(
 ) -> DirectCandidates:
     """Return the simplest ways to the target of a task, or to aims beside it.
 
-    Parameters
-    ----------
-    evaluator : CandidateEvaluator, optional
-        What proves them, for instance also for phases of the breath; made of the task if None.
-    aims : (S, 3) float64, optional
-        Where the ways from each scope tip of the atlas end, LPS mm, nan for none; at the target if None.
+    Args:
+        evaluator: What proves them, for instance also for phases of the breath; made of the task if None.
+        aims ((S, 3) float64): Where the ways from each scope tip of the atlas end, LPS mm, nan for none; at
+            the target if None.
     """
     made = AimedTubes if task.system.needle is None else DirectArcs
     return made(task, atlas, evaluator, aims)

@@ -17,10 +17,8 @@ def different(entries: Deployments, ordered: Int) -> Int:
     Similar are those that leave the same branch and end in the same cell of CELL_MM with about the same
     tangent.
 
-    Parameters
-    ----------
-    ordered : (N,) int64
-        Which of them, the best first.
+    Args:
+        ordered ((N,) int64): Which of them, the best first.
     """
     places = np.floor(entries.positions[ordered] / CELL_MM)
     towards = np.rint(entries.tangents[ordered] * DIRECTIONS)

@@ -22,12 +22,9 @@ class KuntzSearch(SearchInParts):
     Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not hold
     the target; line 9 runs the RRT, here for a fixed number of iterations so that runs repeat.
 
-    Parameters
-    ----------
-    atlas : Atlas
-        Only its motions of the scope are used.
-    rejects : bool
-        Whether line 8 is carried out; the paper compares with a run without it.
+    Args:
+        atlas: Only its motions of the scope are used.
+        rejects: Whether line 8 is carried out; the paper compares with a run without it.
     """
 
     phase = "Algorithm 1"

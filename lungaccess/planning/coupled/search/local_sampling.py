@@ -26,12 +26,9 @@ SPREADS = np.array([math.radians(15.0), 2.0])
 class LocalSampling:
     """Samples deployments near entries of an atlas.
 
-    Parameters
-    ----------
-    local_search : LocalSearch
-        Has the arguments of the kernels.
-    chosen : (N,) int64
-        Entries of the atlas, at least one.
+    Args:
+        local_search: Has the arguments of the kernels.
+        chosen ((N,) int64): Entries of the atlas, at least one.
     """
 
     def __init__(
@@ -91,9 +88,8 @@ def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> I
     A miss is how far the target lies from the needle's workspace, or less.  It counts in relation to how far
     a variation of the deployment moves that workspace: a few mm, and more with the distance from the tubes.
 
-    Parameters
-    ----------
-    target : (3,) float64, LPS mm
+    Args:
+        target: (3,) float64, LPS mm.
     """
     entries = atlas.deployments
     offset = target - entries.positions

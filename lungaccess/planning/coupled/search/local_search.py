@@ -45,11 +45,8 @@ where it was."""
 class TubeChoice:
     """A place of the scope and a deployment from it, which the kernels change.
 
-    Parameters
-    ----------
-    x : (c,) float64
-        See `lungaccess.planning.coupled.kernels.candidate`.
-    shape : ShapeArrays
+    Args:
+        x ((c,) float64): See `lungaccess.planning.coupled.kernels.candidate`.
     """
 
     x: Float
@@ -92,19 +89,13 @@ class TubeChoice:
 class LocalSearchRun:
     """The state of a local search that began at one candidate.
 
-    Parameters
-    ----------
-    goal : tuple of 3 floats
-        Where its paths end.
-    choice : TubeChoice
-    vias : (MAX_VIAS, 3) float64
-        The best choice so far; see `lungaccess.planning.coupled.kernels.candidate`.
-    count : int
-        Number of vias in use.
-    cost : float
-        Estimated cost of that choice; infinite before the search has begun.
-    evaluated_cost : float
-        The estimated cost at which the choice was last evaluated in full.
+    Args:
+        goal (tuple of 3 floats): Where its paths end.
+        vias ((MAX_VIAS, 3) float64): The best choice so far; see
+            `lungaccess.planning.coupled.kernels.candidate`.
+        count: Number of vias in use.
+        cost: Estimated cost of that choice; infinite before the search has begun.
+        evaluated_cost: The estimated cost at which the choice was last evaluated in full.
     """
 
     poses: TipRow
@@ -119,14 +110,9 @@ class LocalSearchRun:
 class LocalSearch:
     """Improves candidates of one task.
 
-    Parameters
-    ----------
-
-    Attributes
-    ----------
-    needle : tuple
-        Argument of the kernels; see `lungaccess.planning.coupled.kernels.candidate`.
-    target : tuple of 3 floats
+    Attributes:
+        needle: Argument of the kernels; see `lungaccess.planning.coupled.kernels.candidate`.
+        target: tuple of 3 floats.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, rng: np.random.Generator) -> None:

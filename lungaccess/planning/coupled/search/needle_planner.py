@@ -34,15 +34,12 @@ DOUBLINGS = 3
 class NamedNeedlePlanner:
     """Searches the needle's paths of one task with the planner that the task names.
 
-    Parameters
-    ----------
-    default : str
-        The planner where the task names none.
+    Args:
+        default: The planner where the task names none.
 
-    Raises
-    ------
-    SettingsError
-        If it is a planner of OMPL and OMPL has been used in this process: it can be seeded once.
+    Raises:
+        SettingsError: If it is a planner of OMPL and OMPL has been used in this process: it can be seeded
+            once.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, default: str) -> None:
@@ -96,14 +93,10 @@ def needle_searches(
     A pass ends where the lower bound reaches the cost of the best candidate.  Each run is an iteration, and
     so is the end of a pass.
 
-    Parameters
-    ----------
-    share : tuple of int
-        Number of this process, and how many processes share the deployments.
+    Args:
+        share: Number of this process, and how many processes share the deployments.
 
-    Yields
-    ------
-    Step, Candidate or None
+    Yields:
         The candidate is where a local search may begin.  The step has it only if there is no plan yet.
     """
     nothing = Step(iteration=0, phase=PHASE)

@@ -17,14 +17,11 @@ from stages.tube import design_arrays, longest_mm
 class Placement:
     """Where scope and tubes are placed.
 
-    Parameters
-    ----------
-    rotation_rad : float
-        Rotation of all tubes.
-    insertions_mm, rotations_rad : (n,) float64
-        Insertion of each tube, the outermost first, and how much farther it is turned.
-    needle_seed : int
-        Seed of the needle's RRT from there.
+    Args:
+        rotation_rad: Rotation of all tubes.
+        insertions_mm, rotations_rad ((n,) float64): Insertion of each tube, the outermost first, and how much
+            farther it is turned.
+        needle_seed: Seed of the needle's RRT from there.
     """
 
     tip: ScopeTip

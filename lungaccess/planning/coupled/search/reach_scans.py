@@ -28,10 +28,8 @@ class WindowReachScan:
     A point is reached if an arc of the needle, or the tubes alone, to an aim beside it is proved clear and on
     target in all of the phases.
 
-    Parameters
-    ----------
-    lung : Lung
-        With a motion, which that of the atlas need not have.
+    Args:
+        lung: With a motion, which that of the atlas need not have.
     """
 
     def __init__(self, lung: Lung, atlas: Atlas, phases: tuple[float, float]) -> None:
@@ -41,9 +39,8 @@ class WindowReachScan:
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
         """Try all points, one after the other; neither seeds nor neighbours matter.
 
-        Parameters
-        ----------
-        points : (N, 3) float64, LPS mm
+        Args:
+            points: (N, 3) float64, LPS mm.
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds = np.full(len(places), UNREACHED, dtype=np.uint8)
@@ -88,13 +85,11 @@ def reach_scan(
 ) -> Scan:
     """Return what tells which points the system of an atlas reaches: by its needle, or by its tubes alone.
 
-    Parameters
-    ----------
-    arcs, trees : int
-        See `stages.needle.ReachScan`; without a needle there are no trees, and `arcs` counts deployments.
-    during : tuple of Lung and phases, optional
-        The lung with its motion, and phases in all of which points are to be reached; then all arcs count,
-        and no trees.
+    Args:
+        arcs, trees: See `stages.needle.ReachScan`; without a needle there are no trees, and `arcs` counts
+            deployments.
+        during (tuple of Lung and phases): The lung with its motion, and phases in all of which points are to
+            be reached; then all arcs count, and no trees.
     """
     if during is not None:
         return WindowReachScan(during[0], atlas, during[1])

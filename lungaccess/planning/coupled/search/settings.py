@@ -16,31 +16,21 @@ class SearchSettings:
 
     The defaults are free choices; the results on that page were measured with them.
 
-    Parameters
-    ----------
-    kept_slack : float
-        Direct arcs that cost up to so many times the cheapest may be starts of local searches.
-    starts : int
-        Direct arcs with which the first successive halving begins.  More of them find a good region more
-        surely, and leave less work for each.
-    rungs : int
-        Rungs of a successive halving.
-    rung_iterations : int
-        Iterations of each local search on the first rung; they double from rung to rung.
-    perturbations : int
-        Perturbed copies of the best candidate that join the successive halving of each round.
-    samplings : int
-        Iterations of local sampling in each round; with one or more, every round has an iteration.
-    needle_searches : int
-        Runs of the needle's optimal search in each round.
-    needle_iterations : int
-        Iterations of such a run in the first pass over the deployments; they double three times.
-    intensifications : int
-        How often in each round the local search from the best candidate is evaluated in full.
-    intensification_iterations : int
-        Iterations of that local search before each of these evaluations.
-    refine_every : int
-        Rounds between two joint refinements, which take as long as several rounds.
+    Args:
+        kept_slack: Direct arcs that cost up to so many times the cheapest may be starts of local searches.
+        starts: Direct arcs with which the first successive halving begins.  More of them find a good region
+            more surely, and leave less work for each.
+        rungs: Rungs of a successive halving.
+        rung_iterations: Iterations of each local search on the first rung; they double from rung to rung.
+        perturbations: Perturbed copies of the best candidate that join the successive halving of each round.
+        samplings: Iterations of local sampling in each round; with one or more, every round has an iteration.
+        needle_searches: Runs of the needle's optimal search in each round.
+        needle_iterations: Iterations of such a run in the first pass over the deployments; they double three
+            times.
+        intensifications: How often in each round the local search from the best candidate is evaluated in
+            full.
+        intensification_iterations: Iterations of that local search before each of these evaluations.
+        refine_every: Rounds between two joint refinements, which take as long as several rounds.
     """
 
     kept_slack: Annotated[float, quantity("slack of kept direct arcs", at_least=1.0, at_most=100.0)] = 1.5

@@ -41,10 +41,8 @@ class TubeReachScan:
     A point is reached directly if the tubes, aimed at it from the scope tip of some deployment that ends
     nearby, are proved clear.  It may be used by several threads at once.
 
-    Parameters
-    ----------
-    deployments : int
-        Of so many deployments to a point the cheapest is told.
+    Args:
+        deployments: Of so many deployments to a point the cheapest is told.
     """
 
     def __init__(self, atlas: Atlas, *, deployments: int = DEFAULT_ARCS) -> None:
@@ -59,9 +57,8 @@ class TubeReachScan:
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
         """Try all points, one after the other; neither seeds nor neighbours matter.
 
-        Parameters
-        ----------
-        points : (N, 3) float64, LPS mm
+        Args:
+            points: (N, 3) float64, LPS mm.
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds, entries = np.full(len(places), UNREACHED, dtype=np.uint8), np.full(len(places), -1)

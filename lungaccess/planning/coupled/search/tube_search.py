@@ -31,12 +31,10 @@ class TubeSearch(SearchInParts):
 
     It ends when it has looked along the motions of all tips with a deployment to the target that differ.
 
-    Attributes
-    ----------
-    blocked : Counter of str
-        How many attempts were refused, by the reason.
-    clear : (C,) int64
-        After the direct steps the entries of the atlas with a deployment to the target, the cheapest first.
+    Attributes:
+        blocked: How many attempts were refused, by the reason.
+        clear ((C,) int64): After the direct steps the entries of the atlas with a deployment to the target,
+            the cheapest first.
     """
 
     def __init__(self, task: Task, atlas: Atlas, aimed: AimedTubes | None = None) -> None:

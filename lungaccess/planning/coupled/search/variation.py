@@ -40,15 +40,11 @@ def varied(
     With a needle its arc follows from the tubes.  Without one the tubes have to end where they are to: then
     the first shift is that of the scope along its motion, and the tubes are aimed from the changed ones.
 
-    Parameters
-    ----------
-    turn_rad : float
-        By which all tubes are turned.
-    shifts : sequence of float
-        Of outer and inner tube, mm.  Behind them by how much each is turned against the others, the innermost
-        first, rad.
-    end : (3,) float64, optional
-        Where the devices end, LPS mm; what the evaluator aims at if None.
+    Args:
+        turn_rad: By which all tubes are turned.
+        shifts: Of outer and inner tube, mm.  Behind them by how much each is turned against the others, the
+            innermost first, rad.
+        end ((3,) float64): Where the devices end, LPS mm; what the evaluator aims at if None.
     """
     tubes, old, tip = evaluator.task.system.tubes, candidate.deployment, candidate.tip
     joints = _changed_joints(tubes, old, shifts)

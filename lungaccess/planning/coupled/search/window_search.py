@@ -56,23 +56,15 @@ _SETTINGS = SearchSettings(kept_slack=100.0)
 class WindowEvaluator(CandidateEvaluator):
     """Proves candidates also for a window of breathing, and aims at where the target moves about.
 
-    Parameters
-    ----------
-    task : Task
-        Of a patient with motion.
-    phases : tuple of 2 floats or None
-        Phases that every window has to hold.
-    widest : bool
-        Whether a wider window counts before cost.
-    middle : float, optional
-        See `MovingTarget`.
+    Args:
+        task: Of a patient with motion.
+        phases (tuple of 2 floats or None): Phases that every window has to hold.
+        widest: Whether a wider window counts before cost.
+        middle: See `MovingTarget`.
 
-    Attributes
-    ----------
-    window : BreathingWindow or None
-        That of the last candidate, where the widest is wanted.
-    limit : WindowLimit or None
-        What refused the last candidate whose proof in the masks' phase was good.
+    Attributes:
+        window: That of the last candidate, where the widest is wanted.
+        limit: What refused the last candidate whose proof in the masks' phase was good.
     """
 
     def __init__(
@@ -132,14 +124,11 @@ def cost_outside(share: float) -> float:
 class WindowAims:
     """Where devices from each of S scope tips have to end for a window.
 
-    Parameters
-    ----------
-    points : (S, 3) float64
-        LPS mm; nan for tips from which no devices get near.
-    misses_mm : (S,) float64
-        Least miss of tips that are ruled out by it, else 0.
-    shares : (S,) float64
-        No end of the devices has the target within the tolerance in more of the breath.
+    Args:
+        points ((S, 3) float64): LPS mm; nan for tips from which no devices get near.
+        misses_mm ((S,) float64): Least miss of tips that are ruled out by it, else 0.
+        shares ((S,) float64): No end of the devices has the target within the tolerance in more of the
+            breath.
     """
 
     points: Float
@@ -179,14 +168,11 @@ def _ending_near(evaluator: WindowEvaluator, atlas: Atlas, within_mm: float) -> 
 class WindowDirectSearch:
     """Evaluates the direct candidates of an atlas, those first that may be the best.
 
-    Attributes
-    ----------
-    clear : (C,) int64
-        After the search the entries with a clear way, the best first.
-    blockers : (N,) int64
-        What blocks the promising entries in the masks' phase; see `DirectCandidates.evaluate`.
-    refused : dict of int to WindowLimit
-        What ends the window too early, by entry.
+    Attributes:
+        clear ((C,) int64): After the search the entries with a clear way, the best first.
+        blockers ((N,) int64): What blocks the promising entries in the masks' phase; see
+            `DirectCandidates.evaluate`.
+        refused: What ends the window too early, by entry.
     """
 
     phase = "direct candidates"
@@ -227,18 +213,7 @@ class WindowDirectSearch:
 
 
 class WindowSearch(AtlasSearch):
-    """Direct arcs to the aims of all scope tips, then rounds as of any search, and variations of the best.
-
-    Parameters
-    ----------
-    evaluator : WindowEvaluator
-    atlas : Atlas
-
-    Attributes
-    ----------
-    aims : WindowAims
-    windows : WindowDirectSearch
-    """
+    """Direct arcs to the aims of all scope tips, then rounds as of any search, and variations of the best."""
 
     def __init__(self, evaluator: WindowEvaluator, atlas: Atlas) -> None:
         self.window_evaluator, self.aims = evaluator, WindowAims.of(evaluator, atlas)
@@ -284,10 +259,8 @@ def window_search(
 ) -> WindowSearch | WindowTubeSearch:
     """Return the search for a window of the breath, with the needle of a system or with its tubes alone.
 
-    Parameters
-    ----------
-    phases, widest, middle
-        As of `WindowEvaluator`.
+    Args:
+        phases, widest, middle: As of `WindowEvaluator`.
     """
     evaluator = WindowEvaluator(task, phases, widest=widest, middle=middle)
     return (WindowTubeSearch if task.system.needle is None else WindowSearch)(evaluator, atlas)

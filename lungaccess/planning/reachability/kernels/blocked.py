@@ -39,27 +39,20 @@ LEAST_STEP_MM, GREATEST_STEP_MM = 0.05, 4.0
 class ProofEnvironment(NamedTuple):
     """What a proof of one target looks at; fields of distances are those of `anatomy.kernels.field`.
 
-    Parameters
-    ----------
-    lumen, may_be_left, hazards : (ni + 1, nj + 1, nk + 1) uint16
-        Distance to the lumen, to the lumen that tubes may leave, and to what they keep clear of.
-    depth, tips : (ni + 1, nj + 1, nk + 1) uint16
-        Depth in the lumen, and distance to where the tip of the scope may be.
-    passable : (ni + 1, nj + 1, nk + 1) uint16
-        Distance to where the needle may pass before the target.
-    labels : (ni, nj, nk) uint16
-    not_lumen : (ni, nj, nk) uint8
-        1 outside the lumen.
-    geometry, depth_geometry : (3, 5) float64
-        Of the labels and the other distances, and of `depth` and `tips`.
-    backward : BackwardReach
-        Directions from which paths come to the target.
-    hazard_bits : int
-        Structures that tubes keep clear of.
-    loss_mm : float
-        By so much a bound of these fields may fall short of the distance.
-    least_depth_mm : float
-        Of a scope tip in the lumen.
+    Args:
+        lumen, may_be_left, hazards ((ni + 1, nj + 1, nk + 1) uint16): Distance to the lumen, to the lumen
+            that tubes may leave, and to what they keep clear of.
+        depth, tips ((ni + 1, nj + 1, nk + 1) uint16): Depth in the lumen, and distance to where the tip of
+            the scope may be.
+        passable ((ni + 1, nj + 1, nk + 1) uint16): Distance to where the needle may pass before the target.
+        labels: (ni, nj, nk) uint16.
+        not_lumen ((ni, nj, nk) uint8): 1 outside the lumen.
+        geometry, depth_geometry ((3, 5) float64): Of the labels and the other distances, and of `depth` and
+            `tips`.
+        backward: Directions from which paths come to the target.
+        hazard_bits: Structures that tubes keep clear of.
+        loss_mm: By so much a bound of these fields may fall short of the distance.
+        least_depth_mm: Of a scope tip in the lumen.
     """
 
     lumen: np.ndarray

@@ -105,21 +105,15 @@ def _project(line, tangent, change, sums):
 def sum_changes(seen, family, tangent, target, frame, box, sums, costs):
     """Sum up by how much the target moves as the tips of a box see it, to first order.
 
-    Parameters
-    ----------
-    seen : Seen
-    family : BoxTubes
-    tangent : tuple of 3 float
-        Direction of the middle tip.
-    target : tuple of 3 float
-        LPS mm.
-    frame, box
-        See the module.
-    sums : (3,) float64
-        Receives by how much the target may move along the line from the centre of the tightest circle in the
-        plane of tip and target, across it, and along the tip's direction, mm.
-    costs : (SIDES,) float64
-        Receives what each side of the box costs, mm.
+    Args:
+        seen: Seen.
+        family: BoxTubes.
+        tangent (tuple of 3 float): Direction of the middle tip.
+        target (tuple of 3 float): LPS mm.
+        frame, box: See the module.
+        sums ((3,) float64): Receives by how much the target may move along the line from the centre of the
+            tightest circle in the plane of tip and target, across it, and along the tip's direction, mm.
+        costs ((SIDES,) float64): Receives what each side of the box costs, mm.
     """
     line = seen.line
     from_place = minus(target, family.base, 1.0)

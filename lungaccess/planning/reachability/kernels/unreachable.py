@@ -64,12 +64,10 @@ MOST_WAITING = 400
 class Pieces(NamedTuple):
     """Pieces of the airway as the kernels take them, see `lungaccess.planning.reachability.tip_places`.
 
-    Parameters
-    ----------
-    frames : (P, 3, 3) float64
-    cones : (N, 7) float64
-        Of all pieces, one after the other.
-    first_cone : (P + 1,) int64
+    Args:
+        frames: (P, 3, 3) float64.
+        cones ((N, 7) float64): Of all pieces, one after the other.
+        first_cone: (P + 1,) int64.
     """
 
     frames: np.ndarray
@@ -80,16 +78,11 @@ class Pieces(NamedTuple):
 class Found(NamedTuple):
     """What `rule_out` finds of M boxes.
 
-    Parameters
-    ----------
-    outcome : (M,) uint8
-        RULED_OUT, UNDECIDED or TOO_MANY.
-    share : (M,) float64
-        Share of each that is ruled out.
-    looked : (M,) int64
-        Boxes looked at for it.
-    left : (M, BOX_COLUMNS) float64
-        The first part that was left, if any was.
+    Args:
+        outcome ((M,) uint8): RULED_OUT, UNDECIDED or TOO_MANY.
+        share ((M,) float64): Share of each that is ruled out.
+        looked ((M,) int64): Boxes looked at for it.
+        left ((M, BOX_COLUMNS) float64): The first part that was left, if any was.
     """
 
     outcome: np.ndarray
@@ -229,22 +222,15 @@ def measures(boxes, out):
 def divide(environment, tubes, insertions, pieces, boxes, owners, greatest, parts, part_owners):
     """Halve the boxes that are larger than `greatest`, and keep the halves that may hold a deployment.
 
-    Parameters
-    ----------
-    environment, tubes, insertions
-        See `rule_out`; the target does not count.
-    pieces : Pieces
-    boxes : (N, BOX_COLUMNS) float64, owners : (N,) int32
-        The boxes and the numbers of their pieces.
-    greatest : float
-        Measure of a box.
-    parts : (2 N, BOX_COLUMNS) float64, part_owners : (2 N,) int32
-        Receive what is kept.
+    Args:
+        environment, tubes, insertions: See `rule_out`; the target does not count.
+        pieces: Pieces.
+        boxes ((N, BOX_COLUMNS) float64, owners : (N,) int32): The boxes and the numbers of their pieces.
+        greatest (float): Measure of a box.
+        parts ((2 N, BOX_COLUMNS) float64, part_owners : (2 N,) int32): Receive what is kept.
 
-    Returns
-    -------
-    int
-        How many are kept.
+    Returns:
+        int: How many are kept.
     """
     costs = np.zeros(SIDES)
     pair = np.zeros((2, BOX_COLUMNS))
@@ -277,26 +263,18 @@ def rule_out(
 ):
     """Try to rule out all deployments of boxes, each by halving it again and again.
 
-    Parameters
-    ----------
-    environment : ProofEnvironment
-    tubes : (N_TUBES,) float64
-    insertions : (N,) float64
-        See `stages.tube.kernels.greatest_insertions`.
-    limits : Limits
-    target : (3,) float64
-        LPS mm.
-    pieces : Pieces
-    boxes : (M, BOX_COLUMNS) float64, owners : (M,) int32
-        The boxes and the numbers of their pieces.
-    rows : (R,) int64
-        Those to look at.
-    most : int
-        Boxes to look at for each of them.
-    to_the_end : bool
-        Whether to go on after a part that is too small to halve.
-    found : Found
-        Its rows receive what is found.
+    Args:
+        environment: ProofEnvironment.
+        tubes: (N_TUBES,) float64.
+        insertions ((N,) float64): See `stages.tube.kernels.greatest_insertions`.
+        limits: Limits.
+        target ((3,) float64): LPS mm.
+        pieces: Pieces.
+        boxes ((M, BOX_COLUMNS) float64, owners : (M,) int32): The boxes and the numbers of their pieces.
+        rows ((R,) int64): Those to look at.
+        most (int): Boxes to look at for each of them.
+        to_the_end (bool): Whether to go on after a part that is too small to halve.
+        found (Found): Its rows receive what is found.
     """
     sums, costs = np.zeros(3), np.zeros(SIDES)
     there = (target[0], target[1], target[2])

@@ -59,12 +59,9 @@ def _pose(matrix: Float) -> Any:
 def motions_of_answer(query: BenchmarkQuery, answer: SubmittedAnswer, tips: PublishedTips) -> Motions:
     """Return what the devices of an answer do.
 
-    Raises
-    ------
-    FileError
-        If the answer names a published tip and the file of tips cannot be read.
-    SettingsError
-        If there is no tip of that number, or the answer is no plan.
+    Raises:
+        FileError: If the answer names a published tip and the file of tips cannot be read.
+        SettingsError: If there is no tip of that number, or the answer is no plan.
     """
     scope, tubes, needle = answer.scope, answer.tubes, answer.needle
     if scope is None or tubes is None or needle is None:

@@ -95,23 +95,15 @@ def write_benchmark(
 ) -> tuple[BenchmarkPhantom, ...]:
     """Make phantoms and write their cases; a phantom that the folder holds already is left as it is.
 
-    Parameters
-    ----------
-    names : iterable of str
-        Of the phantoms; all of them if empty.
-    with_ct : bool
-        Whether to write CTs, 25 MB each, which no rule needs.
-    with_tips : bool
-        Whether to write the tips of the scopes.
+    Args:
+        names: Of the phantoms; all of them if empty.
+        with_ct: Whether to write CTs, 25 MB each, which no rule needs.
+        with_tips: Whether to write the tips of the scopes.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such phantom.
-    AnatomyError
-        If a phantom is not that of the manifest.
-    FileError
-        If a file cannot be written.
+    Raises:
+        SettingsError: If there is no such phantom.
+        AnatomyError: If a phantom is not that of the manifest.
+        FileError: If a file cannot be written.
     """
     cases = tuple(phantom_named(name) for name in names) or benchmark_phantoms()
     say = progress or (lambda _words, _share: None)
@@ -157,10 +149,8 @@ def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips:
 def require_cases(folder: Path) -> tuple[BenchmarkPhantom, ...]:
     """Return the phantoms that a folder holds.
 
-    Raises
-    ------
-    FileError
-        If it is no folder of this benchmark, or of one with other phantoms.
+    Raises:
+        FileError: If it is no folder of this benchmark, or of one with other phantoms.
     """
     remedy = f"Make it with: lungaccess benchmark {VERSION} make --out {folder}"
     content = read_json(folder / BENCHMARK, expected="what `make` wrote", remedy=remedy)
@@ -204,12 +194,9 @@ class PublishedTips:
     def tip(self, phantom: str, system: str, number: int) -> Mapping[str, Any]:
         """Return `lps_from_entry`, `states` and `lps_from_tip` of a tip.
 
-        Raises
-        ------
-        FileError
-            If the file of tips cannot be read.
-        SettingsError
-            If there is no tip of that number.
+        Raises:
+            FileError: If the file of tips cannot be read.
+            SettingsError: If there is no tip of that number.
         """
         path = self._folder / phantom / tips_file(system)
         if (phantom, system) not in self._read:

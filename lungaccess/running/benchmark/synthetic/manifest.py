@@ -28,12 +28,9 @@ Point = tuple[float, float, float]
 class Entry:
     """What is fixed of one phantom.
 
-    Parameters
-    ----------
-    masks_sha256 : str
-        Of grid and masks, see `masks_sha256`.
-    targets_lps : tuple of (float, float, float)
-        LPS mm; target 1 is the first.
+    Args:
+        masks_sha256: Of grid and masks, see `masks_sha256`.
+        targets_lps (tuple of (float, float, float)): LPS mm; target 1 is the first.
     """
 
     masks_sha256: str
@@ -84,10 +81,9 @@ def unproved_phantom(case: BenchmarkPhantom) -> Phantom:
 def make_benchmark_phantom(case: BenchmarkPhantom) -> Phantom:
     """Make a phantom of the benchmark.
 
-    Raises
-    ------
-    AnatomyError
-        If its masks are not those of the manifest: the generator, or a library below it, has changed.
+    Raises:
+        AnatomyError: If its masks are not those of the manifest: the generator, or a library below it, has
+            changed.
     """
     made = unproved_phantom(case)
     wanted, found = entries()[case.name].masks_sha256, masks_sha256(made.images)

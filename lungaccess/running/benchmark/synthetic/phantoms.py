@@ -26,20 +26,11 @@ LOBES = ("right upper", "left upper", "right lower", "left lower", "right middle
 class BenchmarkPhantom:
     """One phantom of the benchmark.
 
-    Parameters
-    ----------
-    name : str
-        Family and number, such as "adult-01".
-    family : str
-        One of `FAMILIES`.
-    number : int
-        1 to `OF_A_FAMILY`.
-    seed : int
-    size : str
-    spacing_mm : float
-    traits : Traits
-    breathes : bool
-        Whether the patient comes with the motion of its breath.
+    Args:
+        name: Family and number, such as "adult-01".
+        family: One of `FAMILIES`.
+        number: 1 to `OF_A_FAMILY`.
+        breathes: Whether the patient comes with the motion of its breath.
     """
 
     name: str
@@ -60,10 +51,8 @@ def benchmark_phantoms() -> tuple[BenchmarkPhantom, ...]:
 def phantom_named(name: str) -> BenchmarkPhantom:
     """Return the phantom of that name.
 
-    Raises
-    ------
-    SettingsError
-        If there is none.
+    Raises:
+        SettingsError: If there is none.
     """
     for each in benchmark_phantoms():
         if each.name == name:

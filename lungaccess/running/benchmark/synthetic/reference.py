@@ -34,10 +34,8 @@ WHERE NOT o.failed ORDER BY r.id"""
 def method_choice(words: str, iterations: int | None) -> PlannerChoice:
     """Return the planner of a study that words name: METHOD, or METHOD+NEEDLE_PLANNER.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such method or planner of the needle.
+    Raises:
+        SettingsError: If there is no such method or planner of the needle.
     """
     method, _joint, needle = words.partition(JOINT)
     return PlannerChoice(
@@ -57,26 +55,17 @@ def benchmark_study(
 ) -> Study:
     """Return the study that runs methods on a folder of cases.
 
-    Parameters
-    ----------
-    methods : sequence of str
-        METHOD or METHOD+NEEDLE_PLANNER; see `lungaccess.planning.searches.planners` and
-        `stages.needle.NEEDLE_PLANNERS`.
-    phantoms : iterable of str
-        Those of the folder if empty.
-    systems : sequence of str
-        Among `SYSTEMS`.
-    targets : int, optional
-        The first so many of each lung of a phantom; all if None.
-    iterations, time_s : optional
-        Budget of a query; iterations can be repeated exactly.
+    Args:
+        methods: METHOD or METHOD+NEEDLE_PLANNER; see `lungaccess.planning.searches.planners` and
+            `stages.needle.NEEDLE_PLANNERS`.
+        phantoms: Those of the folder if empty.
+        systems: Among `SYSTEMS`.
+        targets: The first so many of each lung of a phantom; all if None.
+        iterations, time_s (optional): Budget of a query; iterations can be repeated exactly.
 
-    Raises
-    ------
-    FileError
-        If the folder is not one of this benchmark.
-    SettingsError
-        If it does not hold a phantom, or there is no such device or method.
+    Raises:
+        FileError: If the folder is not one of this benchmark.
+        SettingsError: If it does not hold a phantom, or there is no such device or method.
     """
     held = require_cases(folder)
     chosen = tuple(phantom_named(name) for name in phantoms) or held
@@ -120,12 +109,9 @@ def submissions_of(path: Path) -> list[Submission]:
     Times are processor time of the search; where it found nothing, of the whole run.  Of several runs
     of a query, such as with more iterations, the last counts.
 
-    Raises
-    ------
-    FileError
-        If the results cannot be read.
-    SettingsError
-        If they are not of this benchmark.
+    Raises:
+        FileError: If the results cannot be read.
+        SettingsError: If they are not of this benchmark.
     """
     queries = {(f"{each.phantom}/{each.system}", each.target_lps): each for each in all_queries().values()}
     answers: dict[str, dict[str, SubmittedAnswer]] = {}

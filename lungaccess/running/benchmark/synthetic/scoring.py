@@ -45,27 +45,17 @@ Progress = Callable[[str, float], None]
 class Score:
     """What one answer comes to.
 
-    Parameters
-    ----------
-    query, phantom, family, system : str
-    target : int
-    planner : str
-    status : str
-        "solved", "refused", "no plan", "claimed unreachable", "proved unreachable" or "no answer".
-    reason : str
-        Why it is refused: what the check found.
-    cost : float or None
-        Integral of 1 / clearance over the needle; this and all below only where it is solved.
-    needle_mm : float or None
-        Length of the needle.
-    success : float or None
-        Estimated chance of success under the errors `breath-hold` without correction; None if not asked for.
-    breath_share : float or None
-        Share of the breath in which the plan is proved clear and on target, of phantoms that breathe.
-    not_checked : str
-        What the check could not look at; "" for nothing.
-    first_cpu_s, cpu_s : float or None
-        Processor time, as the submission states it.
+    Args:
+        status: "solved", "refused", "no plan", "claimed unreachable", "proved unreachable" or "no answer".
+        reason: Why it is refused: what the check found.
+        cost: Integral of 1 / clearance over the needle; this and all below only where it is solved.
+        needle_mm: Length of the needle.
+        success: Estimated chance of success under the errors `breath-hold` without correction; None if not
+            asked for.
+        breath_share: Share of the breath in which the plan is proved clear and on target, of phantoms that
+            breathe.
+        not_checked: What the check could not look at; "" for nothing.
+        first_cpu_s, cpu_s: Processor time, as the submission states it.
     """
 
     query: str
@@ -97,27 +87,17 @@ def score_submission(
 ) -> Iterator[Score]:
     """Yield the score of every query of the phantoms in a folder, phantom by phantom.
 
-    Parameters
-    ----------
-    folder : Path
-        The cases, as `write_benchmark` makes them.
-    cache : Path, optional
-        Folder of prepared anatomies; the usual one if None.
-    samples : int
-        Deviated plans for the chance of success; 0 for no estimate.
-    certify_boxes : int
-        Budget of a proof that a target claimed unreachable is so; 0 for no proof.
-    only_answered : bool
-        Whether queries without an answer are left out.
+    Args:
+        folder: The cases, as `write_benchmark` makes them.
+        cache: Folder of prepared anatomies; the usual one if None.
+        samples: Deviated plans for the chance of success; 0 for no estimate.
+        certify_boxes: Budget of a proof that a target claimed unreachable is so; 0 for no proof.
+        only_answered: Whether queries without an answer are left out.
 
-    Raises
-    ------
-    FileError
-        If the folder is not one of this benchmark, or lacks a phantom that an answer is about.
-    AnatomyError
-        If the masks of a phantom in the folder are not those of the manifest.
-    SettingsError
-        If an answer names a tip that was not published.
+    Raises:
+        FileError: If the folder is not one of this benchmark, or lacks a phantom that an answer is about.
+        AnatomyError: If the masks of a phantom in the folder are not those of the manifest.
+        SettingsError: If an answer names a tip that was not published.
     """
     phantoms = require_cases(folder)
     require_queries(submission.answers, (each.name for each in phantoms), folder)
@@ -245,10 +225,8 @@ class _Scorer:
 def _own_masks(case: BenchmarkPhantom, folder: Path, cache: Path | None) -> Lung:
     """Return the lung of a case, whose masks are those of the manifest.
 
-    Raises
-    ------
-    AnatomyError
-        If they are not: answers about other masks count for nothing.
+    Raises:
+        AnatomyError: If they are not: answers about other masks count for nothing.
     """
     from anatomy.io.patients import load_patient as read_images
     from lungaccess.running.benchmark.synthetic.manifest import masks_sha256

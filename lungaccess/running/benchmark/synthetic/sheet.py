@@ -36,21 +36,17 @@ ALL = "all"
 class SheetLine:
     """One line of the score sheet.
 
-    Parameters
-    ----------
-    planner, family, system : str
-        "all" for every family or device.
-    queries, solved, refused, certified, refuted : int
-        Queries that count; answers that the check accepts; that it refuses; queries proved to have no plan;
-        claims of that kind that another planner's accepted answer refutes.
-    first_cpu_s, cpu_s : float or None
-        Medians of the stated processor times: to the first plan where solved, and of all answers.
-    cost, shared_cost : float or None
-        Median cost of what is solved, and of those queries that all planners of the sheet solved.
-    success, breath_share : float or None
-        Mean chance of success, and mean proved share of the breath, of what is solved.
-    not_checked : int
-        Accepted answers of which the check could not look at everything.
+    Args:
+        planner, family, system: "all" for every family or device.
+        queries, solved, refused, certified, refuted: Queries that count; answers that the check accepts; that
+            it refuses; queries proved to have no plan; claims of that kind that another planner's accepted
+            answer refutes.
+        first_cpu_s, cpu_s: Medians of the stated processor times: to the first plan where solved, and of all
+            answers.
+        cost, shared_cost: Median cost of what is solved, and of those queries that all planners of the sheet
+            solved.
+        success, breath_share: Mean chance of success, and mean proved share of the breath, of what is solved.
+        not_checked: Accepted answers of which the check could not look at everything.
     """
 
     planner: str
@@ -153,10 +149,8 @@ def write_sheet(lines: Iterable[SheetLine], path: Path) -> None:
 def write_scores(scores: Iterable[Score], path: Path) -> None:
     """Write scores by the suffix of the file, .csv or .json; what is not known stays empty, or null.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written, or ends in something else.
+    Raises:
+        FileError: If the file cannot be written, or ends in something else.
     """
     _write_rows("scores", Score, [asdict(each) for each in scores], path)
 
@@ -176,10 +170,8 @@ def _write_rows(name: str, cls: type, rows: list[dict[str, Any]], path: Path) ->
 def read_scores(path: Path) -> list[Score]:
     """Read scores that `write_scores` wrote as JSON.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read, holds something else, or is of another benchmark.
+    Raises:
+        FileError: If the file cannot be read, holds something else, or is of another benchmark.
     """
     expected, remedy = (
         "scores in JSON",

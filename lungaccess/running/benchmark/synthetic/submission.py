@@ -30,16 +30,13 @@ State = tuple[Number, Number, Number]
 class ScopeAnswer:
     """How the bronchoscope gets to where it stands: by a published tip, or by a motion of the planner's own.
 
-    Parameters
-    ----------
-    tip : int or None
-        Number of a tip in `tips-DEVICE.json` of the phantom, from 0.
-    lps_from_entry : 4x4 or None
-        Base of the bending section at the beginning, in the trachea.
-    states : list of [mm, rad, rad] or None
-        Advance, twist and bend; the scope never draws back, and turns only where it does not advance.
-    lps_from_tip : 4x4 or None
-        Pose of the working channel's end; needed without `tip`, and compared if stated with it.
+    Args:
+        tip: Number of a tip in `tips-DEVICE.json` of the phantom, from 0.
+        lps_from_entry (4x4 or None): Base of the bending section at the beginning, in the trachea.
+        states (list of [mm, rad, rad] or None): Advance, twist and bend; the scope never draws back, and
+            turns only where it does not advance.
+        lps_from_tip (4x4 or None): Pose of the working channel's end; needed without `tip`, and compared if
+            stated with it.
     """
 
     tip: Annotated[int | None, Field(strict=True, ge=0, description="published tip")] = None
@@ -87,16 +84,11 @@ class NeedleAnswer:
 class SubmittedAnswer:
     """The answer to one query.
 
-    Parameters
-    ----------
-    query : str
-        Name of the query, "PHANTOM/DEVICE/NN".
-    scope, tubes, needle
-        All three, or none where no plan was found.
-    unreachable : bool
-        Whether the planner claims that there is none; only without a plan.
-    first_cpu_s, cpu_s : float or None
-        Processor time of the first plan, and of the whole query.
+    Args:
+        query: Name of the query, "PHANTOM/DEVICE/NN".
+        scope, tubes, needle: All three, or none where no plan was found.
+        unreachable: Whether the planner claims that there is none; only without a plan.
+        first_cpu_s, cpu_s: Processor time of the first plan, and of the whole query.
     """
 
     query: Annotated[str, text("name of the query")]
@@ -140,13 +132,10 @@ class Submission:
 def read_submission(path: Path) -> Submission:
     """Read a submission; every answer is looked at before any is scored.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read or is not JSON.
-    SettingsError
-        If something in it is missing, unknown, of the wrong type or not finite, or a query is unknown or
-        answered twice; the message names the answer.
+    Raises:
+        FileError: If the file cannot be read or is not JSON.
+        SettingsError: If something in it is missing, unknown, of the wrong type or not finite, or a query is
+            unknown or answered twice; the message names the answer.
     """
     content = read_json(path, expected="a submission in JSON", remedy=REMEDY)
     return submission_of(content, path.name)
@@ -191,10 +180,8 @@ def submission_schema() -> dict[str, Any]:
 def write_submission(submission: Submission, path: Path) -> None:
     """Write a submission, all or nothing.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     write_text(path, json.dumps(to_mapping(submission), allow_nan=False) + "\n")
 

@@ -36,13 +36,10 @@ def aim_between(rigid, target, moves, begin, end, samples, aim):
     No end of the devices misses the target by less than the first at all of these shares; the aim misses it
     by the second at most, at the `samples` shares that are looked at.
 
-    Parameters
-    ----------
-    rigid : Rigid
-    target, moves : (3,) float64
-        Place of the masks, LPS mm, and its displacement.
-    begin, end : float
-        First and last share.
+    Args:
+        rigid: Rigid.
+        target, moves ((3,) float64): Place of the masks, LPS mm, and its displacement.
+        begin, end (float): First and last share.
     """
     places = np.zeros((samples, 3))
     _places(rigid, target, moves, begin, end, places)

@@ -21,23 +21,18 @@ of each arc of the needle."""
 class Devices(NamedTuple):
     """A plan as kernels take it.
 
-    Parameters
-    ----------
-    frame : (4, 4) float64, LPS mm
-        Of the scope tip.
-    tubes : (11,) float64
-        Of planar tubes: rotation, insertions of outer and inner tube, the most that the inner one may be
-        inserted and be ahead of the outer one, its curved length, the curvatures inside and beyond the outer
-        tube, the radii of outer and inner tube, and the most that the outer one may be inserted.
-    needle : (A, 4) float64
-        Of each arc: insertion at its end, roll from the tip of the tubes, curvature and radius.
-    shapes : (S, T, 4) float64
-        Arcs of tubes that are not planar, as pieces of the chain; none of planar tubes.
-    rolled_rad : (S,) float64
-        By how much too far the end of such tubes is rolled.
-    n_tube : int
-        Pieces of the tubes, T.
-    max_needle_mm : float
+    Args:
+        frame ((4, 4) float64, LPS mm): Of the scope tip.
+        tubes ((11,) float64): Of planar tubes: rotation, insertions of outer and inner tube, the most that
+            the inner one may be inserted and be ahead of the outer one, its curved length, the curvatures
+            inside and beyond the outer tube, the radii of outer and inner tube, and the most that the outer
+            one may be inserted.
+        needle ((A, 4) float64): Of each arc: insertion at its end, roll from the tip of the tubes, curvature
+            and radius.
+        shapes ((S, T, 4) float64): Arcs of tubes that are not planar, as pieces of the chain; none of planar
+            tubes.
+        rolled_rad ((S,) float64): By how much too far the end of such tubes is rolled.
+        n_tube: Pieces of the tubes, T.
     """
 
     frame: Float

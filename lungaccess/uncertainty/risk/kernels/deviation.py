@@ -98,25 +98,19 @@ def follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enou
     and the needle's surface may not enter a lumen again.  Clearance changes by no more than one moves, so
     from one look to the next nothing is missed, but for what is touched over less than STEP_MM.
 
-    Parameters
-    ----------
-    obstacles : Obstacles
-        All structures that count.
-    depth : tuple
-        Lumen depth and its geometry.
-    mediastinal : (B,) bool
-        The branches that lie in the mediastinum: what leaves one of them pierces the pleura.
-    start : (9,) float64
-    pieces : (P, 4) float64
-    n_tube : int
-    exempt_mm : float
-    enough : int
-        Flags of which one ends the search for more; 0 to find all that is touched.
+    Args:
+        obstacles (Obstacles): All structures that count.
+        depth (tuple): Lumen depth and its geometry.
+        mediastinal ((B,) bool): The branches that lie in the mediastinum: what leaves one of them pierces the
+            pleura.
+        start: (9,) float64.
+        pieces: (P, 4) float64.
+        n_tube: int.
+        exempt_mm: float.
+        enough (int): Flags of which one ends the search for more; 0 to find all that is touched.
 
-    Returns
-    -------
-    int
-        The bits of the structures touched, with STAYS_INSIDE where the chain was not judged.
+    Returns:
+        int: The bits of the structures touched, with STAYS_INSIDE where the chain was not judged.
     """
     clearance, labels, geometry, bits = obstacles
     corners, depth_geometry = depth

@@ -26,14 +26,10 @@ N_START = 9
 class Judging(NamedTuple):
     """What decides about a deviated plan beside its obstacles, see `deviation.follow`.
 
-    Parameters
-    ----------
-    depth, geometry
-        Depth of the lumen.
-    least_depth_mm : float
-        The scope tip stands where the lumen is at least so deep.
-    mediastinal : (B,) bool
-    exempt_mm : float
+    Args:
+        depth, geometry: Depth of the lumen.
+        least_depth_mm: The scope tip stands where the lumen is at least so deep.
+        mediastinal: (B,) bool.
     """
 
     depth: UInt16
@@ -78,23 +74,16 @@ def _touched(obstacles, judging, start, pieces, n_tube, enough):
 def find_successes(devices, errors, which, obstacles, judging, wanted, forbidden, first, done):
     """Tell which deviated plans end with enough of the nodule in the tool and touch nothing forbidden.
 
-    Parameters
-    ----------
-    devices : Devices
-    errors : (M, E) float64
-        See `chain`.
-    which : (M,) int64
-        The shape of each draw, see `Devices`.
-    obstacles : Obstacles
-        All structures, see `deviation.follow`.
-    judging : Judging
-    wanted : Wanted
-        See `lungaccess.plans.kernels.tissue`.
-    forbidden : int
-        Flags of what must not be touched.
-    first : int
-        Number of the first deviated plan; as many are judged as there is room in `done`.
-    done : (N,) bool
+    Args:
+        devices: Devices.
+        errors ((M, E) float64): See `chain`.
+        which ((M,) int64): The shape of each draw, see `Devices`.
+        obstacles (Obstacles): All structures, see `deviation.follow`.
+        judging: Judging.
+        wanted (Wanted): See `lungaccess.plans.kernels.tissue`.
+        forbidden (int): Flags of what must not be touched.
+        first (int): Number of the first deviated plan; as many are judged as there is room in `done`.
+        done: (N,) bool.
     """
     start, pieces = np.zeros(N_START), np.zeros((devices.n_tube + devices.needle.shape[0], N_PIECE))
     for m in range(done.shape[0]):

@@ -17,11 +17,9 @@ DEFAULT_SYSTEM = "lung-default"
 def answer(goal: Any, tell: Callable[[float], object] = lambda _cost: None) -> dict[str, Any]:
     """Plan, check and estimate, and return the result of `PlanAccess` as plain values.
 
-    Parameters
-    ----------
-    goal : the goal of `PlanAccess`
-    tell : callable
-        Receives the cost of each better plan.
+    Args:
+        goal: the goal of `PlanAccess`.
+        tell: Receives the cost of each better plan.
     """
     none = {"found": False, "accepted": False, "success": -1.0, "plan": ""}
     try:

@@ -38,16 +38,13 @@ _NOBODY = np.int64(-1)
 class BackwardReach(NamedTuple):
     """From which directions paths come to a target, on K shells.
 
-    Parameters
-    ----------
-    frame : (4, 3) float64
-        Two axes and the middle direction, unit vectors across each other, and the target in LPS mm.
-    cell : float
-        Side of a cell of the plane of directions.
-    kappa : float
-        Greatest curvature, 1/mm.
-    angles : (K, N, N) uint8
-        How far from the middle of a cell the nearest direction is from which a path may come, or less.
+    Args:
+        frame ((4, 3) float64): Two axes and the middle direction, unit vectors across each other, and the
+            target in LPS mm.
+        cell: Side of a cell of the plane of directions.
+        kappa: Greatest curvature, 1/mm.
+        angles ((K, N, N) uint8): How far from the middle of a cell the nearest direction is from which a path
+            may come, or less.
     """
 
     frame: np.ndarray
@@ -109,13 +106,10 @@ def _all_blocked(obstacles, required, around, x, y, z):
 def fill_backward_reach(obstacles, required, reach):
     """Fill the angles of a `BackwardReach`.
 
-    Parameters
-    ----------
-    obstacles : tuple
-        Clearance field, labels, geometry and bits; see `stages.needle.kernels.proof`.
-    required : float
-        Clearance that a path to the target itself keeps, mm.
-    reach : BackwardReach
+    Args:
+        obstacles (tuple): Clearance field, labels, geometry and bits; see `stages.needle.kernels.proof`.
+        required (float): Clearance that a path to the target itself keeps, mm.
+        reach: BackwardReach.
     """
     frame, cell, kappa, angles = reach
     shells, count, _ = angles.shape

@@ -41,15 +41,12 @@ def _probed_at(v, u, window, scale, depth):
 def mark_probed(states, window, scale, depths, probed, corners):
     """Set the bits of the cells that the tangents of a plane's states meet at some depths.
 
-    Parameters
-    ----------
-    states : (V, U, Y, W) uint64, window : (4,) int64
-    scale : (SCALE_SIZE,) float64
-    depths : (D,) float64
-        As seen from the plane, mm.
-    probed : (D, Y', W') uint64
-    corners : (D, 2) int64
-        Cell numbers (y, x) of the first cell of each.
+    Args:
+        states: (V, U, Y, W) uint64, window : (4,) int64.
+        scale: (SCALE_SIZE,) float64.
+        depths ((D,) float64): As seen from the plane, mm.
+        probed: (D, Y', W') uint64.
+        corners ((D, 2) int64): Cell numbers (y, x) of the first cell of each.
     """
     nv, nu, _rows, _words = states.shape
     box = np.zeros(4, np.int64)
@@ -125,14 +122,11 @@ def grade_clearance(obstacles, limits, exempt_branch, inserted, origin, across, 
 def keep_clear(states, window, scale, depths, corners, grades, slacks):
     """Remove the states from which half a slab behind or ahead is blocked for every path.
 
-    Parameters
-    ----------
-    states : (V, U, Y, W) uint64, window : (4,) int64
-    scale : (SCALE_SIZE,) float64
-    depths, corners
-        See `mark_probed`.
-    grades : (D, Y', X') uint8, slacks : (Q,) float64
-        See `grade_clearance`.
+    Args:
+        states: (V, U, Y, W) uint64, window : (4,) int64.
+        scale: (SCALE_SIZE,) float64.
+        depths, corners: See `mark_probed`.
+        grades ((D, Y', X') uint8, slacks : (Q,) float64): See `grade_clearance`.
     """
     nv, nu, _rows, _words = states.shape
     free = np.zeros((depths.shape[0], slacks.shape[0], grades.shape[1], grades.shape[2] // 64), np.uint64)
@@ -178,29 +172,20 @@ def flood(
 
     A path goes from one cube to another through a point of both, so to one of its 26 neighbours.
 
-    Parameters
-    ----------
-    obstacles : Obstacles
-    limits : Limits
-    exempt_branch : int
-        Branch whose wall is exempt in the exit; -1 for none.
-    inserted : float
-        Length of the needle at the start, mm.
-    scale, ends : (SCALE_SIZE,), (ENDS_SIZE,) float64
-    frame : (4, 3) float64
-        Position of the start; the planes' normal, row and column direction.
-    side : float
-        Of the cubes, mm.
-    corner : (3,) int64
-        Cube numbers (depth, y, x) of the first cube; that of the start has numbers 0.
-    seen : (H, Y, X) bool
-        All False at first; those looked at are set.
-    queue : (Q,) int32
-        Cubes that may be passed, with room for the NEIGHBOURS of so many.
-    span : (2,) int64
-        Part of the queue that is left, 0 at first; the flood is complete where it is empty.
-    most : int
-        Cubes from which the flood goes on, at most.
+    Args:
+        obstacles: Obstacles.
+        limits: Limits.
+        exempt_branch (int): Branch whose wall is exempt in the exit; -1 for none.
+        inserted (float): Length of the needle at the start, mm.
+        scale, ends: (SCALE_SIZE,), (ENDS_SIZE,) float64.
+        frame ((4, 3) float64): Position of the start; the planes' normal, row and column direction.
+        side (float): Of the cubes, mm.
+        corner ((3,) int64): Cube numbers (depth, y, x) of the first cube; that of the start has numbers 0.
+        seen ((H, Y, X) bool): All False at first; those looked at are set.
+        queue ((Q,) int32): Cubes that may be passed, with room for the NEIGHBOURS of so many.
+        span ((2,) int64): Part of the queue that is left, 0 at first; the flood is complete where it is
+            empty.
+        most (int): Cubes from which the flood goes on, at most.
     """
     nh, ny, nx = seen.shape
     half = 0.8661 * side + SPARE

@@ -36,20 +36,15 @@ def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_wi
     integral of (d / 2 - t) x'' over the slab.  With |x''| <= w the last term is at most w d^2 / 4, and by the
     inequality of Cauchy and Schwarz at most w d^2 sqrt((1 - r^2) / 12) where the slope changes by r w d.
 
-    Parameters
-    ----------
-    now, out : (V, U, Y, W) uint64
-        States of this plane, and of the other.
-    now_window, out_window : (4,) int64
-    scale : (SCALE_SIZE,) float64
-    depth : float
-        Distance of the planes in mm.
-    direction : int
-        1 to the next plane, -1 to the one before.
-    blur : float
-        2, or 1 if the one state in `now` is known exactly.
-    edges : (C,) float64
-        Upper edges of the classes of slope change, as shares of the largest, rising to 1.
+    Args:
+        now, out ((V, U, Y, W) uint64): States of this plane, and of the other.
+        now_window, out_window: (4,) int64.
+        scale: (SCALE_SIZE,) float64.
+        depth (float): Distance of the planes in mm.
+        direction (int): 1 to the next plane, -1 to the one before.
+        blur (float): 2, or 1 if the one state in `now` is known exactly.
+        edges ((C,) float64): Upper edges of the classes of slope change, as shares of the largest, rising to
+            1.
     """
     nv, nu = now.shape[0], now.shape[1]
     to_v, to_u, rows, words = out.shape

@@ -229,43 +229,31 @@ def search_words(
 ):  # fmt: skip
     """Go on with the search for up to `pops` entries, or until a cheaper path is found.
 
-    Parameters
-    ----------
-    obstacles, limits, objective : Obstacles, Limits, ObjectiveArrays
-    rates : tuple of float
-        Least cost of a mm of path, and what each mm costs by which the path ends short of the goal; no
-        more than the former.
-    branch : int
-        Pierced branch, whose wall is exempt at the exit; -1 for none.
-    goal : (3,) float64, LPS mm
-    reference : (3,) float64
-        Direction from which the limit of the angle counts.
-    words : tuple
-        Step in mm; cosine and sine of the n directions of bending, (n, 2) float64; of an arc of k steps,
-        (K + 1, 4) float64, its advance along the tangent and towards the bend in mm, cosine and sine of its
-        turn; primitives by level, (P, 2) int64, direction and steps, and the first of each level and the end,
-        (levels + 1,) int64.
-    merge : tuple of float, float, bool
-        Size of a cell of poses in mm and in components of the tangent; whether a node makes each costlier one
-        in its cell superfluous, or only equal ones that are in nothing better.
-    store : tuple
-        nodes (N, NODE_COLUMNS) float64, links (N, LINK_COLUMNS) int32, proved (N, n + 1, 2) uint8, and the
-        hash table of nodes, row + 1, (H,) int32, with H a power of two and at least 2 N.
-    queue, state : tuple, (STATE_SIZE,) int64
-        See `rank_queue`.
-    counts : (COUNTS,) int64
-        All 0 at first but NODES, 1: row 0 is the start.
-    best : (BEST_SIZE,) float64
-        Gets the best path.
-    cost : float
-        Cost of the best path so far.
-    pops : int
-        The start counts as one.
+    Args:
+        obstacles, limits, objective: Obstacles, Limits, ObjectiveArrays.
+        rates (tuple of float): Least cost of a mm of path, and what each mm costs by which the path ends
+            short of the goal; no more than the former.
+        branch (int): Pierced branch, whose wall is exempt at the exit; -1 for none.
+        goal: (3,) float64, LPS mm.
+        reference ((3,) float64): Direction from which the limit of the angle counts.
+        words (tuple): Step in mm; cosine and sine of the n directions of bending, (n, 2) float64; of an arc
+            of k steps, (K + 1, 4) float64, its advance along the tangent and towards the bend in mm, cosine
+            and sine of its turn; primitives by level, (P, 2) int64, direction and steps, and the first of
+            each level and the end, (levels + 1,) int64.
+        merge (tuple of float, float, bool): Size of a cell of poses in mm and in components of the tangent;
+            whether a node makes each costlier one in its cell superfluous, or only equal ones that are in
+            nothing better.
+        store (tuple): nodes (N, NODE_COLUMNS) float64, links (N, LINK_COLUMNS) int32, proved (N, n + 1, 2)
+            uint8, and the hash table of nodes, row + 1, (H,) int32, with H a power of two and at least 2 N.
+        queue, state (tuple, (STATE_SIZE,) int64): See `rank_queue`.
+        counts ((COUNTS,) int64): All 0 at first but NODES, 1: row 0 is the start.
+        best ((BEST_SIZE,) float64): Gets the best path.
+        cost (float): Cost of the best path so far.
+        pops (int): The start counts as one.
 
-    Returns
-    -------
-    reason, cost : int, float
-        SPENT, BETTER, EXHAUSTED, or which arrays have to grow; cost of the best path.
+    Returns:
+        reason, cost (int, float): SPENT, BETTER, EXHAUSTED, or which arrays have to grow; cost of the best
+            path.
     """
     nodes, entries = store[0], queue[1]
     most_new = words[3].shape[0] + 1

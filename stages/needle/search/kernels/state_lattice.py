@@ -141,34 +141,22 @@ def explore(
 ):  # fmt: skip
     """Find the cheapest path to each state; return how many arcs were tried, and whether all states fitted.
 
-    Parameters
-    ----------
-    base : (L + 2, 3) float64
-        Start, a control point for each layer, and an end.
-    axes : (2, 3) float64
-        Of the lattice, as long as a cell.
-    goal_cells : (2,) int64
-        The goal aside of the end of the base, in half cells along each axis.
-    kappa : float
-        Greatest curvature of the arcs, 1/mm.
-    reach : int
-        How many cells from the base vertices lie at most.
-    inserted : float
-        Length of the needle behind the start, mm.
-    bound : float
-        States to which no path leads for less are left out.
-    begins : (L + 2,) int64
-        Filled: the first state of each layer from 0, the start, to L, and the number of states.
-    states : (N, STATE_COLUMNS) int64
-        Filled.
-    before : (N,) int32
-        Filled: the state before each on the cheapest path to it, NONE at the start.
-    costs : (N,) float64
-        Filled: cost of the cheapest path from the start to the middle of the piece after the vertex.
-    table : (M,) int32
-        For the hash table, all NONE; M is a power of two and at least twice N.
-    order : (N,) int32
-        Scratch.
+    Args:
+        base ((L + 2, 3) float64): Start, a control point for each layer, and an end.
+        axes ((2, 3) float64): Of the lattice, as long as a cell.
+        goal_cells ((2,) int64): The goal aside of the end of the base, in half cells along each axis.
+        kappa (float): Greatest curvature of the arcs, 1/mm.
+        reach (int): How many cells from the base vertices lie at most.
+        inserted (float): Length of the needle behind the start, mm.
+        bound (float): States to which no path leads for less are left out.
+        begins ((L + 2,) int64): Filled: the first state of each layer from 0, the start, to L, and the number
+            of states.
+        states ((N, STATE_COLUMNS) int64): Filled.
+        before ((N,) int32): Filled: the state before each on the cheapest path to it, NONE at the start.
+        costs ((N,) float64): Filled: cost of the cheapest path from the start to the middle of the piece
+            after the vertex.
+        table ((M,) int32): For the hash table, all NONE; M is a power of two and at least twice N.
+        order ((N,) int32): Scratch.
     """
     layers = len(base) - 2
     begins[0], count, tried = 0, 1, 0

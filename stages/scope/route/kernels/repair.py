@@ -101,20 +101,15 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
 def repair(control, program, rounds, steps, tolerance):
     """Move the free control points to the solution of the program.
 
-    Parameters
-    ----------
-    control : (n, 3) float64
-        Changed in place.
-    program : lagrangian.Program
-    rounds, steps : int
-        Updates of the multipliers, and least-squares steps in each.
-    tolerance : float
-        Largest violation that counts as none: a share of the limit of curvature, or of the local radius.
+    Args:
+        control ((n, 3) float64): Changed in place.
+        program: lagrangian.Program.
+        rounds, steps (int): Updates of the multipliers, and least-squares steps in each.
+        tolerance (float): Largest violation that counts as none: a share of the limit of curvature, or of the
+            local radius.
 
-    Returns
-    -------
-    (float, int)
-        The largest violation that is left, and the least-squares steps taken.
+    Returns:
+        (float, int): The largest violation that is left, and the least-squares steps taken.
     """
     count = program.first.shape[0]
     n = 3 * (program.hi - program.lo)

@@ -76,22 +76,15 @@ def _parts(union, above, a, b):
 def solve(left, right, lift, cost, below, open_sets, offset, closed_tour, best, split, chosen):
     """Return the least cost, and mark the chosen exits.
 
-    Parameters
-    ----------
-    left, right : (T,) int64
-        Children of a node; -1 for a leaf.
-    lift, cost : (T,) float64
-        Stretch above the node; cost of a leaf's exit.
-    below : (T,) int64
-        Lesions with an exit below the node, as bits.
-    open_sets : (T,) int64
-        Open lesions, as bits; a subset of `below`.
-    offset : (T + 1,) int64
-        Where the values of a node begin in `best` (2, ...) and `split` (2, ...): rows for tours that do not
-        end below the node, and for those that do.
-    closed_tour : bool
-    chosen : (T,) bool
-        Filled: which leaves are taken.
+    Args:
+        left, right ((T,) int64): Children of a node; -1 for a leaf.
+        lift, cost ((T,) float64): Stretch above the node; cost of a leaf's exit.
+        below ((T,) int64): Lesions with an exit below the node, as bits.
+        open_sets ((T,) int64): Open lesions, as bits; a subset of `below`.
+        offset ((T + 1,) int64): Where the values of a node begin in `best` (2, ...) and `split` (2, ...):
+            rows for tours that do not end below the node, and for those that do.
+        closed_tour: bool.
+        chosen ((T,) bool): Filled: which leaves are taken.
     """
     nodes = left.shape[0]
     widest = 1

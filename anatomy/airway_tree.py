@@ -1,7 +1,5 @@
 """The airway tree: a rooted tree of centred points with radius, branches and generations."""
 
-from __future__ import annotations
-
 from dataclasses import field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -192,14 +190,14 @@ class AirwayTree:
         return bool(radius[branch] >= 0.85 and (others < 0.6).all())
 
     @cached_property
-    def bronchi(self) -> BronchialNames:
+    def bronchi(self) -> "BronchialNames":
         """Which bronchus each branch is, with a confidence; see `anatomy.tree.naming`."""
         from anatomy.tree.naming import name_bronchi
 
         return name_bronchi(self)
 
     @cached_property
-    def nearest_point_index(self) -> cKDTree:
+    def nearest_point_index(self) -> "cKDTree":
         """Search tree of the points: `query` finds the nearest tree points of any points."""
         from scipy.spatial import cKDTree
 

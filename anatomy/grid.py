@@ -1,7 +1,5 @@
 """Voxel grids and volumes in LPS millimetres, indexed `[i, j, k]`."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Self
 
@@ -153,7 +151,7 @@ class Grid:
         ijk = np.floor(self.ijk(lps) + 0.5)
         return np.asarray(((ijk >= 0) & (ijk < np.asarray(self.shape))).all(axis=-1))
 
-    def crop(self, start: ArrayLike, stop: ArrayLike) -> Grid:
+    def crop(self, start: ArrayLike, stop: ArrayLike) -> "Grid":
         """Return the grid of voxels `start <= ijk < stop`; it may reach beyond this grid."""
         start = np.asarray(start, dtype=np.int64)
         shape = np.asarray(stop, dtype=np.int64) - start
@@ -175,13 +173,13 @@ class Grid:
         away = np.maximum(np.abs(np.asarray(voxels) - self.ijk(point_lps)) - 0.5, 0.0) * self.spacing_mm
         return np.asarray(np.linalg.norm(away, axis=1))
 
-    def is_close(self, other: Grid, tolerance_mm: float = 1e-2) -> bool:
+    def is_close(self, other: "Grid", tolerance_mm: float = 1e-2) -> bool:
         """Tell whether every voxel of the two grids agrees to `tolerance_mm`."""
         if self.shape != other.shape:
             return False
         return bool(np.abs(self.corners_lps - other.corners_lps).max() <= tolerance_mm)
 
-    def require_same(self, other: Grid, name: str) -> None:
+    def require_same(self, other: "Grid", name: str) -> None:
         """Raise `GridMismatchError` unless `other`, the grid of `name`, is this grid."""
         if not self.is_close(other):
             raise GridMismatchError(

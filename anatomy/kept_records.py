@@ -1,8 +1,6 @@
 """What is slow to make, kept: records in the cache, one file of arrays for all that a record depends on, and
 plain values that follow from a lung alone, beside its stored arrays."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
@@ -114,7 +112,7 @@ def _save(kind: str, header: dict[str, str], made: object, path: Path) -> None:
         ) from error
 
 
-def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
+def kept(lung: "Organ", name: str, version: int, make: Callable[[], Any]) -> Any:
     """Return plain JSON values that follow from a lung: those kept with it, else those that `make` returns.
 
     A lung that is not stored keeps nothing.  What is kept is made anew if it is missing, damaged or of
@@ -150,6 +148,6 @@ def kept(lung: Organ, name: str, version: int, make: Callable[[], Any]) -> Any:
     return values
 
 
-def _seal_of(lung: Organ, name: str, values: Any) -> str:
+def _seal_of(lung: "Organ", name: str, values: Any) -> str:
     """Return what binds values to the lung and the name under which they are kept."""
     return values_checksum({"lung": lung.key, "name": name, "values": values})

@@ -1,7 +1,5 @@
 """An organ as a needle sees it: labels of every voxel, clearances, and what came with the patient."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from functools import cached_property
@@ -119,7 +117,7 @@ class Organ:
             )
         return Volume(grid=self.grid, array=(self.labels & structures.BITS[name]) != 0)
 
-    def surface(self, name: str) -> SurfaceMesh:
+    def surface(self, name: str) -> "SurfaceMesh":
         """Return the mesh of the faces of the voxels of a structure (see `mask`), made anew at each call."""
         from anatomy.meshes import box_surface
 

@@ -5,8 +5,6 @@ as itself, or a stub `__init__.pyi` beside it does.  `lazy_exports` reads that w
 Importing the package therefore loads none of its modules, and the names stand in one place.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from functools import cache

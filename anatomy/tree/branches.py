@@ -1,7 +1,5 @@
 """Divide a rooted tree of nodes into branches and put them together as an `AirwayTree`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +18,7 @@ class NodeBranch:
     """A branch as node indices; `attach` is the node of the parent branch that it grows from."""
 
     nodes: list[int]
-    parent: NodeBranch | None
+    parent: "NodeBranch | None"
     attach: int
 
 

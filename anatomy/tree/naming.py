@@ -10,8 +10,6 @@ References:
     [Boyden1955], [Javed2024], [Javed2024a], [Huang2019], [Tschirren2005]
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from functools import cache, cached_property
@@ -239,7 +237,7 @@ class _Lung:
     A node holds one branch, or several that part together.  All probabilities are logarithms.
     """
 
-    def __init__(self, side: str, tree: BranchedTree, shape: _Shape, roots: list[int]) -> None:
+    def __init__(self, side: str, tree: BranchedTree, shape: "_Shape", roots: list[int]) -> None:
         self.atlas, self._tree, self._shape = _atlas(side), tree, shape
         whole_mm = float(shape.beyond_mm[roots].sum())
         self.groups, self._children = [roots], []
@@ -324,7 +322,7 @@ class _Shape:
     direction: Float
 
     @classmethod
-    def of(cls, tree: BranchedTree) -> _Shape:
+    def of(cls, tree: BranchedTree) -> "_Shape":
         above = np.maximum(tree.parent_point, 0)
         length = np.maximum(tree.distance_from_root_mm - tree.distance_from_root_mm[above], 1e-6)
         moment = np.column_stack([length, length[:, None] * tree.points_lps])

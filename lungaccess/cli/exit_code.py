@@ -1,7 +1,5 @@
 """How a command ends, for shells and scripts."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 
@@ -22,6 +20,6 @@ class ExitCode(IntEnum):
     """What reads the output, such as `head`, stopped before its end; shells state the same number."""
 
     @classmethod
-    def of(cls, positive: bool) -> ExitCode:
+    def of(cls, positive: bool) -> "ExitCode":
         """Return `OK` for a positive outcome, `NEGATIVE` for another."""
         return cls.OK if positive else cls.NEGATIVE

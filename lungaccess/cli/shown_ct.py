@@ -1,7 +1,5 @@
 """The CT that commands show in their slices."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,7 +19,7 @@ CtOption = Annotated[
 ]
 
 
-def shown_ct(stated: Path | None, patient: Path) -> CtFile | None:
+def shown_ct(stated: Path | None, patient: Path) -> "CtFile | None":
     """Return the CT that was stated, else the patient's; without one, a warning says where it was looked for.
 
     Raises:

@@ -1,7 +1,5 @@
 """How the command line shows things: tables, JSON, and short panels for errors."""
 
-from __future__ import annotations
-
 import codecs
 import io
 import json
@@ -197,7 +195,7 @@ def show_wide(tables: Iterable[Table]) -> None:
         console.print()
 
 
-def show_error(error: LungaccessError, title: str = "bad input") -> None:
+def show_error(error: "LungaccessError", title: str = "bad input") -> None:
     """Print what was found, what was expected and what to do, in a short panel on standard error."""
     parts = [(error.found.rstrip(".") + ".", "")]
     if error.expected:
@@ -207,7 +205,7 @@ def show_error(error: LungaccessError, title: str = "bad input") -> None:
     error_console.print(Panel(styled(*parts), title=title, title_align="left", border_style="red"))
 
 
-def show_no_plan(failure: NoPlan) -> None:
+def show_no_plan(failure: "NoPlan") -> None:
     """Print why no plan was found: the counted reasons, and what would help."""
     console.print(Panel(failure.found, title="no plan", title_align="left", border_style="yellow"))
     show_reasons(failure)
@@ -215,7 +213,7 @@ def show_no_plan(failure: NoPlan) -> None:
         console.print(styled(("\nWhat would help:", "bold"), (f" {failure.advice}", "")))
 
 
-def show_reasons(failure: NoPlan) -> None:
+def show_reasons(failure: "NoPlan") -> None:
     """Print the counted reasons, and why each of several systems failed."""
     if failure.attempts:
         console.print(table("Systems that were tried", ("system", "outcome"), failure.attempts.items()))

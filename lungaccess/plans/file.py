@@ -1,7 +1,5 @@
 """Plans as JSON: nothing lost, nothing unknown accepted, protected by a digest."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

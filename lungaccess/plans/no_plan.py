@@ -1,7 +1,5 @@
 """`NoPlan`: the answer when there is no plan, with the reasons counted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -33,7 +31,7 @@ class NoPlan(LungaccessError):  # noqa: N818
         reasons: Mapping[str, int],
         main_reason: str = "",
         advice: str = "",
-        counterfactuals: Mapping[str, Plan] | None = None,
+        counterfactuals: "Mapping[str, Plan] | None" = None,
         attempts: Mapping[str, str] | None = None,
     ) -> None:
         self.counterfactuals: Mapping[str, Plan] = MappingProxyType(dict(counterfactuals or {}))

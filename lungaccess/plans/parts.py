@@ -1,7 +1,5 @@
 """The parts of a plan: what each of the three devices does, and the one wall that they may touch."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 
@@ -85,7 +83,7 @@ class DeployedShape(Record):
     least_determinant: float
 
     @classmethod
-    def of(cls, tubes: ConcentricTubes, shape: TubeShape) -> DeployedShape:
+    def of(cls, tubes: ConcentricTubes, shape: TubeShape) -> "DeployedShape":
         """Return a shape of the tubes as a plan states it."""
         turned = zip(tubes.named, shape.rotations_rad[::-1].tolist(), strict=True)
         return cls(

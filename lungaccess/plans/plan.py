@@ -1,7 +1,5 @@
 """The plan of all three stages: what each device does, why it is allowed, and where it came from."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import field
@@ -212,7 +210,7 @@ class Plan(Record):
         """Return the clearance that all of "tube" or "needle" keeps: of the tubes, that of the inner one."""
         return self.required_clearance_mm[{"tube": "inner_tube"}.get(device, device)]
 
-    def require_lung(self, lung: Lung) -> None:
+    def require_lung(self, lung: "Lung") -> None:
         """Raise PlanFileError unless the plan was made for a lung: the same masks, bit for bit."""
         if self.lung_key != lung.key:
             raise PlanFileError(

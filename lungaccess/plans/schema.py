@@ -1,7 +1,5 @@
 """JSON Schemas of the files that users write and plans that are stored, for other programs."""
 
-from __future__ import annotations
-
 import types
 import typing
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What counts as success: the last tip in a ball about the target, or enough of the nodule in the tool."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

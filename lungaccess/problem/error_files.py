@@ -1,7 +1,5 @@
 """Read error models: the presets that ship with the package, and files of one's own."""
 
-from __future__ import annotations
-
 import functools
 import os
 import tomllib

@@ -1,7 +1,5 @@
 """The error model: how large the errors of devices, patient and images are, and who says so."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import field, replace
 from typing import Annotated, Any, ClassVar, Self
@@ -221,11 +219,11 @@ class BreathingError(_Term):
         """The median motion, mm."""
         return self.median_mm
 
-    def sized(self, size: float) -> BreathingError:
+    def sized(self, size: float) -> "BreathingError":
         """Return the term with another median."""
         return replace(self, median_mm=size)
 
-    def scaled(self, factor: float) -> BreathingError:
+    def scaled(self, factor: float) -> "BreathingError":
         """Return the term with its median multiplied by a factor."""
         return self.sized(factor * self.median_mm)
 
@@ -338,7 +336,7 @@ class ErrorModel:
         stated = [*map(self.term, UNITS), *(term for each in self.place for term in each.terms.values())]
         return any(term.distribution == RESTING for term in stated)
 
-    def at(self, lobe: str, generation: int) -> ErrorModel:
+    def at(self, lobe: str, generation: int) -> "ErrorModel":
         """Return the model of a place of the scope's tip: its lobe, "" if not known, and its generation."""
         terms: dict[str, Any] = {}
         for each in self.place:
@@ -350,13 +348,13 @@ class ErrorModel:
         found: Term = getattr(self, kind)
         return found
 
-    def only(self, kind: str, size: float | None = None) -> ErrorModel:
+    def only(self, kind: str, size: float | None = None) -> "ErrorModel":
         """Return the model with errors of one kind only, scaled to a size if one is given."""
         term = self.term(kind)
         kept: dict[str, Any] = {kind: term if size is None else term.sized(size)}
         return ErrorModel(wall=self.wall, **kept)
 
-    def scaled(self, factor: float) -> ErrorModel:
+    def scaled(self, factor: float) -> "ErrorModel":
         """Return the model with all sizes multiplied by a factor."""
         terms: dict[str, Any] = {kind: self.term(kind).scaled(factor) for kind in UNITS}
         places = (

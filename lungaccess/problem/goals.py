@@ -5,8 +5,6 @@ the plan that a user writes.  Searches, the check, tables, studies and pages ask
 called, which way is better and how large it is.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -41,7 +39,7 @@ class Goal:
     objective: Any = None
 
     @classmethod
-    def of_costs(cls, objective: Any) -> Goal:
+    def of_costs(cls, objective: Any) -> "Goal":
         """Return the goal to make a weighted sum of costs small: a `stages.needle.Objective`."""
         return cls(name=str(objective), words=objective.words, objective=objective)
 

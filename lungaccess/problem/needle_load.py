@@ -1,7 +1,5 @@
 """What the needle does to the tubes that aim it: how stiff it is beside them, and what it bends."""
 
-from __future__ import annotations
-
 import math
 from typing import TYPE_CHECKING
 
@@ -39,7 +37,7 @@ class NeedleLoad:
         )
 
 
-def stiffness_ratio(system: System) -> float:
+def stiffness_ratio(system: "System") -> float:
     """Return how many times as stiff in bending the needle is as the tube that aims it, 0 if it is neglected.
 
     Of the needle the stiffest part counts that comes to lie in tubes beyond the scope, on its whole way; of
@@ -54,7 +52,7 @@ def stiffness_ratio(system: System) -> float:
     return float(needle / parts.stiffness_n_mm2[parts.begin_mm < tubes.max_extension_mm].min())
 
 
-def needle_load(system: System) -> NeedleLoad | None:
+def needle_load(system: "System") -> NeedleLoad | None:
     """Return what a system's needle does to its tubes; None without one, or if its stiffness is neglected.
 
     The section does not give way here, and no tissue holds it; docs/explanation/tubes.md says what they do.
@@ -85,7 +83,7 @@ def needle_load(system: System) -> NeedleLoad | None:
     )
 
 
-def system_warnings(system: System) -> tuple[str, ...]:
+def system_warnings(system: "System") -> tuple[str, ...]:
     """Return what no plan with a system counts, in sentences with numbers."""
     load = None if system.needle_preloaded else needle_load(system)
     # A needle that moves the tubes' tip by less is not worth a warning: a tenth of a mm is far below errors.

@@ -1,7 +1,5 @@
 """Load a patient from disk, prepared and cached; or a liver, for the needle alone."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Collection
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings by the name of a preset that ships with the package, or by the path of a TOML file."""
 
-from __future__ import annotations
-
 import os
 import tomllib
 from importlib import resources

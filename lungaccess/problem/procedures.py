@@ -1,7 +1,5 @@
 """What a procedure measures after each stage, to what error, and whether it plans again from there."""
 
-from __future__ import annotations
-
 import os
 from typing import Annotated
 

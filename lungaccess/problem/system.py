@@ -1,7 +1,5 @@
 """The whole device: bronchoscope, tubes, needle and margins, read from a preset or a TOML file."""
 
-from __future__ import annotations
-
 import functools
 import os
 import tomllib

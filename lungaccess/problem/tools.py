@@ -1,7 +1,5 @@
 """What is done at the target: the tool, and how much of the nodule has to be in it."""
 
-from __future__ import annotations
-
 import math
 import os
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """The tree of states of a bronchoscope over the whole airway, grown along its branches."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -46,7 +44,7 @@ class StateTree:
     advance_mm: Float
     turned_from: Int
 
-    def only(self, needed: Int) -> tuple[StateTree, Int]:
+    def only(self, needed: Int) -> "tuple[StateTree, Int]":
         """Return the states on the ways to some of them, and the new numbers of those.
 
         Args:

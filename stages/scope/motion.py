@@ -6,8 +6,6 @@ one state to the next the scope either advances with its twist and bend held, so
 its own arc, or twists and bends in place, both at a steady rate.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 
@@ -88,7 +86,7 @@ class ScopeMotion:
             tips.append(tip)
         return read_only(np.array(tips))
 
-    def between(self, advance_mm: float, turn_rad: float) -> ScopeMotion:
+    def between(self, advance_mm: float, turn_rad: float) -> "ScopeMotion":
         """Return the same motion with states put between, so that none differs more from the one before it.
 
         Args:
@@ -101,7 +99,7 @@ class ScopeMotion:
             states.append(np.linspace(before, after, max(1, int(np.ceil(most - 1e-9))) + 1)[1:])
         return replace(self, states=np.concatenate(states))
 
-    def written(self, decimals: int) -> ScopeMotion:
+    def written(self, decimals: int) -> "ScopeMotion":
         """Return the motion that is made by who reads its states in mm and degrees with so many decimals.
 
         Bends are cut off rather than rounded, so that they stay within the limits of the device.

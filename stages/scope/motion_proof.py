@@ -3,8 +3,6 @@
 These lie along its own motion, each with a proved motion of its own.
 """
 
-from __future__ import annotations
-
 import math
 from weakref import WeakKeyDictionary
 
@@ -35,11 +33,11 @@ ROUNDING = 1e-9
 """Limits are kept up to this share of them: states were computed with rounding."""
 
 
-_PROVERS: WeakKeyDictionary[Lung, dict[Bronchoscope, MotionProver]] = WeakKeyDictionary()
+_PROVERS: "WeakKeyDictionary[Lung, dict[Bronchoscope, MotionProver]]" = WeakKeyDictionary()
 """The provers of each lung: to make one takes a fraction of a second, to prove a motion milliseconds."""
 
 
-def prover_of(lung: Lung, scope: Bronchoscope) -> MotionProver:
+def prover_of(lung: Lung, scope: Bronchoscope) -> "MotionProver":
     """Return the prover of a scope's motions in a lung, made once."""
     provers = _PROVERS.setdefault(lung, {})
     if scope not in provers:
@@ -129,7 +127,7 @@ class MotionProver:
         found = Simplifier(self._walls, device, motion, end_bends_rad=ends, least_mm=least).best()
         return motion if isinstance(self.prove(found), str) else found
 
-    def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> TipRow:
+    def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> "TipRow":
         """Return tips along the motion to one of them, and which of them may be tips of a plan.
 
         Those have a proved motion and lie in the region of scope tips, as all tips of `find_motions` do.

@@ -5,8 +5,6 @@ wall, and its tip lies and looks elsewhere.  Here the shaft takes the shape of l
 the section bent as commanded, and the hand advances until the tip has the planned depth.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 from weakref import WeakKeyDictionary
@@ -121,7 +119,7 @@ class RestingShaft:
         lumen: See `lumen_of`.
     """
 
-    def __init__(self, lumen: Lumen, scope: Bronchoscope, contact: WallContact) -> None:
+    def __init__(self, lumen: Lumen, scope: Bronchoscope, contact: "WallContact") -> None:
         self._lumen, self._scope, self._contact = lumen, scope, contact
 
     def rest(

@@ -1,7 +1,5 @@
 """Motions of few changes: from a proved motion to one of fewer, longer legs that ends in the same pose."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -67,7 +65,7 @@ class Legs:
         """What a fit changes."""
         return np.concatenate([self.twists, self.bends, self.advances])
 
-    def changed(self, x: Float) -> Legs:
+    def changed(self, x: Float) -> "Legs":
         """Return the legs with other unknowns."""
         twists, bends, advances = np.split(x, [len(self.twists), len(self.twists) + len(self.bends)])
         return replace(self, twists=twists, bends=bends, advances=advances)

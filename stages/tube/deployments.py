@@ -1,7 +1,5 @@
 """The enumeration of all deployments from many scope poses: shapes of a design, placed in a lung."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -67,7 +65,7 @@ class Deployments:
         """Number of accepted deployments, E."""
         return len(self.site)
 
-    def only(self, chosen: Int) -> Deployments:
+    def only(self, chosen: Int) -> "Deployments":
         """Return some of them, by their numbers `(N,)`."""
         arrays: dict[str, Any] = {
             f.name: read_only(getattr(self, f.name)[chosen])
@@ -92,7 +90,7 @@ def enumerate_deployments(
     stop_spacing_mm: float = DEFAULT_STOP_MM,
     worthwhile: Callable[[Float, Float], Bool] | None = None,
     progress: Callable[[float], None] | None = None,
-    enumerator: SiteEnumerator | None = None,
+    enumerator: "SiteEnumerator | None" = None,
 ) -> Deployments:
     """Enumerate what the tubes can do from many scope tips: the shapes of the design that leave safely.
 

@@ -1,7 +1,5 @@
 """What the planner has to know of concentric tubes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import field, replace
 from functools import cached_property
@@ -332,7 +330,7 @@ class ConcentricTubes:
         """Length of inner tube that can be ahead of the outer one, mm, their rear ends being in order."""
         return self.inner.length_mm - (0.0 if self.outer is None else self.outer.length_mm)
 
-    def with_needle(self, shaft: Tube | None) -> ConcentricTubes:
+    def with_needle(self, shaft: Tube | None) -> "ConcentricTubes":
         """Return the same tubes with a straight needle whose tip stays at that of the inner tube.
 
         It belongs to the system and not to the tubes, so no file states it among them.

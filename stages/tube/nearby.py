@@ -1,7 +1,5 @@
 """Shapes between those of the grid: any joint values near a deployment, fast enough for local search."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -62,7 +60,7 @@ class Neighbourhood:
         rotations_rad: ArrayLike,
         *,
         needle: Tube | None = None,
-    ) -> Neighbourhood:
+    ) -> "Neighbourhood":
         """Return that of a deployment which is reached by the sequence `together`.
 
         A needle's tip stays where that of the innermost tube is.
@@ -77,7 +75,7 @@ class Neighbourhood:
         deployed = deploy(mechanics, together(tubes, turned + BEND_RAD, inserted), step_rad=math.pi)
         return cls(mechanics, inserted, turned, np.array(deployed.final.tip_angles_rad))
 
-    def moved(self, shape: NearbyShape) -> Neighbourhood:
+    def moved(self, shape: NearbyShape) -> "Neighbourhood":
         """Return the neighbourhood of a shape nearby."""
         return Neighbourhood(self._mechanics, shape.insertions_mm, shape.rotations_rad, shape.tip_angles_rad)
 

@@ -4,8 +4,6 @@ They do not depend on the patient, who only decides where the scope tip is and h
 turned about it.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -63,7 +61,7 @@ class ShapeGrid:
     rotations: Annotated[int, quantity("relative rotations of a tube", at_least=1, at_most=360)] = 24
 
     @classmethod
-    def default(cls, tubes: Sequence[Tube]) -> ShapeGrid:
+    def default(cls, tubes: Sequence[Tube]) -> "ShapeGrid":
         """Return the grid for a design: coarser for two independent rotations, whose deployments are many."""
         if _free_rotations(tubes) > 1:
             return cls(stop_mm=4.0, rotations=12)
@@ -139,7 +137,7 @@ class TubeShapes:
             least_determinant=float(self.least_determinant[shape]),
         )
 
-    def subset(self, members: Int) -> TubeShapes:
+    def subset(self, members: Int) -> "TubeShapes":
         """Return some of the deployments `(M,)` as a set."""
         counts = np.diff(self.first_arc)[members]
         chosen: dict[str, Any] = {

@@ -1,7 +1,5 @@
 """The command `lungaccess advise`: the path of the bronchoscope alone, turn by turn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,7 +53,7 @@ def advise(
     return ExitCode.of(advice.path.reached)
 
 
-def _show(advice: ScopeAdvice) -> None:
+def _show(advice: "ScopeAdvice") -> None:
     path = advice.path
     rows = [("insertion", f"{path.length_mm:.0f} mm"), ("retreats", f"{path.retreats}")]
     if path.reached:

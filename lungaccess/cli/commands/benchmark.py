@@ -1,7 +1,5 @@
 """The commands `lungaccess benchmark ...`: published queries run with several planners."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -104,13 +102,13 @@ def med_rad(
 def _rows(
     folder: Path,
     rules: Rules,
-    device: System,
+    device: "System",
     radii: tuple[float, ...],
     planners: tuple[str, ...],
     seeds: range,
     budget_s: float,
     output: PatientOptions,
-) -> Iterator[BenchmarkRow]:
+) -> "Iterator[BenchmarkRow]":
     """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
     from lungaccess.running.benchmark import BenchmarkRow, patients_of, published_queries, run_query
     from lungaccess.running.benchmark.published import why_no_query
@@ -134,8 +132,8 @@ def _rows(
 
 
 def _posing(
-    path: Path, rules: Rules, device: System, output: PatientOptions
-) -> tuple[Pose, Organ | PatientImages | LiverImages]:
+    path: Path, rules: Rules, device: "System", output: PatientOptions
+) -> "tuple[Pose, Organ | PatientImages | LiverImages]":
     """Return what makes environments of a patient by the rules, and the patient."""
     from lungaccess.running.benchmark import posed_by_unc, posed_in_lung
 
@@ -168,7 +166,7 @@ def _planners(text: str) -> tuple[str, ...]:
     return names
 
 
-def _radii(text: str | None, rules: Rules, device: System) -> tuple[float, ...]:
+def _radii(text: str | None, rules: Rules, device: "System") -> tuple[float, ...]:
     if text is None and rules == "ours":
         return (device.require_needle("The benchmark of needles").min_radius_of_curvature_mm,)
     try:

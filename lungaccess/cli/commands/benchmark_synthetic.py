@@ -1,7 +1,5 @@
 """The commands `lungaccess benchmark synthetic-v1 ...`: make cases, run methods, score, compare."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -235,7 +233,7 @@ def schema() -> ExitCode:
     return ExitCode.OK
 
 
-def _show_sheet(scores: list[Score], output: OutputOptions, *, by_family: bool = True) -> None:
+def _show_sheet(scores: "list[Score]", output: OutputOptions, *, by_family: bool = True) -> None:
     from lungaccess.running.benchmark.synthetic.manifest import manifest_sha256
     from lungaccess.running.benchmark.synthetic.sheet import HEADINGS, score_sheet
 

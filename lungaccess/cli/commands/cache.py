@@ -1,7 +1,5 @@
 """The commands `lungaccess cache ...`: what is kept for the next command, and how to get rid of it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -71,7 +69,7 @@ def clear(*, output: CacheOptions = CacheOptions()) -> ExitCode:
     return _remove([each for each in entries if each.kind != "unfinished" or each.abandoned], output)
 
 
-def _entries(folder: Path) -> tuple[CacheEntry, ...]:
+def _entries(folder: Path) -> "tuple[CacheEntry, ...]":
     from anatomy.base.cache_entries import cache_entries
     from anatomy.store import stored_format
     from lungaccess.planning.coupled.atlas_store import atlas_format
@@ -82,7 +80,7 @@ def _entries(folder: Path) -> tuple[CacheEntry, ...]:
     )
 
 
-def _remove(entries: Iterable[CacheEntry], output: CacheOptions) -> ExitCode:
+def _remove(entries: "Iterable[CacheEntry]", output: CacheOptions) -> ExitCode:
     """Remove entries and say so."""
     from anatomy.base.cache_entries import remove_entry
 
@@ -100,14 +98,14 @@ def _remove(entries: Iterable[CacheEntry], output: CacheOptions) -> ExitCode:
     return ExitCode.OK
 
 
-def _row(entry: CacheEntry) -> terminal.Row:
+def _row(entry: "CacheEntry") -> terminal.Row:
     used = "today" if entry.days_unused < 1.0 else f"{entry.days_unused:.0f} days ago"
     kind = entry.kind if entry.current else f"old {entry.kind}"
     pictures = size_in_words(entry.pictures_bytes) if entry.pictures_bytes else ""
     return kind, entry.patient, size_in_words(entry.size_bytes), pictures, used, entry.path.name[:12]
 
 
-def _record(entry: CacheEntry) -> dict[str, object]:
+def _record(entry: "CacheEntry") -> dict[str, object]:
     return {
         "path": str(entry.path),
         "kind": entry.kind,

@@ -1,7 +1,5 @@
 """The command `lungaccess certify`: proof that a target is out of a system's reach."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -89,7 +87,7 @@ def certify(
     return ExitCode.of(verdict.proved)
 
 
-def _as_json(verdict: ReachVerdict) -> dict[str, object]:
+def _as_json(verdict: "ReachVerdict") -> dict[str, object]:
     return {
         "proved_unreachable": verdict.proved,
         "boxes": verdict.boxes,
@@ -120,7 +118,7 @@ def _percent(share: float) -> str:
     return "all but a millionth of a percent"
 
 
-def _words(place: OpenPlace) -> str:
+def _words(place: "OpenPlace") -> str:
     from anatomy.display import point
 
     return (

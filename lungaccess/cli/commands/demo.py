@@ -1,7 +1,5 @@
 """The command `lungaccess demo`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +49,7 @@ def demo(
     return _first_reachable_nodule(lung, job)
 
 
-def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> Lung:
+def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> "Lung":
     """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
 
     An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
@@ -64,7 +62,7 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
     return open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
 
 
-def _first_reachable_nodule(lung: Lung, job: PlanJob) -> ExitCode:
+def _first_reachable_nodule(lung: "Lung", job: PlanJob) -> ExitCode:
     """Plan to the nodules in their order until one can be reached."""
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import stated_target

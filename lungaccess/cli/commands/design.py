@@ -1,7 +1,5 @@
 """The command `lungaccess design`: the numbers of a device that reach most of a cohort."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -62,7 +60,7 @@ def design(
     return ExitCode.of(any(best.reached))
 
 
-def _show(title: str, found: DesignFound) -> None:
+def _show(title: str, found: "DesignFound") -> None:
     """Print the first device and the front, and how many others were tried or refused."""
     devices = found.record()["devices"]
     first = found.counted[0].system.name

@@ -1,7 +1,5 @@
 """The command `lungaccess doctor`: libraries, machine, kernels, folders, and what has to be mended."""
 
-from __future__ import annotations
-
 import os
 import platform
 import sys
@@ -33,7 +31,7 @@ def doctor(*, cache: Path | None = None, output: OutputOptions = OutputOptions()
     return ExitCode.of(not health.complaints)
 
 
-def _show(health: Health) -> None:
+def _show(health: "Health") -> None:
     kernels = health.kernels
     rows: list[terminal.Row] = [
         ("lungaccess", health.version),
@@ -63,7 +61,7 @@ def _show(health: Health) -> None:
         terminal.console.print(f"{complaint}.", style="bold red")
 
 
-def _folder(folder: Folder) -> str:
+def _folder(folder: "Folder") -> str:
     if not folder.exists:
         return f"{folder.path} (not there yet)"
     rights = "" if folder.writable else ", cannot be written"

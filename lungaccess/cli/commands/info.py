@@ -1,7 +1,5 @@
 """The commands `lungaccess info` and `lungaccess presets`: what is known of patients and systems."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -89,7 +87,7 @@ def presets(
     return ExitCode.OK
 
 
-def _preset_table(systems: Mapping[str, System]) -> Table:
+def _preset_table(systems: "Mapping[str, System]") -> Table:
     """Return one line a preset: the sizes that matter, and what it is."""
     rows = [
         (

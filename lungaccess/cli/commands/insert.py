@@ -1,7 +1,5 @@
 """The command `lungaccess insert`: the needle of a plan inserted with errors, watched by a tracker."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any
@@ -94,7 +92,7 @@ def insert(
     return ExitCode.of(accepted)
 
 
-def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
+def _table(found: "InsertionStudy", record: dict[str, Any]) -> Table:
     columns = [record["open_loop"], record["closed_loop"]]
     hits = [", ".join(f"{name} {n}" for name, n in each["hits"].items()) or "none" for each in columns]
     reached = [each["reached"] for each in columns]
@@ -120,7 +118,7 @@ def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
     return made
 
 
-def _known(found: InsertionStudy) -> str:
+def _known(found: "InsertionStudy") -> str:
     """Return by how much the believed factor of the curvature differs from the true one, in words."""
     bent = [run for run in found.closed_loop.insertions if run.factor > 0.0]
     off = [abs(run.believed_factor / run.factor - 1.0) for run in bent]

@@ -1,7 +1,5 @@
 """The command `lungaccess needle`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -115,7 +113,7 @@ def needle(
     return ExitCode.of(answer.path is not None and (checked is None or checked.accepted))
 
 
-def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
+def _tables(answer: "NeedleAnswer", *, is_lung: bool) -> list[Table]:
     """Return what a needle planner found: the outcome, and the path arc by arc."""
     from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.planning.one_stage import obstruction_rows
@@ -155,7 +153,7 @@ def _tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
     return [terminal.table("needle", ("", ""), rows), arcs_table(path.arcs)]
 
 
-def _start_pose(lung: Organ, start: str, frame: FrameOfPose) -> Float:
+def _start_pose(lung: "Organ", start: str, frame: FrameOfPose) -> "Float":
     """Return a pose by its number among those of the patient, from a plan, or from a file of numbers."""
     from anatomy.io.frames import read_pose
     from lungaccess.plans.plan import Plan

@@ -1,7 +1,5 @@
 """The command `lungaccess replan`."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -166,7 +164,7 @@ def _decided(
     return ExitCode.OK if decision.goes_on else ExitCode.NEGATIVE
 
 
-def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[Float, Plan | None]:
+def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> "tuple[Float, Plan | None]":
     """Return the pose as measured, and the plan that it is of if it is one of a plan."""
     given = scope if tube is None else tube
     if given is None or (scope is not None and tube is not None):
@@ -178,7 +176,7 @@ def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[
     return _pose(given, "scope" if tube is None else "tubes", frame)
 
 
-def _pose(given: str, stage: str, frame: FrameOfPose) -> tuple[Float, Plan | None]:
+def _pose(given: str, stage: str, frame: FrameOfPose) -> "tuple[Float, Plan | None]":
     """Return a pose as it is stated, and the plan that it is of if it is one of a plan."""
     from anatomy.io.frames import read_pose
     from anatomy.io.markups import parse_reference, read_named_pose
@@ -193,7 +191,7 @@ def _pose(given: str, stage: str, frame: FrameOfPose) -> tuple[Float, Plan | Non
     return (plan.scope.lps_from_scope_tip if stage == "scope" else plan.tube.lps_from_tip), plan
 
 
-def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
+def _tables(found: "RestOfPlan", *, has_map: bool) -> list[Table]:
     from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.plans.costs import costs_in_words, known_costs
 
@@ -217,7 +215,7 @@ def _tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
     return tables
 
 
-def tube_rows(tube: TubeDeployment) -> list[tuple[str, str]]:
+def tube_rows(tube: "TubeDeployment") -> list[tuple[str, str]]:
     """Return how tubes are to be turned and inserted."""
     turned = tube.shape.relative_rotations_rad
     middle = [("middle tube", f"{tube.middle_insertion_mm:.1f} mm")] if tube.middle_insertion_mm else []
@@ -235,7 +233,7 @@ def tube_rows(tube: TubeDeployment) -> list[tuple[str, str]]:
     ]
 
 
-def decision_tables(decision: Decision) -> list[Table]:
+def decision_tables(decision: "Decision") -> list[Table]:
     """Return what a policy says is to be done next."""
     from lungaccess.cli.plan_tables import arcs_table
 

@@ -1,7 +1,5 @@
 """The command `lungaccess report`: everything about a plan on one page that opens offline."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -93,7 +91,7 @@ def report(
     return ExitCode.OK
 
 
-def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple[Plan, ...]:
+def _others(plan: "Plan", lung: "Lung", count: int, output: PatientOptions) -> "tuple[Plan, ...]":
     """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it.
 
     Of a patient that breathes they have their windows.

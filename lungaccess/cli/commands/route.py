@@ -1,7 +1,5 @@
 """The command `lungaccess route`: a route along airways or vessels for a device of limited curvature."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -98,7 +96,7 @@ def route(
     return _verdict(found)
 
 
-def _rows(found: Route, written: dict[str, object]) -> list[terminal.Row]:
+def _rows(found: "Route", written: dict[str, object]) -> list[terminal.Row]:
     limits = found.limits
     return [
         ("length", f"{written['length_mm']:.1f} mm", ""),
@@ -111,7 +109,7 @@ def _rows(found: Route, written: dict[str, object]) -> list[terminal.Row]:
     ]  # fmt: skip
 
 
-def _verdict(found: Route) -> ExitCode:
+def _verdict(found: "Route") -> ExitCode:
     from stages.scope.route import NoRouteError, require_proved
 
     try:

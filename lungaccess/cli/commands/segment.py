@@ -1,7 +1,5 @@
 """The command `lungaccess segment`: from a CT to a patient folder for planning."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -177,7 +175,7 @@ def segment(
     return ExitCode.OK
 
 
-def _show_refused(ct: Volume, error: AnatomyError, path: Path) -> None:
+def _show_refused(ct: "Volume", error: AnatomyError, path: Path) -> None:
     """Draw the CT with what was found in it until it was refused."""
     from anatomy.segmentation.parts import RefusedError
     from lungaccess.showing.report.segmentation import segmentation_png
@@ -186,7 +184,7 @@ def _show_refused(ct: Volume, error: AnatomyError, path: Path) -> None:
     terminal.progress_console.print(f"{path} shows what was found", highlight=False)
 
 
-def _tables(result: Segmentation, quality: Quality) -> list[Table]:
+def _tables(result: "Segmentation", quality: "Quality") -> "list[Table]":
     volumes = [(name, f"{volume:.3f}") for name, volume in quality.volumes_l.items() if volume]
     tree = quality.tree
     airway = [("ends", f"{quality.ends}")]
@@ -215,7 +213,7 @@ def _tables(result: Segmentation, quality: Quality) -> list[Table]:
     return [each for each in made if each.row_count]
 
 
-def _written(result: Segmentation) -> str:
+def _written(result: "Segmentation") -> str:
     words = f"Written to {result.folder}: patient.toml, its masks, quality.json, segmentation.json."
     if result.kept_description:
         words += " patient.toml was edited by hand and is kept as it was."

@@ -1,7 +1,5 @@
 """The command `lungaccess selftest`: every kind of proof computed again, and compared with a truth."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,7 +35,7 @@ def selftest(
     return ExitCode.of(all(each.held for each in outcomes))
 
 
-def _show(outcomes: tuple[Outcome, ...]) -> None:
+def _show(outcomes: "tuple[Outcome, ...]") -> None:
     rows = [
         (
             each.kind,
@@ -55,5 +53,5 @@ def _show(outcomes: tuple[Outcome, ...]) -> None:
             terminal.console.print(f"{each.kind}, seed {failure.seed}: {failure.said}", style="bold red")
 
 
-def _verdict(failures: tuple[Failure, ...]) -> str:
+def _verdict(failures: "tuple[Failure, ...]") -> str:
     return f"NO, in {len(failures)}" if failures else "yes"

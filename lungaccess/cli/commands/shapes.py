@@ -1,7 +1,5 @@
 """The command `lungaccess shapes`: all that a design of tubes can do, whatever the patient."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -47,7 +45,7 @@ def shapes(
     return ExitCode.of(found.count > 0)
 
 
-def _rows(name: str, found: TubeShapes) -> list[terminal.Row]:
+def _rows(name: str, found: "TubeShapes") -> list[terminal.Row]:
     from lungaccess.planning.one_stage import shapes_record
 
     record = shapes_record(name, found)

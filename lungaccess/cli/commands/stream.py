@@ -1,7 +1,5 @@
 """The command `lungaccess stream`: a plan over OpenIGTLink, planned again from what is tracked."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
@@ -82,11 +80,11 @@ def stream(
     return ExitCode.OK
 
 
-def _say(answer: Answer) -> None:
+def _say(answer: "Answer") -> None:
     terminal.say(f"{answer.name}: {answer.words} ({1e3 * answer.processor_s:.1f} ms)")
 
 
-def _table(counts: LiveCounts) -> Table:
+def _table(counts: "LiveCounts") -> Table:
     link = counts.link
     rows = [
         ("rounds", f"{counts.ticks}, of which {counts.overrun} took too long"),

@@ -1,7 +1,5 @@
 """The commands `lungaccess study ...`: sweeps of patients, targets, devices, planners and seeds."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -149,7 +147,7 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
     return ExitCode.of(not found)
 
 
-def _table(title: str, groups: list[Group]) -> Table:
+def _table(title: str, groups: "list[Group]") -> "Table":
     headings = (
         "case", "planner", "runs", "failed", "solved, %", "accepted, %", "first, s", "run, s", "cost",
         "succeeds, %",
@@ -158,7 +156,7 @@ def _table(title: str, groups: list[Group]) -> Table:
     return terminal.table(title, headings[:columns], [_row(group)[:columns] for group in groups])
 
 
-def _row(group: Group) -> tuple[str, ...]:
+def _row(group: "Group") -> tuple[str, ...]:
     return (
         group.case,
         group.planner,

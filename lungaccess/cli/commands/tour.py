@@ -1,7 +1,5 @@
 """The command `lungaccess tour`: several lesions in one procedure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -105,7 +103,7 @@ def tour(
     return ExitCode.of(not answer.left_out)
 
 
-def _show(answer: TourAnswer, speed: float, per_lesion: float) -> None:
+def _show(answer: "TourAnswer", speed: float, per_lesion: float) -> None:
     rows = [_summary("shortest", answer.shortest, answer, speed, per_lesion)]
     if answer.least_resistance is not None:
         rows.append(_summary("least resistance", answer.least_resistance, answer, speed, per_lesion))
@@ -146,7 +144,7 @@ def _show(answer: TourAnswer, speed: float, per_lesion: float) -> None:
 
 
 def _summary(
-    name: str, tour: Itinerary, answer: TourAnswer, speed: float, per_lesion: float
+    name: str, tour: "Itinerary", answer: "TourAnswer", speed: float, per_lesion: float
 ) -> tuple[str, ...]:
     seconds = tour.seconds(speed, per_lesion)
     saved = 100.0 * (1.0 - tour.length_mm / answer.one_by_one_mm)

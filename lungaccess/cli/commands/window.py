@@ -1,7 +1,5 @@
 """The command `lungaccess window`: the phases of the breath in which a plan is proved."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -72,7 +70,7 @@ def window(
     return ExitCode.of(len(found.phases) > 0)
 
 
-def _in_place(needle: CarriedNeedle) -> Table:
+def _in_place(needle: "CarriedNeedle") -> "Table":
     """Return what the breath does to the needle in place."""
     rows = [
         ("its end to the moving target", f"{needle.end_miss_mm:.1f} mm"),

@@ -1,7 +1,5 @@
 """The headline of a plan: how likely it succeeds, and whether its geometry was accepted, always together."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 
 from anatomy.base.records import frozen_value
@@ -69,7 +67,7 @@ class Headline:
     @classmethod
     def of(
         cls, report: CheckReport | None, estimate: Estimate | None, without_measuring: Share | None = None
-    ) -> Headline:
+    ) -> "Headline":
         """Return the headline of a check, or of none, and of an estimate, or of none."""
         if report is None:
             return cls(geometry=Geometry.UNCHECKED, estimate=estimate)

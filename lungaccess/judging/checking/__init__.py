@@ -1,7 +1,5 @@
 """The independent check of a plan: it shares no arithmetic with the planners."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from anatomy.base.facade import lazy_exports

@@ -1,7 +1,5 @@
 """Exact distances from points and segments to structures, their voxels as solid boxes."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import cKDTree
 

@@ -1,7 +1,5 @@
 """Own view of breathing: where tissue and devices are in a phase, by interpolation and singular values."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +23,7 @@ STEPS = 50
 class Breath:
     """The breathing of the lung that holds a target, and the devices that the airway around a tip carries."""
 
-    def __init__(self, motion: Motion, target_lps: Float, tip_lps: Float) -> None:
+    def __init__(self, motion: "Motion", target_lps: Float, tip_lps: Float) -> None:
         side = 1 if target_lps[0] > motion.middle_x_mm else 0
         self._motion, self._nodes = motion, np.moveaxis(np.asarray(motion.nodes[side]), -1, 0)
         self._tip = np.asarray(tip_lps, dtype=np.float64)

@@ -1,7 +1,5 @@
 """Own look at the working channel: strain of tubes and needle on their way, and what straightens it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

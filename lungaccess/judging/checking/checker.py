@@ -1,7 +1,5 @@
 """The independent check: it computes everything in a finished plan anew and accepts or refuses the plan."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,7 +33,7 @@ class Checker:
         lung: The patient that the plans are for; its arrays must not change while the checker is used.
     """
 
-    def __init__(self, lung: Lung) -> None:
+    def __init__(self, lung: "Lung") -> None:
         self._environment = Environment(lung)
 
     def check(
@@ -64,7 +62,7 @@ class Checker:
 
 
 def check(
-    plan: Plan, lung: Lung, system: System | None = None, *, target_lps: ArrayLike | None = None
+    plan: Plan, lung: "Lung", system: System | None = None, *, target_lps: ArrayLike | None = None
 ) -> CheckReport:
     """Check a plan against the masks of a patient, independently of how it was made.
 
@@ -82,7 +80,7 @@ def check(
     return Checker(lung).check(plan, system, target_lps=target_lps)
 
 
-def check_functions(plan: Plan, lung: Lung, found: Findings) -> None:
+def check_functions(plan: Plan, lung: "Lung", found: Findings) -> None:
     """Compute every function that the plan states a value of, where it is known here."""
     known = goals()
     for name, stated in plan.goals.items():

@@ -1,7 +1,5 @@
 """Clearances from structures: recomputed against what is required, and stated against recomputed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -43,7 +41,7 @@ REACH_MM = 20.0
 """Clearances are recomputed up to this distance; what lies farther counts as this far."""
 
 
-def structures_known(cases: Iterable[Case], stage: str, lung: Lung, found: Findings) -> Iterator[Case]:
+def structures_known(cases: Iterable[Case], stage: str, lung: "Lung", found: Findings) -> Iterator[Case]:
     """Yield the structures to keep clear of, and record that fissures are not checked if there is no mask."""
     for case in cases:
         if case[0] == "fissure" and not lung.has_fissures:

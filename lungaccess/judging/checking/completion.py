@@ -8,8 +8,6 @@ they are.  The angle to the wall is known to `WALL_ANGLE_TOLERANCE_RAD` alone: w
 that is allowed, that is what is filled in, as a planner could have stated it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Third part of the check: the tubes follow from their insertions, leave the airway once and stay clear."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -121,7 +119,7 @@ def _check_out_of_lumen(environment: Environment, curve: Curve, way_out: Exit, f
     check_clear("tube.beyond_wall.lumen", boxes, points, needed, found, limited=True)
 
 
-def _first_contact(lung: Lung, curve: Curve, way_out: Exit, plan: Plan) -> int:
+def _first_contact(lung: "Lung", curve: Curve, way_out: Exit, plan: Plan) -> int:
     """Return the frame from which on, up to the exit, the tube's rim is never wholly in the lumen."""
     phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
     frames = curve.frames[: way_out.frame + 1, None, :3]

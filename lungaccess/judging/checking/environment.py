@@ -1,7 +1,5 @@
 """One lung as the check sees it, with what follows from the lung alone kept for the next plan."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -23,7 +21,7 @@ class Environment:
     The arrays of the lung must not change while this is used.
     """
 
-    def __init__(self, lung: Lung) -> None:
+    def __init__(self, lung: "Lung") -> None:
         self.lung = lung
         self._tiles = Tiles(lung)
 

@@ -1,7 +1,5 @@
 """What the check found: one line for each thing it looked at."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """The check of a needle that was planned alone: its motion, its target, and its distance from everything."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -33,7 +31,7 @@ LEAVING_DEG = 10.0
 
 
 def check_needle_alone(
-    lung: Lung,
+    lung: "Lung",
     system: System,
     lps_from_start: Float,
     arcs: ArrayLike,
@@ -102,7 +100,7 @@ def _check_clear(
 
 
 def _check_exit(
-    lung: Lung,
+    lung: "Lung",
     system: System,
     curve: Curve,
     exempt: Bool,
@@ -137,7 +135,7 @@ def _check_exit(
     found.true("needle.not_in_lumen", outside.all(), f"{int((~outside).sum())} samples in an airway")
 
 
-def _box_distance(points: Float, centres: Float, lung: Lung) -> Float:
+def _box_distance(points: Float, centres: Float, lung: "Lung") -> Float:
     """Return the distance `(N,)` of points from voxels as solid boxes, at most `REACH_MM`."""
     axes = lung.grid.lps_from_ijk[:3, :3] / lung.grid.spacing_mm
     half = 0.5 * lung.grid.spacing_mm

@@ -1,7 +1,5 @@
 """Own look at what the needle's stiffness does to the tubes that aim it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Last part of the check: the devices end at the target, and cost what the plan states."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -81,7 +79,7 @@ def recomputed_costs(
     }
 
 
-def check_target(plan: Plan, lung: Lung, end: Float, found: Findings) -> None:
+def check_target(plan: Plan, lung: "Lung", end: Float, found: Findings) -> None:
     """The needle, or the tubes, end at the target, which lies in the lung and in no obstacle.
 
     Devices with an aim end there instead: how near that is to the target, its window says, or for a tool
@@ -103,7 +101,7 @@ def check_target(plan: Plan, lung: Lung, end: Float, found: Findings) -> None:
     found.true("target.free", not label & forbidden, "the target lies in no obstacle")
 
 
-def _in_nodule(lung: Lung, points: Float) -> bool:
+def _in_nodule(lung: "Lung", points: Float) -> bool:
     if lung.nodules is None:
         return False
     index = np.rint(lung.nodules.grid.ijk(points)).astype(np.int64)
@@ -201,7 +199,7 @@ def tissue(plan: Plan, environment: Environment, curve: Curve) -> float:
     return total
 
 
-def cost_map_integral_and_sum(lung: Lung, curve: Curve) -> tuple[float, float]:
+def cost_map_integral_and_sum(lung: "Lung", curve: Curve) -> tuple[float, float]:
     """Return the line integral of the cost map in mm, and its sum over the set of voxels crossed.
 
     The chords of the curve, shorter than a voxel, are cut at the faces of voxels.  Without a map both are

@@ -1,7 +1,5 @@
 """Comparison of poses and directions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.typed import Float

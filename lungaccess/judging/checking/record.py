@@ -1,7 +1,5 @@
 """First part of the check: is the plan intact, and does it belong to this patient and this device."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
@@ -33,7 +31,7 @@ MAX_STATES, MAX_ANGLE_RAD = 10_000, 100.0
 
 
 def check_record(
-    plan: Plan, lung: Lung, found: Findings, system: System | None, target_lps: Float | None
+    plan: Plan, lung: "Lung", found: Findings, system: System | None, target_lps: Float | None
 ) -> bool:
     """Record all that needs no geometry; return whether geometry can be looked at."""
     usable = _check_numbers(plan, found)
@@ -49,7 +47,7 @@ def check_record(
     return _check_lengths(plan, found)
 
 
-def _check_fissures(plan: Plan, lung: Lung, found: Findings) -> None:
+def _check_fissures(plan: Plan, lung: "Lung", found: Findings) -> None:
     """The plan treats fissures as mask and system say; without a mask it states no distance from them."""
     allowed, known = plan.system.fissures_allowed, lung.has_fissures
     stated = any("fissure" in distances for distances in plan.clearance_mm.values())
@@ -94,7 +92,7 @@ def _check_integrity(plan: Plan, found: Findings) -> None:
         found.true("record.round_trip", False, str(error))
 
 
-def _check_patient(plan: Plan, lung: Lung, found: Findings) -> None:
+def _check_patient(plan: Plan, lung: "Lung", found: Findings) -> None:
     found.true("patient.name", plan.patient_name == lung.name, f"{plan.patient_name} against {lung.name}")
     found.true("patient.key", plan.lung_key == lung.key, f"{plan.lung_key} against {lung.key}")
     found.true("patient.sources", dict(plan.sources) == dict(lung.sources), "hashes of the image files")

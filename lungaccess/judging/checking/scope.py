@@ -1,7 +1,5 @@
 """Second part of the check: the bronchoscope can move as stated, in the lumen, and its tip ends as stated."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree

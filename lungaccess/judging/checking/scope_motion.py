@@ -4,8 +4,6 @@ The bending section is a screw: forward at unit speed, turning towards where twi
 follows the section when the scope advances, and stays where it is when it twists or bends.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record

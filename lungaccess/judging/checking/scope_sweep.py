@@ -6,8 +6,6 @@ place of it is farther from the middle than its length and its motion say, so th
 near is cut in two, until it is seen whether it does.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from anatomy.base.records import frozen_record
@@ -39,12 +37,12 @@ class Cells:
     time: Float
     half_time: Float
 
-    def pick(self, which: Bool | Int) -> Cells:
+    def pick(self, which: Bool | Int) -> "Cells":
         """Return some of the cells."""
         parts = {name: value[which] for name, value in vars(self).items()}
         return Cells(**parts)
 
-    def halves(self, in_time: Bool) -> Cells:
+    def halves(self, in_time: Bool) -> "Cells":
         """Cut every cell in two, along time where asked for, else along the arc."""
         twice = self.pick(np.repeat(np.arange(len(self.state)), 2))
         side = np.tile([-0.5, 0.5], len(self.state))

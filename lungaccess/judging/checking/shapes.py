@@ -1,7 +1,5 @@
 """Own kinematics of the check: poses re-integrated with matrix exponentials, shapes by quadrature."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

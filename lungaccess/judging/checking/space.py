@@ -1,7 +1,5 @@
 """Own view of the anatomy: voxel labels at points, and which voxels make up a structure."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,7 +51,7 @@ def branch_of(labels: Labels) -> Int:
     return (np.asarray(labels).astype(np.int64) >> structures.BRANCH_SHIFT) - 1
 
 
-def labels_at(lung: Lung, points_lps: Float) -> Labels:
+def labels_at(lung: "Lung", points_lps: Float) -> Labels:
     """Return the labels `(N,)` of the voxels that hold the points; beyond the grid all is OUTSIDE."""
     points = np.asarray(points_lps, dtype=np.float64).reshape(-1, 3)
     axes = lung.grid.lps_from_ijk[:3, :3]
@@ -65,7 +63,7 @@ def labels_at(lung: Lung, points_lps: Float) -> Labels:
     return labels
 
 
-def window_of(lung: Lung, low: Int, high: Int) -> Labels:
+def window_of(lung: "Lung", low: Int, high: Int) -> Labels:
     """Return the labels of the voxels `low <= ijk < high`, OUTSIDE beyond the lung's grid."""
     low, high = np.asarray(low), np.asarray(high)
     labels = np.full(tuple(high - low), structures.OUTSIDE, dtype=np.uint16, order="F")
@@ -89,7 +87,7 @@ class Region:
     labels: Labels
 
 
-def region_around(lung: Lung, points_lps: Float, reach_mm: float) -> Region:
+def region_around(lung: "Lung", points_lps: Float, reach_mm: float) -> Region:
     """Cut out the region that holds everything within `reach_mm` of the points."""
     fraction = lung.grid.ijk(points_lps)
     reach = reach_mm / lung.grid.spacing_mm + 2.0

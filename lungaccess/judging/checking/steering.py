@@ -1,7 +1,5 @@
 """Fourth part of the check: the needle follows its arcs to the target, within its limits and clear of all."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -119,7 +117,7 @@ def _check_exemption(plan: Plan, device: Needle, found: Findings) -> None:
     found.at_least("exemption.length.sign", exempt, 0.0, "mm")
 
 
-def _check_containment(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> None:
+def _check_containment(plan: Plan, lung: "Lung", curve: Curve, found: Findings) -> None:
     """Every sample is in the lung and in no obstacle: a surface alone does not tell inside from outside."""
     labels = labels_at(lung, curve.points)
     outside = (labels & structures.OUTSIDE) != 0

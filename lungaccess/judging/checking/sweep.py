@@ -1,7 +1,5 @@
 """How far tubes get sideways while they are deployed, against the limit and against what a plan states."""
 
-from __future__ import annotations
-
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.plans.plan import Plan
 

@@ -1,7 +1,5 @@
 """The surface voxels of every structure of a lung, found tile by tile when they are asked for, and kept."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import product
@@ -65,7 +63,7 @@ class Cluster:
 class Tiles:
     """The surfaces of a lung's structures; each tile is looked through once, so labels must not change."""
 
-    def __init__(self, lung: Lung) -> None:
+    def __init__(self, lung: "Lung") -> None:
         self.lung = lung
         self.spacing_mm = lung.grid.spacing_mm
         self._kept: dict[tuple[int, tuple[int, ...]], tuple[Cluster, ...]] = {}

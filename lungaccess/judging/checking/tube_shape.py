@@ -1,7 +1,5 @@
 """The tubes, derived anew by the CasADi model from their insertions and rotations alone."""
 
-from __future__ import annotations
-
 import itertools
 from typing import TYPE_CHECKING
 
@@ -62,7 +60,7 @@ def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
     return off_mm + _replay(plan, derived, found)
 
 
-def _check_arcs(plan: Plan, curve: Curve, derived: DerivedShape, found: Findings) -> float:
+def _check_arcs(plan: Plan, curve: Curve, derived: "DerivedShape", found: Findings) -> float:
     """The stated arcs are the derived shape up to their stated error; return how far they are from it."""
     shape, scope = plan.tube.shape, plan.scope.lps_from_scope_tip
     length = float(shape.arcs[:, 0].sum())
@@ -85,7 +83,7 @@ def _check_arcs(plan: Plan, curve: Curve, derived: DerivedShape, found: Findings
     return off
 
 
-def _replay(plan: Plan, derived: DerivedShape, found: Findings) -> float:
+def _replay(plan: Plan, derived: "DerivedShape", found: Findings) -> float:
     """Compare every step of the way with the final place; return how far the tubes get from it.
 
     Tubes that bend in one plane state how far they get from the final shape, all others how far each place
@@ -103,7 +101,7 @@ def _replay(plan: Plan, derived: DerivedShape, found: Findings) -> float:
     return check_sweep(plan, sweep, leader, len(derived.way), found)
 
 
-def _check_strain(plan: Plan, derived: DerivedShape, found: Findings) -> None:
+def _check_strain(plan: Plan, derived: "DerivedShape", found: Findings) -> None:
     """Where several tubes lie in each other, each is bent away from its rest by the others."""
     tubes, inserted = plan.system.tubes.nested, plan.tube.insertions_mm(plan.system.tubes)[::-1]
     needle = plan.system.needle_tube if plan.system.needle_preloaded else None

@@ -1,7 +1,5 @@
 """Where the tubes of a plan leave the lumen for good, at which angle, and how far they run in the wall."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -63,7 +61,7 @@ class _Samples:
     in_lumen: Bool
 
 
-def check_exit(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> Exit | None:
+def check_exit(plan: Plan, lung: "Lung", curve: Curve, found: Findings) -> Exit | None:
     """Derive the exit anew and compare it with what the plan states and exempts."""
     stated, exemption = plan.tube.exit, plan.exemption
     samples = _samples_of(lung, curve)
@@ -99,7 +97,7 @@ def check_exit(plan: Plan, lung: Lung, curve: Curve, found: Findings) -> Exit | 
     return Exit(frame=frame, arc_mm=arc_mm, branch=exemption.branch)
 
 
-def derived_exit(lung: Lung, curve: Curve) -> tuple[Exit, Float] | None:
+def derived_exit(lung: "Lung", curve: Curve) -> tuple[Exit, Float] | None:
     """Return where a curve leaves the lumen for good, and that point `(3,)`; None where it does not.
 
     Of several places that `check_exit` would accept it is the first.
@@ -113,7 +111,7 @@ def derived_exit(lung: Lung, curve: Curve) -> tuple[Exit, Float] | None:
     return Exit(frame=frame, arc_mm=arc_mm, branch=int(samples.branch[last])), point
 
 
-def _samples_of(lung: Lung, curve: Curve) -> _Samples:
+def _samples_of(lung: "Lung", curve: Curve) -> _Samples:
     """Return points along a curve, its end the last of them."""
     share = np.arange(SAMPLES)[:, None] / SAMPLES
     step = np.diff(curve.points, axis=0)[:, None]
@@ -142,7 +140,7 @@ def _last_in_lumen(samples: _Samples, stated_mm: float) -> tuple[int, float]:
     return int(last[chosen]), float((begin[1 : chosen + 1] - end[:chosen]).max(initial=0.0))
 
 
-def _border(lung: Lung, samples: _Samples, last: int) -> tuple[float, Float]:
+def _border(lung: "Lung", samples: _Samples, last: int) -> tuple[float, Float]:
     """Return arc length and position of the border of the lumen behind a sample, by bisection."""
     a, b = samples.points[last], samples.points[last + 1]
     inside, outside = 0.0, 1.0
@@ -156,7 +154,7 @@ def _border(lung: Lung, samples: _Samples, last: int) -> tuple[float, Float]:
     return float(arc_mm), a + inside * (b - a)
 
 
-def wall_angle_rad(lung: Lung, point_lps: Float, tangent: Float) -> float:
+def wall_angle_rad(lung: "Lung", point_lps: Float, tangent: Float) -> float:
     """Return the angle between a tangent and the lumen's border; pi/2 is perpendicular to the wall.
 
     The border faces away from the centroid of the lumen voxels whose centres lie within

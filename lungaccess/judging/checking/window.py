@@ -4,8 +4,6 @@ The surfaces of the voxels near the devices are deformed as the lung is in a pha
 carried devices to them.  What holds between the phases that are looked at rests on the planner's proof.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Deployment atlases on disk: one file per lung, scope, tubes and margins, whatever the needle."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import fields

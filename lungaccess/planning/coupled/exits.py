@@ -1,7 +1,5 @@
 """The feasible exits of a target: where tubes can leave the airway so that it is reached directly."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -142,13 +140,13 @@ class _Found:
     points: Float
 
     @classmethod
-    def nothing(cls) -> _Found:
+    def nothing(cls) -> "_Found":
         return cls(
             entries=np.zeros(0, np.int64), cost=np.zeros(0), length_mm=np.zeros(0), points=np.zeros((0, 3))
         )
 
     @classmethod
-    def of(cls, arcs: DirectCandidates, entries: Int, cost: Float) -> _Found:
+    def of(cls, arcs: DirectCandidates, entries: Int, cost: Float) -> "_Found":
         atlas = arcs.atlas
         if isinstance(arcs, DirectArcs):
             lengths = arcs.blockers(entries)[1]
@@ -158,7 +156,7 @@ class _Found:
             lengths, points = np.linalg.norm(np.diff(lines, axis=1), axis=2).sum(axis=1), lines[:, 0]
         return cls(entries=entries, cost=cost, length_mm=lengths, points=points)
 
-    def joined(self, other: _Found) -> _Found:
+    def joined(self, other: "_Found") -> "_Found":
         return _Found(
             entries=np.concatenate([self.entries, other.entries]),
             cost=np.concatenate([self.cost, other.cost]),

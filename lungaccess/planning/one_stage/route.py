@@ -1,7 +1,5 @@
 """Sources of centrelines for the route planner, and the record of a route."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import field
@@ -29,7 +27,7 @@ class RouteSource:
 
     name: str
     kind: str
-    centreline: Centreline
+    centreline: "Centreline"
     places: Mapping[str, Float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
@@ -154,7 +152,7 @@ def read_drawing(path: Path) -> Any:
     return ~dark if dark.mean() > 0.5 else dark
 
 
-def widest_end(centreline: Centreline) -> Float:
+def widest_end(centreline: "Centreline") -> Float:
     """Return the end of the tube system with the widest lumen, `(3,)` mm: where a device usually enters."""
     ends = np.flatnonzero(np.bincount(centreline.edges.ravel(), minlength=centreline.n_nodes) == 1)
     if not len(ends):
@@ -162,7 +160,7 @@ def widest_end(centreline: Centreline) -> Float:
     return np.asarray(centreline.nodes_mm[ends[int(np.argmax(centreline.radius_mm[ends]))]])
 
 
-def route_record(source: RouteSource, route: Route) -> dict[str, Any]:
+def route_record(source: RouteSource, route: "Route") -> dict[str, Any]:
     """Return a route as plain JSON types, in LPS mm."""
     from anatomy.base.settings import to_mapping
     from stages.scope.route import measure

@@ -1,7 +1,5 @@
 """All that a design of tubes can do, whatever the patient: the answer, and how it is written down."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

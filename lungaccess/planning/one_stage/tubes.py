@@ -1,7 +1,5 @@
 """One deployment of two concentric tubes: what it does, whether it is stable, what would sweep less."""
 
-from __future__ import annotations
-
 import math
 import os
 from typing import Annotated, Any

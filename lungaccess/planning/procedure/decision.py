@@ -1,7 +1,5 @@
 """What was measured in a procedure, and what a policy then says is to be done next."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import asdict
 from enum import StrEnum
@@ -64,7 +62,7 @@ class Measurements:
         needle: Iterable[Float] = (),
         target_lps: Float | None = None,
         placements: int = 1,
-    ) -> Measurements:
+    ) -> "Measurements":
         """Return what was measured from arrays of poses `(4, 4)` and a point `(3,)`."""
         point = None if target_lps is None else tuple(np.asarray(target_lps, dtype=np.float64).tolist())
         stages = {"scope": scope, "tubes": tubes, "needle": needle}

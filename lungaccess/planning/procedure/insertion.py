@@ -1,7 +1,5 @@
 """Insert the needle of a plan many times: blindly, and planned again by what a tracker sees."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from enum import StrEnum
@@ -105,7 +103,7 @@ class Summary:
     reached: Share
 
     @staticmethod
-    def of(insertions: Iterable[Insertion]) -> Summary:
+    def of(insertions: Iterable[Insertion]) -> "Summary":
         """Count what became of at least one insertion."""
         runs = tuple(insertions)
         reached = sum(run.outcome is Outcome.REACHED for run in runs)

@@ -4,8 +4,6 @@ Going on with the plan as it is, from where things were measured to be, is alway
 have their chance from the same kernels.  The simulator of procedures decides by the same functions.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -118,7 +116,7 @@ class Chosen:
     tubes: Float
     deployed: tuple[TubeDeployment, ...] = ()
 
-    def only(self, chosen: Int) -> Chosen:
+    def only(self, chosen: Int) -> "Chosen":
         """Return some of the procedures, by their numbers."""
         arrays = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "deployed"}
         arrays = {name: each[chosen] if len(each) else each for name, each in arrays.items()}

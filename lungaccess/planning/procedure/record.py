@@ -1,7 +1,5 @@
 """The record of a procedure: what was measured and decided, which can be written, read and played again."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -49,7 +47,7 @@ class ProcedureRecord:
         write_text(os.fspath(path), json.dumps(content, indent=1))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], plan: Plan, lung: Lung) -> ProcedureRecord:
+    def load(cls, path: str | os.PathLike[str], plan: Plan, lung: Lung) -> "ProcedureRecord":
         """Read a record of the procedure of a plan, and play it again.
 
         Raises:

@@ -1,7 +1,5 @@
 """What is left of the errors after what a procedure measures."""
 
-from __future__ import annotations
-
 import math
 
 from anatomy.base.records import frozen_record
@@ -37,7 +35,7 @@ class Residuals:
     foot_mm: float
 
     @staticmethod
-    def of(errors: ErrorModel, procedure: Procedure, stretch: float) -> Residuals:
+    def of(errors: ErrorModel, procedure: Procedure, stretch: float) -> "Residuals":
         """Return what a procedure leaves of errors; `stretch` is that of `Draws`."""
         placed, aimed = errors.term("scope_position").rms, errors.term("target_position").rms
         angles = ("scope_direction", "tube_rotation", "needle_roll")

@@ -1,7 +1,5 @@
 """Simulate a procedure many times: how often it succeeds, what fails, and what each stage corrects."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from multiprocessing.connection import Connection
 from types import MappingProxyType
@@ -193,7 +191,7 @@ class _Run:
         planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip)) @ np.append(plan.end_lps, 1.0)
         return np.asarray(np.linalg.norm((likely @ planned)[:, :3] - plan.goal_lps, axis=1))
 
-    def _devices_out(self, went: _Went, left: int, at: Int, found: _Found) -> Bool:
+    def _devices_out(self, went: "_Went", left: int, at: Int, found: _Found) -> Bool:
         """Let tubes and needles out, and note what came of it; tell which needles were inserted."""
         policy, plan, procedure = self._policy, self._policy.plan, self._policy.procedure
         chosen, errors = went.chosen, went.errors
@@ -239,7 +237,7 @@ class _Run:
 
     def _steered(
         self,
-        went: _Went,
+        went: "_Went",
         chosen: Chosen,
         done: Bool,
         true_tips: Float,

@@ -1,7 +1,5 @@
 """The work behind a reachability map: its points layer by layer, kept on disk as they are finished."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -41,7 +39,11 @@ def _layer_points(grid: Grid, k: int) -> Float:
 
 
 def scan_layers(
-    scan: Scan, grid: Grid, counted: Mask, store: LayerStore | None, progress: Callable[[float], None] | None
+    scan: Scan,
+    grid: Grid,
+    counted: Mask,
+    store: "LayerStore | None",
+    progress: Callable[[float], None] | None,
 ) -> tuple[Float32, Int32, int]:
     """Try the points of all layers, slab by slab.
 

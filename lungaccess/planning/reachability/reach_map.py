@@ -1,7 +1,5 @@
 """The reachability map: for a grid of points in the lung, whether and how well a system reaches them."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import time
@@ -146,7 +144,7 @@ class ReachMap:
         """Return the voxels of one of `STATES`."""
         return np.isin(self.kinds.array, [KINDS[name] for name in STATES[state]])
 
-    def gained_and_lost_ml(self, other: ReachMap) -> tuple[float, float]:
+    def gained_and_lost_ml(self, other: "ReachMap") -> tuple[float, float]:
         """Return the volume that this map reaches and another does not, and the reverse.
 
         Raises:

@@ -5,8 +5,6 @@ Sine and cosine are power series of the squared angle, so that a straight arc is
 derivatives exist there.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,7 +60,7 @@ class Frame:
         q = (kx * kx + ky * ky) * s * s
         return (1.0 - q * _series(q, 2)) * self.z + s * _series(q, 1) * (kx * self.x + ky * self.y)
 
-    def along(self, kx: Any, ky: Any, s: Any) -> Frame:
+    def along(self, kx: Any, ky: Any, s: Any) -> "Frame":
         """Return the frame at the end of an arc, transported without roll."""
         q = (kx * kx + ky * ky) * s * s
         sine, versine = s * _series(q, 1), s * s * _series(q, 2)

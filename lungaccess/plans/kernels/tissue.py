@@ -4,8 +4,6 @@ The end of the devices is a point, the direction ahead and a normal across it, n
 nodule lies `shift` (three numbers) from where it was planned.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

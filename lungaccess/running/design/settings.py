@@ -4,8 +4,6 @@ A point of the unit cube, with one coordinate a number, stands for a device that
 criterion is a line of a table.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """What a run ended with, as plain values that go from workers to the results file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Any
@@ -84,7 +82,7 @@ class Answer:
         return self.outcome in (PLAN, PATH)
 
     @staticmethod
-    def from_mapping(values: Mapping[str, Any]) -> Answer:
+    def from_mapping(values: Mapping[str, Any]) -> "Answer":
         """Return the answer that `dataclasses.asdict` made plain."""
         made = tuple(Improvement(**each) for each in values["improvements"])
         return Answer(**{**values, "improvements": made, "findings": tuple(values["findings"])})

@@ -1,7 +1,5 @@
 """The dask cluster of a study: a scheduler that runs somewhere, or processes on this machine."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os
@@ -50,7 +48,7 @@ def require_dask() -> None:
 
 
 @contextlib.contextmanager
-def connect(scheduler: str | None, workers: int | None) -> Iterator[Client]:
+def connect(scheduler: str | None, workers: int | None) -> "Iterator[Client]":
     """Connect to a scheduler, or start processes on this machine and stop them afterwards."""
     import dask
     from distributed import Client, LocalCluster
@@ -126,7 +124,7 @@ def interruptions_noted() -> Iterator[Callable[[], None]]:
 
 
 def each_done(
-    client: Client, work: Callable[..., Any], asked: Sequence[T], *more: Any
+    client: "Client", work: Callable[..., Any], asked: Sequence[T], *more: Any
 ) -> Iterator[tuple[T, Any]]:
     """Yield each piece of work with what became of it, in the order in which they end.
 
@@ -168,7 +166,7 @@ def each_done(
 class Backlog:
     """The largest number of runs that the scheduler may hold, by the number of its workers."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: "Client") -> None:
         self._client = client
         self._asked_s = -math.inf
         self._limit = LEAST_RUNS

@@ -1,7 +1,5 @@
 """Run a study on a cluster of dask.distributed; only this process writes the results file."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import time
@@ -78,7 +76,7 @@ def run_study(
 @contextlib.contextmanager
 def open_results(
     path: Path, *, scheduler: str | None, workers: int | None, cache: Path | None
-) -> Iterator[RunMaker]:
+) -> "Iterator[RunMaker]":
     """Open a results file, for runs that are added to it; parameters and errors are those of `run_study`."""
     if workers is not None and scheduler is not None:
         raise SettingsError(
@@ -95,7 +93,7 @@ def open_results(
 class RunMaker:
     """Makes the runs that a results file does not have; workers start with the first that is missing."""
 
-    def __init__(self, results: ResultsFile, cache: Path | None, start: Callable[[], Client]) -> None:
+    def __init__(self, results: ResultsFile, cache: Path | None, start: "Callable[[], Client]") -> None:
         self.results, self._cache, self._client = results, cache, functools.cache(start)
         self._began = time.perf_counter()
 
@@ -133,7 +131,7 @@ class RunMaker:
         )
 
 
-def _prepare(client: Client, runs: Sequence[Run], cache: Path | None, say: Progress) -> None:
+def _prepare(client: "Client", runs: Sequence[Run], cache: Path | None, say: Progress) -> None:
     """Let one worker for each patient, scope and tubes make the atlas, before all of them need it."""
     from lungaccess.running.study.one_run import prepare
 

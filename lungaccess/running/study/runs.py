@@ -1,7 +1,5 @@
 """The runs of a study: every case, target and start with every planner and seed, each with its key."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, fields, replace
@@ -129,7 +127,7 @@ class Run:
         return json.dumps({"problem": values, "planner": to_mapping(self.planner), "seed": self.seed})
 
     @staticmethod
-    def from_json(text: str) -> Run:
+    def from_json(text: str) -> "Run":
         """Return the run that `to_json` wrote."""
         from anatomy.base.settings import parse
 

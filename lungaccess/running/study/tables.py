@@ -1,7 +1,5 @@
 """The tables of a results file as a user wants them, as CSV or Parquet, and how two files differ."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterator
@@ -216,7 +214,7 @@ def _write_parquet(content: Table, path: Path) -> None:
             writer.write_batch(pyarrow.record_batch(arrays, schema=schema))
 
 
-def _kind(column: str) -> pyarrow.DataType:
+def _kind(column: str) -> "pyarrow.DataType":
     import pyarrow
 
     if column in TEXTS:

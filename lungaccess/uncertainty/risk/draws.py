@@ -1,7 +1,5 @@
 """Random numbers drawn once and scaled to any error model: the same luck for every plan and every model."""
 
-from __future__ import annotations
-
 from copy import copy
 
 import numpy as np
@@ -89,13 +87,13 @@ class Draws:
         own.deviations(model)
         return own._made
 
-    def with_numbers(self, made: dict[tuple[str, int], Float]) -> Draws:
+    def with_numbers(self, made: dict[tuple[str, int], Float]) -> "Draws":
         """Return draws with other numbers, by kind and level as `numbers` returns them."""
         own = self._again()
         own._made = made
         return own
 
-    def _again(self) -> Draws:
+    def _again(self) -> "Draws":
         own = copy(self)
         own._made = {}
         return own

@@ -1,7 +1,5 @@
 """The states that paths can have on one plane between start and target, and where and how steep paths are."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +21,7 @@ class Plane:
     bits: UInt64
     window: Int
 
-    def trimmed(self) -> Plane:
+    def trimmed(self) -> "Plane":
         """Return the same without empty rows and columns at the edges."""
         box = np.zeros(8, dtype=np.int64)
         bitmaps.extent(self.bits, box)
@@ -38,7 +36,7 @@ class Plane:
         last: Int = self.window + np.array([nv, nu, rows, 64 * words]) - 1
         return last
 
-    def refined(self, *, directions: bool, require: Callable[[int], None]) -> Plane:
+    def refined(self, *, directions: bool, require: Callable[[int], None]) -> "Plane":
         """Return the same states in cells of half the side.
 
         Args:
@@ -96,7 +94,7 @@ class PathBounds:
     before_mm: float
 
     @classmethod
-    def of(cls, total_mm: float, tolerance_mm: float, kappa: float, length_mm: float) -> PathBounds:
+    def of(cls, total_mm: float, tolerance_mm: float, kappa: float, length_mm: float) -> "PathBounds":
         """Return the bounds for a target `total_mm` from the start.
 
         Args:

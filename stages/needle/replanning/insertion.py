@@ -3,8 +3,6 @@
 Every few millimetres the tip and the target are measured, and a `Replanner` makes a new path from there.
 """
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np
@@ -28,7 +26,7 @@ class Truth(Protocol):
     def bend(self, frame: Float, curvature: float, inserted_mm: float) -> tuple[float, float]:
         """Return direction (rad about +z from +x of a frame) and amount (1/mm) of the true curvature."""
 
-    def measure(self, needle: TrueNeedle) -> tuple[Float, Float | None] | None:
+    def measure(self, needle: "TrueNeedle") -> tuple[Float, Float | None] | None:
         """Return the tip as it is measured, and the target if it is seen; None if the measurement is lost."""
 
 

@@ -1,7 +1,5 @@
 """Replanning on the way: a new path from wherever the needle's tip really is [Patil2014]."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from enum import StrEnum

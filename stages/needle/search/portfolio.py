@@ -1,7 +1,5 @@
 """A portfolio of optimal searches, each with its own path between the obstacles, under successive halving."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Generator, Iterator
 from itertools import count
@@ -82,7 +80,7 @@ class PortfolioSearch:
         self.path, self.cost = path, cost
         self._adopted = path, cost
 
-    def _next(self) -> _Turns:
+    def _next(self) -> "_Turns":
         """Return the turns that have had less than their share, guided ones only if there are guide paths."""
         if self._guided is None:
             # Of pure length, trees and refinement find the least as fast.
@@ -107,7 +105,7 @@ class PortfolioSearch:
         self._made[kind] += 1
         return OptimalSearch(self._environment, self._query, seed=seed, objective=self._objective)
 
-    def _free_turns(self) -> Iterator[Turn]:
+    def _free_turns(self) -> "Iterator[Turn]":
         """Yield whose turn it is and for how many iterations, for ever."""
         best, size = self._new(FREE), FIRST_SIZE
         while self.path is None:
@@ -120,7 +118,7 @@ class PortfolioSearch:
             best = yield from self._round(searches, patience)
             size = min(2 * size, LARGEST_SIZE)
 
-    def _guided_turns(self, finder: GuidePathFinder) -> Iterator[Turn]:
+    def _guided_turns(self, finder: GuidePathFinder) -> "Iterator[Turn]":
         """Yield turns of guided searches."""
         best, size = self._new(GUIDED), FIRST_SIZE
         while True:
@@ -132,7 +130,7 @@ class PortfolioSearch:
 
     def _round(
         self, searches: list[OptimalSearch], patience: int, finder: GuidePathFinder | None = None
-    ) -> Generator[Turn, None, OptimalSearch]:
+    ) -> "Generator[Turn, None, OptimalSearch]":
         """Yield the turns of a round of halving; a finder, if given, guides the searches.  Return the best.
 
         `patience` is how many iterations a search may take at least to find its first path.

@@ -1,7 +1,5 @@
 """How a bronchoscope moves: advance, twist and bend of a chain of links [Rosell2012, sec. IV-C]."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 
@@ -102,7 +100,7 @@ class ScopeState:
         return np.concatenate([frame[:3, :3].ravel(), frame[:3, 3], [self.twist_rad, self.bend_rad]])
 
     @classmethod
-    def of_array(cls, array: Float) -> ScopeState:
+    def of_array(cls, array: Float) -> "ScopeState":
         """Return the state in a `(14,)` array."""
         frame = np.eye(4)
         frame[:3, :3] = array[:9].reshape(3, 3)

@@ -1,7 +1,5 @@
 """Centrelines with radii: what a route follows, and the lumen as a union of cones."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np
@@ -104,7 +102,7 @@ class Centreline:
         offset = self.nodes_mm - np.asarray(point_mm, dtype=np.float64)
         return int(np.argmin(np.einsum("ij,ij->i", offset, offset)))
 
-    def moved(self, nodes_mm: ArrayLike, radius_mm: ArrayLike | None = None) -> Centreline:
+    def moved(self, nodes_mm: ArrayLike, radius_mm: ArrayLike | None = None) -> "Centreline":
         """Return the same graph with its nodes at other places, as after breathing or registration."""
         return Centreline(
             nodes_mm=np.asarray(nodes_mm, dtype=np.float64),
@@ -268,7 +266,7 @@ def _refined(nodes: Float, edges: Int) -> tuple[Float, Int]:
     return np.vstack((nodes, added)), np.concatenate(chains)
 
 
-def _smoothed(nodes: Float, edges: Int, walls: _Walls) -> Float:
+def _smoothed(nodes: Float, edges: Int, walls: "_Walls") -> Float:
     """Draw each node towards the middle of its neighbours as long as it stays about as deep."""
     # Smoothing never takes a point of a skeleton to less than this share of the depth it had.
     floor = 0.9 * walls.depth_mm(nodes)
@@ -285,7 +283,7 @@ def _smoothed(nodes: Float, edges: Int, walls: _Walls) -> Float:
     return current
 
 
-def _proved(nodes: Float, edges: Int, walls: _Walls) -> Centreline:
+def _proved(nodes: Float, edges: Int, walls: "_Walls") -> Centreline:
     """Give every node the largest radius with which the cones are proved to lie in the lumen.
 
     The depth is 1-Lipschitz: between two places `h` apart where it is `d` and `e`, it is nowhere less than

@@ -7,8 +7,6 @@ unless they are start or goal; the cost adds the means of distance to the centre
 curvature over its limit, the length over that of the chord, and 10000 for each broken limit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from functools import partial
@@ -177,7 +175,7 @@ def _children(parents: Float, count: int, mutation_share: float, rng: np.random.
 class _Evaluator:
     """Fits a chromosome, whose genes lie in [0, 1], and finds its cost."""
 
-    def __init__(self, segment: Segment, limits: RouteLimits, near: KDTree) -> None:
+    def __init__(self, segment: Segment, limits: RouteLimits, near: "KDTree") -> None:
         self._segment, self._limits, self._near = segment, limits, near
         step = np.linalg.norm(np.diff(segment.points_mm, axis=0), axis=1)
         self._u = np.concatenate(((0.0,), np.cumsum(step)))

@@ -1,7 +1,5 @@
 """The part of the airway tree that leads to the exits: a small rooted tree of stretches."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -80,7 +78,7 @@ def subtree_to(
     tree: AirwayTree,
     exits: Sequence[Sequence[Exit]],
     *,
-    weights: Resistances | None = None,
+    weights: "Resistances | None" = None,
     exit_cost_mm: Sequence[Sequence[float]] | None = None,
 ) -> Subtree:
     """Return the part of a tree that leads from the root to all exits.

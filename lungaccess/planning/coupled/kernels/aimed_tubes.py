@@ -3,8 +3,6 @@
 `tube` is that of `lungaccess.planning.coupled.kernels.candidate`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ its half widths.  Every box has a rotation of the tubes (rad) and two insertions
 are is for each kind of box to say.  docs/theory/unreachable.md derives the bounds.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

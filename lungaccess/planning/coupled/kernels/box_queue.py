@@ -1,7 +1,5 @@
 """The open boxes of a bound, the lowest first, and how they are divided; see `cost_bound`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

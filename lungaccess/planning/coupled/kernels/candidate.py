@@ -9,8 +9,6 @@ points (LPS mm) through which single arcs lead from the tube to the target.  A r
 scope tip: point, unit tangent, and the unit vector across the tangent from which the rotation counts.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 docs/theory/cost_bound.md derives them; boxes are those of `deployment_box`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ docs/theory/cost_bound.md derives it.  A direction from the target is a point of
 to an axis.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

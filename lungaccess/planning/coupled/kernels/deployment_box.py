@@ -5,8 +5,6 @@ halfway to the target, as a rotation vector (rad) from the straight line; a half
 range.  docs/theory/cost_bound.md derives what is ruled out.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

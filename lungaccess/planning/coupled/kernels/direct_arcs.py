@@ -3,8 +3,6 @@
 `needle` is a `lungaccess.plans.evaluator.NeedleArrays`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -8,8 +8,6 @@ legs are single arcs.
 The arguments are those of `lungaccess.planning.coupled.kernels.candidate`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled kernels of the coupled search: what tubes cost from an arc length on, piece by piece."""
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.compiling import inner_kernel, kernel

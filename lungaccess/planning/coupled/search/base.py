@@ -1,7 +1,5 @@
 """What the planner needs of a search for whole plans, and what it gets from it."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -69,7 +67,7 @@ class ParallelSearch(PlanSearch, Protocol):
         incumbent: The best candidate so far, shared between rounds.
     """
 
-    incumbent: Incumbent
+    incumbent: "Incumbent"
 
     def direct_steps(self) -> Iterator[Step]:
         """Do what one process does alone, before the others begin."""

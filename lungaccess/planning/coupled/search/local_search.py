@@ -1,7 +1,5 @@
 """Stochastic local search over scope pose, tubes and needle together, in compiled batches."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -53,13 +51,13 @@ class TubeChoice:
     shape: ShapeArrays
 
     @classmethod
-    def empty(cls, design: DesignArrays) -> TubeChoice:
+    def empty(cls, design: DesignArrays) -> "TubeChoice":
         """Return one without a deployment."""
         shape = shape_arrays(design)
         return cls(x=np.zeros(INSERTED + len(shape.joints)), shape=shape)
 
     @classmethod
-    def of(cls, design: DesignArrays, deployment: Deployment, row: float) -> TubeChoice | None:
+    def of(cls, design: DesignArrays, deployment: Deployment, row: float) -> "TubeChoice | None":
         """Return that of a deployment; None if its way does not keep the limits when it is followed anew."""
         made = deployment.shape
         shape = deployed(design, made.insertions_mm, made.rotations_rad)

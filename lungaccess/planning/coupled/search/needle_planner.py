@@ -1,7 +1,5 @@
 """A needle planner by its name in the coupled search: ours, or one of OMPL; driven by OMPL if it is there."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -74,7 +72,7 @@ class NamedNeedlePlanner:
         )
 
     @cached_property
-    def _problem(self) -> NeedleProblem:
+    def _problem(self) -> "NeedleProblem":
         from stages.needle.ompl import NeedleProblem  # Here: many searches end before they need it.
 
         return NeedleProblem(self._evaluator.environment, objective=self._evaluator.objective)

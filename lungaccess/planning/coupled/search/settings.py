@@ -1,7 +1,5 @@
 """Settings of the search over the deployment atlas."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from anatomy.base.settings import quantity, settings

@@ -1,7 +1,5 @@
 """Which of many points the tip of the tubes reaches, for a system without a needle."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,7 +79,7 @@ class TubeReachScan:
         return None
 
     def _best_within(
-        self, places: cKDTree, point: Float, within_mm: float
+        self, places: "cKDTree", point: Float, within_mm: float
     ) -> tuple[int, float, float] | None:
         """Return the same for deployments that end within a distance of the point."""
         atlas, made = self._atlas, self._atlas.deployments

@@ -1,7 +1,5 @@
 """The search for plans of a system without a needle: tubes aimed from the atlas, then along each motion."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

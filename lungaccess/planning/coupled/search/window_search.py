@@ -1,7 +1,5 @@
 """The search over the atlas for a window of breathing: every scope tip has an aim of its own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -136,7 +134,7 @@ class WindowAims:
     shares: Float
 
     @classmethod
-    def of(cls, evaluator: WindowEvaluator, atlas: Atlas) -> WindowAims:
+    def of(cls, evaluator: WindowEvaluator, atlas: Atlas) -> "WindowAims":
         """Return those of the scope tips of an atlas."""
         motion, phases = require_motion(evaluator.task.lung), evaluator.phases
         held = phases is None or phases[0] <= motion.masks_phase <= phases[1]

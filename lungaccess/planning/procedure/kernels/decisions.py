@@ -4,8 +4,6 @@ A path of the needle is `(A, 3)`: length in mm, roll in rad before it and curvat
 small error moves a point `p` by `W x p - U`: a turn about the axis `a` through `r` has `W = a`, `U = a x r`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

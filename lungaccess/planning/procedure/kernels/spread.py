@@ -4,8 +4,6 @@ A rotation about an axis `a` moves a point by `a x v`, where `v` is its arm.  Su
 direction, the squares of these are `|v|^2 I - v v^T - (f x v)(f x v)^T`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """What rules out a box of deployments by the anatomy: blocked tips, and tubes that meet a hazard."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -7,8 +7,6 @@ of both tubes.  A box is a range of each, a `(BOX_COLUMNS,)` float64 array: see 
 along them in mm, a direction is the axis turned by the rotation vector `EAST X + NORTH Y`.
 """
 
-from __future__ import annotations
-
 import math
 
 from anatomy.kernels.compiling import inner_kernel

@@ -7,8 +7,6 @@ others differ.  A box that cannot be ruled out is halved; see docs/theory/unreac
 directions that they may have; and the greatest angle (rad) from it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

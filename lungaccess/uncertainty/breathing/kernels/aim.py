@@ -4,8 +4,6 @@ A point e of the devices misses the target by norm(e - p(share)), p being the pl
 frame of the devices: p(share) = c + R'(x + share d(x) - c - share d(c)).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

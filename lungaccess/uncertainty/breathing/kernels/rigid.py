@@ -5,8 +5,6 @@ polar decomposition F = R U.  With K = R'G, R' d/dshare R = W solves W U + U W =
 solves (tr(U) I - U) w = axis of K - K'.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ by `half` in the share moves X by at most `(step + half speed) / least`; so the 
 reach - step - half speed`.  The derivation stands in docs/theory/proofs.md.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ the way: on a cell each column of G is affine in every coordinate, so G is nowhe
 G(X) than at the corners of the parts into which the cells divide the box.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

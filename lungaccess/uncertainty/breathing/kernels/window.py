@@ -1,7 +1,5 @@
 """Divides the phases into stretches in which a plan is proved clear and on target, or is not."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

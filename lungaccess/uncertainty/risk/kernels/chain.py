@@ -1,7 +1,5 @@
 """Compiled kernel of the risk: the chain of arcs that a deviated plan is, and where it ends."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ the roll in rad before it, the curvature in 1/mm and the radius in mm of each of
 them are the tubes.  `start` is `(9,)`: scope tip, its unit tangent and the +x axis of its frame, LPS mm.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

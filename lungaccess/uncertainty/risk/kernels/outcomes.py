@@ -1,7 +1,5 @@
 """Compiled kernel of the risk: what becomes of many deviated plans, each in one pass."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

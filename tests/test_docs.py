@@ -14,9 +14,8 @@ from anatomy.base.facade import public_names
 from anatomy.base.settings import parse
 from anatomy.io.own_masks import PatientFile
 from anatomy.segmentation.learned import NetworkSettings
-from lungaccess.cli.app import app
+from lungaccess.cli.app import app, with_nodule_number
 from lungaccess.cli.examples import EXAMPLES
-from lungaccess.cli.usage import with_nodule_number
 from lungaccess.planning.one_stage import load_tubes
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.system import load_system

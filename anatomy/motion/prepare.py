@@ -7,14 +7,13 @@ import numpy as np
 from scipy import ndimage
 
 from anatomy.base.errors import AnatomyError, FrameError
-from anatomy.base.typed import Float, Labels, Mask
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Labels, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid
-from anatomy.motion.landmarks import Fitted, fit_landmarks
 from anatomy.motion.motion import LEFT, RIGHT, Motion, cell_bounds
 from anatomy.motion.plausible import require_onto_lungs, require_plausible
-from anatomy.motion.population import POPULATION_ERROR_MM, shares_of_motion
-from anatomy.motion.source import MotionSource
+from anatomy.motion.source import POPULATION_ERROR_MM, MotionSource, shares_of_motion
 from anatomy.structures import OUTSIDE
 
 NODE_MM = 5.0
@@ -296,3 +295,76 @@ def _shifted(values: Float, axis: int, by: int) -> Float:
     """Return the neighbours of all nodes along an axis, those of the border being themselves."""
     index = np.clip(np.arange(values.shape[axis]) + by, 0, values.shape[axis] - 1)
     return np.asarray(np.take(values, index, axis=axis))
+
+
+SMOOTHINGS = (1e2, 1e3, 1e4, 1e5)
+"""From a spline that passes its pairs by a tenth of a mm to one that is nearly affine over a lung."""
+LEAST_PAIRS = 20
+"""In a lung: twice as many as a quadratic field has coefficients, so that either half determines one."""
+
+
+@frozen_record
+class Fitted:
+    """A displacement field of one lung: `(N, 3)` LPS mm to `(N, 3)` mm, and its residuals in mm.
+
+    `residual_mm` `(N,)` is that of the pairs themselves, `left_out_mm` `(N,)` that of each half of the pairs
+    as the other half predicts it.
+    """
+
+    at: Callable[[Float], Float]
+    residual_mm: Float
+    left_out_mm: Float
+
+
+def fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
+    """Fit a thin-plate spline with the smoothness by which each half of the pairs predicts the other.
+
+    Args:
+        points ((N, 3) float64, LPS mm): Places in the masks.
+        vectors ((N, 3) float64): Displacements, mm.
+        lung: Whose they are, for messages.
+
+    Raises:
+        AnatomyError: If there are too few pairs, or they lie in a plane.
+    """
+    if len(points) < LEAST_PAIRS:
+        raise AnatomyError(
+            f"There are {len(points)} pairs of landmarks in the {lung} lung",
+            expected=f"at least {LEAST_PAIRS} in each lung, spread over it",
+            remedy="Mark more pairs; check that their coordinates are mm of the masks in the frame stated",
+        )
+    try:
+        return _fitted(points, vectors)
+    except np.linalg.LinAlgError as error:
+        raise AnatomyError(
+            f"The landmarks of the {lung} lung determine no field ({error})",
+            expected="different points that do not all lie in one plane",
+            remedy="Spread the landmarks over the lung, and state each once",
+        ) from error
+
+
+def _fitted(points: Float, vectors: Float) -> Fitted:
+    halves = np.arange(len(points)) % 2 == 0
+    errors = [_left_out(points, vectors, halves, smoothing) for smoothing in SMOOTHINGS]
+    means = np.array([error.mean() for error in errors])
+    # The smoothest spline is taken whose prediction is worse than the best by no more than this factor.
+    chosen = int(np.flatnonzero(means <= 1.1 * means.min())[-1])
+    at = _spline(points, vectors, SMOOTHINGS[chosen])
+    residual = np.linalg.norm(at(points) - vectors, axis=1)
+    return Fitted(at=at, residual_mm=residual, left_out_mm=errors[chosen])
+
+
+def _left_out(points: Float, vectors: Float, half: Bool, smoothing: float) -> Float:
+    """Return the errors `(N,)` of each half as the other predicts it."""
+    out = np.zeros(len(points))
+    for known in (half, ~half):
+        predicted = _spline(points[known], vectors[known], smoothing)(points[~known])
+        out[~known] = np.linalg.norm(predicted - vectors[~known], axis=1)
+    return out
+
+
+def _spline(points: Float, vectors: Float, smoothing: float) -> Callable[[Float], Float]:
+    from scipy.interpolate import RBFInterpolator
+
+    fitted = RBFInterpolator(points, vectors, kernel="thin_plate_spline", smoothing=smoothing, degree=1)
+    return lambda at: np.asarray(fitted(at))

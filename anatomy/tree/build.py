@@ -6,16 +6,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.base.typed import Int
+from anatomy.base.errors import AnatomyError
+from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume
-from anatomy.tree.branches import Strand, assemble, divide
+from anatomy.tree.branches import NodeBranch, Strand, assemble, divide
 from anatomy.tree.coverage import complete
-from anatomy.tree.depth import inside
-from anatomy.tree.lumen import PreparedLumen, prepare_lumen
-from anatomy.tree.noise import require_few_tunnels
+from anatomy.tree.depth import exact_depth_mm, inside, segments_inside
+from anatomy.tree.lumen import PreparedLumen, prepare_lumen, require_few_tunnels
 from anatomy.tree.parallel import unite_parallel
-from anatomy.tree.resample import strands_along
-from anatomy.tree.skeleton import prune, spanning_tree, thin
+from anatomy.tree.skeleton import SkeletonTree, prune, span, spanning_tree, thin
 from anatomy.tree.trachea import find_trachea
 from anatomy.tree.voxel_tree import ROUNDS, VoxelTree, centred, rooted_voxel_tree, voxel_tree_of
 from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
@@ -83,7 +82,6 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
     Raises:
         AnatomyError: If the arrays are empty, do not fit together, hold no finite numbers or no trachea.
     """
-    from anatomy.tree.graph import spanned_graph
 
     skeleton, report = spanned_graph(points_lps, radius_mm, edges)
     trunk = find_trachea(skeleton, np.eye(3))
@@ -228,3 +226,170 @@ def _path(prepared: PreparedLumen, begins: VoxelPath, end: tuple[int, ...]) -> V
     if not np.isfinite(total[target]):
         return []
     return [tuple((np.array(step) + low).tolist()) for step in search.traceback(target)]
+
+
+SAME_POINT_MM = 1e-3
+"""Files store points in single precision; true neighbours are a hundred times farther apart."""
+
+
+MOST_RADIUS_MM = 100.0
+"""No tube of a body is as wide as this."""
+
+
+def spanned_graph(
+    points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike
+) -> tuple[SkeletonTree, TreeReport]:
+    """Check the arrays of a graph, unite equal points, keep the largest piece and open its rings."""
+    points, radius, pairs = _checked(points_lps, radius_mm, edges)
+    points, radius, pairs = _united(points, radius, pairs)
+    points, radius, pairs, dropped, left_out = _largest_piece(points, radius, pairs)
+    tree, rings = span(points, radius, pairs)
+    report = TreeReport(
+        loops_opened=tuple(
+            LoopOpened(position_lps=(points[a] + points[b]) / 2, length_mm=length) for a, b, length in rings
+        ),
+        components_dropped=dropped,
+        voxels_dropped=left_out,
+    )
+    return tree, report
+
+
+def _checked(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> tuple[Float, Float, Int]:
+    points = np.asarray(points_lps, dtype=np.float64)
+    radius = np.asarray(radius_mm, dtype=np.float64)
+    pairs = np.asarray(edges, dtype=np.int64)
+    problem = ""
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
+        problem = f"the points have the shape {points.shape}"
+    elif radius.shape != (len(points),):
+        problem = f"{len(points)} points have radii of the shape {radius.shape}"
+    elif pairs.ndim != 2 or pairs.shape[1] != 2 or len(pairs) == 0:
+        problem = f"the edges have the shape {pairs.shape}"
+    elif not np.isfinite(points).all() or not np.isfinite(radius).all() or (radius < 0).any():
+        problem = "a coordinate or radius is not finite, or a radius is negative"
+    elif radius.max() > MOST_RADIUS_MM:
+        problem = f"a radius is {radius.max():.3g} mm"
+    elif pairs.min() < 0 or pairs.max() >= len(points):
+        problem = f"an edge names the point {pairs.max()} of {len(points)}, or a negative one"
+    if problem:
+        raise AnatomyError(
+            f"A centreline graph is unusable: {problem}",
+            expected="points (N, 3) and radii (N,) in mm, edges (E, 2) between them",
+            remedy="Check the centreline file",
+        )
+    return points, radius, pairs
+
+
+def _united(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int]:
+    """Unite points that coincide and drop edges that then lead nowhere or twice to the same point."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    same = KDTree(points).query_pairs(SAME_POINT_MM, output_type="ndarray")
+    n = len(points)
+    links = coo_array((np.ones(len(same)), (same[:, 0], same[:, 1])), shape=(n, n))
+    _, label = connected_components(links, directed=False)
+    _, first, index = np.unique(label, return_index=True, return_inverse=True)
+    # Numbered by first occurrence, so that the order of the file is kept.
+    order = np.argsort(first)
+    rank = np.argsort(order)
+    mapped = np.sort(rank[index][pairs], axis=1)
+    mapped = np.unique(mapped[mapped[:, 0] != mapped[:, 1]], axis=0)
+    return points[first[order]], radius[first[order]], mapped
+
+
+def _largest_piece(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int, int, int]:
+    """Keep the connected piece with most points; also count the pieces and points left out."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(points)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    count, label = connected_components(graph, directed=False)
+    keep = label == np.argmax(np.bincount(label))
+    new = np.cumsum(keep) - 1
+    inner = pairs[keep[pairs[:, 0]]] if len(pairs) else pairs
+    return points[keep], radius[keep], new[inner], count - 1, int(n - keep.sum())
+
+
+def strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: float) -> list[Strand]:
+    """Resample the branches of a voxel tree and measure their radius."""
+    voxel_mm = prepared.grid.spacing_mm
+    mm = voxel_tree.ijk * voxel_mm
+    depth = exact_depth_mm(prepared.lumen, voxel_mm, voxel_tree.ijk)
+    branches = divide(mm, voxel_tree.parent, depth, voxel_tree.trunk_end)
+    _drop_cap(branches, mm, depth)
+    marks = {b.attach for b in branches} | set(np.flatnonzero(voxel_tree.across_gap).tolist())
+    marks |= set(voxel_tree.parent[voxel_tree.across_gap].tolist())
+    index = {id(branch): b for b, branch in enumerate(branches)}
+    lines = [_resample(branch, voxel_tree, prepared, marks, spacing_mm) for branch in branches]
+    ends = np.cumsum([len(points) for points, _ in lines])
+    radius = np.split(
+        exact_depth_mm(prepared.lumen, voxel_mm, np.concatenate([points for points, _ in lines])), ends[:-1]
+    )
+    return [
+        Strand(
+            points_lps=prepared.grid.lps(lines[b][0]),
+            radius_mm=radius[b],
+            parent=-1 if branch.parent is None else index[id(branch.parent)],
+            attach=-1 if branch.parent is None else lines[index[id(branch.parent)]][1][branch.attach],
+        )
+        for b, branch in enumerate(branches)
+    ]
+
+
+def _drop_cap(branches: list[NodeBranch], mm: Float, depth_mm: Float) -> None:
+    """Take off the beginning of the trachea, where the end of the mask cuts the inscribed sphere."""
+    nodes = branches[0].nodes
+    median = float(np.median(depth_mm[nodes]))
+    hooks = {b.attach for b in branches}
+    first = 0
+    # The trachea begins where the inscribed sphere reaches this fraction of the trachea's radius.
+    while (
+        depth_mm[nodes[first]] < 0.8 * median
+        and float(np.linalg.norm(mm[nodes[first]] - mm[nodes[0]])) < 2 * median
+        and nodes[first] not in hooks
+    ):
+        first += 1
+    branches[0].nodes = nodes[first:]
+
+
+def _resample(
+    branch: NodeBranch, voxel_tree: VoxelTree, prepared: PreparedLumen, marks: set[int], spacing_mm: float
+) -> tuple[Float, dict[int, int]]:
+    """Space the points of a branch evenly between the nodes in `marks`, which are kept.
+
+    Returns:
+        - ijk ((n, 3) float64) - Without the point of the parent branch.
+        - index - Index in `ijk` of each node that was kept.
+    """
+    line = branch.nodes if branch.attach < 0 else [branch.attach, *branch.nodes]
+    keep = [n for n in range(len(line)) if n in (0, len(line) - 1) or line[n] in marks]
+    pieces, index, count = [voxel_tree.ijk[line[:1]]], {line[0]: 0}, 1
+    for a, b in zip(keep[:-1], keep[1:], strict=True):
+        fine = voxel_tree.ijk[line[a : b + 1]]
+        across = b == a + 1 and voxel_tree.across_gap[line[b]]
+        points = fine[1:] if across else _even(fine, prepared, spacing_mm)[1:]
+        pieces.append(points)
+        count += len(points)
+        index[line[b]] = count - 1
+    ijk = np.concatenate(pieces)
+    if branch.attach < 0:
+        return ijk, index
+    return ijk[1:], {node: at - 1 for node, at in index.items()}
+
+
+def _even(fine: Float, prepared: PreparedLumen, spacing_mm: float) -> Float:
+    """Space points evenly along a polyline; where a chord would leave the lumen, keep the polyline."""
+    steps = np.linalg.norm(np.diff(fine, axis=0) * prepared.grid.spacing_mm, axis=1)
+    along = np.concatenate(([0.0], np.cumsum(steps)))
+    station = np.linspace(0.0, along[-1], max(1, round(float(along[-1]) / spacing_mm)) + 1)
+    points = np.stack([np.interp(station, along, x) for x in fine.T], axis=1)
+    bad = np.flatnonzero(~segments_inside(prepared.lumen, points[:-1], points[1:]))
+    if len(bad) == 0:
+        return points
+    inner = [(along > station[k] + 1e-9) & (along < station[k + 1] - 1e-9) for k in bad]
+    extra = np.flatnonzero(np.any(inner, axis=0))
+    order = np.argsort(np.concatenate((station, along[extra])), kind="stable")
+    return np.concatenate((points, fine[extra]))[order]

@@ -8,8 +8,7 @@ it to the skeleton is added.
 import numpy as np
 
 from anatomy.base.typed import Bool, Int
-from anatomy.tree.lumen import CONNECT_26, PreparedLumen
-from anatomy.tree.noise import require_at_most
+from anatomy.tree.lumen import CONNECT_26, PreparedLumen, require_at_most
 
 MOST_PATHS = 500
 """An airway has some hundred branches; more paths than that come from noise in the mask."""

@@ -5,14 +5,19 @@ refuses it; 2, the input is bad; 70, the program crashed, which is no answer.
 """
 
 import contextlib
+import os
+import platform
+import re
 import signal
 import sys
+import tempfile
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, Argument, CycloptsError, Group, Parameter, exceptions
 
 from anatomy.base.checksums import DamagedCacheWarning
 from anatomy.base.errors import AnatomyError, FileError, LungaccessError
@@ -51,10 +56,9 @@ from lungaccess.cli.commands.tour import tour
 from lungaccess.cli.commands.tubes import tubes
 from lungaccess.cli.commands.view import view
 from lungaccess.cli.commands.window import window
-from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXIT_CODES, START_PAGE, epilogue
+from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXAMPLES, EXIT_CODES, START_PAGE, epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.terminal import error_console
-from lungaccess.cli.usage import asks_json, usage_error, with_nodule_number
 
 _TOO_LARGE = AnatomyError(
     "There is not enough memory for this patient",
@@ -219,7 +223,6 @@ def _answer(words: list[str]) -> int:
 
 def _crashed(error: Exception, words: list[str], as_json: bool) -> ExitCode:
     """Write a report of an error of the program itself, and say where it is."""
-    from lungaccess.cli.crash import write_report
 
     crash = write_report(error, words, _version())
     terminal.show_error(crash, title="crash")
@@ -259,3 +262,130 @@ def _unusable(error: OSError) -> FileError:
 
 
 __all__ = ["app", "main"]
+
+
+class CrashError(LungaccessError):
+    """The program itself is at fault, whatever the input was."""
+
+
+def write_report(error: Exception, words: Sequence[str], version: str) -> CrashError:
+    """Write what is known of a crash into a file of its own, and return the error that names the file.
+
+    Args:
+        error: Raised where no error of a user was expected.
+        words: The command line without the name of the program.
+        version: Of lungaccess.
+    """
+    system = f"Python {platform.python_version()} on {platform.platform()}"
+    lines = [f"lungaccess {version}, {system}", f"command: {list(words)!r}", ""]
+    lines += traceback.format_exception(error)
+    try:
+        file, name = tempfile.mkstemp(prefix="lungaccess-crash-", suffix=".txt")
+        with open(file, "w", encoding="utf-8", errors="backslashreplace") as stream:
+            stream.write("\n".join(lines))
+    except OSError:
+        name = f"{os.devnull}: there is no room for it"
+    return CrashError(
+        f"The program crashed ({type(error).__name__}: {str(error)[:200]}); that is no answer",
+        expected="an answer, or an error that says what is wrong with the input",
+        remedy=f"Send the report {name} to the developers; the command line and names of files in it may "
+        "name a patient, so read it first",
+    )
+
+
+_GUESS = re.compile(r"\s*(Did you mean [^?]*\?)")
+_AVAILABLE = re.compile(r"\s*Available commands: .*", re.DOTALL)
+_NOUNS = {int: "a whole number", float: "a number", bool: "true or false"}
+
+
+class UsageError(LungaccessError):
+    """A command or an option is unknown, missing, or has a value that it cannot have."""
+
+
+def usage_error(error: CycloptsError) -> UsageError:
+    """Return what is wrong with the words of a command line, and which words would be right."""
+    error.verbose = False
+    command = " ".join(error.command_chain or ())
+    example = EXAMPLES.get(command)
+    found, expected = _found_and_expected(error)
+    found = _AVAILABLE.sub("", found)
+    guess = _GUESS.search(found)
+    explained = (
+        f"`lungaccess {command} --help` explains every option; an example: {example}"
+        if example
+        else f"`{' '.join(('lungaccess', *command.split()))} --help` lists the commands"
+    )
+    remedy = f"{guess.group(1)} {explained}" if guess else explained
+    return UsageError(
+        _one_line(_GUESS.sub("", found)), expected=_one_line(expected), remedy=_one_line(remedy)
+    )
+
+
+def _found_and_expected(error: CycloptsError) -> tuple[str, str]:
+    """Return what the user wrote, and what could stand there."""
+    argument, written = error.argument, str(error)
+    if isinstance(error, exceptions.ValidationError) and argument is not None:
+        return f"{_name(argument)} is {_value(argument)}", error.exception_message
+    if isinstance(error, exceptions.MissingArgumentError) and argument is not None:
+        name, what = (error.keyword, "has no value") if error.keyword else (_name(argument), "is missing")
+        return f"{name} {what}", argument.parameter.help or f"a value for {_name(argument)}"
+    if isinstance(error, exceptions.CoercionError) and error.token is not None:
+        name = error.token.keyword or ("A value" if argument is None else _name(argument))
+        return f"{name} is {error.token.value!r}. {_guess(written)}", _kind(error)
+    if isinstance(error, exceptions.UnknownCommandError):
+        return written, "a command of lungaccess"
+    if isinstance(error, exceptions.UnknownOptionError):
+        return written, "an option of this command"
+    if isinstance(error, exceptions.UnusedCliTokensError):
+        return f"Words too many: {' '.join(error.unused_tokens or ())}", "no more words than the example has"
+    return written, "the words that this command takes"
+
+
+def _kind(error: exceptions.CoercionError) -> str:
+    """Return what a value has to be."""
+    choices = re.search(r"Choose from:? (.*?)\.?( Did you mean|$)", str(error), re.DOTALL)
+    if choices:
+        return f"one of {choices.group(1)}"
+    return _NOUNS.get(error.target_type or str, "a value of another kind")
+
+
+def _guess(text: str) -> str:
+    found = _GUESS.search(text)
+    return found.group(1) if found else ""
+
+
+def _value(argument: Argument) -> str:
+    return " ".join(token.value for token in argument.tokens)
+
+
+def _name(argument: Argument) -> str:
+    """Return the name of an option as the user wrote it, of a folder or file in capitals."""
+    written = [token.keyword for token in argument.tokens if token.keyword]
+    if written:
+        return str(written[0])
+    return argument.name if argument.field_info.is_keyword_only else argument.name.lstrip("-").upper()
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def asks_json(words: Sequence[str]) -> bool:
+    """Return whether the words of a command line ask for JSON, also where they make no sense otherwise."""
+    asked = False
+    for word in words:
+        if word == "--":
+            break
+        if word in ("--json", "--json=true", "--no-json"):
+            asked = word != "--no-json"
+    return asked
+
+
+def with_nodule_number(words: Sequence[str]) -> list[str]:
+    """Let `--nodule` stand alone for `--nodule 0`, the largest; a point may follow it, as in `segment`."""
+    completed: list[str] = []
+    for word, following in zip(words, [*words[1:], ""], strict=False):
+        completed.append(word)
+        if word == "--nodule" and not (following.lstrip("+-").isdigit() or ":" in following):
+            completed.append("0")
+    return completed

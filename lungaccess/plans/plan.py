@@ -1,7 +1,7 @@
 """The plan of all three stages: what each device does, why it is allowed, and where it came from."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field
 from functools import cached_property
 from typing import TYPE_CHECKING, Self
@@ -12,6 +12,7 @@ from anatomy.base.errors import PlanFileError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.base.typed import Float
 from anatomy.base.words import percent, plural
+from anatomy.display import AXIAL, CORONAL, Drawing, side_by_side, table
 from anatomy.poses import poses_on_pieces
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.chance import Chance
@@ -108,7 +109,6 @@ class Plan(Record):
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
-        from lungaccess.plans.display import plan_html
 
         heading = f"Plan for {self.patient_name}, {self.system.name}"
         return plan_html(heading, self.figures(), self.curves(), self.tube.exit.point_lps, self.target_lps)
@@ -290,3 +290,32 @@ class Plan(Record):
             PlanFileError: If there is no such file or it is not an intact plan.
         """
         return plan_file.load(cls, path)
+
+
+TARGET_COLOUR, EXIT_COLOUR = "#2ca02c", "#d62728"
+"""The colours of target and exit in 3D Slicer's scene and in the drawings."""
+
+
+def plan_html(
+    heading: str, rows: Iterable[tuple[str, str]], curves: DeviceCurves, exit_lps: Float, target_lps: Float
+) -> str:
+    """Return a plan as HTML.
+
+    Args:
+        rows (iterable of (str, str)): Names and values of the table.
+        exit_lps, target_lps ((3,) float64, LPS mm): Where rings are drawn.
+    """
+    drawings = [_drawing(view, curves, exit_lps, target_lps) for view in (CORONAL, AXIAL)]
+    return side_by_side(table(rows, heading), *drawings)
+
+
+def _drawing(view: str, curves: DeviceCurves, exit_lps: Float, target_lps: Float) -> str:
+    drawing = Drawing(view)
+    for curve in curves.present:
+        red, green, blue = (round(255 * c) for c in curve.colour)
+        # A thinner device is drawn this wide, so that it can be seen.
+        width_mm = max(2.0 * float(curve.radius_mm.max()), 1.5)
+        drawing.line(curve.points_lps, f"#{red:02x}{green:02x}{blue:02x}", width_mm)
+    drawing.mark(exit_lps, EXIT_COLOUR)
+    drawing.mark(target_lps, TARGET_COLOUR)
+    return drawing.svg()

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
         prover_of,
         shifted,
     )
-    from stages.scope.motions import ScopeMotions, ScopeTip, find_motions
-    from stages.scope.passages import Passages, find_passages
+    from stages.scope.motions import Passages, ScopeMotions, ScopeTip, find_motions, find_passages
     from stages.scope.resting import RestingShaft, RestingShape, WallContact, lumen_of
     from stages.scope.tip_spread import TipSpread, off_pose, spread_of_tip
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         shapes_format,
         shapes_of,
     )
-    from stages.tube.device import BentPiece, ConcentricTubes, Tube
+    from stages.tube.device import BentPiece, ConcentricTubes, Tube, straightening
     from stages.tube.environment import DEFAULT_ROTATIONS, tube_constants, tube_environment
     from stages.tube.equilibrium import Equilibrium
     from stages.tube.errors import ConvergenceError
@@ -58,7 +58,6 @@ if TYPE_CHECKING:
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
     from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
-    from stages.tube.strain import straightening
     from stages.tube.validation import REASONS, Deployment, DeploymentValidator
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -1,19 +1,82 @@
 """What the planner has to know of concentric tubes."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import impossible, quantity, settings
+from anatomy.base.typed import Float
 from anatomy.shafts import SlottedSegment, check_segments, second_moment_mm4
-from stages.tube.parts import Bend, TubeParts, tube_parts
+
+
+class TubeParts(NamedTuple):
+    """The parts of a tube of one precurvature and one pattern of slots each, K of them, from the tip on.
+
+    Args:
+        begin_mm, end_mm ((K,) float64): Places along the tube, counted from its tip.
+        curvature_per_mm, direction_rad ((K,) float64): Precurvature, and its direction about the axis, 0
+            where it is straight.
+        stiffness_n_mm2 ((K,) float64): Bending stiffness.
+        strained_radius_mm ((K,) float64): Strain for each 1/mm of change of curvature: the radius by the
+            factor of the slots.
+    """
+
+    begin_mm: Float
+    end_mm: Float
+    curvature_per_mm: Float
+    direction_rad: Float
+    stiffness_n_mm2: Float
+    strained_radius_mm: Float
+
+
+class Bend(NamedTuple):
+    """A piece of a tube of one precurvature, by arc lengths from the tube's rear end."""
+
+    from_mm: float
+    to_mm: float
+    curvature_per_mm: float
+    direction_rad: float
+
+
+def tube_parts(
+    length_mm: float,
+    bends: Sequence[Bend],
+    slots: Sequence[SlottedSegment],
+    stiffness_n_mm2: float,
+    radius_mm: float,
+) -> TubeParts:
+    """Cut a tube, of which stiffness and radius are given where it is plain, into its parts."""
+    curved = [(length_mm - bend.to_mm, length_mm - bend.from_mm, bend) for bend in bends]
+    slotted = [(each.from_tip_mm, each.to_mm, each) for each in slots]
+    edges = {0.0, length_mm, *(edge for begin, end, _ in (*curved, *slotted) for edge in (begin, end))}
+    ends = np.array(sorted(edges))
+    middle = 0.5 * (ends[:-1] + ends[1:])
+    curvature, direction = np.zeros(len(middle)), np.zeros(len(middle))
+    stiffness, strain = np.ones(len(middle)), np.ones(len(middle))
+    for begin, end, bend in curved:
+        within = (middle > begin) & (middle < end)
+        curvature[within], direction[within] = bend.curvature_per_mm, bend.direction_rad
+    for begin, end, each in slotted:
+        within = (middle > begin) & (middle < end)
+        stiffness[within], strain[within] = each.stiffness_factor, each.strain_factor
+    return TubeParts(
+        begin_mm=ends[:-1],
+        end_mm=ends[1:],
+        curvature_per_mm=curvature,
+        direction_rad=direction,
+        stiffness_n_mm2=stiffness_n_mm2 * stiffness,
+        strained_radius_mm=radius_mm * strain,
+    )
+
 
 ROUNDING = 1e-9
 """Share of a limit by which a value may seem to break it that was computed from it."""
@@ -364,3 +427,36 @@ class ConcentricTubes:
         straight = around if self.needle_shaft is None else (self.needle_shaft, *around)
         inner, *others = (float(tube.parts.stiffness_n_mm2[0]) for tube in (self.inner, *straight))
         return self.inner.precurvature_per_mm * (inner / (inner + sum(others)))
+
+
+def straightening(
+    tubes: ConcentricTubes,
+    insertions_mm: ArrayLike,
+    bending_length_mm: float,
+    section_stiffness_n_mm2: float,
+    *,
+    needle: Tube | None = None,
+    needle_out_mm: float = 0.0,
+) -> float:
+    """Return the bending stiffness of what lies in a scope's bending section, as a share of the section's.
+
+    Beam in beam: the section's own bending moment, which the handle sets, also bends what is inside.  With
+    the share q the handle must be set to 1 + q times the bend that is wanted [Rucker2010, for tubes].
+    Where the tubes are not equally stiff all along the section, their stiffest part there counts, and of the
+    needle the stiffest that passes the section on the whole of its way.
+
+    Args:
+        insertions_mm ((n,) float64): Of the tubes beyond the scope's tip, the outermost first; the last are
+            those of the tubes there are.
+        needle_out_mm: How far the needle goes beyond the tip of the inner tube.
+    """
+    total = 0.0
+    inserted = np.asarray(insertions_mm, dtype=np.float64)[-len(tubes.nested) :]
+    for (_name, tube), out_mm in zip(tubes.named, inserted, strict=True):
+        parts = tube.parts
+        inside = (parts.end_mm > out_mm) & (parts.begin_mm < out_mm + bending_length_mm)
+        total += float(parts.stiffness_n_mm2[inside].max(initial=0.0))
+    if needle is not None:
+        passing_mm = float(inserted[-1]) + needle_out_mm + bending_length_mm
+        total += float(needle.parts.stiffness_n_mm2[needle.parts.begin_mm < passing_mm].max())
+    return total / section_stiffness_n_mm2

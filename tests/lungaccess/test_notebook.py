@@ -129,7 +129,7 @@ def test_showing_needs_no_plotting_library() -> None:
     code = (
         "import sys, lungaccess as la; from lungaccess.judging.checking import CheckReport;"
         "CheckReport(accepted=True, findings=())._repr_html_(); la.Plan._repr_html_; la.Lung; la.AirwayTree;"
-        "import anatomy.display, lungaccess.plans.display;"
+        "import anatomy.display, lungaccess.plans.plan;"
         "sys.exit(int(bool({'matplotlib', 'IPython'} & set(sys.modules))))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

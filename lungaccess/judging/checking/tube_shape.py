@@ -11,12 +11,12 @@ from lungaccess.judging.checking.channel import slots_at
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.poses import ANGLE_TOLERANCE_RAD, angle_between
 from lungaccess.judging.checking.shapes import Curve, distance_to_polyline, radius_at
-from lungaccess.judging.checking.sweep import check_sweep
 from lungaccess.plans.plan import Plan
 from stages.tube.device import Tube
 
 if TYPE_CHECKING:
     from stages.tube.casadi_shape import DerivedShape
+
 
 SHAPE_TOLERANCE_MM = 1e-3
 """Two integrations of one equilibrium differ by far less; so much more than stated may the arcs be off."""
@@ -160,3 +160,25 @@ def _strained_mm(tube: Tube) -> float:
         * tube.outer_diameter_mm
         * max((each.strain_factor for each in tube.slotted_segments), default=1.0)
     )
+
+
+SWEEP_TOLERANCE_MM = 0.02
+"""So much less may a replay at steps find than a planner that takes the largest sweep."""
+
+
+def check_sweep(plan: Plan, sweep: float, leader: float, steps: int, found: Findings) -> float:
+    """Record sweep and error at the tip of a replay; return the sweep, mm, that clearance allows for.
+
+    The sweep is the farthest that any place of the tubes gets from their final shape, `leader` the farthest
+    that their tip does.
+    """
+    tube, limit = plan.tube, plan.system.tubes.max_lateral_sweep_mm
+    detail = f"sideways motion while the tubes are deployed, {steps} steps replayed"
+    found.at_most("tube.sweep.limit", sweep, limit, "mm", detail, SWEEP_TOLERANCE_MM)
+    detail = "sideways motion as stated"
+    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm", detail)
+    stated = ((tube.lateral_sweep_mm, sweep, "sweep"), (tube.follow_the_leader_error_mm, leader, "leader"))
+    for value, recomputed, name in stated:
+        detail = "not less than recomputed"
+        found.at_least(f"tube.{name}.stated", value, recomputed, "mm", detail, SWEEP_TOLERANCE_MM)
+    return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)

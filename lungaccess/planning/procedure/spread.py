@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from anatomy.motion.population import share_of_motion
+from anatomy.motion.source import share_of_motion
 from lungaccess.planning.procedure.kernels import spread as kernel
 from lungaccess.planning.procedure.residuals import Residuals
 from lungaccess.problem.errors import CURVATURE, ErrorModel

@@ -13,10 +13,9 @@ from lungaccess.planning.procedure.policy import Chosen
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import NeedleSteering
-from lungaccess.uncertainty.risk.deviations import Deviations, in_rows
+from lungaccess.uncertainty.risk.deviations import Deviations, in_rows, twisted_shapes
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
-from lungaccess.uncertainty.risk.twisted import twisted_shapes
 from stages.needle import (
     ArcPath,
     Belief,

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.reachability.open_places import OpenPlace
     from lungaccess.planning.reachability.reach_map import (
         KINDS,
         NOT_COUNTED,
@@ -17,6 +16,11 @@ if TYPE_CHECKING:
     )
     from lungaccess.planning.reachability.reach_stream import ReachPart, ReachStream
     from lungaccess.planning.reachability.regions import Regions
-    from lungaccess.planning.reachability.unreachable import MOST_BOXES, ReachVerdict, UnreachableProof
+    from lungaccess.planning.reachability.unreachable import (
+        MOST_BOXES,
+        OpenPlace,
+        ReachVerdict,
+        UnreachableProof,
+    )
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

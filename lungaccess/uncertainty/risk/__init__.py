@@ -5,13 +5,19 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.uncertainty.risk.assessment import MISSES, DrawnReport, RiskReport, assess, rare_touch
+    from lungaccess.uncertainty.risk.assessment import (
+        MISSES,
+        DrawnReport,
+        RiskReport,
+        Sensitivity,
+        assess,
+        rare_touch,
+    )
     from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor
     from lungaccess.uncertainty.risk.deviations import Deviations
     from lungaccess.uncertainty.risk.draws import Draws
     from lungaccess.uncertainty.risk.rare import RareShare, rare_share
     from lungaccess.uncertainty.risk.resting import RestingRow, resting_rows, resting_tip
-    from lungaccess.uncertainty.risk.sensitivity import Sensitivity
     from lungaccess.uncertainty.risk.start_region import proved_body, safe_start_region, tried_body
     from lungaccess.uncertainty.risk.statistics import Share
     from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances

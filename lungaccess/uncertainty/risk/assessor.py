@@ -11,7 +11,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
-from anatomy.motion.population import share_of_motion
+from anatomy.motion.source import share_of_motion
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.tissue import goal_radius, wanted_in, wanted_of

@@ -5,7 +5,7 @@ to end-inhale, A being the patient's.  Scope and target move in the same phase. 
 along with the airway that holds it, so that only the difference of the two counts: in the frame of the
 reference image the scope stays, and the target moves by `A f (g(h_target) - g(h_scope))`.  The phase f runs
 from 0 at end-exhale, where the image was taken, to 1; the procedure is at any time of the cycle.  g is that
-of `anatomy.motion.population`.  Where the motion of the patient is known, it takes the place of this model.
+of `anatomy.motion.source`.  Where the motion of the patient is known, it takes the place of this model.
 """
 
 from dataclasses import replace

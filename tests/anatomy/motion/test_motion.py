@@ -14,9 +14,8 @@ from anatomy.build import build_lung
 from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.motion.motion import LEFT, RIGHT, Motion, cell_bounds
-from anatomy.motion.population import share_of_motion
 from anatomy.motion.prepare import continued_unfolded, prepare_motion
-from anatomy.motion.source import MotionSource
+from anatomy.motion.source import MotionSource, share_of_motion
 from anatomy.phantom import Phantom
 from anatomy.phantom.files import PhantomBreathing
 from anatomy.store import folder_name, open_lung

@@ -10,7 +10,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.grid import Volume
 from anatomy.phantom import Phantom
 from anatomy.tree import tree_from_mask
-from anatomy.tree.noise import tunnels
+from anatomy.tree.lumen import tunnels
 
 
 def test_tunnels_are_counted() -> None:

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation
 from anatomy.lung import Lung
 from anatomy.structures import BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 from stages.scope.device import Bronchoscope
-from stages.scope.passages import Passages, find_passages
+from stages.scope.motions import Passages, find_passages
 from tests.stages.scenes import Canvas, brute_clearance, forked_tree, lung_of
 
 CARINA, FORK = np.array([0.0, 0.0, 20.0]), np.array([26.0, 0.0, -4.0])

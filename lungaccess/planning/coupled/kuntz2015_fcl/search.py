@@ -15,7 +15,7 @@ from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT
 from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import Obstacles
 from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator, path_of
 from lungaccess.planning.coupled.search.base import SearchInParts, Step
-from lungaccess.planning.coupled.search.random_placement import Placement, random_placements
+from lungaccess.planning.coupled.search.kuntz2015 import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task

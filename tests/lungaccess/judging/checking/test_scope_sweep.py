@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lungaccess.judging.checking import shapes
+from lungaccess.judging.checking.scope import least_gap_mm
 from lungaccess.judging.checking.scope_motion import Motion, motion_of, screws
-from lungaccess.judging.checking.scope_sweep import least_gap_mm
 from stages.scope.motion import ScopeMotion
 
 SECTION_MM = 16.0

@@ -18,10 +18,9 @@ from anatomy.structures import LUMEN
 from experiments.support.warped_voxels import BruteForce
 from lungaccess.judging.appraisal import Headline
 from lungaccess.judging.checking import check
-from lungaccess.judging.checking.breath import Breath
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.findings import Findings
-from lungaccess.judging.checking.window import check_window
+from lungaccess.judging.checking.window import Breath, check_window
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim, BreathingWindow
 from lungaccess.uncertainty.breathing.aim import MovingTarget

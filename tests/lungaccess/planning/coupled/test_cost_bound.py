@@ -16,8 +16,7 @@ from anatomy.fields import distance_field
 from anatomy.grid import Grid
 from anatomy.kernels.field import most_distance
 from anatomy.lung import Lung
-from lungaccess.planning.coupled.cost_bound import QUEUES, CostBound, GapGoal
-from lungaccess.planning.coupled.cost_to_go import cost_to_go
+from lungaccess.planning.coupled.cost_bound import QUEUES, CostBound, GapGoal, cost_to_go
 from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, ROTATION
 from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment, between, bound_box
 from lungaccess.planning.coupled.kernels.cost_to_go import cost_from

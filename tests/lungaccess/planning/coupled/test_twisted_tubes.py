@@ -14,8 +14,8 @@ from anatomy.lung import Lung
 from experiments.support.mutants import twisted
 from experiments.support.mutants.mutant import Case
 from lungaccess.planning.coupled import AtlasSearch
+from lungaccess.planning.coupled.search.kuntz2015 import random_placements
 from lungaccess.planning.coupled.search.local_search import LocalSearch
-from lungaccess.planning.coupled.search.random_placement import random_placements
 from lungaccess.planning.one_stage.replan import replan_from_scope
 from lungaccess.planning.reachability import UnreachableProof
 from lungaccess.planning.refinement import refine

@@ -17,7 +17,7 @@ from scipy.stats import kstest, norm, uniform
 from anatomy.base.errors import FileError, SettingsError
 from anatomy.base.settings import parse, to_mapping
 from anatomy.lung import Lung
-from anatomy.motion.population import share_of_motion
+from anatomy.motion.source import share_of_motion
 from lungaccess.problem.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
 from lungaccess.problem.errors import (
     BREATHING,

@@ -12,7 +12,7 @@ import pytest
 from anatomy.base.errors import SettingsError
 from anatomy.grid import Grid
 from anatomy.motion.motion import Motion
-from lungaccess.judging.checking.breath import Breath
+from lungaccess.judging.checking.window import Breath
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import IN_WINDOW, ErrorModel
 from lungaccess.uncertainty.risk.breathing import BREATHS_LN, PatientMotion, model_for, phase

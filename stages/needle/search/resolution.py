@@ -27,7 +27,6 @@ from stages.needle.search.kernels import resolution_nodes as node_kernel
 T = TypeVar("T", bound=np.generic)
 Words = tuple[float, Float, Float, Int, Int]
 Store = tuple[Float, Int32, UInt8, Int32]
-Queue = tuple[Float, Int32, Float, Int32, Int32]
 
 FIRST_NODES = 1024
 FIRST_ENTRIES = 4096

@@ -32,9 +32,6 @@ FORMAT = 5
 PAD_VOXELS = 2
 """One voxel around the lungs must be outside of them, and the fields look one farther."""
 
-NEIGHBOURS = 8
-"""Centreline points that are looked at to find the branch of an airway voxel."""
-
 
 def lung_key(sources: Mapping[str, str]) -> str:
     """Return the key of the lung made from input files with these hashes."""
@@ -200,7 +197,8 @@ def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, g
             remedy="Remove noise from the airway mask",
         )
     voxels = np.argwhere(airway)
-    neighbours = min(NEIGHBOURS, tree.n_points)
+    # Centreline points that are looked at to find the branch of an airway voxel.
+    neighbours = min(8, tree.n_points)
     distance, index = tree.nearest_point_index.query(grid.lps(voxels), k=neighbours)
     distance, index = distance.reshape(len(voxels), -1), index.reshape(len(voxels), -1)
     nearest = np.argmin(distance - tree.radius_mm[index], axis=1)

@@ -12,8 +12,6 @@ CORONAL, AXIAL = "coronal, from the front", "axial, from the feet"
 GENERATION_COLOURS = ("#08306b", "#2171b5", "#4eb3d3", "#41ab5d", "#fe9929", "#cc4c02", "#7f0000")
 DRAWING_PX = 260
 """Side of a drawing: two of them and a table stand side by side in a notebook."""
-LEAST_STEP_MM = 1.5
-"""Points of a drawn line are at least this far apart, its ends excepted: half a pixel of a whole lung."""
 
 
 def table(rows: Iterable[tuple[str, str]], heading: str = "") -> str:
@@ -88,7 +86,8 @@ class Drawing:
 def _polyline(points: Float, colour: str, width_mm: float) -> str:
     kept = [0]
     for n in range(1, len(points)):
-        if n == len(points) - 1 or np.linalg.norm(points[n] - points[kept[-1]]) >= LEAST_STEP_MM:
+        # Points of a drawn line are at least this far apart, its ends excepted: half a pixel of a whole lung.
+        if n == len(points) - 1 or np.linalg.norm(points[n] - points[kept[-1]]) >= 1.5:
             kept.append(n)
     places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points[kept])
     return (

@@ -12,8 +12,6 @@ from anatomy.base.typed import Array, Bool, Float, Int
 
 ORTHONORMAL_TOLERANCE = 1e-4
 """Headers store directions in single precision with six digits or so; grids have the nearest rotation."""
-ROUNDING = 1e-12
-"""Axes that differ by less are perpendicular up to the rounding of double precision."""
 
 
 def read_only(array: Array) -> Array:
@@ -82,7 +80,8 @@ class Grid:
                 expected="three perpendicular unit axes (no shear or gantry tilt)",
                 remedy="Resample the image onto an orthogonal grid",
             )
-        if np.abs(direction.T @ direction - np.eye(3)).max() > ROUNDING:
+        # Axes that differ by less are perpendicular up to the rounding of double precision.
+        if np.abs(direction.T @ direction - np.eye(3)).max() > 1e-12:
             # Distances are computed as if the axes were perpendicular, so they are made so.
             left, _stretch, right = np.linalg.svd(direction)
             matrix[:3, :3] = left @ right * spacing

@@ -25,8 +25,6 @@ FISSURES_UNKNOWN = "no fissure mask, so that nobody knows whether a fissure is c
 """Check, plan and report say this where a patient has no mask of the fissures."""
 GAP_VOXELS = 2
 """Masks of two lobes may leave so many voxels between them to neither: a fissure as drawn by hand."""
-MAIN_PIECE_SHARE = 0.1
-"""A piece of a lobe's mask with less than this share of it is a slip of the pen, not a part of the lobe."""
 
 _SHORT = {"rul": RIGHT_UPPER, "rml": RIGHT_MIDDLE, "rll": RIGHT_LOWER, "lul": LEFT_UPPER, "lll": LEFT_LOWER}
 _LEVELS = {"upper": "upper", "superior": "upper", "middle": "middle", "lower": "lower", "inferior": "lower"}
@@ -62,7 +60,9 @@ def main_pieces(mask: Mask) -> Mask:
     if count:
         sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
-        kept[box] = (sizes >= MAIN_PIECE_SHARE * sizes.sum())[pieces]
+        # A piece of a lobe's mask with less than this share of it is a slip of the pen, not a part of the
+        # lobe.
+        kept[box] = (sizes >= 0.1 * sizes.sum())[pieces]
     return kept
 
 

@@ -18,21 +18,11 @@ from anatomy.tree_report import PieceLeftOut
 
 WALL_MM = 4.0
 """Walls are up to 3 mm thick, and their inner voxels share a face with the lumen."""
-PARTS = 3
-"""Each lung is looked at in so many parts from apex to base, of the same volume."""
 AROUND = np.vstack([np.eye(3), -np.eye(3)])
 """Directions in which what lies around a point is looked for."""
-RIM_MM = 3.0
-"""Fissures that end as near to the surface of the lungs reach it."""
-LEAST_CUT_NODULE = 50
-"""A nodule of fewer voxels may well have a flat face."""
-LEAST_PIECE = 0.05
-"""A piece with less than this share of the lungs is no lung."""
 LEAST_CUT, GREATEST_CUT = 0.01, 0.1
 """A piece of the airway with this share of the lumen is named, and one with the other share is refused: in
 phantoms a segment and all behind it has 2 to 5 %, what hangs on a main bronchus 20 % and more."""
-MOST_VOXELS = 5_000_000
-"""Nodules of more voxels are not taken apart: they are refused for their volume."""
 
 
 def mask_findings(
@@ -83,7 +73,8 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         yield "fissures_in_lungs", within / _count(fissures)
         sheet = sampled(fissures & lung, images.grid, SAMPLE_MM / 2)
         if len(sheet):
-            yield "fissures_at_rim", float((~_around(lung, images.grid, sheet, RIM_MM)).any(1).mean())
+            # Fissures that end as near to the surface of the lungs reach it.
+            yield "fissures_at_rim", float((~_around(lung, images.grid, sheet, 3.0)).any(1).mean())
         yield "fissures_in_others", _count(fissures & (vessels | lumen)) / _count(fissures)
     if images.nodules is not None:
         nodules = images.nodules.array
@@ -93,7 +84,8 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         if images.targets_lps:
             there = images.grid.values_at(nodules, np.array(images.targets_lps), False)
             yield "targets_in_nodules", float(there.mean())
-        if _count(nodules) <= MOST_VOXELS:
+        # Nodules of more voxels are not taken apart: they are refused for their volume.
+        if _count(nodules) <= 5_000_000:
             yield from _of_nodules(nodules, lung)
     if images.lobes is not None:
         yield from _of_lobes(images.lobes.array, lung, images.grid, tree)
@@ -118,7 +110,8 @@ def _shares_of_parts(marks: Mask, points: Float, tree: AirwayTree) -> list[float
     """Return the share of points that are marked in every part of either lung, from apex to base."""
     left = points[:, 0] > tree.carina_lps[0]
     ordered = [np.flatnonzero(side)[np.argsort(points[side, 2], kind="stable")] for side in (left, ~left)]
-    parts = [part for order in ordered for part in np.array_split(order, PARTS)]
+    # Each lung is looked at in so many parts from apex to base, of the same volume.
+    parts = [part for order in ordered for part in np.array_split(order, 3)]
     return [float(marks[part].mean()) for part in parts if len(part)]
 
 
@@ -141,7 +134,8 @@ def _of_lungs(
     pieces, count = ndimage.label(coarse, np.ones((3, 3, 3)))
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
     total = float(max(sizes.sum(), 1))
-    yield "lung_pieces", float(sizes[sizes < LEAST_PIECE * total].sum()) / total
+    # A piece with less than this share of the lungs is no lung.
+    yield "lung_pieces", float(sizes[sizes < 0.05 * total].sum()) / total
     outside, _ = ndimage.label(~coarse)
     yield "lung_holes", float(np.count_nonzero((outside != outside[0, 0, 0]) & ~coarse)) / total
     points = sampled(lung, grid, SAMPLE_MM)
@@ -195,7 +189,8 @@ def _flattest(places: Int, part: Int) -> float:
     first = np.flatnonzero(np.diff(keys // length, prepend=-1))
     last = np.append(first[1:], len(keys)) - 1
     ends = np.maximum(counts[first], counts[last]) / np.maximum.reduceat(counts, first)
-    return float(ends[np.bincount(part) >= LEAST_CUT_NODULE].max(initial=0.0))
+    # A nodule of fewer voxels may well have a flat face.
+    return float(ends[np.bincount(part) >= 50].max(initial=0.0))
 
 
 def _of_lobes(lobes: Array, lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:

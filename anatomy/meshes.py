@@ -159,10 +159,6 @@ class MeshDistance:
         return max(float(found), 0.0)
 
 
-FIRST_NEIGHBOURS = 16
-"""Nearest triangles asked for at first: mostly enough to be sure of the nearest."""
-
-
 def point_distances_mm(mesh: SurfaceMesh, points_lps: ArrayLike, at_most_mm: float) -> Float:
     """Return the exact `(N,)` distances in mm from points `(N, 3)`, LPS mm, to a surface, up to a bound.
 
@@ -173,7 +169,8 @@ def point_distances_mm(mesh: SurfaceMesh, points_lps: ArrayLike, at_most_mm: flo
     from trimesh.triangles import closest_point
 
     points = np.asarray(points_lps, dtype=np.float64).reshape(-1, 3)
-    out, left, count = np.full(len(points), at_most_mm), np.arange(len(points)), FIRST_NEIGHBOURS
+    # Nearest triangles asked for at first: mostly enough to be sure of the nearest.
+    out, left, count = np.full(len(points), at_most_mm), np.arange(len(points)), 16
     if not len(mesh.faces):
         return out
     corners = mesh.vertices_lps[mesh.faces]

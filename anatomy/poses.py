@@ -11,8 +11,6 @@ from anatomy.grid import read_only
 
 ANTERIOR = np.array([0.0, -1.0, 0.0])
 SUPERIOR = np.array([0.0, 0.0, 1.0])
-SHORTEST = 1e-9
-"""A shorter vector has no direction in double precision."""
 
 
 def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = None) -> Float:
@@ -47,7 +45,8 @@ def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = 
 
 def _unit(vector: Float, name: str) -> Float:
     length = float(np.linalg.norm(vector))
-    if not length > SHORTEST:
+    # A shorter vector has no direction in double precision.
+    if not length > 1e-9:
         raise FrameError(
             f"A pose has no {name} direction: {vector.tolist()}",
             expected="two directions with a length, not parallel to each other",

@@ -9,9 +9,6 @@ import numpy as np
 from anatomy.base.typed import Array, Float, Int32, Mask
 from anatomy.grid import Grid
 
-SMALLER_LUNG_SHARE = 0.1
-"""The smaller of two lungs holds at least this share of the larger one."""
-
 
 def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | None:
     """Return the lung, 1 or 2, or 0 for none, of every coarse voxel of `tissue`, and its size in voxels.
@@ -75,7 +72,8 @@ def _two_largest(mask: Mask, axes: Float, least: float) -> Int32 | None:
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     order = np.argsort(sizes)[::-1]
-    if sizes[order[1]] < max(SMALLER_LUNG_SHARE * sizes[order[0]], least):
+    # The smaller of two lungs holds at least this share of the larger one.
+    if sizes[order[1]] < max(0.1 * sizes[order[0]], least):
         return None
     centres = np.array(ndimage.center_of_mass(mask, parts, order[:2]))
     apart = np.abs(axes @ (centres[0] - centres[1]))

@@ -4,9 +4,6 @@ import math
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-MOST_DECIMALS = 6
-"""Shares that are smaller than these decimals tell are written as 0: nothing is known so well."""
-
 
 def plural(count: int, noun: str) -> str:
     """Return a count with its noun, which takes an "s" unless the count is 1.
@@ -32,7 +29,8 @@ def of_hundred(share: float, *, up: bool = False) -> str:
     """
     decimals = 0 if 0.1 <= share <= 0.9 else 1
     if 0.0 < share < 0.001:
-        decimals = min(-math.floor(math.log10(share)) - 2, MOST_DECIMALS)
+        # Shares that are smaller than these decimals tell are written as 0: nothing is known so well.
+        decimals = min(-math.floor(math.log10(share)) - 2, 6)
     exact = round(100.0 * 10**decimals * share, 6)
     text = f"{(math.ceil(exact) if up else math.floor(exact)) / 10**decimals:.{decimals}f}"
     return text.rstrip("0").rstrip(".") if decimals else text

@@ -20,8 +20,6 @@ NODE_MM = 5.0
 """Distance of nodes: motion varies over centimetres, and its bounds are tighter the smaller the cells."""
 BORDER_MM = 20.0
 """Nodes around the lungs, so that what lies near the pleura has cells on all sides."""
-LEAST_COVERED = 0.99
-"""Share of the lungs that a field must cover: a field in a wrong frame covers far less."""
 SAMPLE_MM = 4.0
 """Distance of the places in the lungs at which a motion is looked at."""
 SIDES = {RIGHT: "right", LEFT: "left"}
@@ -162,7 +160,8 @@ def _of_field(
 
 def _require_covered(source: MotionSource, places: Float) -> None:
     covered = 0.0 if source.grid is None else float(source.grid.contains(places).mean())
-    if not covered >= LEAST_COVERED:
+    # Share of the lungs that a field must cover: a field in a wrong frame covers far less.
+    if not covered >= 0.99:
         raise FrameError(
             f"The {source.description} covers {percent(covered)} of the lungs",
             expected="a field over both lungs, LPS mm of the masks",
@@ -244,12 +243,6 @@ def _sliding(labels: Labels, grid: Grid, field: At) -> float:
     return float(np.linalg.norm(field(points + 5.0 * n) - field(points - 5.0 * n), axis=1).mean())
 
 
-STEEP = 0.5
-"""Tissue that would be squeezed or sheared by half within one cell: a field slides there, or is noise."""
-ROUNDS = 3
-"""Each takes away the nodes of one more layer of such cells."""
-
-
 def continued_unfolded(values: Float, inside: Mask, spacing_mm: float) -> tuple[Float, float]:
     """Return a continuation that mends a field where it slides or folds, and the share of nodes it mends.
 
@@ -262,10 +255,12 @@ def continued_unfolded(values: Float, inside: Mask, spacing_mm: float) -> tuple[
         spacing_mm: Distance of nodes.
     """
     known = inside.copy()
-    for _ in range(ROUNDS):
+    # Each takes away the nodes of one more layer of such cells.
+    for _ in range(3):
         out = continued(values, known)
         bounds = cell_bounds(out, spacing_mm)
-        steep = np.pad(np.maximum(-bounds[..., 0], bounds[..., 1]) > STEEP, 1)
+        # Tissue that would be squeezed or sheared by half within one cell: a field slides there, or is noise.
+        steep = np.pad(np.maximum(-bounds[..., 0], bounds[..., 1]) > 0.5, 1)
         wrong = known & ndimage.maximum_filter(steep, 2)[1:, 1:, 1:]
         if not wrong.any() or wrong.sum() > 0.5 * known.sum():
             break

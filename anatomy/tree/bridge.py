@@ -16,8 +16,6 @@ NEAR_MM = 5.0
 """The side of a gap that faces it is judged from the voxels within this distance."""
 
 STRETCH_MM = 15.0
-ELONGATION = 1.5
-"""A piece runs along an axis if, within `STRETCH_MM`, its variance along it is this many times the next."""
 
 
 @frozen_record
@@ -121,7 +119,8 @@ def _in_direction(near: Int, far: Int, begin: Int, end: Int, spacing_mm: Float) 
     offset = (far - end) * spacing_mm
     reach = np.linalg.norm(offset, axis=1)
     variance, axes = np.linalg.eigh(np.cov(offset[reach <= STRETCH_MM], rowvar=False))
-    if variance[2] >= ELONGATION * variance[1]:
+    # A piece runs along an axis if, within `STRETCH_MM`, its variance along it is this many times the next.
+    if variance[2] >= 1.5 * variance[1]:
         return bool(abs(axes[:, 2] @ across) >= MAX_TURN_COS)
     return bool(reach.max() > STRETCH_MM)
 

@@ -228,10 +228,6 @@ def _path(prepared: PreparedLumen, begins: VoxelPath, end: tuple[int, ...]) -> V
     return [tuple((np.array(step) + low).tolist()) for step in search.traceback(target)]
 
 
-SAME_POINT_MM = 1e-3
-"""Files store points in single precision; true neighbours are a hundred times farther apart."""
-
-
 MOST_RADIUS_MM = 100.0
 """No tube of a body is as wide as this."""
 
@@ -286,7 +282,8 @@ def _united(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    same = KDTree(points).query_pairs(SAME_POINT_MM, output_type="ndarray")
+    # Files store points in single precision; true neighbours are a hundred times farther apart.
+    same = KDTree(points).query_pairs(1e-3, output_type="ndarray")
     n = len(points)
     links = coo_array((np.ones(len(same)), (same[:, 0], same[:, 1])), shape=(n, n))
     _, label = connected_components(links, directed=False)

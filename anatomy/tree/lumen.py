@@ -62,7 +62,8 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     left_out: tuple[PieceLeftOut, ...] = ()
     if count > 1:
         pieces = _pieces(labels, sizes, main, grid.spacing_mm)
-        require_at_most(len(pieces), MOST_PIECES, "separate pieces")
+        # A CT shows some hundred branches; every pair of pieces is looked at, which takes minutes for more.
+        require_at_most(len(pieces), 2000, "separate pieces")
         for join in join_pieces(np.argwhere(lumen), pieces, grid.spacing_mm, max_gap_mm):
             lumen[tuple(join.voxels.T)] = True
             bridges[tuple(join.bridge.T)] = True
@@ -169,10 +170,6 @@ def _pieces(labels: Int32, sizes: Int, main: int, spacing_mm: Float) -> list[Pie
         if float(np.linalg.norm(extent)) >= Piece.MIN_EXTENT_MM:
             pieces.append(Piece(voxels=voxels))
     return pieces
-
-
-MOST_PIECES = 2000
-"""A CT shows some hundred branches; every pair of pieces is looked at, which takes minutes for more."""
 
 
 def require_at_most(count: int, most: int, what: str) -> None:

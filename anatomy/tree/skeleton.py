@@ -18,8 +18,6 @@ SPUR_VOXELS = 1.5
 """A branch this far beyond the surface of its parent's sphere, or less, is roughness of the mask."""
 SPUR_RADII = 0.5
 """The same as a share of the sphere's radius: wide airways have larger bumps."""
-SPUR_MAX_RADII = 3.0
-"""A branch longer than this many radii of its parent and `SPUR_MAX_MM` is no spur, wherever its tip lies."""
 SPUR_MAX_MM = 3.0
 """Even the thinnest airways that a CT shows are longer than this."""
 
@@ -214,7 +212,8 @@ def _protrusion(tree: SkeletonTree, end: int, reach_mm: Float, alive: Bool) -> f
     """Return by how far a tip leaves the reach of the rest of the tree, mm; negative for a spur."""
     nodes = tree.chain(end, tree.neighbours[end][0])
     root = nodes[-1]
-    longest = SPUR_MAX_RADII * float(tree.depth_mm[root]) + SPUR_MAX_MM
+    # A branch longer than this many radii of its parent and `SPUR_MAX_MM` is no spur, wherever its tip lies.
+    longest = 3.0 * float(tree.depth_mm[root]) + SPUR_MAX_MM
     if len(tree.neighbours[root]) < 3 or tree.length_mm(nodes) > longest:
         return float("inf")
     rest = alive.copy()

@@ -15,9 +15,6 @@ from anatomy.tree.skeleton import SkeletonTree
 ROUNDS = 30
 """Rounds of centring and smoothing; together they reach about 4 voxels and smooth over about 2 mm."""
 
-HALVINGS = 4
-"""A step that leaves the lumen is halved so often before it is given up: a sixteenth of it is nothing."""
-
 
 @frozen_record
 class VoxelTree:
@@ -139,4 +136,5 @@ def _kept_inside(voxel_tree: VoxelTree, base: Float, wanted: Float, lumen: Bool)
             return replace(voxel_tree, ijk=ijk)
         touched = np.unique(np.concatenate((parent[bad], child[bad])))
         share[touched] /= 2
-        share[share < 0.5**HALVINGS] = 0.0
+        # A step that leaves the lumen is halved so often before it is given up: a sixteenth of it is nothing.
+        share[share < 0.5**4] = 0.0

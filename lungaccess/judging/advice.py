@@ -25,12 +25,8 @@ from lungaccess.uncertainty.risk import Share
 
 GOOD = 0.9
 """A plan that succeeds so often is left without advice."""
-WORTH_SAYING = 0.03
-"""A chance that is higher by less than this may be so by the luck of the draws."""
 DRAWS, SIMULATED = 2000, 250
 """Draws of each trial in open loop, and procedures of one that measures: a half is known to 1 and 3 %."""
-MOST = 5
-"""So many pieces of advice are given, the best first."""
 KNOWN = {
     "scope_position": 0.5,
     "scope_direction": 0.5,
@@ -203,8 +199,10 @@ def advise(
         procedure = load_procedure(chance.procedure)
     began, found = working_s(), []
     for each in Adviser(plan, lung, errors, procedure, atlas_of, systems).trials():
-        if each is not None and each.success.value > success.value + WORTH_SAYING:
+        # A chance that is higher by less than this may be so by the luck of the draws.
+        if each is not None and each.success.value > success.value + 0.03:
             found.append(each)
         if working_s() - began > time_s:
             break
-    return tuple(sorted(found, key=lambda each: -each.success.value)[:MOST])
+    # So many pieces of advice are given, the best first.
+    return tuple(sorted(found, key=lambda each: -each.success.value)[:5])

@@ -33,8 +33,6 @@ SEPARATION_MM = 5.0
 WINDOW = "window_share"
 ITERATIONS = 100
 """Iterations of the search for the best plan: some seconds."""
-STATED = 1000
-"""Draws of the chance that each of the other plans states: one half is then known to 1.5 %."""
 METHOD = "alternatives"
 """What the method of the other plans is called."""
 
@@ -131,7 +129,8 @@ def _others(request: Request, atlas: Atlas, count: int, separation_mm: float) ->
     for each in separated_candidates(arcs, count, separation_mm):
         made = plan_of(request, task, atlas, each, 0, 0.0)
         if holds(request, made):
-            yield made if rating is None else rating.stated(made, STATED)
+            # Draws of the chance that each of the other plans states: one half is then known to 1.5 %.
+            yield made if rating is None else rating.stated(made, 1000)
 
 
 class RankedArcs:

@@ -38,8 +38,6 @@ from stages.scope.tour import (
     subtree_to,
 )
 
-FARTHEST_MM = 200.0
-"""No exit farther from a lesion is of use: a lung is not wider."""
 ITERATIONS = 100
 """Of the coupled planner for a lesion that no direct arc reaches: some seconds."""
 
@@ -197,7 +195,8 @@ def _rule_of(atlas: Atlas | None) -> ExitRule:
         return ExitRule()
     system, needle = atlas.system, atlas.system.needle
     reach = system.tubes.max_extension_mm + (0.0 if needle is None else needle.max_length_mm)
-    return ExitRule(reach_mm=min(reach, FARTHEST_MM))
+    # No exit farther from a lesion is of use: a lung is not wider.
+    return ExitRule(reach_mm=min(reach, 200.0))
 
 
 def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATIONS) -> ExitTest:

@@ -31,8 +31,6 @@ from stages.needle import ArcPath, InTissue
 from stages.scope import ScopeTip, prove_motion
 from stages.tube import Deployment
 
-CLEARANCE_CAP_MM = 5.0
-"""Clearances below this are stated exactly: larger ones never limit a plan."""
 SAMPLE_MM = 0.05
 """Spacing of the samples of a clearance, which is lowered by half of it to hold between them."""
 
@@ -218,7 +216,6 @@ def _least_clearance(lung: Lung, points: Float, name: str, exempt_branch: int) -
     most half their spacing less.
     """
     field = "pleura" if name == "outside" else name
-    least = lung.least_clearance_mm(
-        points, field, BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=exempt_branch
-    )
+    # Clearances below this are stated exactly: larger ones never limit a plan.
+    least = lung.least_clearance_mm(points, field, BITS[name], cap_mm=5.0, exempt_branch=exempt_branch)
     return max(least - 0.5 * SAMPLE_MM, 0.0)

@@ -30,8 +30,6 @@ LOOKED_PIXELS, SHOWN_PIXELS = 24, 80
 """Pictures among which one is chosen have as many pixels along an edge, and the chosen one."""
 LEAST_CLARITY = 0.0005
 """Openings are in view if each fills 0.2 % of the picture where they are 15 degrees apart, or the like."""
-TOGETHER_MM = 10.0
-"""Branches of the same parent that part within so many mm are openings of one bifurcation."""
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth")
 
 
@@ -165,10 +163,11 @@ def route_bifurcations(
 def _first_points(tree: AirwayTree, parent: int, child: int) -> list[int]:
     """Return the first point of each way on at a bifurcation, that to a child first, the parent's last."""
     depth, fork, last = tree.distance_from_root_mm, _fork(tree, child), int(tree.branch_start[parent + 1]) - 1
+    # Branches of the same parent that part within so many mm are openings of one bifurcation.
     others = [
         each
         for each in tree.children(parent).tolist()
-        if each != child and abs(depth[_fork(tree, each)] - depth[fork]) <= TOGETHER_MM
+        if each != child and abs(depth[_fork(tree, each)] - depth[fork]) <= 10.0
     ]
     goes_on = fork < last and all(_fork(tree, each) < last for each in others)
     return [*(int(tree.branch_start[each]) for each in (child, *others)), *([fork + 1] if goes_on else [])]

@@ -9,9 +9,6 @@ from lungaccess.plans.curves import pieces_beyond
 from stages import needle
 from stages.needle import TERMS, ArcPath, InTissue, Objective, Obstacles, Term
 
-LEAST_MM = 1e-6
-"""So much of a path is left where all of it lies in the wall: the voxel of its end still counts."""
-
 
 def path_cost(
     lung: Lung,
@@ -74,7 +71,8 @@ def path_beyond(path: ArcPath, begin_mm: float) -> ArcPath:
     """Return what lies beyond a length of a path: nearly nothing of it where that is its end or farther."""
     if begin_mm <= 0.0:
         return path
-    start, arcs = pieces_beyond(path.lps_from_start, path.arcs, min(begin_mm, path.length_mm - LEAST_MM))
+    # So much of a path is left where all of it lies in the wall: the voxel of its end still counts.
+    start, arcs = pieces_beyond(path.lps_from_start, path.arcs, min(begin_mm, path.length_mm - 1e-6))
     return ArcPath(lps_from_start=start, arcs=arcs)
 
 

@@ -21,8 +21,6 @@ from stages.tube.device import ConcentricTubes
 STEP_MM = 0.25
 """Largest distance between the poses of tubes and needle: the chord of a 40 mm arc is off by 0.2 um."""
 
-SCOPE_STEP_MM = 1.0
-"""Largest distance between the poses of the scope: the chord of its tightest arcs is off by 0.01 mm."""
 
 SHORTEST_MM = 1e-6
 """Lengths that differ by less are one."""
@@ -82,7 +80,8 @@ def device_curves(
     """
     tubes = system.tubes
     laid = laid_pieces(scope.states, system.scope.bending_length_mm)
-    scope_poses, scope_mm = poses_on_pieces(scope.lps_from_entry, laid, SCOPE_STEP_MM)
+    # Largest distance between the poses of the scope: the chord of its tightest arcs is off by 0.01 mm.
+    scope_poses, scope_mm = poses_on_pieces(scope.lps_from_entry, laid, 1.0)
     tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube), step_mm)
     start = tube.lps_from_tip if needle is None else needle.lps_from_start
     needle_poses, needle_mm = poses_on_pieces(start, needle_pieces(needle), step_mm)

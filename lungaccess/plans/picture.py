@@ -19,14 +19,8 @@ HALF_ANGLE_RAD = math.radians(48.0)
 """Half the angle of the round picture: common bronchoscopes see 90 to 120 degrees."""
 ASIDE_SHARE, MOST_ASIDE_SHARE, CHANNEL_ROOM_MM = 0.7, 0.9, 0.35
 """The camera is aside of the axis by shares of the scope's radius, and clear of the tubes in its channel."""
-FARTHEST_MM = 150.0
-"""The light of a scope does not reach farther."""
 HALF_BRIGHT_MM = math.sqrt(520.0)
 """At this distance the light has half its brightness, as the pages draw it."""
-DARK = 0.75
-"""An opening is as dark as this share of its darkest place, or darker."""
-BEGIN_MM = 2.0
-"""A place in an opening is so far behind its rim, where it stays in the opening as the scope comes nearer."""
 STRAIGHT_RAD = math.radians(4.0)
 """What lies nearer to the middle of the picture is straight ahead."""
 STRAIGHT_AHEAD = "straight ahead"
@@ -88,7 +82,8 @@ class Picture:
         self._across, self._rays = rays[:, :2] / rays[:, 2:], rays @ lps_from_eye[:3, :3].T
         self._away_mm, ends = np.zeros(len(rays)), np.zeros(len(rays), dtype=np.int64)
         eyes = np.broadcast_to(self._eye, rays.shape)
-        follow_rays(lung.labels, lung.geometry, LUMEN, eyes, self._rays, FARTHEST_MM, self._away_mm, ends)
+        # The light of a scope does not reach farther.
+        follow_rays(lung.labels, lung.geometry, LUMEN, eyes, self._rays, 150.0, self._away_mm, ends)
         self._branch = (ends >> BRANCH_SHIFT) - 1
 
     def _beyond(self, point: int) -> Bool:
@@ -119,13 +114,16 @@ class Picture:
             along = tree.distance_from_root_mm[points] - tree.distance_from_root_mm[fork]
             return Hole(place_lps=tree.points_lps[points[np.sum(along[1:] <= 2.0 * tree.radius_mm[fork])]])
         square = np.zeros(self._inside.shape, dtype=np.bool_)
-        square[self._inside] = dark >= DARK * dark.max()
+        # An opening is as dark as this share of its darkest place, or darker.
+        square[self._inside] = dark >= 0.75 * dark.max()
         region = ndimage.label(square, np.ones((3, 3)))[0][self._inside]
         own = np.flatnonzero(region == np.bincount(region, dark * (region > 0)).argmax())
         dark, across = dark[own], self._across[own]
         shown = own[np.linalg.norm(across - dark @ across / dark.sum(), axis=1).argmin()]
         whole = (1.0 - (across**2).sum(axis=1) / math.tan(HALF_ANGLE_RAD) ** 2) ** 2
-        away = float(np.linalg.norm(tree.points_lps[fork] - self._eye)) + BEGIN_MM
+        # A place in an opening is so far behind its rim, where it stays in the opening as the scope comes
+        # nearer.
+        away = float(np.linalg.norm(tree.points_lps[fork] - self._eye)) + 2.0
         return Hole(
             place_lps=self._eye + min(away, self._away_mm[shown]) * self._rays[shown],
             share=float(dark @ whole / len(rays)),

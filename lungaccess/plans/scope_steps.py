@@ -17,8 +17,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion, prover_of
 
-AHEAD_MM = 12.0
-"""Where the way goes on is told by what the picture shows of the airway from so far ahead on."""
 MOST_DECIMALS = 6
 """Steps are written with as many decimals as their proof takes, at most so many: no motor is finer."""
 NEAR_MM, NEAR_RAD = 0.1, math.radians(0.1)
@@ -262,7 +260,8 @@ def _goes_on(lung: Lung, route: Int, lps_from_eye: Float) -> str:
     """Say where a picture shows that the route over points of the tree goes on."""
     points, depth = lung.tree.points_lps[route], lung.tree.distance_from_root_mm[route]
     here = int(np.linalg.norm(points - lps_from_eye[:3, 3], axis=1).argmin())
-    ahead = min(int(np.searchsorted(depth, depth[here] + AHEAD_MM)), len(route) - 1)
+    # Where the way goes on is told by what the picture shows of the airway from so far ahead on.
+    ahead = min(int(np.searchsorted(depth, depth[here] + 12.0)), len(route) - 1)
     # A picture of 48 pixels along each edge shows where the lumen goes on.
     (hole,) = Picture(lung, lps_from_eye, 48).holes([int(route[ahead])])
     return goes_on_words(clock_hour(lps_from_eye, hole.place_lps))

@@ -11,8 +11,6 @@ from anatomy.lung import Lung
 from lungaccess.plans.kernels.tissue import Wanted
 from lungaccess.problem.tools import Tool
 
-COVERED = 1000
-"""About so many points of a nodule say which share of it is in a tool: to a thousandth."""
 _NO_POINTS = np.zeros((0, 3))
 _NO_VOXELS = np.zeros((0, 0, 0), dtype=np.uint8), np.zeros((3, 4))
 _BALL_STEPS = 12
@@ -78,7 +76,8 @@ def _counted(tool: Tool, own: Int, grid: Grid) -> tuple[UInt8, Float]:
 def _spread_over(tissue: UInt8, geometry: Float, target: Float, between_mm: tuple[float, float]) -> Float:
     """Return points `(M, 3)` spread over a nodule, LPS mm from the target."""
     if tissue.size:
-        voxels = np.argwhere(tissue)[:: max(1, int(tissue.sum()) // COVERED)] + 0.5
+        # About so many points of a nodule say which share of it is in a tool: to a thousandth.
+        voxels = np.argwhere(tissue)[:: max(1, int(tissue.sum()) // 1000)] + 0.5
         return np.asarray(np.linalg.solve(geometry[:, :3], (voxels - geometry[:, 3]).T).T - target)
     inner, outer = between_mm
     side = outer * ((2.0 * np.arange(_BALL_STEPS) + 1.0) / _BALL_STEPS - 1.0)

@@ -10,12 +10,8 @@ from anatomy.base.settings import impossible, parse, quantity, settings, text
 from anatomy.base.typed import Float
 from lungaccess.problem.preset_files import PresetFiles
 
-FINEST_MM = 0.1
-"""Points on the axis of a thin tool are so far apart: with 0.25 a core's chance was 0.8 of 100 too high."""
 ACROSS = 9
 """So many points lie across a wide tool: its volume in the nodule is then known to some percent."""
-WIDE_MM = 2.0
-"""A tool that is no wider takes beside its axis what it takes along it."""
 _FILES = PresetFiles(
     what="tool",
     folders=("presets/tools",),
@@ -103,8 +99,11 @@ class Tool:
 
     def points(self) -> Float:
         """Return points `(K, 3)` of the body in the frame of the tip, +z ahead; each stands for as much."""
-        if self.diameter_mm <= WIDE_MM:
-            count = max(math.ceil(self.length_mm / FINEST_MM), 1)
+        # A tool that is no wider takes beside its axis what it takes along it.
+        if self.diameter_mm <= 2.0:
+            # Points on the axis of a thin tool are so far apart: with 0.25 a core's chance was 0.8 of 100 too
+            # high.
+            count = max(math.ceil(self.length_mm / 0.1), 1)
             z = self.from_tip_mm + self.length_mm * (np.arange(count) + 0.5) / count
             return np.column_stack([np.zeros((count, 2)), z])
         side = (2.0 * np.arange(ACROSS) + 1.0) / ACROSS - 1.0

@@ -15,9 +15,6 @@ from stages.needle.kernels.proof import Obstacles
 from stages.needle.objective import TERMS, Term
 from stages.needle.path import ArcPath, kernel_arcs
 
-SAMPLE_MM = 0.1
-"""Greatest step of the trapezoid rule, as long as the least clearance that counts."""
-
 
 def obstacle_clearance_mm(obstacles: Obstacles, points: Float) -> Float:
     """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle.
@@ -49,7 +46,8 @@ def inverse_clearance(obstacles: Obstacles, path: ArcPath) -> float:
     Args:
         obstacles: See `NeedleEnvironment`.
     """
-    points, lengths = path.sample(SAMPLE_MM)
+    # Greatest step of the trapezoid rule, as long as the least clearance that counts.
+    points, lengths = path.sample(0.1)
     clearance = np.maximum(obstacle_clearance_mm(obstacles, points), kernel.CLEARANCE_FLOOR_MM)
     return float(np.trapezoid(1.0 / clearance, lengths))
 

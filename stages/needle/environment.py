@@ -112,10 +112,6 @@ def environment_of_labels(
     )
 
 
-LEAVING_DEG = 10.0
-"""A needle that pierces the wall itself leaves it at this angle at least: the least of the presets' tubes."""
-
-
 def begun_at_wall(
     environment: NeedleEnvironment, point: ArrayLike, branches: tuple[int, ...]
 ) -> NeedleEnvironment:
@@ -128,7 +124,8 @@ def begun_at_wall(
         branches: The pierced branch and those that are pierced with it: their airway counts as that of the
             first, as far as the exemption reaches.
     """
-    limits = environment.limits._replace(leaving_sine=math.sin(math.radians(LEAVING_DEG)))
+    # A needle that pierces the wall itself leaves it at this angle at least: the least of the presets' tubes.
+    limits = environment.limits._replace(leaving_sine=math.sin(math.radians(10.0)))
     obstacles = environment.obstacles
     if len(branches) > 1:
         far = limits.exempt_mm + limits.required_mm + EXACT_REACH_MM

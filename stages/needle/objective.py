@@ -22,8 +22,6 @@ MAX_CLEARANCE_MM = 256.0
 
 DEFAULT = "default"
 """The objective of whoever states none: far from obstacles, and from thin vessels where there is a map."""
-DEFAULT_MAP_WEIGHT = 1.0
-"""A mm in a thin vessel costs as much as one at 1 mm from an obstacle: hardly any axis may lie nearer."""
 
 NO_MAP = read_only(np.zeros((2, 2, 2), dtype=np.float32, order="F"))
 """Stands for a map that is not looked at, of the type of all maps: the kernels are compiled once."""
@@ -133,7 +131,9 @@ class Objective:
         if isinstance(stated, Objective):
             return stated
         if stated == DEFAULT:
-            return cls(inverse_clearance=1.0, cost_map=DEFAULT_MAP_WEIGHT)
+            # A mm in a thin vessel costs as much as one at 1 mm from an obstacle: hardly any axis may lie
+            # nearer.
+            return cls(inverse_clearance=1.0, cost_map=1.0)
         weights: dict[str, float] = {}
         for part in stated.split(","):
             name, equals, weight = (word.strip() for word in part.partition("="))

@@ -15,8 +15,6 @@ from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.proof import Limits, exact_gap
 from stages.needle.path import Query
 
-TRIALS = 256
-"""Paths that are tried for the easiest one: some milliseconds."""
 SAME_SHARE = 1e-6
 """A radius is found to this share of itself, and limits may be exceeded by it through rounding."""
 NEAR_MM = 1e-3
@@ -83,9 +81,10 @@ def blocked_end(environment: NeedleEnvironment, query: Query) -> Obstruction | N
 def easiest_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     """Return the tightest place of the easiest of some trial paths; None if there is none or it is free."""
     found = np.zeros(kernels.FOUND_SIZE)
+    # Paths that are tried for the easiest one: some milliseconds.
     label, tried = kernels.easiest_trial(
         environment.obstacles, environment.limits, _pose(query), query.inserted_mm, query.branch, query.goal,
-        TRIALS, np.zeros(1, dtype=np.uint64), np.zeros(kernels.FOUND_SIZE), found,
+        256, np.zeros(1, dtype=np.uint64), np.zeros(kernels.FOUND_SIZE), found,
     )  # fmt: skip
     if not tried or not label or found[kernels.DISTANCE] >= found[kernels.NEEDED]:
         return None

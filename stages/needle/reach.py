@@ -12,8 +12,6 @@ from stages.needle.kernels import start_trial as kernel
 from stages.needle.objective import Objective
 from stages.needle.search.base import RANDOM_SHARE
 
-CELL_MM = 5.0
-"""Poses of one bundle lie in one such cube."""
 DIRECTION_CELLS = 8
 """Cells along an edge of a cube on whose faces directions are sorted."""
 
@@ -201,7 +199,8 @@ class StartIndex:
 
 def _keys(positions: Float, directions: Float) -> Int:
     """Return the number of each pose's cell, in place and on the cube of directions."""
-    cell = np.floor((positions - positions.min(axis=0, initial=0.0)) / CELL_MM).astype(np.int64)
+    # Poses of one bundle lie in one such cube.
+    cell = np.floor((positions - positions.min(axis=0, initial=0.0)) / 5.0).astype(np.int64)
     key = np.zeros(len(cell), dtype=np.int64)
     for axis in range(3):
         key = key * (cell[:, axis].max(initial=0) + 1) + cell[:, axis]

@@ -13,14 +13,8 @@ from stages.scope.kernels.growth import Device, Route
 
 STEP_MM = 1.0
 """Advance from layer to layer: about a voxel and a half, far shorter than a bending section."""
-RINGS_PER_MM = (0.003, 0.01, 0.03)
-"""Curvatures beside that which leads to the route ahead: at a tip of 15 mm they move it by 0.3 to 3 mm."""
 TANGENT_MM = 3.0
 """The direction of a route is that of its chord so far each way: several voxels, less than a branch."""
-LEAST_ROOM_MM = 0.3
-"""The room beside the axis counts at least so much, half a voxel: costs stay finite where it is narrow."""
-START_MM = 30.0
-"""The first straight section may begin so far down the trachea."""
 TURNED_A_LAYER = 16
 """States of a layer from which tips are turned, spread over those that it keeps, the best among them."""
 
@@ -79,7 +73,9 @@ class Growth:
         self._walls, self._tree, self._device = walls, tree, device
         self._tried, self._passable = tried, passable
         # Directions of a ring: 45 degrees apart.
-        self._offsets = np.vstack([np.zeros((1, 2)), rings(RINGS_PER_MM, 8)])
+        # Curvatures beside that which leads to the route ahead: at a tip of 15 mm they move it by 0.3 to 3
+        # mm.
+        self._offsets = np.vstack([np.zeros((1, 2)), rings((0.003, 0.01, 0.03), 8)])
         self._rows: list[Float] = []
         self._parents: list[Int] = []
         self._straight: list[Bool] = []
@@ -181,7 +177,8 @@ class Growth:
 
         length = self._device.length
         along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route.points, axis=0), axis=1)))
-        for n in range(int(np.searchsorted(along, START_MM))):
+        # The first straight section may begin so far down the trachea.
+        for n in range(int(np.searchsorted(along, 30.0))):
             tip = int(np.searchsorted(along, along[n] + length))
             if tip >= len(along):
                 return False
@@ -204,7 +201,9 @@ class Growth:
         chords = places[ahead] - places[behind]
         lengths = np.linalg.norm(chords, axis=1, keepdims=True)
         tangents = np.where(lengths > 0.0, chords / np.maximum(lengths, 1e-9), tree.tangents[points])
-        room = np.maximum(tree.radius_mm[points] - self._device.radius, LEAST_ROOM_MM)
+        # The room beside the axis counts at least so much, half a voxel: costs stay finite where it is
+        # narrow.
+        room = np.maximum(tree.radius_mm[points] - self._device.radius, 0.3)
         return Route(points=places, tangents=tangents, room=room)
 
     def _add(self, states: Float, parents: Int, straight: Bool, advance_mm: float) -> int:

@@ -74,10 +74,6 @@ def find_passages(lung: Lung, scope: Bronchoscope, *, reach_mm: float) -> Passag
     )
 
 
-PROOF_STEP_MM = 0.05
-"""Spacing of the samples of a proof along the medial axis; half of it is lost, far less than a voxel."""
-
-
 def _narrowest_on_the_route(lung: Lung) -> Float:
     """Return the proved lumen radius of the narrowest place between the root and each point.
 
@@ -86,7 +82,8 @@ def _narrowest_on_the_route(lung: Lung) -> Float:
     tree = lung.tree
     parent = np.maximum(tree.parent_point, 0)
     step = tree.points_lps - tree.points_lps[parent]
-    count = max(1, math.ceil(float(np.linalg.norm(step, axis=1).max()) / PROOF_STEP_MM))
+    # Spacing of the samples of a proof along the medial axis; half of it is lost, far less than a voxel.
+    count = max(1, math.ceil(float(np.linalg.norm(step, axis=1).max()) / 0.05))
     share = np.linspace(0.0, 1.0, count + 1)
     samples = tree.points_lps[parent][:, None] + share[:, None] * step[:, None]
     depth = lung.lumen_depth.lower_bound_mm(samples.reshape(-1, 3)).reshape(len(step), -1)
@@ -96,8 +93,6 @@ def _narrowest_on_the_route(lung: Lung) -> Float:
     return np.asarray(narrowest, dtype=np.float64)
 
 
-WALL_PROBE_MM = 2.5
-"""Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes leave."""
 PROBE_DIRECTIONS = 8
 """Directions across the airway in which tissue is looked for; at 2 to 6 mm they are a few voxels apart."""
 
@@ -112,7 +107,9 @@ def _in_lung_tissue(lung: Lung) -> Bool:
     nowhere = np.ones(tree.n_points, dtype=bool)
     for phi in np.arange(PROBE_DIRECTIONS) * (2 * math.pi / PROBE_DIRECTIONS):
         direction = math.cos(phi) * first + math.sin(phi) * second
-        probe = tree.points_lps + (tree.radius_mm + WALL_PROBE_MM)[:, None] * direction
+        # Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes
+        # leave.
+        probe = tree.points_lps + (tree.radius_mm + 2.5)[:, None] * direction
         nowhere &= (_labels_at(lung, probe) & (OUTSIDE | AIRWAY)) != 0
     return ~nowhere
 
@@ -314,9 +311,6 @@ def _entry(states: StateTree) -> Float:
     return entry
 
 
-TURNED_COARSER = 2.0
-"""Turned tips are so much farther apart: each place has many directions, and nearer ones give about the same
-poses."""
 TURN_SPOKES = 12
 KINDS = (math.floor(MAX_TURN_AT_TIP_RAD / turning.POLAR_RAD + 0.5) + 1) * turning.AZIMUTHS * turning.SIDES
 """Kinds of tips at a place, by angle from the axis, direction and side."""
@@ -365,7 +359,9 @@ def find_tips(
 def _places(tree: AirwayTree, wanted: Bool, spacing_mm: float) -> tuple[Places, int, int]:
     """Return where tips may be, how many groups there are of tips that look ahead, and how many in all."""
     ahead = _slots(tree, spacing_mm)
-    aside = _slots(tree, TURNED_COARSER * spacing_mm)
+    # Turned tips are so much farther apart: each place has many directions, and nearer ones give about the
+    # same poses.
+    aside = _slots(tree, 2.0 * spacing_mm)
     groups = int(ahead.max()) + 1
     helper = np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)]
     first = np.cross(tree.tangents, helper)

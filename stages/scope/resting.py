@@ -33,14 +33,8 @@ MOST_STEPS = 1000
 """Ten to sixty steps bring a shaft to rest, some hundreds one that begins deep in the wall."""
 ROUNDS = 12
 """The tip comes to its depth, and friction to what the wall presses, in so many rounds at most."""
-HOLD_N_PER_MM = 1.0
-"""How stiffly the tip is held at its depth while the shaft settles at first, lest it leaves its branch."""
-HELD_MM = 0.01
-"""The hand has followed where the tip, let go, moves the spring by less than this: a force of 0.01 N."""
 FARTHER_MM = 3.0
 """The hand advances by no more in a round."""
-DEPTH_MM = 0.02
-"""The tip has its depth up to this, far less than anybody measures."""
 PRESSED_MM = 10.0
 """The force on the wall is stated as the largest on a stretch of this length, about that of one contact."""
 
@@ -161,7 +155,8 @@ class RestingShaft:
             # Friction has settled where a round moves the tip by less than this.
             still = not chosen.friction or moved < 0.05
             settled = expected <= ENOUGH_N_MM
-            if abs(beyond) < DEPTH_MM and still:
+            # The tip has its depth up to this, far less than anybody measures.
+            if abs(beyond) < 0.02 and still:
                 break
             if chosen.friction:
                 pull = _friction(laid, force, chosen)
@@ -199,7 +194,9 @@ class RestingShaft:
         The laid shaft is longer than one at rest: it would push the tip out of its branch, or, drawn back too
         far, pull it out.
         """
-        held = shaft._replace(hold=HOLD_N_PER_MM)
+        # How stiffly the tip is held at its depth while the shaft settles at first, lest it leaves its
+        # branch.
+        held = shaft._replace(hold=1.0)
         farther, before, slope = 0.0, (0.0, 0.0), 0.0
         for count in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
@@ -207,7 +204,9 @@ class RestingShaft:
             # While the tip is held, a step is worth at least this.
             kernel.bring_to_rest(self._lumen, drawn, entry, curvature, pull, laid, 1e-4, MOST_STEPS)
             beyond = float((laid[-1, 9:] - held.tip) @ held.ahead)
-            if abs(beyond) < HELD_MM:
+            # The hand has followed where the tip, let go, moves the spring by less than this: a force of 0.01
+            # N.
+            if abs(beyond) < 0.01:
                 break
             if count and abs(farther - before[0]) > 1e-6:
                 slope = (beyond - before[1]) / (farther - before[0])

@@ -13,18 +13,12 @@ from stages.scope.kernels.body import MOST_TWIST_RAD, Walls
 from stages.scope.kernels.growth import Device
 from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
 
-SPARE_MM = 0.5
-"""So much more depth than needed is wanted: it becomes the tolerance of the steps."""
-SAMPLE_MM = 2.0
-"""Spacing of the places of a leg that are looked at as it is fitted: less than a lumen is wide."""
 LADDER = ((3, 2), (4, 3), (6, 4), (8, 5), (11, 7), (15, 10), (20, 14))
 """Legs and twists that are tried at once, the simplest first."""
 TURN_MM, STEP_MM = 0.2, 0.1
 """Longest parts of changes in place and longest steps along the body in which room is measured."""
 STEPS, GAIN = 40, 0.005
 """A fit ends after so many steps, or where a step gains less than this share."""
-FREE = (2, 4, 3)
-"""So many of the last twists, bends and advances stay as they are: the six numbers of a pose need some."""
 MOST_TRIES = 60
 """Removals that are tried one by one."""
 
@@ -108,7 +102,8 @@ class Simplifier:
         least_mm: float,
     ) -> None:
         self._walls, self._device, self._motion, self._least_mm = walls, device, motion, least_mm
-        self._section = kernel.Section(length=device.length, radius=device.radius, spare_mm=SPARE_MM)
+        # So much more depth than needed is wanted: it becomes the tolerance of the steps.
+        self._section = kernel.Section(length=device.length, radius=device.radius, spare_mm=0.5)
         laying = device.laying * device.length
         self._laid = max(device.least_bend, -laying), min(device.most_bend, laying)
         self._end = end_bends_rad
@@ -156,7 +151,9 @@ class Simplifier:
             x = units * np.round(legs.unknowns / units)
             fixed = (bounds[:, 0] < x) & (x < bounds[:, 1])
             begin = 0
-            for count, free in zip((len(legs.twists), len(legs.bends), legs.count), FREE, strict=True):
+            # So many of the last twists, bends and advances stay as they are: the six numbers of a pose need
+            # some.
+            for count, free in zip((len(legs.twists), len(legs.bends), legs.count), (2, 4, 3), strict=True):
                 fixed[begin + max(count - free, 0) : begin + count] = False
                 begin += count
             bounds[fixed] = x[fixed, None]
@@ -245,7 +242,8 @@ class Simplifier:
             bounds ((n, 2) float64): Those of the unknowns, if they are narrower than those of the device.
         """
         x = legs.unknowns
-        counts = np.ceil((np.append(legs.advances, 0.0) + self._device.length) / SAMPLE_MM).astype(np.int64)
+        # Spacing of the places of a leg that are looked at as it is fitted: less than a lumen is wide.
+        counts = np.ceil((np.append(legs.advances, 0.0) + self._device.length) / 2.0).astype(np.int64)
         left = kernel.fit_legs(
             self._walls, self._section, self._entry, self._target, legs.group, counts, x,
             self._bounds(legs) if bounds is None else bounds, STEPS, GAIN,

@@ -9,8 +9,6 @@ from stages.scope.resting import Circumstances, RestingShaft, RestingShape, Wall
 
 PATIENTS, ATTEMPTS = 6, 6
 """Choices of the stiffness of scope and wall, and of friction for each of them."""
-SEED = 1
-"""The choices are the same for all motions: what differs between two of them is not luck."""
 SAME_MM, SAME_DEG = 0.5, 1.0
 """Two shapes whose tips differ by less are one."""
 
@@ -60,7 +58,8 @@ def off_pose(lps_from_pose: Float, lps_from_tip: Float) -> Float:
 
 def choices(contact: WallContact) -> list[list[Circumstances]]:
     """Return what is not known, for some patients in some attempts each, from the stated ranges."""
-    rng = np.random.Generator(np.random.PCG64(SEED))
+    # The choices are the same for all motions: what differs between two of them is not luck.
+    rng = np.random.Generator(np.random.PCG64(1))
     wide = np.log([contact.scope_stiffness_range, contact.wall_stiffness_range])
     made = []
     for _ in range(PATIENTS):

@@ -21,9 +21,6 @@ DEFAULT_STEP_RAD = 0.1
 SAMPLE_MM = 0.25
 """Spacing of the points of the body that are looked at; the tip is always one of them."""
 
-HALVINGS = 12
-"""How often a step is halved before its branch of equilibria is said to end there."""
-
 
 class SnapError(LungaccessError):
     """The tubes would snap: during the motion they lose stability, or their branch of equilibria ends.
@@ -113,7 +110,8 @@ def deploy(
     steps = [_first(mechanics, angles[0], beta[0])]
     for number in range(1, len(beta)):
         try:
-            steps.append(_reach(mechanics, steps[-1], angles[number], beta[number], HALVINGS))
+            # How often a step is halved before its branch of equilibria is said to end there.
+            steps.append(_reach(mechanics, steps[-1], angles[number], beta[number], 12))
         except _BranchEndError as end:
             lengths = np.array([tube.length_mm for tube in mechanics.tubes])
             raise SnapError(

@@ -26,13 +26,9 @@ from stages.tube.mechanics import TubeMechanics
 from stages.tube.nesting import SAME_MM
 from stages.tube.sequences import BEND_RAD
 
-THREADS = 2
-"""The kernel runs without the interpreter's lock."""
 SNAPS = "the tubes would snap on the way"
 SWEEPS = "the tubes would sweep tissue sideways"
 STRAINS = "a tube would be strained too much"
-SAME_SHARE = 1e-9
-"""Rounding of stiffness factors."""
 
 
 @settings
@@ -190,7 +186,8 @@ def tube_shapes(
     def with_rotations(base: Float) -> tuple[Float, Int, Float, Float]:
         return _follow(mechanics, strained, base + BEND_RAD, stops, states, parents)
 
-    with ThreadPoolExecutor(THREADS) as pool:
+    # The kernel runs without the interpreter's lock.
+    with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(with_rotations, rotations))
     results = np.concatenate([rows for rows, _, _, _ in found])
     tips = np.concatenate([tips for _, _, _, tips in found])
@@ -229,7 +226,8 @@ def strained_radii(tubes: Sequence[Tube], longest_mm: float) -> Float:
         strained.append(float(parts.strained_radius_mm[out].max()))
     factors = np.concatenate(softened)
     slotted = any(tube.slotted_segments for tube in tubes)
-    if np.ptp(factors) > SAME_SHARE or (slotted and _free_rotations(tubes) > 0):
+    # Rounding of stiffness factors.
+    if np.ptp(factors) > 1e-9 or (slotted and _free_rotations(tubes) > 0):
         raise SettingsError(
             f"{sum(bool(tube.slotted_segments) for tube in tubes)} of {len(tubes)} tubes have slots, with "
             f"{factors.min():g} to {factors.max():g} of the plain stiffness, and "

@@ -20,9 +20,6 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from lungaccess.planning.reachability import OpenPlace, ReachVerdict
 
-SHOWN = 8
-"""Open places that the table names."""
-
 
 def certify(
     patient: PatientFolder,
@@ -80,7 +77,8 @@ def certify(
     if verdict.open_places:
         branches = len({place.branch for place in verdict.open_places})
         rows.append(("open", f"{len(verdict.open_places)} places in {branches} branches"))
-        rows += [("", _words(place)) for place in verdict.open_places[:SHOWN]]
+        # Open places that the table names.
+        rows += [("", _words(place)) for place in verdict.open_places[:8]]
     if out is not None:
         rows.append(("picture", str(out)))
     terminal.show([terminal.table("proof", ("", ""), rows)])

@@ -8,11 +8,6 @@ from anatomy.meshes import MeshDistance, SurfaceMesh, box_surface
 from lungaccess.judging.checking.space import Select, labels_at
 from lungaccess.judging.checking.tiles import Cluster, Tiles
 
-FIRST_NEIGHBOURS = 16
-"""Nearest centres asked for at first: mostly enough to be sure of the nearest box."""
-STRIDE = 16
-"""Along a path every so manieth point is measured first; the others are skipped where it tells enough."""
-
 
 class Boxes:
     """One structure of a lung as solid boxes.
@@ -52,7 +47,8 @@ class Boxes:
         neighbours are added until that is sure.
         """
         out = known.copy()
-        left, count = np.arange(len(local)), min(FIRST_NEIGHBOURS, len(cluster.voxels))
+        # Nearest centres asked for at first: mostly enough to be sure of the nearest box.
+        left, count = np.arange(len(local)), min(16, len(cluster.voxels))
         centres = np.vstack([cluster.centres_mm, np.full(3, np.inf)])
         while len(left):
             within = float(out[left].max()) + self._half_diagonal
@@ -97,7 +93,8 @@ class PathDistances:
         The distance changes no faster than one walks along the path.
         """
         points = self._points
-        chosen = np.unique(np.append(np.arange(0, len(points), STRIDE), len(points) - 1))
+        # Along a path every so manieth point is measured first; the others are skipped where it tells enough.
+        chosen = np.unique(np.append(np.arange(0, len(points), 16), len(points) - 1))
         exact = self._boxes.distance_mm(points[chosen])
         walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
         behind = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1

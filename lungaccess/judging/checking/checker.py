@@ -22,9 +22,6 @@ from lungaccess.problem.system import System
 if TYPE_CHECKING:
     from anatomy.lung import Lung
 
-ROUNDING = 1e-9
-"""A function of the same plan may differ by this share of its value on another machine."""
-
 
 class Checker:
     """Checks many plans of one lung: what follows from the lung alone is computed once.
@@ -89,4 +86,5 @@ def check_functions(plan: Plan, lung: "Lung", found: Findings) -> None:
             found.unchecked(f"goals.{name}", "no such goal is known here: import the code that registers it")
             continue
         value = goal.computed(plan, lung)
-        found.agrees(f"goals.{name}", stated, value, ROUNDING * abs(value), goal.unit)
+        # A function of the same plan may differ by this share of its value on another machine.
+        found.agrees(f"goals.{name}", stated, value, 1e-9 * abs(value), goal.unit)

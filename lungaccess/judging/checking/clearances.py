@@ -17,8 +17,6 @@ Case = TypeVar("Case", bound=tuple[Any, ...])
 
 CLEARANCE_TOLERANCE_MM = 1e-3
 """A planner may keep exactly the required clearance, so that the check may find a micrometre less."""
-BEYOND_MM = 1.0
-"""Distances up to this much beyond what is required are measured with FCL, larger ones at samples alone."""
 
 MEANING = {
     "vessel": "axis to vessels",
@@ -28,14 +26,7 @@ MEANING = {
     "other_airway": "axis to airways of other branches, while the pierced wall is exempt",
     "lumen": "axis to any lumen, while the pierced wall is exempt",
 }
-UNDERSTATED_MM = 0.25
-"""A planner may state its proved lower bound: less than the truth by a voxel's diagonal and this."""
 
-STATED_TOLERANCE_MM = 0.05
-"""A stated clearance is a lower bound; where it was sampled, it may be this much above the recomputed one."""
-
-STATED_MM = 5.0
-"""A clearance beyond this may be stated as no more than this."""
 
 REACH_MM = 20.0
 """Clearances are recomputed up to this distance; what lies farther counts as this far."""
@@ -63,7 +54,8 @@ def check_clear(
     if not limited:
         found.measured(name, least, "mm", f"{words}, which may be crossed")
         return least
-    within = float(needed_mm.max()) + BEYOND_MM
+    # Distances up to this much beyond what is required are measured with FCL, larger ones at samples alone.
+    within = float(needed_mm.max()) + 1.0
     gap = distances.segments_mm(within)
     worst = int((gap - needed_mm).argmin())
     value, limit = float(gap[worst]), float(needed_mm[worst])
@@ -86,6 +78,9 @@ def check_stated_clearance(
     least, most = range_mm
     label = f"{stage}.clearance.{name}.stated"
     detail = "not more than recomputed"
-    found.at_most(label, min(stated, REACH_MM), most, "mm", detail, STATED_TOLERANCE_MM)
-    slack, detail = diagonal_mm + UNDERSTATED_MM, "not much less than recomputed"
-    found.at_least(f"{label}.least", stated, min(least, STATED_MM), "mm", detail, slack)
+    # A stated clearance is a lower bound; where it was sampled, it may be this much above the recomputed one.
+    found.at_most(label, min(stated, REACH_MM), most, "mm", detail, 0.05)
+    # A planner may state its proved lower bound: less than the truth by a voxel's diagonal and this.
+    slack, detail = diagonal_mm + 0.25, "not much less than recomputed"
+    # A clearance beyond this may be stated as no more than this.
+    found.at_least(f"{label}.least", stated, min(least, 5.0), "mm", detail, slack)

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
 
 WALL_ZONE_MM = 1.0
-LEAVING_DEG = 10.0
-"""The rule at the wall, stated a second time: docs/theory/proofs.md."""
 
 
 def check_needle_alone(
@@ -121,7 +119,8 @@ def _check_exit(
     found.at_least("needle.clearance.other_airway", gap, required, "mm", "to branches not pierced", tolerance)
     kept = np.full(len(points), system.track_radius_mm)
     if at_wall:
-        kept = np.clip(np.sin(np.radians(LEAVING_DEG)) * (arc - WALL_ZONE_MM), 0.0, kept)
+        # The rule at the wall, stated a second time: docs/theory/proofs.md.
+        kept = np.clip(np.sin(np.radians(10.0)) * (arc - WALL_ZONE_MM), 0.0, kept)
         points, kept = points[arc >= WALL_ZONE_MM - TINY_MM], kept[arc >= WALL_ZONE_MM - TINY_MM]
     if not len(points):
         return

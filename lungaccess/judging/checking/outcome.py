@@ -20,20 +20,14 @@ if TYPE_CHECKING:
 
 COST_TOLERANCE = 0.02
 """Share by which a planner's sampled integral may differ from the finer one of the check."""
-COST_STEP_MM = 0.1
-"""Step of the integral: small against the distances over which a clearance changes."""
 COST_REACH_MM = 100.0
 """No point of a lung is farther than this from the pleura, so that every clearance is found."""
-CLEARANCE_FLOOR_MM = 0.1
-"""1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1]."""
 GREATEST_VOXEL_COST = 1.0
 """Of one voxel: so much may two sums differ because one grazes a voxel that the other does not."""
 GRAZED_MM = 1e-9
 """A voxel that is crossed for less than this is met at an edge only, by rounding."""
 LATER_COSTS = frozenset({"voxel_sum", "tissue"})
 """Costs that a plan may leave out: one of an earlier version, or whose tubes cross an infinite cost."""
-ROUNDING = 1e-12
-"""Sums of four numbers agree to this share of them, whatever the order."""
 
 
 def check_tubes_at_target(
@@ -132,7 +126,8 @@ def check_costs(
         and weights is not None
     ):
         total = sum(weight * stated[name] for name, weight in weights.items())
-        tolerance = ROUNDING * abs(total)
+        # Sums of four numbers agree to this share of them, whatever the order.
+        tolerance = 1e-12 * abs(total)
         found.agrees("costs.objective.sum", stated[plan.objective], total, tolerance, "")
     for name, (value, tolerance, unit) in costs.items():
         if name in stated:
@@ -163,14 +158,16 @@ def inverse_clearance(plan: Plan, environment: Environment, curve: Curve) -> flo
     `COST_REACH_MM`, which is farther than any point of a lung lies from its pleura.
     """
     length = float(curve.arc_mm[-1])
-    arc = np.linspace(0.0, length, max(int(np.ceil(length / COST_STEP_MM)), 1) + 1)
+    # Step of the integral: small against the distances over which a clearance changes.
+    arc = np.linspace(0.0, length, max(int(np.ceil(length / 0.1)), 1) + 1)
     points = np.stack([np.interp(arc, curve.arc_mm, curve.points[:, axis]) for axis in range(3)], axis=1)
     obstacles = has(forbidden_bits(plan))
     clearance = environment.boxes(obstacles, REACH_MM).distance_mm(points)
     far = clearance >= REACH_MM
     if far.any():
         clearance[far] = environment.boxes(obstacles, COST_REACH_MM).distance_mm(points[far])
-    return float(np.trapezoid(1.0 / np.maximum(clearance, CLEARANCE_FLOOR_MM), arc))
+    # 1 / clearance counts a clearance as no less than this [Kuntz2015, eq. 1].
+    return float(np.trapezoid(1.0 / np.maximum(clearance, 0.1), arc))
 
 
 def tissue(plan: Plan, environment: Environment, curve: Curve) -> float:

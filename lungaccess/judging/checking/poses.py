@@ -11,8 +11,6 @@ ANGLE_TOLERANCE_RAD = 1e-4
 """Over 100 mm of needle an angle of this size moves the tip by 0.01 mm."""
 LENGTH_TOLERANCE_MM = 1e-6
 """Lengths are sums of a few numbers and agree up to rounding."""
-ROTATION_TOLERANCE = 1e-6
-"""Rounding of a matrix that is the product of a hundred rotations is less by far."""
 
 
 def angle_between(a: Float, b: Float) -> Float:
@@ -25,7 +23,8 @@ def check_rigid(name: str, pose: Float, found: Findings) -> bool:
     """Record whether a 4x4 matrix is a rigid, right-handed pose."""
     rotation = pose[:3, :3]
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    rigid = error <= ROTATION_TOLERANCE and float(np.linalg.det(rotation)) > 0.0
+    # Rounding of a matrix that is the product of a hundred rotations is less by far.
+    rigid = error <= 1e-6 and float(np.linalg.det(rotation)) > 0.0
     rigid &= bool(np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]))
     return found.true(f"{name}.rigid", rigid, f"deviation from a rotation {error:.2g}")
 

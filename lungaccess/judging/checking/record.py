@@ -19,8 +19,6 @@ from lungaccess.problem.system import System, preset_named, system_fingerprint
 if TYPE_CHECKING:
     from anatomy.lung import Lung
 
-NUMBER_TOLERANCE = 1e-9
-"""Stated and recomputed sums of radii and margins agree up to rounding."""
 STRUCTURES = {"airway", "vessel", "outside", "fissure"}
 """The structures from which a plan may state clearances."""
 MAX_NUMBER = 1e5
@@ -127,7 +125,8 @@ def _check_required(plan: Plan, found: Findings) -> None:
     stated = plan.required_clearance_mm
     if found.true("clearance.required.names", set(stated) == set(wanted), ", ".join(stated)):
         for name, value in wanted.items():
-            found.agrees(f"clearance.required.{name}", stated[name], value, NUMBER_TOLERANCE, "mm")
+            # Stated and recomputed sums of radii and margins agree up to rounding.
+            found.agrees(f"clearance.required.{name}", stated[name], value, 1e-9, "mm")
 
 
 def wanted_clearance_mm(system: System) -> dict[str, float]:

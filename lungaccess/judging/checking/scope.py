@@ -21,20 +21,8 @@ from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.problem.system import System
 from stages.scope.device import Bronchoscope
 
-START_MM = 30.0
-"""A motion begins at most so far from the root of the airway tree: a trachea is about 100 mm long."""
-AXIS_TOLERANCE_MM = 0.01
-"""Entries are points of the airway tree, so that only rounding lies between them."""
 MAX_ANGLE_RAD = np.deg2rad(45.0)
 """A scope looks along the airway, within so much: more means sideways."""
-MAX_OFF_AXIS_MM = 3.0
-"""Proofs that a target is unreachable rule out tips up to here from the nearest point of the airway tree."""
-BODY_STEP_MM = 0.1
-"""Spacing of the points of the body among which the nearest to the carina is looked for."""
-CARINA_TOLERANCE_MM = 0.1
-"""The place of the body that is nearest to a point, by two samplings, agrees to less than this."""
-REACH_MM = 1.0
-"""Distances are measured so far beyond what is needed: as far as the first cells of a motion reach."""
 MARGIN_TOLERANCE_MM = 0.05
 """The stated margin may be so much too large."""
 CURVATURE_TOLERANCE_PER_MM = 1e-9
@@ -95,9 +83,11 @@ def _check_start(motion: Motion, environment: Environment, found: Findings) -> N
     nearest = int(environment.nearest_tree_points(entry[:3, 3], 1)[0])
     found.true("scope.start.trachea", tree.branch_of_point[nearest] == 0, "branch at the entry")
     gap = float(np.linalg.norm(entry[:3, 3] - tree.points_lps[nearest]))
-    found.at_most("scope.start", gap, AXIS_TOLERANCE_MM, "mm", "entry to the axis of the trachea")
+    # Entries are points of the airway tree, so that only rounding lies between them.
+    found.at_most("scope.start", gap, 0.01, "mm", "entry to the axis of the trachea")
     depth = float(tree.distance_from_root_mm[nearest])
-    found.at_most("scope.start.depth", depth, START_MM, "mm", "root of the airway tree to the entry")
+    # A motion begins at most so far from the root of the airway tree: a trachea is about 100 mm long.
+    found.at_most("scope.start.depth", depth, 30.0, "mm", "root of the airway tree to the entry")
     tilt = float(angle_between(entry[:3, 2], tree.tangents[nearest]))
     found.at_most("scope.start.direction", tilt, float(MAX_ANGLE_RAD), "rad", "entry to the trachea")
 
@@ -109,7 +99,8 @@ def _check_fit(
     radius = 0.5 * device.outer_diameter_mm
     needed = radius + device.lumen_margin_mm
     stated = scope.min_lumen_margin_mm + radius
-    boxes = environment.boxes(not_lumen, max(needed, stated) + REACH_MM)
+    # Distances are measured so far beyond what is needed: as far as the first cells of a motion reach.
+    boxes = environment.boxes(not_lumen, max(needed, stated) + 1.0)
     gap = least_gap_mm(motion, boxes, needed - POSITION_TOLERANCE_MM, stated - MARGIN_TOLERANCE_MM)
     found.at_least(
         "scope.fits",
@@ -131,9 +122,8 @@ def _check_end(motion: Motion, environment: Environment, found: Findings) -> Non
     tree, tip = environment.lung.tree, motion.tip
     nearest = int(environment.nearest_tree_points(tip[:3, 3], 1)[0])
     gap = float(np.linalg.norm(tip[:3, 3] - tree.points_lps[nearest]))
-    found.at_most(
-        "scope.tip.off_axis", gap, MAX_OFF_AXIS_MM, "mm", "tip to the airway tree", POSITION_TOLERANCE_MM
-    )
+    # Proofs that a target is unreachable rule out tips up to here from the nearest point of the airway tree.
+    found.at_most("scope.tip.off_axis", gap, 3.0, "mm", "tip to the airway tree", POSITION_TOLERANCE_MM)
     tilt = float(angle_between(tip[:3, 2], tree.tangents[nearest]))
     found.at_most(
         "scope.tip.forward", tilt, float(MAX_ANGLE_RAD), "rad", "tip to the airway", ANGLE_TOLERANCE_RAD
@@ -157,7 +147,8 @@ def _check_statements(
     states, lengths = motion.body_pieces()
     found.agrees("scope.length", scope.length_mm, float(lengths.sum()), POSITION_TOLERANCE_MM, "mm")
     beyond = beyond_carina_mm(motion, tree)
-    found.agrees("scope.length_from_carina", scope.length_from_carina_mm, beyond, CARINA_TOLERANCE_MM, "mm")
+    # The place of the body that is nearest to a point, by two samplings, agrees to less than this.
+    found.agrees("scope.length_from_carina", scope.length_from_carina_mm, beyond, 0.1, "mm")
     most = float(np.hypot(*motion.bends[states].T).max())
     found.agrees("scope.curvature", scope.max_curvature_per_mm, most, CURVATURE_TOLERANCE_PER_MM, "1/mm")
 
@@ -172,15 +163,10 @@ def branches_to(tree: AirwayTree, branch: int) -> list[int]:
 
 def beyond_carina_mm(motion: Motion, tree: AirwayTree) -> float:
     """Return the length of the body beyond the place of it that is nearest to the carina."""
-    points, along = motion.body(BODY_STEP_MM)
+    # Spacing of the points of the body among which the nearest to the carina is looked for.
+    points, along = motion.body(0.1)
     passed = float(along[np.linalg.norm(points - tree.carina_lps, axis=1).argmin()])
     return float(along[-1]) - passed
-
-
-FIRST_MM = 1.0
-"""Half the length of cells to begin with: about the room that a scope has in the airways it fits into."""
-SURE_MM = 1e-3
-"""A cell whose places differ by less is not cut further."""
 
 
 @frozen_record
@@ -233,7 +219,8 @@ def least_gap_mm(motion: Motion, boxes: Boxes, needed_mm: float, stated_mm: floa
         if not kept:
             break
         arc, swept = cells.half_mm, swept_mm(motion, cells)
-        open_ = (gaps - arc - swept < max(kept)) & (arc + swept > SURE_MM)
+        # A cell whose places differ by less is not cut further.
+        open_ = (gaps - arc - swept < max(kept)) & (arc + swept > 1e-3)
         cells = cells.pick(open_).halves(swept[open_] > arc[open_])
     return least
 
@@ -256,7 +243,8 @@ def first_cells(motion: Motion) -> Cells:
     half_time = np.concatenate([np.zeros(len(slides)), np.full(len(in_place), 0.5), [0.0]])
     order = np.argsort(states, kind="stable")
     states, total, half_time = states[order], total[order], half_time[order]
-    counts = np.maximum(np.ceil(0.5 * total / FIRST_MM).astype(np.int64), 1)
+    # Half the length of cells to begin with: about the room that a scope has in the airways it fits into.
+    counts = np.maximum(np.ceil(0.5 * total / 1.0).astype(np.int64), 1)
     half = np.repeat(0.5 * total / counts, counts)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     return Cells(

@@ -9,8 +9,6 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 
-SMALL_RAD = 1e-2
-"""Below this angle the coefficients of a screw come from their series, whose next term is below 1e-12."""
 TINY_MM = 1e-9
 TINY_RAD = 1e-9
 """A smaller change between two states is rounding."""
@@ -114,7 +112,8 @@ def screws(bends: Float, lengths_mm: Float) -> Float:
     spin[:, 0, 2], spin[:, 1, 2] = bends[:, 0], bends[:, 1]
     spin[:, 2, 0], spin[:, 2, 1] = -bends[:, 0], -bends[:, 1]
     angle = np.hypot(bends[:, 0], bends[:, 1]) * s
-    small = np.abs(angle) < SMALL_RAD
+    # Below this angle the coefficients of a screw come from their series, whose next term is below 1e-12.
+    small = np.abs(angle) < 1e-2
     safe = np.where(small, 1.0, angle)
     square = angle**2
     first = np.where(small, 1.0 - square / 6.0 + square**2 / 120.0, np.sin(safe) / safe)

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 TURN_TOLERANCE_RAD = 1e-3
 """The turn is summed over thousands of small steps, whose rounding adds up to less than this."""
-LIMIT_TOLERANCE = 1e-9
-"""A planner may use all of a limit, so that rounding alone may exceed it, by this share."""
 
 
 def check_needle(
@@ -94,7 +92,8 @@ def check_limits(pieces: Sequence[Piece], device: Needle, curve: Curve, found: F
     curvature = [piece.curvature_per_mm for piece in pieces]
     bound = device.max_curvature_per_mm
     detail = "tightest arc"
-    found.at_most("needle.curvature", max(curvature), bound, "1/mm", detail, LIMIT_TOLERANCE * bound)
+    # A planner may use all of a limit, so that rounding alone may exceed it, by this share.
+    found.at_most("needle.curvature", max(curvature), bound, "1/mm", detail, 1e-9 * bound)
     found.at_least("needle.curvature.sign", min(curvature), 0.0, "1/mm", "a bend is turned by its roll")
     found.at_least("needle.arc_length", min(piece.length_mm for piece in pieces), 1e-9, "mm", "shortest arc")
     turned, angle = turning(curve)

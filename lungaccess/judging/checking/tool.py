@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 
 PARTS = 6
 """A voxel is cut into so many parts along each axis where a volume is counted."""
-LENGTH_TOLERANCE_MM = 0.3
-"""The planner knows where a core enters and leaves the nodule, and voxels at the edge, to 0.1 mm each."""
-VOLUME_TOLERANCE = 0.1
-"""Share of what is wanted by which volumes may differ: the planner counts few points of the tool."""
 BALL_RADIUS_MM = 5.0
 """A target in no nodule of a mask counts as the centre of a nodule of this radius."""
 BALL_VOXEL_MM = 0.25
@@ -36,12 +32,14 @@ def check_tool(plan: Plan, lung: Lung, lps_from_end: Float, found: Findings) -> 
     ijk_from_tip = np.linalg.inv(frame) @ lps_from_end
     edges_mm = np.linalg.norm(frame[:3, :3], axis=0)
     if tool.unit == "mm":
-        value, tolerance = _length_in(tool, voxels, ijk_from_tip), LENGTH_TOLERANCE_MM
+        # The planner knows where a core enters and leaves the nodule, and voxels at the edge, to 0.1 mm each.
+        value, tolerance = _length_in(tool, voxels, ijk_from_tip), 0.3
     else:
         inside_mm3 = float(_share_in(tool, voxels, ijk_from_tip).sum() * np.prod(edges_mm))
         whole_mm3 = len(voxels) * float(np.prod(edges_mm))
         value = inside_mm3 if tool.unit == "mm3" else inside_mm3 / whole_mm3
-        tolerance = VOLUME_TOLERANCE * tool.least
+        # Share of what is wanted by which volumes may differ: the planner counts few points of the tool.
+        tolerance = 0.1 * tool.least
     found.at_least("tool.tissue", value, tool.least, tool.unit, f"wanted: {tool.words}", tolerance)
 
 

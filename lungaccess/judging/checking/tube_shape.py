@@ -20,10 +20,6 @@ if TYPE_CHECKING:
 
 SHAPE_TOLERANCE_MM = 1e-3
 """Two integrations of one equilibrium differ by far less; so much more than stated may the arcs be off."""
-DETERMINANT_TOLERANCE = 0.05
-"""The least on the way is met by steps, and those of a planner and of the check are others."""
-SPACING_MM = 0.5
-"""Spacing of the points of a body that are compared with its final place."""
 
 
 def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
@@ -52,9 +48,8 @@ def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
         found.true("tube.stable", False, str(error))
         return None
     found.at_least("tube.stable", derived.least_determinant, 0.0, "", "least determinant on the way")
-    found.agrees(
-        "tube.stable.stated", shape.least_determinant, derived.least_determinant, DETERMINANT_TOLERANCE, ""
-    )
+    # The least on the way is met by steps, and those of a planner and of the check are others.
+    found.agrees("tube.stable.stated", shape.least_determinant, derived.least_determinant, 0.05, "")
     off_mm = _check_arcs(plan, curve, derived, found)
     _check_strain(plan, derived, found)
     return off_mm + _replay(plan, derived, found)
@@ -91,7 +86,8 @@ def _replay(plan: Plan, derived: "DerivedShape", found: Findings) -> float:
     """
     final, sweep, leader = derived.points_mm, 0.0, 0.0
     for body in derived.way:
-        arc = np.linspace(0.0, body[-1, 0], max(int(np.ceil(body[-1, 0] / SPACING_MM)), 1) + 1)
+        # Spacing of the points of a body that are compared with its final place.
+        arc = np.linspace(0.0, body[-1, 0], max(int(np.ceil(body[-1, 0] / 0.5)), 1) + 1)
         points = np.stack([np.interp(arc, body[:, 0], axis) for axis in body[:, 1:].T], axis=1)
         off = distance_to_polyline(points, final)
         leader = max(leader, float(off.max()))

@@ -19,14 +19,8 @@ if TYPE_CHECKING:
 
 EXIT_TOLERANCE_MM = 0.02
 """Two bisections of the border of a voxel, on curves that differ by micrometres, agree to less than this."""
-BISECTIONS = 20
-"""The spacing of the samples, halved so often, is less than a nanometre."""
 SAMPLES = 25
 """Samples in a step of the curve, 0.002 mm apart: voxel corners thinner than the step are found."""
-CORNER_MM = 0.05
-"""An axis that is out of the lumen for no more than this cuts the corner of a voxel: not an exit."""
-CORNER_TOLERANCE_MM = 0.005
-"""Both ends of such a stretch are known to a sample."""
 SLIVER_MM = 0.03
 """Lumen that is met for less than this behind the exit may be overlooked by a search point by point."""
 
@@ -34,12 +28,6 @@ WALL_ANGLE_TOLERANCE_RAD = 0.05
 """The centroid of the lumen's voxels jumps where one of them enters the ball; the angle by less than this."""
 NORMAL_RADIUS_MM = 2.5
 """A ball of several voxels: the steps of the mask average out, and the bronchus is still nearly straight."""
-
-BRANCH_ZONE_MM = 0.25
-"""The pierced branch is that of a lumen voxel which the axis meets in this last length before the exit."""
-
-RUN_SLACK_MM = 0.04
-"""A planner may count steps of half of this in which the body comes as near as half of this to the wall."""
 
 
 @frozen_record
@@ -72,9 +60,12 @@ def check_exit(plan: Plan, lung: "Lung", curve: Curve, found: Findings) -> Exit 
         return None
     last, out_mm = _last_in_lumen(samples, stated.arc_length_mm)
     detail = "longest stretch out of the lumen before the exit; so far a corner of a voxel is cut"
-    found.at_most("tube.one_exit", out_mm, CORNER_MM, "mm", detail, CORNER_TOLERANCE_MM)
+    # An axis that is out of the lumen for no more than this cuts the corner of a voxel: not an exit.
+    # Both ends of such a stretch are known to a sample.
+    found.at_most("tube.one_exit", out_mm, 0.05, "mm", detail, 0.005)
     arc_mm, point = _border(lung, samples, last)
-    near = samples.in_lumen & (np.abs(samples.arc_mm - samples.arc_mm[last]) <= BRANCH_ZONE_MM)
+    # The pierced branch is that of a lumen voxel which the axis meets in this last length before the exit.
+    near = samples.in_lumen & (np.abs(samples.arc_mm - samples.arc_mm[last]) <= 0.25)
     branches = {int(b) for b in np.unique(samples.branch[: last + 1][near[: last + 1]])}
     found.true("tube.exit.branch", stated.branch in branches, f"{stated.branch} against {sorted(branches)}")
     outside_mediastinum = stated.branch in np.flatnonzero(~lung.tree.mediastinal)
@@ -144,7 +135,8 @@ def _border(lung: "Lung", samples: _Samples, last: int) -> tuple[float, Float]:
     """Return arc length and position of the border of the lumen behind a sample, by bisection."""
     a, b = samples.points[last], samples.points[last + 1]
     inside, outside = 0.0, 1.0
-    for _ in range(BISECTIONS):
+    # The spacing of the samples, halved so often, is less than a nanometre.
+    for _ in range(20):
         middle = 0.5 * (inside + outside)
         if labels_at(lung, a + middle * (b - a))[0] & structures.LUMEN:
             inside = middle
@@ -198,7 +190,8 @@ def wall_run_mm(plan: Plan, environment: Environment, curve: Curve, way_out: Exi
     distance = walls.distance_mm(curve.points[ends])
     step = np.diff(curve.arc_mm)[behind]
     nearer = [np.clip(radius - each, 0.0, step) for each in (distance[:-1], distance[1:])]
-    free = distance - RUN_SLACK_MM
+    # A planner may count steps of half of this in which the body comes as near as half of this to the wall.
+    free = distance - 0.04
     farther = [np.clip(each - radius, 0.0, step) for each in (free[:-1], free[1:])]
     least = float(np.minimum(nearer[0] + nearer[1], step).sum())
     most = float((step - np.minimum(farther[0] + farther[1], step)).sum())

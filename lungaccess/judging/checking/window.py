@@ -30,10 +30,6 @@ if TYPE_CHECKING:
 
 TIP_BALL_MM = 10.0
 """Tissue so near to the tip of the scope turns it."""
-TIP_STEP_MM = 2.5
-"""Distance of the places that are looked at in it."""
-CONVERGED_MM = 1e-8
-"""A step below this ends the search for a place."""
 STEPS = 50
 """Of the fixed point that pulls a point back; each takes a third of the error or less in a lung."""
 
@@ -45,7 +41,8 @@ class Breath:
         side = 1 if target_lps[0] > motion.middle_x_mm else 0
         self._motion, self._nodes = motion, np.moveaxis(np.asarray(motion.nodes[side]), -1, 0)
         self._tip = np.asarray(tip_lps, dtype=np.float64)
-        steps = np.arange(-TIP_BALL_MM, TIP_BALL_MM + 1e-9, TIP_STEP_MM)
+        # Distance of the places that are looked at in it.
+        steps = np.arange(-TIP_BALL_MM, TIP_BALL_MM + 1e-9, 2.5)
         ball = np.array([(x, y, z) for x in steps for y in steps for z in steps])
         ball = ball[(ball**2).sum(axis=1) <= TIP_BALL_MM**2]
         with_constant = np.column_stack([ball, np.ones(len(ball))])
@@ -72,7 +69,8 @@ class Breath:
         share, found = self.share(phase), np.asarray(points)
         for _ in range(STEPS):
             before, found = found, points - share * self.displacement(found)
-            if float(np.abs(found - before).max(initial=0.0)) < CONVERGED_MM:
+            # A step below this ends the search for a place.
+            if float(np.abs(found - before).max(initial=0.0)) < 1e-8:
                 break
         return found
 
@@ -82,24 +80,12 @@ class Breath:
         return np.asarray((points - self._tip) @ (left @ right).T + self.moved(self._tip[None], phase))
 
 
-LARGEST_TOLERANCE_MM = 2.0
-"""The promise of a window is an end within this of the moving target."""
-PHASE_STEP = 0.05
-"""Between two phases that are looked at a device moves against tissue by less than a millimetre, mostly."""
-TARGET_STEPS = 200
-"""Phases at which the distance to the target is looked at, which costs nothing."""
 MESH_TOLERANCE_MM = 0.005
 """A deformed face is flat here: off by a voxel's edge times what the gradient changes on it."""
 NEAR_MM = 0.5
 """Voxels are meshed that come nearer than what is required and this in any phase."""
 CORNER_MM = 0.06
 """An axis in the airway cuts corners by 0.05 mm; a sample may see a little more."""
-FLATTEST_DEG = 10.0
-"""A wall that is pierced at less counts as pierced at this angle."""
-HOLE_TOLERANCE_MM = 0.02
-"""The point of the exit is known to this."""
-VARIES_MM = 0.01
-"""What is to be kept from straying tissue is taken as equal along pieces over which it varies by this."""
 ROUNDING = 1e-9
 
 
@@ -136,7 +122,8 @@ def check_window(plan: Plan, environment: Environment, found: Findings) -> None:
     detail = f"{window.motion_source}; phase of the masks {window.masks_phase:g}"
     found.true("window.source", same == own, detail)
     detail = "largest distance to the moving target that is promised"
-    found.at_most("window.tolerance", window.tolerance_mm, LARGEST_TOLERANCE_MM, "mm", detail)
+    # The promise of a window is an end within this of the moving target.
+    found.at_most("window.tolerance", window.tolerance_mm, 2.0, "mm", detail)
     if window.warning_only:
         found.unchecked("window.model", "the motion is that of other people's lungs: a warning, no promise")
     _check_ends(plan, found)
@@ -154,7 +141,8 @@ class _Devices:
         way_out = plan.tube.exit.arc_length_mm
         pieces = shapes.tube_pieces(plan)
         self.hole_mm = float(shapes.radius_at(plan, np.array([way_out]))[0])
-        angle = max(plan.tube.exit.wall_angle_rad, np.deg2rad(FLATTEST_DEG))
+        # A wall that is pierced at less counts as pierced at this angle.
+        angle = max(plan.tube.exit.wall_angle_rad, np.deg2rad(10.0))
         self.zone_mm = WALL_ZONE_MM + self.hole_mm / float(np.sin(angle))
         for at in (way_out, way_out + self.zone_mm, *plan.tube.insertions_mm(plan.system.tubes)):
             pieces = cut_at(pieces, at)
@@ -251,7 +239,8 @@ def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings
     window = plan.window
     if window is None or not len(window.phases):
         return
-    phases = np.concatenate([np.linspace(a, b, TARGET_STEPS) for a, b in window.phases])
+    # Phases at which the distance to the target is looked at, which costs nothing.
+    phases = np.concatenate([np.linspace(a, b, 200) for a, b in window.phases])
     most = max(_miss(plan, breath, devices, float(phase)) for phase in phases)
     detail = f"end of the devices to the moving target, at {len(phases)} phases of the window"
     most += window.hysteresis * (float(devices.from_tip_mm(devices.end)) + most)
@@ -261,7 +250,8 @@ def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings
     most = float(np.linalg.norm(np.concatenate(shifts), axis=1).max())
     detail = "shift of the tubes in the hole in the airway wall; at most their radius"
     most += window.hysteresis * (float(devices.from_tip_mm(hole[0])) + most)
-    found.at_most("window.hole", most, devices.hole_mm, "mm", detail, HOLE_TOLERANCE_MM)
+    # The point of the exit is known to this.
+    found.at_most("window.hole", most, devices.hole_mm, "mm", detail, 0.02)
 
 
 def _miss(plan: Plan, breath: Breath, devices: _Devices, phase: float) -> float:
@@ -276,10 +266,11 @@ def _check_clear(
     window = plan.window
     if window is None or not len(window.phases):
         return
+    # Between two phases that are looked at a device moves against tissue by less than a millimetre, mostly.
     phases = [
         float(phase)
         for a, b in window.phases
-        for phase in np.linspace(a, b, max(int(np.ceil((b - a) / PHASE_STEP)), 1) + 1)
+        for phase in np.linspace(a, b, max(int(np.ceil((b - a) / 0.05)), 1) + 1)
     ]
     spare, worst, inside, airway = np.inf, "", 0, 0
     for part in devices.parts():
@@ -350,7 +341,8 @@ def _kept_mm(required: Float | float, share: float, lever_mm: Float) -> Float:
 
 def _least_spare(mesh: MeshDistance, points: Float, kept: Float) -> float:
     """Return the least of distance less `kept` `(N,)` along points, by pieces over which it hardly varies."""
-    pieces = 1 + int(np.ptp(kept) / VARIES_MM)
+    # What is to be kept from straying tissue is taken as equal along pieces over which it varies by this.
+    pieces = 1 + int(np.ptp(kept) / 0.01)
     ends = np.linspace(0, len(points) - 1, pieces + 1).astype(int)
     return min(
         mesh.polyline_distance_mm(points[a : b + 1]) - float(kept[a : b + 1].min())

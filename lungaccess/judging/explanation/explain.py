@@ -37,8 +37,6 @@ from stages.needle import DEFAULT, Objective, needle_environment
 
 DEFAULT_TIME_S = 10.0
 """All parts of a patient whose atlases are cached take about so long, and a user still waits."""
-ITERATIONS = 20
-"""Each preset is searched this long: those that reach the target mostly do so with a direct arc."""
 NO_NEEDLE = "the system has no needle"
 
 SHARED, KEPT, TO_BE_MADE = range(3)
@@ -241,7 +239,8 @@ class Explainer:
             atlas = replace(self._atlas, system=system)
         else:
             atlas = self._atlas_of(system, self._alive_share)
-        asked = Request.by_cost(replace(task, system=system), limits=Limits(iterations=ITERATIONS))
+        # Each preset is searched this long: those that reach the target mostly do so with a direct arc.
+        asked = Request.by_cost(replace(task, system=system), limits=Limits(iterations=20))
         plans = run(asked, atlas=atlas, counterfactuals=False)
         tried.append(first_attempt(plans, system, self._checker))
 

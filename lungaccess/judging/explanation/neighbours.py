@@ -22,8 +22,6 @@ from stages.needle import DIRECT
 
 RADII_MM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 11.0, 16.0, 22.0, 30.0, 40.0)
 """Radii of the spheres on which points are tried; beyond the last, a point is no neighbour."""
-HALVINGS = 4
-"""The distance between the sphere that is reached and the one before it is halved this often."""
 AROUND_MM = 20.0
 """Radius of the surroundings of a target whose reached share is told."""
 DRAWS = 120
@@ -98,7 +96,8 @@ class Surroundings:
     def _nearer(self, direction: Float, low: float, high: float, alive: Callable[[], None]) -> float:
         """Return the least distance along a direction that is reached, by halving."""
         target = self._task.target.lps_mm
-        for _ in range(HALVINGS):
+        # The distance between the sphere that is reached and the one before it is halved this often.
+        for _ in range(4):
             alive()
             middle = 0.5 * (low + high)
             point = target + middle * direction

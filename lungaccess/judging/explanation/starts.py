@@ -10,9 +10,6 @@ from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled import DirectArcs
 from lungaccess.plans.evaluator import blocker_name
 
-CELL_MM = 4.0
-"""Starts in one cube of this side are shown as one: about the distance at which two dots are still two."""
-
 CLEAR, LIMITS, OUT_OF_REACH = "clear", "needs several arcs", "out of reach"
 FAILS = MappingProxyType(
     {
@@ -52,7 +49,8 @@ def map_starts(arcs: DirectArcs) -> StartMap:
     codes = np.array([names.index(_reason(int(label))) for label in labels], dtype=np.int64)
     why[arcs.in_workspace] = codes[of_arc.ravel()] if len(labels) else why[arcs.in_workspace]
     counted = np.bincount(why, minlength=len(names))
-    cells = np.floor(entries.positions / CELL_MM).astype(np.int64)
+    # Starts in one cube of this side are shown as one: about the distance at which two dots are still two.
+    cells = np.floor(entries.positions / 4.0).astype(np.int64)
     _cells, of_start = np.unique(cells, axis=0, return_inverse=True)
     of_start = of_start.ravel()
     count = int(of_start.max(initial=-1)) + 1

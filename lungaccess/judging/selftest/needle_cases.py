@@ -162,7 +162,8 @@ def no_path(rng: scenes.Random) -> scenes.Case:
     proof = NoPathProof(environment, Query(lps_from_start=path.lps_from_start, target=target))
     # The cubes, and the planes of the first one or two levels.
     for _ in range(25):
-        if proof.advance() or proof.states > MOST_STATES:
+        # Where there are more, the next planes take seconds in Python.
+        if proof.advance() or proof.states > 800:
             break
     denied = proof.outcome == "no path"
 
@@ -173,9 +174,6 @@ def no_path(rng: scenes.Random) -> scenes.Case:
     return scenes.Case(answers=np.array([denied, proof.states, proof.cell_mm]), contradiction=contradiction)
 
 
-"""The cubes, and the planes of the first one or two levels."""
-MOST_STATES = 800
-"""Where there are more, the next planes take seconds in Python."""
 SPACING_MM = 1.0
 
 

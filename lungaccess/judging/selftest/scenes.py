@@ -17,8 +17,6 @@ from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, FIELD_BITS, LUMEN, OUTSIDE, close_border
 
 Random = np.random.Generator
-NEAREST = 16
-"""Voxels whose centres are looked at first for the nearest box."""
 ROUNDING_MM = 1e-7
 """Distances of kernels and of numpy differ by less."""
 
@@ -106,7 +104,8 @@ def true_distances(labels: Labels, grid: Grid, points: Float, bits: int, exempt:
     local, centres, spacing = grid.ijk(points), np.argwhere(chosen), grid.spacing_mm
     out = np.full(len(points), np.inf)
     if len(centres) and len(points):
-        some = [*range(1, min(NEAREST, len(centres)) + 1)]
+        # Voxels whose centres are looked at first for the nearest box.
+        some = [*range(1, min(16, len(centres)) + 1)]
         away, voxels = cKDTree(centres * spacing).query(local * spacing, k=some)
         out = _to_boxes(local[:, None], centres[voxels], spacing)
         # A box whose centre is farther than these may yet be nearer.

@@ -19,8 +19,6 @@ ENTRY = pose([0.0, 0.0, -1.0], [0.0, 0.0, -1.0])
 NEEDED_MM = SCOPE.radius_mm + SCOPE.lumen_margin_mm
 TIMES, PLACES = 60, 25
 """Places of a change in place that are sampled: states, and points of the section in each."""
-LOST_MM = 0.15
-"""The proof gives up this much near a wall at most: half of a step, and of a part of a change."""
 
 
 def motions(rng: scenes.Random) -> scenes.Case:
@@ -48,7 +46,8 @@ def motions(rng: scenes.Random) -> scenes.Case:
         for motion, (margin, room) in zip(drawn, rooms, strict=True):
             least = float(scenes.true_distances(wall, grid, places(motion), AIRWAY).min()) - NEEDED_MM
             proved = max(margin, room)
-            if proved > max(least + scenes.ROUNDING_MM, -0.5) or (margin < 0.0 and least > LOST_MM):
+            # The proof gives up this much near a wall at most: half of a step, and of a part of a change.
+            if proved > max(least + scenes.ROUNDING_MM, -0.5) or (margin < 0.0 and least > 0.15):
                 return f"room {margin:.4f} mm, by long steps {room:.4f} mm; in samples {least:.4f} mm"
         return ""
 

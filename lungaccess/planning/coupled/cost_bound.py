@@ -33,18 +33,10 @@ from stages.needle.kernels import Limits
 from stages.tube import deployed, design_arrays, shape_of_arrays, tube_constants, tube_environment
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, TubeEnvironment, greatest_insertions
 
-BOXES_A_STEP = 500
-"""Boxes that are divided beside one step of a search: in two threads they take as long, or twice as long."""
 STEADY_STEPS, MOST_TIMES = 16, 8
 """After each so many steps without a cheaper plan they are so many more, up to so many times as many."""
-STEPS_TOGETHER = 4
-"""Steps of a search, at most, before both threads are waited for: more boxes take both more equally long."""
-TRIED_A_QUEUE = 2
-"""Deployments that are tried in one step, in the middle of the lowest boxes: less than a millisecond."""
 QUEUES = 2
 """Queues of boxes, each in a thread of its own: of every second scope tip.  More would be other plans."""
-INSERTION_SPACING_MM = 0.01
-"""Spacing of the insertions that are tried for the greatest one."""
 
 
 class LowerBound(Protocol):
@@ -142,7 +134,8 @@ class CostBound:
         if not self.queues:
             environment = _environment(self._task, self._tips, cost, self._beside_mm)
             insertions = np.zeros(int(self._tubes[MAX_EXTENSION] / INSERTION_STEP_MM) + 1)
-            greatest_insertions(self._tubes, self._tubes[MAX_EXTENSION], INSERTION_SPACING_MM, insertions)
+            # Spacing of the insertions that are tried for the greatest one.
+            greatest_insertions(self._tubes, self._tubes[MAX_EXTENSION], 0.01, insertions)
             x, y, z = self._task.target.lps_mm.tolist()
             for n in range(QUEUES):
                 tips = np.ascontiguousarray(self._tips[n::QUEUES])
@@ -161,10 +154,11 @@ class CostBound:
             return
         least = min(self.queues, key=lambda each: each.value)
         self._value, self.settled = min(least.value, self._left_out), least.settled
+        # Deployments that are tried in one step, in the middle of the lowest boxes: less than a millisecond.
         self._lowest = [
             (tip * QUEUES + n, rotation, outer, inner)
             for n, each in enumerate(self.queues)
-            for tip, rotation, outer, inner in each.lowest(TRIED_A_QUEUE)
+            for tip, rotation, outer, inner in each.lowest(2)
         ]
 
     def improve(self, cost: float, boxes: int) -> float:
@@ -280,8 +274,12 @@ class GapGoal:
         met = cost <= (1.0 + self._gap) * self.bound.value
         if not met:
             times = min(1 + self._steady // STEADY_STEPS, MOST_TIMES)
-            self._ahead = min(times, STEPS_TOGETHER)
-            self.bound.start(cost, times * BOXES_A_STEP)
+            # Steps of a search, at most, before both threads are waited for: more boxes take both more
+            # equally long.
+            self._ahead = min(times, 4)
+            # Boxes that are divided beside one step of a search: in two threads they take as long, or twice
+            # as long.
+            self.bound.start(cost, times * 500)
         return met
 
 
@@ -341,8 +339,6 @@ HALF_WIDTH = 0.8
 """Of the window in the plane of directions: up to 77 degrees from the middle."""
 THREADS = 2
 """Threads that fill a shell; their number changes nothing."""
-SPREAD = 1.1
-"""Cells are by this wider than the directions of paths change from a shell to the next near the target."""
 
 
 def cost_to_go(
@@ -365,7 +361,8 @@ def cost_to_go(
         limit: Costs above are not told apart.
     """
     kappa = limits.kappa
-    cell = 0.25 * kappa * SHELL_MM * SPREAD
+    # Cells are by this wider than the directions of paths change from a shell to the next near the target.
+    cell = 0.25 * kappa * SHELL_MM * 1.1
     cells = 2 * int(HALF_WIDTH / cell) + 1
     shells = int(min(limits.max_length_mm, 1.9 / kappa) / SHELL_MM)
     away = places - np.asarray(target_lps)

@@ -23,8 +23,6 @@ from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
 TIGHTEST_RADIUS_MM = 20.0
 THINNEST_NEEDLE_MM = 0.3
-LEAST_WALL_MM = 0.2
-"""A scope is thicker than its channel by so much at least."""
 RADIUS_STEP_MM = 1.0
 DIAMETER_STEP_MM = 0.05
 SCOPE_STEP_MM = 0.1
@@ -175,7 +173,8 @@ def _widest_mm(task: Task, motion: ScopeMotion, known_mm: float) -> float:
 
 def _thinnest_mm(scope: Bronchoscope) -> float:
     # Beyond these sizes no device is proposed.
-    return max(2.2, scope.channel_diameter_mm + LEAST_WALL_MM)
+    # A scope is thicker than its channel by so much at least.
+    return max(2.2, scope.channel_diameter_mm + 0.2)
 
 
 def _with_the_thinnest_scope(atlas: Atlas, progress: Callable[[float], None] | None) -> Atlas | None:

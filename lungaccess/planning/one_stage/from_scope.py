@@ -19,8 +19,6 @@ from stages.tube import Deployment, Enumerator, SiteEnumerator, design_arrays
 
 SEARCHED = 30
 """So many deployments get a search of the needle where no direct arc is clear: some ten milliseconds."""
-SEARCH_ITERATIONS = 300
-"""Iterations of such a search, as the first of the coupled search."""
 TRIES = 400
 """Variations of rotation, insertions and needle that improve the first answer: some milliseconds."""
 
@@ -145,7 +143,8 @@ class _FromScope:
                 seed=self._task.seed,
                 objective=self._evaluator.objective,
             )
-            search.advance(SEARCH_ITERATIONS)
+            # Iterations of such a search, as the first of the coupled search.
+            search.advance(300)
             if search.path is None:
                 continue
             if self._evaluator.allows(self._frame, deployment, search.path):

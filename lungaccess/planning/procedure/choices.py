@@ -23,15 +23,8 @@ from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_dev
 from stages.needle import needle_environment, workspace_lengths
 from stages.tube import Deployment, Deployments, DeploymentValidator, SiteEnumerator
 
-ENOUGH = 512
-"""Deployments towards the target that are looked at from a scope's tip: several times what is ranked, since
-most are refused."""
-KEPT = 12
-"""Deployments that are kept from one tip, the likeliest: further ones are alike or worse."""
 DRAWS = 16
 """Draws in which the tubes of a choice are followed: they compare choices, which have the same luck."""
-_SEED = 1
-"""Seed of these draws, which have nothing to do with those of a simulated procedure."""
 
 
 @frozen_record
@@ -59,7 +52,8 @@ def scope_frames(starts: Float) -> Float:
 
 def residual_rows(left: Residuals) -> Float:
     """Return what is left of the errors of scope and tubes in some draws, as kernels take it."""
-    rng = np.random.default_rng(_SEED)
+    # Seed of these draws, which have nothing to do with those of a simulated procedure.
+    rng = np.random.default_rng(1)
     drawn = {
         "scope_mm": left.scope_mm * rng.standard_normal((DRAWS, 3)),
         "tilt_rad": left.scope_rad * rng.standard_normal((DRAWS, 2)),
@@ -128,8 +122,10 @@ def offered(
     needle = system.require_needle("A choice of deployments")
     environment = needle_environment(lung, needle, system.margins, with_fissures=fissures)
     validator = DeploymentValidator(lung, system.tubes, system.margins, with_fissures=fissures)
+    # Deployments towards the target that are looked at from a scope's tip: several times what is ranked,
+    # since most are refused.
     enumerate_from = SiteEnumerator(
-        lung, system.tubes, system.margins, with_fissures=fissures, enough=ENOUGH
+        lung, system.tubes, system.margins, with_fissures=fissures, enough=512
     ).deployments
 
     def worthwhile(positions: Float, tangents: Float) -> Bool:
@@ -141,7 +137,8 @@ def offered(
         entries = _some(enumerate_from(row, worthwhile), worthwhile)
         tips = np.repeat(row[None], entries.count, axis=0)
         spread = Spread(lung, system, tips, entries, target, errors, procedure, radius_mm)
-        for number in np.argsort(-spread.chances, kind="stable")[:KEPT].tolist():
+        # Deployments that are kept from one tip, the likeliest: further ones are alike or worse.
+        for number in np.argsort(-spread.chances, kind="stable")[:12].tolist():
             deployed = entries.choice(number)
             if deployed not in found:
                 made = validator.choose(frame, *deployed)

@@ -56,8 +56,6 @@ ITERATIONS = 300
 """Of a replan: more made no difference in simulated insertions."""
 TOLERANCE_MM = 2.0
 SHOWN_STEP_MM = 0.5
-_MEASURING = 1000
-"""Stream of the tracker's noise, beyond those of the kinds of error."""
 
 
 class Outcome(StrEnum):
@@ -262,7 +260,8 @@ class _Inserter:
             settings=ReplanSettings(largest_miss_mm=min(self._assessor.radius_mm, 10.0)),
             iterations=ITERATIONS, seed=luck[1],
         )  # fmt: skip
-        rng = np.random.default_rng(np.random.SeedSequence(luck[0], spawn_key=(_MEASURING, luck[1])))
+        # Stream of the tracker's noise, beyond those of the kinds of error.
+        rng = np.random.default_rng(np.random.SeedSequence(luck[0], spawn_key=(1000, luck[1])))
         return insert_needle(
             self._environment, self.query, self.path, replanner, attempt, tip, self.steering, self._unknown,
             rng,

@@ -60,20 +60,12 @@ ASIDES = 2
 """Points beside the target that are tried, the two that the needle has to bend least for."""
 SHARES = 9
 """Shares of an error of measuring that are tried until a scope's tip lies in the lumen."""
-SEARCH_ITERATIONS = 300
-"""Iterations of the needle's search where neither a single arc nor the planned turns are clear."""
 LEAST_CHANCE = 0.01
 """Below it nothing is left to do: chances are known to some percent."""
-SEARCHED_BELOW = 0.2
-"""A search may find more where no path is proved and going on as planned succeeds less often than this."""
 IMAGINED = 24
 """Placements of the scope that are imagined beforehand: their mean chance is then known to some percent."""
 PLACES = 1024
 """Places of the scope's tip that are imagined before it is measured: dozens are near any that is."""
-NEAREST_MM = 0.25
-"""Spacing of the points of a path of which the one nearest to a needle's tip tells how much is inserted."""
-SAME = 1e-4
-"""Arcs that differ by less, in mm, rad and 1/mm, are the same: no hand or drive tells them apart."""
 LONGEST = 12
 """Arcs of a path of the needle for which there is room; more where the plan has more."""
 _SEED = 2
@@ -357,7 +349,9 @@ class Policy:
             return replace(chosen, tips=tips)
         branches = np.ascontiguousarray(chosen.found[:, 2])
         found, chances, arcs = self._paths(chosen.arcs, chosen.found[:, 1], tips, branches, targets)
-        for n in np.flatnonzero((found[:, 2] == 0) & (chances < SEARCHED_BELOW)).tolist():
+        # A search may find more where no path is proved and going on as planned succeeds less often than
+        # this.
+        for n in np.flatnonzero((found[:, 2] == 0) & (chances < 0.2)).tolist():
             path = self._searched(tips[n], targets[n])
             if path is None or len(path) > arcs.shape[1]:
                 continue
@@ -387,9 +381,10 @@ class Policy:
     def _searched(self, tip: Float, target: Float) -> Float | None:
         """Return the arcs that the needle's own search finds, None without."""
         try:
+            # Iterations of the needle's search where neither a single arc nor the planned turns are clear.
             rest = replan_from_tube(
                 self.lung, self.system, tip, Target(lps_mm=target, origin=self.plan.target_origin),
-                objective=self.plan.objective, seed=self.plan.seed, iterations=SEARCH_ITERATIONS,
+                objective=self.plan.objective, seed=self.plan.seed, iterations=300,
             )  # fmt: skip
         except (NoPlan, TargetError):
             return None
@@ -499,7 +494,9 @@ class Policy:
     def _on_the_way(self, chosen: Chosen, pose: Float, target: Float) -> Decision:
         """Return the decision about a needle on its way: what lies behind the nearest point is inserted."""
         path = ArcPath(lps_from_start=chosen.tips[0], arcs=chosen.arcs[0, : chosen.found[0, 1]])
-        points, lengths = path.sample(NEAREST_MM)
+        # Spacing of the points of a path of which the one nearest to a needle's tip tells how much is
+        # inserted.
+        points, lengths = path.sample(0.25)
         inserted = float(lengths[np.linalg.norm(points - pose[:3, 3], axis=1).argmin()])
         rest, turned = rest_of(path.arcs, inserted)
         branch = int(chosen.found[0, 2])
@@ -608,7 +605,8 @@ def rest_of(arcs: Float, behind_mm: float) -> tuple[Float, float]:
 
 def _same(arcs: Float, others: Float) -> Bool:
     """Tell which paths `(N, A, 3)` are the same but for rounding."""
-    return np.asarray((np.abs(arcs - others) <= SAME).all(axis=(1, 2)))
+    # Arcs that differ by less, in mm, rad and 1/mm, are the same: no hand or drive tells them apart.
+    return np.asarray((np.abs(arcs - others) <= 1e-4).all(axis=(1, 2)))
 
 
 def _joined(parts: Sequence[Chosen]) -> Chosen:

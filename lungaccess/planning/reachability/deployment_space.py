@@ -17,12 +17,8 @@ from lungaccess.planning.reachability.layers import THREADS
 from lungaccess.planning.reachability.tip_places import PlacePiece
 from stages.tube.kernels import CURVED_LENGTH
 
-MOST_PARTS = 150_000
-"""Boxes into which the space is divided: 20 MB, and a second or two of work before the first target."""
 TASK_BOXES = 2048
 """Boxes that a thread takes at a time."""
-TASKS_AT_ONCE = 8
-"""Tasks after which it is looked whether to stop; the same number whatever the threads."""
 
 
 @frozen_record
@@ -66,7 +62,8 @@ def divided_space(
     looked = 0
     greatest = np.inf if not len(boxes) else float(_measures(boxes).max())
     with ThreadPoolExecutor(THREADS) as pool:
-        while 0 < len(boxes) <= MOST_PARTS // 2:
+        # Boxes into which the space is divided: 20 MB, and a second or two of work before the first target.
+        while 0 < len(boxes) <= 150_000 // 2:
             between()
             greatest *= 0.5
             looked += int((_measures(boxes) > greatest).sum())
@@ -93,7 +90,8 @@ def divided_space(
 def in_tasks(pool: ThreadPoolExecutor, work: Callable[[Int], Any], rows: Int, size: int) -> Iterator[Int]:
     """Do work on rows, so many a task, on the threads of a pool; yield those that are done, in order."""
     tasks = iter(range(0, len(rows), size))
-    while begins := list(islice(tasks, TASKS_AT_ONCE)):
+    # Tasks after which it is looked whether to stop; the same number whatever the threads.
+    while begins := list(islice(tasks, 8)):
         list(pool.map(lambda begin: work(rows[begin : begin + size]), begins))
         yield rows[begins[0] : begins[-1] + size]
 

@@ -14,8 +14,6 @@ from anatomy.structures import OBSTACLES
 
 RIGHT, LEFT = 1, 2
 NAMES: Mapping[int, str] = MappingProxyType({RIGHT: "right lung", LEFT: "left lung"})
-SMALLER_LUNG_SHARE = 0.1
-"""The smaller of two lungs holds at least this share of the larger one."""
 
 
 @frozen_record
@@ -60,7 +58,8 @@ def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
     two = np.argsort(sizes)[::-1][:2]
-    lungs_are_separate = len(two) == 2 and bool(sizes[two[1]] >= max(1.0, SMALLER_LUNG_SHARE * sizes[two[0]]))
+    # The smaller of two lungs holds at least this share of the larger one.
+    lungs_are_separate = len(two) == 2 and bool(sizes[two[1]] >= max(1.0, 0.1 * sizes[two[0]]))
     ijk = np.argwhere(where)
     points = grid.lps(ijk)
     # LPS: the patient's left is +x.

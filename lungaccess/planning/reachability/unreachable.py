@@ -37,9 +37,6 @@ from stages.needle.kernels import Limits
 from stages.tube import tube_constants
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, greatest_insertions
 
-TOGETHER_MM = 12.0
-"""Open pieces of a branch that begin so near to each other are one place: a piece has 8 mm."""
-
 
 @frozen_record
 class OpenPlace:
@@ -104,15 +101,12 @@ def open_places(lung: Lung, space: DeploymentSpace, found: Found) -> tuple[OpenP
 
 def _near(space: DeploymentSpace, one: int, other: int) -> bool:
     away = space.pieces[one].cones[0, :3] - space.pieces[other].cones[0, :3]
-    return float(np.linalg.norm(away)) <= TOGETHER_MM
+    # Open pieces of a branch that begin so near to each other are one place: a piece has 8 mm.
+    return float(np.linalg.norm(away)) <= 12.0
 
 
-INSERTION_SPACING_MM = 0.02
-"""Spacing of the insertions that are tried; the bound between two of them is loose by about as much."""
 MOST_BOXES = 20_000_000
 """Boxes looked at for a target before it is given up, after half a minute or so."""
-MORE_LOOKS = 16
-"""A box is given so many times as many looks as in the round before, so that rounds repeat little."""
 
 
 NO_NEEDLE = Limits(**dict.fromkeys(Limits._fields, 0.0) | {"kappa": 1.0})
@@ -182,7 +176,8 @@ class UnreachableProof:
         self._limits = NO_NEEDLE if self._needle is None else self._needle.limits
         longest = float(self._tubes[MAX_EXTENSION])
         self._insertions = np.zeros(int(longest / INSERTION_STEP_MM) + 1)
-        greatest_insertions(self._tubes, longest, INSERTION_SPACING_MM, self._insertions)
+        # Spacing of the insertions that are tried; the bound between two of them is loose by about as much.
+        greatest_insertions(self._tubes, longest, 0.02, self._insertions)
         pause()
         spacing_mm = lung.grid.spacing_mm
         hazards = VESSEL | OUTSIDE | (FISSURE if with_fissures else 0)
@@ -299,7 +294,9 @@ class UnreachableProof:
 
                     # Looks that a thread may take at a time.
                     yield from in_tasks(pool, work, rows, max(16384 // most, 1))
-                    most *= MORE_LOOKS
+                    # A box is given so many times as many looks as in the round before, so that rounds repeat
+                    # little.
+                    most *= 16
 
     def _environment(self, target: Float) -> ProofEnvironment:
         lung = self._lung

@@ -22,10 +22,6 @@ from lungaccess.planning.refinement.layout import (
 
 SERIES_TERMS = 14
 """Up to an angle of 2 pi the series are off by less than 1e-6."""
-RADIUS_STEP_MM = 0.2
-"""Length over which the radius changes at the end of the outer tube, so that it has derivatives."""
-STRAIGHTNESS = 1e-3
-"""Rounds off the turn of an arc at no curvature, as a share of the greatest; it is never understated."""
 
 
 def _series(q: Any, first: int) -> Any:
@@ -38,7 +34,8 @@ def _series(q: Any, first: int) -> Any:
 
 def _before(end: Any, s: Any) -> Any:
     """Return 1 before the end of a tube and 0 behind it."""
-    return 0.5 + 0.5 * casadi.tanh((end - s) / RADIUS_STEP_MM)
+    # Length over which the radius changes at the end of the outer tube, so that it has derivatives.
+    return 0.5 + 0.5 * casadi.tanh((end - s) / 0.2)
 
 
 @dataclass(frozen=True)
@@ -206,7 +203,9 @@ class Geometry:
         """Return the accumulated turn in rad, a little overstated."""
         total: Any = 0.0
         for a, (bx, by) in enumerate(self.bends):
-            total += self._kappa * casadi.sqrt(bx * bx + by * by + STRAIGHTNESS**2) * self.lengths[a]
+            # Rounds off the turn of an arc at no curvature, as a share of the greatest; it is never
+            # understated.
+            total += self._kappa * casadi.sqrt(bx * bx + by * by + 1e-3**2) * self.lengths[a]
         return total
 
     def cosines_from_start(self) -> list[Any]:

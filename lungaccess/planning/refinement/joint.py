@@ -18,8 +18,6 @@ from stages.tube import Deployment
 
 SHARES = (1.0, 0.85, 0.7, 0.5, 0.35, 0.2, 0.1)
 """Shares of the step from the candidate to what the program found that are tried until one is proved."""
-MOVED_PLACEMENTS = 2
-"""So many proved placements besides the candidate's own get a program for the needle alone, to save time."""
 
 ITERATIONS = 40
 """Most steps of IPOPT by default; docs/explanation/refinement.md has what they save."""
@@ -99,7 +97,9 @@ class Reconstruction:
 
     def placements(self, found: Float) -> Iterator[Placement]:
         """Yield proved tubes: the nearest to `found`, some at most half as far, those of the candidate."""
-        farthest, left = 1.0, MOVED_PLACEMENTS
+        # So many proved placements besides the candidate's own get a program for the needle alone, to save
+        # time.
+        farthest, left = 1.0, 2
         for share in SHARES:
             moved = self.placement(found, share) if left and share <= farthest else None
             if moved is not None:

@@ -28,9 +28,6 @@ from stages.scope import ScopeTip, evenly
 from stages.tube import TubeShape, design_arrays, longest_mm
 from stages.tube import kernels as index
 
-SAMPLE_MM = 0.125
-"""Step in which poses of the tip are proved and fitted; a voxel is several times as large."""
-
 ARC_COUNTS = (3, 5, 8)
 """A program is built for each; shorter paths are split."""
 NEEDLE_MARGIN_MM = 10.0
@@ -41,8 +38,6 @@ MAX_TURN_RAD = 1.2
 SHORTEST_ARC_MM = 1.0
 """Shorter arcs are not made: the direction of their curvature would hardly matter."""
 NEEDLE_SLACK_MM = 0.02
-TUBE_SLACK_MM = 0.1
-"""The program demands so much more clearance, for what lies between samples and between lattice points."""
 CURVATURE_SLACK = 1e-3
 ANGLE_SLACK_RAD = math.radians(2.0)
 """The program keeps so far from the limits of curvature and wall angle, for the same reason."""
@@ -263,7 +258,9 @@ class Problem:
         level, slope = self._lumen_at_exit()
         # The program keeps so far from the limit of the sweep, which its model knows to a few hundredths.
         allowed = max(tubes.max_lateral_sweep_mm - 0.02, deployment.lateral_sweep_mm)
-        thick = tubes.inner.radius_mm + TUBE_SLACK_MM
+        # The program demands so much more clearance, for what lies between samples and between lattice
+        # points.
+        thick = tubes.inner.radius_mm + 0.1
         clear = needle.radius_mm + margin + NEEDLE_SLACK_MM
         steep = math.sin(math.radians(tubes.min_wall_angle_deg) + ANGLE_SLACK_RAD)
         bounds = {
@@ -301,7 +298,8 @@ class LocalAxis:
 
     def __init__(self, rows: TipRows, tip: ScopeTip) -> None:
         self._rows, self._tip = rows, tip
-        shifts = evenly(SAMPLE_MM, AXIS_SCALE_MM)
+        # Step in which poses of the tip are proved and fitted; a voxel is several times as large.
+        shifts = evenly(0.125, AXIS_SCALE_MM)
         row = rows.along(tip, shifts)
         home = len(shifts) // 2
         refused = np.flatnonzero(~row.proved)

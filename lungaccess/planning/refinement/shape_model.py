@@ -25,8 +25,6 @@ TURNED_RAD = math.radians(25.0)
 millimetre, which the slack of its constraints covers."""
 PLACES = 4 * CURVE_DEGREE
 """Points to which the polynomial of a curve is fitted, so many that it does not swing between them."""
-SHORTEST_MM = 0.5
-"""A shape nearby is at least so long."""
 
 
 class ShapeModel:
@@ -84,7 +82,8 @@ class ShapeModel:
     def _shape_at(self, design: DesignArrays, joints: Float) -> TubeShape | None:
         n = len(design.radii)
         inserted, turned = np.clip(joints[:n], 0.0, self._most_mm), np.array(self._shape.rotations_rad)
-        inserted = np.minimum.accumulate(np.maximum(inserted, SHORTEST_MM * (np.arange(n) == n - 1))[::-1])
+        # A shape nearby is at least so long.
+        inserted = np.minimum.accumulate(np.maximum(inserted, 0.5 * (np.arange(n) == n - 1))[::-1])
         turned[design.turned] = joints[n:]
         made = deployed(design, inserted, turned)
         return None if made is None else shape_of_arrays(made)

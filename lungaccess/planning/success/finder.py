@@ -41,14 +41,10 @@ from lungaccess.problem.task import Task
 
 BY_COST = 300
 """Iterations of the search by cost whose plans take part: more make them only a little cheaper."""
-SHRINK = 0.98
-"""Variations become smaller with every one that fails: after 35 they are half as large."""
 RARE, ENOUGH = 0.05, 0.3
 """Where hardly a draw succeeds, the errors are made smaller until so many do: few successes tell nothing."""
 SMALLER, LEAST_FACTOR = 0.7, 0.1
 """The step by which the errors are made smaller, and the least size."""
-STEPS = 20
-"""Steps of the search by cost for one challenge, which take as long as some thousand draws."""
 
 
 @frozen_record
@@ -212,7 +208,8 @@ class ContestFinder:
             elif tried % 3 == 1 or not varies or size < SMALLEST:
                 other = next(pool, None)
             elif (shifted := self._varied(best, rng, size)) is not None:
-                other, size = shifted, SHRINK * size
+                # Variations become smaller with every one that fails: after 35 they are half as large.
+                other, size = shifted, 0.98 * size
             better = None if other is None else self._beats(best, other)
             if better is None:
                 yield Turn(iteration=tried, phase="challenge", message=self._message)
@@ -222,7 +219,8 @@ class ContestFinder:
 
     def _cheaper(self) -> Contender | None:
         """Return what the search by cost finds next, in a few of its steps."""
-        for step in islice(self._steps, STEPS):
+        # Steps of the search by cost for one challenge, which take as long as some thousand draws.
+        for step in islice(self._steps, 20):
             found = self._of_step(step)
             if found is not None:
                 return found

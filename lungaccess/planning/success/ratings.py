@@ -23,12 +23,6 @@ from lungaccess.problem.request import Request
 from lungaccess.uncertainty.risk import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
 
-BATCH_SEED = 1 << 24
-"""Distance between the seeds of two batches of draws: no seed of a search comes to that of another batch."""
-MANY = 10.0
-"""Clear deployments that a scope tip needs so that one is likely to be left after measuring: ten lie some
-millimetres or degrees apart, as far as the errors move the tip.  It only ranks."""
-
 Scorer = Callable[[int, int, float], float]
 """Returns what a plan gains: the successes of so many draws of a batch, with errors of a factor times their
 size."""
@@ -114,7 +108,9 @@ class ChanceRating:
         ).chances  # fmt: skip
         if self.procedure.scope.measured:
             _sites, which, counts = np.unique(chosen.site, return_inverse=True, return_counts=True)
-            chances = chances * -np.expm1(-counts[which] / MANY)
+            # Clear deployments that a scope tip needs so that one is likely to be left after measuring: ten
+            # lie some millimetres or degrees apart, as far as the errors move the tip.  It only ranks.
+            chances = chances * -np.expm1(-counts[which] / 10.0)
         return chances
 
     def scorer(self, plan: Plan) -> Scorer:
@@ -138,7 +134,9 @@ class ChanceRating:
         return counted
 
     def _batch_seed(self, batch: int) -> int:
-        return self._seed + BATCH_SEED * (batch + 1)
+        # Distance between the seeds of two batches of draws: no seed of a search comes to that of another
+        # batch.
+        return self._seed + (1 << 24) * (batch + 1)
 
     def stated(self, plan: Plan, most: int | None = None) -> Plan:
         """Return a plan with its chance, counted on draws that no round has seen."""

@@ -40,8 +40,6 @@ UNC_MAX_LENGTH_MM = 150.0
 UNC_MAX_TURN_DEG = 90.0
 UNC_EXEMPT_MM = 3.0
 """Numbers of the recorded runs: diameter, tolerance, insertion, total turn, and the radius of the ball."""
-BORDER_MM = 30.0
-"""Obstacles are cut out so far around a query; a path that leaves this box is too long."""
 
 NO_STARTS = "no query: the patient came without start poses"
 
@@ -154,7 +152,8 @@ class UncObstacles:
             exempt_mm: Obstacle voxels whose centres lie so near to the start do not count.
         """
         ends = np.stack([lps_from_start[:3, 3], target_lps])
-        border = BORDER_MM + 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
+        # Obstacles are cut out so far around a query; a path that leaves this box is too long.
+        border = 30.0 + 0.2 * float(np.linalg.norm(ends[1] - ends[0]))
         corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
         ijk = self.grid.ijk((ends[:, None] + border * corners).reshape(-1, 3))
         low = np.maximum(np.floor(ijk.min(axis=0)).astype(int), 0)

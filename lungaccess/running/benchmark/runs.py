@@ -33,8 +33,6 @@ SUFFIXES = (".csv", ".json")
 
 SLICE = 200
 """Iterations between two looks at the clock: a fraction of a millisecond."""
-SAMPLE_MM = 0.05
-"""Clearance is measured at points so far apart: a tenth of a voxel."""
 THERE_IS_ONE = "nothing found in the time given, though another planner found a path"
 
 
@@ -168,7 +166,8 @@ def _length(path: ArcPath, query: Query) -> float:
 
 
 def _clearance(environment: NeedleEnvironment, query: Query, path: ArcPath) -> float | None:
-    points, lengths = path.sample(SAMPLE_MM)
+    # Clearance is measured at points so far apart: a tenth of a voxel.
+    points, lengths = path.sample(0.05)
     exempt_mm = environment.limits.exempt_mm if query.branch >= 0 else 0.0
     beyond = points[lengths >= exempt_mm]
     return float(obstacle_clearance_mm(environment.obstacles, beyond).min()) if len(beyond) else None

@@ -14,9 +14,6 @@ from lungaccess.running.study.answers import STATUS, Answer
 from lungaccess.running.study.rows import add_rest, experiment_row, problem_row, run_row
 from lungaccess.running.study.runs import Problem, Run
 
-BATCH = 1000
-"""Rows that are read at once: a few of them take no time, and all of them would fill the memory."""
-
 
 class ResultsFile:
     """A results file, open for reading and adding; for a `with` statement.
@@ -102,7 +99,9 @@ class ResultsFile:
             cursor = self._connection.execute(query, values)
         while True:
             with file_errors(self.path):
-                batch = cursor.fetchmany(BATCH)
+                # Rows that are read at once: a few of them take no time, and all of them would fill the
+                # memory.
+                batch = cursor.fetchmany(1000)
             if not batch:
                 return
             yield from batch

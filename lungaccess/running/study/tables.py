@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     import pyarrow
 
 
-BATCH = 5000
-"""Rows of a group in a Parquet file: large enough to compress well, small enough to hold in memory."""
-
 MOST = 20
 """At most this many differences are listed: enough to see what kind they are."""
 
@@ -204,7 +201,8 @@ def _write_parquet(content: Table, path: Path) -> None:
 
     schema = pyarrow.schema([(name, _kind(name)) for name in content.columns])
     with parquet.ParquetWriter(path, schema) as writer:
-        while batch := list(islice(content.rows, BATCH)):
+        # Rows of a group in a Parquet file: large enough to compress well, small enough to hold in memory.
+        while batch := list(islice(content.rows, 5000)):
             arrays = [
                 pyarrow.array(
                     [bool(v) if name in TRUTHS else v for v in values], type=schema.field(name).type

@@ -24,8 +24,6 @@ SAMPLES = 33
 """Phases that are looked at: between two of them the target strays from a line by micrometres."""
 HALVINGS = 10
 """Of the width of phases that an aim is made for: to 0.1 % of the breath."""
-USED = 0.999
-"""Share of the tolerance that an aim uses: the proof needs some room for rounding."""
 
 
 @frozen_value
@@ -87,7 +85,8 @@ class MovingTarget:
 
         def fits(phases: tuple[float, float]) -> bool:
             miss = made_for(phases)[1]
-            return miss <= miss_allowed(self._motion, USED * TOLERANCE_MM, distance_mm(point, tip_lps))
+            # Share of the tolerance that an aim uses: the proof needs some room for rounding.
+            return miss <= miss_allowed(self._motion, 0.999 * TOLERANCE_MM, distance_mm(point, tip_lps))
 
         middle = self._middle if towards is None else towards
         phases = self._phases or (middle, middle)

@@ -18,10 +18,6 @@ from lungaccess.uncertainty.breathing.kernels.rules import (
     TUBE,
 )
 
-POINT_MM = 0.05
-"""Distance of the points: between two the chord of the tightest arc is off by less than 0.00005 mm."""
-WALL_ZONE_MM = 1.0
-"""Length of tube that is spent on piercing the wall."""
 SHORTEST_MM = 1e-9
 
 
@@ -91,7 +87,8 @@ def device_points(plan: Plan) -> DevicePoints:
 def exit_zone_mm(hole_mm: float, wall_angle_rad: float) -> float:
     """Return how far along the tube, either way of the exit, a hole is that shifts sideways by its limit."""
     # The least angle at which the tubes of the presets may pierce a wall.
-    return WALL_ZONE_MM + hole_mm / math.sin(max(wall_angle_rad, math.radians(10.0)))
+    # Length of tube that is spent on piercing the wall.
+    return 1.0 + hole_mm / math.sin(max(wall_angle_rad, math.radians(10.0)))
 
 
 def _edges(lengths: list[float], most: float) -> list[float]:
@@ -104,7 +101,8 @@ def _edges(lengths: list[float], most: float) -> list[float]:
 
 
 def _arcs(begin: float, end: float) -> Float:
-    return np.linspace(begin, end, max(math.ceil((end - begin) / POINT_MM), 1) + 1)
+    # Distance of the points: between two the chord of the tightest arc is off by less than 0.00005 mm.
+    return np.linspace(begin, end, max(math.ceil((end - begin) / 0.05), 1) + 1)
 
 
 def points_on_pieces(frame: Float, pieces: Float, arcs_mm: Float) -> Float:

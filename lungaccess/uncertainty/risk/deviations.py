@@ -14,8 +14,6 @@ from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES, Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import N_START, Judging, find_pieces, find_starts
 from stages.tube import ConcentricTubes, Neighbourhood, pieces_of_arcs
 
-ROUNDING_MM = 1e-9
-"""The planned tip itself stands in the lumen, however its depth is rounded."""
 COLUMNS = (
     "scope_mm",
     "tilt_rad",
@@ -125,10 +123,11 @@ def judging(plan: Plan, lung: Lung) -> Judging:
     """Return what decides about a deviated plan in its lung."""
     depth = lung.lumen_depth
     planned = float(depth.lower_bound_mm(np.asarray(plan.scope.lps_from_scope_tip)[:3, 3])[0])
+    # The planned tip itself stands in the lumen, however its depth is rounded.
     return Judging(
         depth.corners,
         depth.geometry,
-        min(plan.system.scope.radius_mm, planned) - ROUNDING_MM,
+        min(plan.system.scope.radius_mm, planned) - 1e-9,
         lung.tree.mediastinal,
         float(plan.exemption.needle_length_mm),
     )

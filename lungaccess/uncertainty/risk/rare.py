@@ -28,12 +28,6 @@ SPREADS = (2.0, 3.0, 4.0)
 """Spreads of the numbers in which events are looked for, the next one if there were fewer than ENOUGH."""
 ENOUGH = 20
 """Events that show where it happens."""
-NEAREST = 256
-"""Events, the nearest ones, that are moved towards the origin."""
-CENTRES = 32
-"""Most centres of the mixture: one for each side from which a structure can be met."""
-APART = 0.8
-"""Cosine of the least angle between centres: nearer ones describe one way to fail."""
 EXACT = 30
 """Effective events from which the normal approximation is usually taken to hold."""
 HALVINGS = 12
@@ -107,7 +101,8 @@ def _centres(
         found = np.concatenate([found, tried[happens(tried)]])
         if len(found) >= ENOUGH:
             break
-    nearest = found[np.argsort(np.linalg.norm(found, axis=1), kind="stable")[:NEAREST]]
+    # Events, the nearest ones, that are moved towards the origin.
+    nearest = found[np.argsort(np.linalg.norm(found, axis=1), kind="stable")[:256]]
     if not len(nearest):
         return []
     for column in range(dimensions):
@@ -124,8 +119,10 @@ def _centres(
     chosen: list[Float] = []
     for row in nearest[np.argsort(np.linalg.norm(nearest, axis=1), kind="stable")]:
         length = float(np.linalg.norm(row))
-        alike = any(row @ other > APART * length * np.linalg.norm(other) for other in chosen)
-        if length > 0.0 and not alike and len(chosen) < CENTRES:
+        # Cosine of the least angle between centres: nearer ones describe one way to fail.
+        alike = any(row @ other > 0.8 * length * np.linalg.norm(other) for other in chosen)
+        # Most centres of the mixture: one for each side from which a structure can be met.
+        if length > 0.0 and not alike and len(chosen) < 32:
             chosen.append(row)
     return chosen
 

@@ -25,10 +25,6 @@ DEFAULT_SAMPLES = 2000
 """A share of 0.95 is then known to 1 % with 95 % confidence, at every size that is tried."""
 LARGEST = {"mm": 20.0, "deg": 90.0, "ln": 1.0}
 """Sizes beyond which no tolerance is looked for."""
-LARGEST_FACTOR = 3.0
-"""Factor of the curvature beyond which no margin is looked for."""
-BISECTIONS = 10
-"""A tolerance is then known to a thousandth of the largest size."""
 LADDER = 64
 """Sizes tried at once for a margin, and again between the last that holds and the first that fails."""
 AZIMUTHS = 16
@@ -121,7 +117,8 @@ def _largest(holds: Callable[[float], bool], most: float) -> float:
     if holds(most):
         return most
     low, high = 0.0, most
-    for _ in range(BISECTIONS):
+    # A tolerance is then known to a thousandth of the largest size.
+    for _ in range(10):
         middle = 0.5 * (low + high)
         if holds(middle):
             low = middle
@@ -156,7 +153,8 @@ def _curvature_margin(assessor: RiskAssessor) -> tuple[float, float]:
         return Deviations(**{**assessor.no_deviations(len(factors)), "factor": factors})
 
     below = _unfailing(assessor, made, np.array([[-1.0]]), 1.0)
-    above = _unfailing(assessor, made, np.array([[1.0]]), LARGEST_FACTOR - 1.0)
+    # Factor of the curvature beyond which no margin is looked for.
+    above = _unfailing(assessor, made, np.array([[1.0]]), 3.0 - 1.0)
     return 1.0 - below, 1.0 + above
 
 

@@ -30,17 +30,11 @@ FIRST_CELL_MM, LARGEST_SLOPE_CELL = 0.5, 0.17
 """Largest sides of the first cells: of the size of a voxel, and of about 10 degrees."""
 ALL_CUBES = 1 << 31
 """There are fewer cubes than this."""
-LEVELS = 9
-"""How often cells are halved at most: then positions are known to 2 um."""
-CELLS_PER_BOW = 16.0
-"""Planes are moved nearer to each other where curvature times their distance squared is more."""
 SLOPE_CHANGE_EDGES = np.array([0.5, 0.75, 0.92, 1.0])
 """Classes of slope change, see `step_sets`: finer where the bound on the position falls fast."""
 PROBES_PER_DEPTH = 8
 """Depths of a slab at which clearance is looked at."""
 SLACKS = 48
-LARGEST_DEPTH_MM = 12.5
-"""Greatest distance of the planes, however little the needle bends."""
 LEAST_DISTANCE_MM = 1e-3
 """Nearer targets are left undecided; targets outside the workspace by less are not ruled out at once."""
 MAX_BYTES = 1 << 30
@@ -208,7 +202,8 @@ class NoPathProof:
         """Choose the planes and the direction from which the limit of the angle counts."""
         last = float(self._paths.ends[bounds.TOTAL]) - self._tolerance
         # Distance of the planes as a share of the radius of curvature.
-        self._count = math.ceil(last / min(0.1 / self._kappa, LARGEST_DEPTH_MM))
+        # Greatest distance of the planes, however little the needle bends.
+        self._count = math.ceil(last / min(0.1 / self._kappa, 12.5))
         self._depth = last / self._count
         # Largest sine of the angle between paths and the planes' normal for which planes are tried.
         self._proved_steepest = self._paths.steepest <= 0.995
@@ -224,11 +219,13 @@ class NoPathProof:
     def _refine(self) -> Iterator[None]:
         """Go through all planes forward and backward, again and again with smaller cells."""
         self.cell_mm = min(FIRST_CELL_MM, 0.5 * LARGEST_SLOPE_CELL * self._depth)
-        for level in range(LEVELS):
+        # How often cells are halved at most: then positions are known to 2 um.
+        for level in range(9):
             self._split = False
             if level > 0:
                 # Halving positions and depth leaves the cells of directions as they are.
-                self._split = self._kappa * self._depth**2 > CELLS_PER_BOW * self.cell_mm
+                # Planes are moved nearer to each other where curvature times their distance squared is more.
+                self._split = self._kappa * self._depth**2 > 16.0 * self.cell_mm
                 self.cell_mm *= 0.5
                 self._depth *= 0.5 if self._split else 1.0
                 self._count *= 2 if self._split else 1

@@ -17,8 +17,6 @@ from stages.needle.infeasibility.plane import PathBounds, Plane
 
 CELL = 0.008
 """Side of a cell of the plane of directions: 0.016 rad in the middle, 0.8 mm at 50 mm."""
-HALF_WIDTH = 1.2
-"""The window in this plane holds directions up to 100 degrees from the middle."""
 
 NOT_BOUNDED = BackwardReach(
     frame=np.zeros((4, 3)), cell=CELL, kappa=0.0, angles=np.zeros((0, 1, 1), dtype=np.uint8)
@@ -106,7 +104,8 @@ def backward_reach(
     if limits.max_length_mm * limits.kappa > math.pi:
         return NOT_BOUNDED
     shells = int(min(limits.max_length_mm + SHELL_MM, 2.0 / limits.kappa) / SHELL_MM)
-    count = 2 * int(HALF_WIDTH / cell) + 1
+    # The window in this plane holds directions up to 100 degrees from the middle.
+    count = 2 * int(1.2 / cell) + 1
     axis = np.asarray(middle, dtype=np.float64) / max(float(np.linalg.norm(middle)), 1e-300)
     across = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     across /= np.linalg.norm(across)

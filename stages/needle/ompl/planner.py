@@ -12,8 +12,6 @@ from stages.needle.kernels import states
 from stages.needle.path import ArcPath, Query, arc_transform
 from stages.needle.search.base import Search, in_slices
 
-ROUNDING_MM = 1e-6
-"""Every goal tolerance is larger by this for OMPL, whose states are rounded."""
 NO_LIMIT = 2**62
 
 
@@ -52,7 +50,8 @@ class NeedleGoal(base.GoalSampleableRegion):
         self._si = si
         self._sampler: Any = None
         self.target = tuple(float(v) for v in target)
-        self.setThreshold(tolerance_mm + ROUNDING_MM)
+        # Every goal tolerance is larger by this for OMPL, whose states are rounded.
+        self.setThreshold(tolerance_mm + 1e-6)
 
     def distanceGoal(self, state: Any) -> float:  # noqa: N802
         """Return the distance in mm."""

@@ -36,8 +36,6 @@ from stages.needle.search.base import Search
 
 ARC_STEPS = 20
 """A control of duration 1 is an arc; OMPL propagates it in so many steps."""
-LONGEST_STEP_MM = 1.0
-"""Longest step of a propagation."""
 
 util.setLogLevel(util.LogLevel.LOG_ERROR)
 
@@ -282,7 +280,8 @@ def position_bounds(environment: NeedleEnvironment) -> Any:
 def control_bounds(environment: NeedleEnvironment) -> Any:
     """Bound length, roll and curvature of an arc, so that a step is at most 1 mm long."""
     bounds = base.RealVectorBounds(3)
-    highs = (ARC_STEPS * LONGEST_STEP_MM, math.pi, environment.needle.max_curvature_per_mm)
+    # Longest step of a propagation.
+    highs = (ARC_STEPS * 1.0, math.pi, environment.needle.max_curvature_per_mm)
     for n, (low, high) in enumerate(zip((0.0, -math.pi, 0.0), highs, strict=True)):
         bounds.setLow(n, low)
         bounds.setHigh(n, high)

@@ -17,8 +17,6 @@ MAX_NODES = 20_000
 """Rows of a tree, 2 MB; a tree that has more begins anew."""
 RANDOM_SHARE = 0.5
 """Share of the iterations that extend a random node by a random arc; a free choice."""
-SLICE_ITERATIONS = 200
-"""Iterations of a slice, a few milliseconds."""
 RESTART_ITERATIONS = 200
 """Unit of the restart schedule: trees that are lucky are so early."""
 
@@ -64,7 +62,8 @@ def in_slices(
     """
     used = 0
     while not (ended() or search.finished):
-        portion = min(SLICE_ITERATIONS, iterations - used)
+        # Iterations of a slice, a few milliseconds.
+        portion = min(200, iterations - used)
         used += portion
         yield used, search.path if search.advance(portion) else None
         if used >= iterations:

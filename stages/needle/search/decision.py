@@ -15,15 +15,10 @@ from stages.needle.search.resolution import ResolutionSearch
 
 ENDS_FROM = 100
 """Iterations before start and target are looked at, which takes a tenth as long."""
-FIRST_ITERATIONS = 400
-"""The tree goes first: nearly all paths that it finds sooner than the resolution search are found by then."""
 PIECE = 200
 """Iterations between two steps of the proof, a few tenths of a millisecond."""
 BETTER_SHARE = 1 / 3
 """The same with a path: the portfolio has the rest, as each refined path ends at the cheapest near it."""
-PATIENCE = 1600
-"""Iterations in which nearly all paths are found.  Until then the proof has about a sixth of the time, and
-afterwards most of it while it fills cubes."""
 CUBES, MORE_CUBES = 2, 300
 """Cubes that the proof fills for an iteration, before and afterwards; an iteration takes as long as ten."""
 
@@ -96,7 +91,9 @@ class Decision:
         yield self.search, ENDS_FROM
         if self.path is None:
             self._prove()
-        yield self.search, FIRST_ITERATIONS - ENDS_FROM
+        # The tree goes first: nearly all paths that it finds sooner than the resolution search are found by
+        # then.
+        yield self.search, 400 - ENDS_FROM
         while True:
             # Share of the iterations without a path: in narrow passages it is nearly always the first, and so
             # it is at most a fifth later than alone.
@@ -130,7 +127,9 @@ class Decision:
         if self._proof.states < 1000:
             spent = self.iterations - self._looked
             self._looked = self.iterations
-            self._proof.advance(spent * (CUBES if self.iterations < PATIENCE else MORE_CUBES))
+            # Iterations in which nearly all paths are found.  Until then the proof has about a sixth of the
+            # time, and afterwards most of it while it fills cubes.
+            self._proof.advance(spent * (CUBES if self.iterations < 1600 else MORE_CUBES))
             self.outcome = self._proof.outcome
         else:
             self._planes = self._planes or _PlanesInThread(self._proof)

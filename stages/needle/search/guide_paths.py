@@ -29,8 +29,6 @@ LEAST_GAIN = 0.01
 ARCS_PER_BEGINNING = 1 << 16
 """Before each search but the first, lattices are searched until so many arcs were tried.  That takes less
 time than to refine the guide path, and cheap guide paths lead to cheaper ones."""
-SPARE_COST = 1.5
-"""A guide path near a path may at first cost so many times as much, since it is not quite that path."""
 ROUNDING = 1e-9
 """The cost of a guide path may be so much greater, as a share, when the same one is found again."""
 
@@ -82,7 +80,9 @@ class GuidePathFinder:
         layers = self._layers[int(self._random.integers(len(self._layers)))]
         controls = self._lattices.controls_of(search.path, layers)
         if controls is not None:
-            yield from self._refine(search, controls, SPARE_COST * search.cost, best)
+            # A guide path near a path may at first cost so many times as much, since it is not quite that
+            # path.
+            yield from self._refine(search, controls, 1.5 * search.cost, best)
 
     def _search_everywhere(self) -> Iterator[Work]:
         """Find the cheapest guide paths of some more lattices; only a first one if no search has begun."""
@@ -129,8 +129,6 @@ CURVATURE_SHARE = 0.97
 """Share of the greatest curvature that guide paths take; arcs laid along them bend a little more."""
 SKEWS = 6
 """Number of turns of a lattice about the line to the target."""
-SAMPLE_MM = 0.05
-"""Distance of the points of a path between which its controls are interpolated."""
 
 
 @frozen_record
@@ -204,7 +202,8 @@ class StateLatticeSearch:
 
         A control point is where the tangents at the two planes beside it meet.
         """
-        points, _ = path.sample(SAMPLE_MM)
+        # Distance of the points of a path between which its controls are interpolated.
+        points, _ = path.sample(0.05)
         ahead = (points - self._start) @ self._axis
         if (np.diff(ahead) <= 0.0).any():
             return None

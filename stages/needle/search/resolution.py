@@ -31,8 +31,6 @@ Store = tuple[Float, Int32, UInt8, Int32]
 FIRST_NODES = 1024
 FIRST_ENTRIES = 4096
 """Sizes of the arrays at first; they are doubled when they are full."""
-MOST_STEPS = 128
-"""The greatest power of two of which the kernel's bytes can hold the number of steps."""
 MOST_ROLLS = 64
 """The directions of a larger number would differ by less than 6 degrees."""
 EQUAL_CELL_MM = 1e-3
@@ -69,8 +67,9 @@ class Resolution:
     def __post_init__(self) -> None:
         if not (0.0 < self.fine_mm <= self.coarse_mm < math.inf and 0 < self.coarse_rolls <= self.fine_rolls):
             raise SettingsError(f"{self} is no resolution", expected="0 < fine <= coarse")
+        # The greatest power of two of which the kernel's bytes can hold the number of steps.
         for name, ratio, most in (
-            ("lengths", self.coarse_mm / self.fine_mm, MOST_STEPS),
+            ("lengths", self.coarse_mm / self.fine_mm, 128),
             ("rolls", self.fine_rolls / self.coarse_rolls, MOST_ROLLS),
         ):
             if ratio != 2.0 ** round(math.log2(ratio)) or ratio > most:

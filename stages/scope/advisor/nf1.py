@@ -21,8 +21,6 @@ Metric = Literal["mm", "voxels"]
 Kind = Literal["clearance", "plain"]
 
 THRESHOLD = 0.9
-LEAST = 0.1
-"""Eq. 2: from this share of C_max on, entering a voxel costs the least."""
 
 
 @frozen_record
@@ -146,4 +144,5 @@ def navigation_field(
 def entering_costs(clearance: Float, largest_clearance: float) -> Float:
     """Return what entering each voxel costs by eq. 2, `(N,)`, for a step that counts 1."""
     share = clearance / largest_clearance
-    return np.where(share < THRESHOLD, 1.0 - share, LEAST)
+    # Eq. 2: from this share of C_max on, entering a voxel costs the least.
+    return np.where(share < THRESHOLD, 1.0 - share, 0.1)

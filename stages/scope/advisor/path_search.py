@@ -48,8 +48,6 @@ RETREATS_MM = (3.0, 6.0, 12.0, 24.0, 48.0)
 """Lengths of retreat, taken in turn, each times 0.5 to 1.5: from a fork just missed to a lost lobe."""
 LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
 """For a retry one of these shares of the look-ahead is drawn: a shorter one fits into a tighter turn."""
-LOOKS_PER_MM = 4
-"""Collision is tested this often a mm of advance: the body moves by less than a voxel between two poses."""
 
 
 class PathSearch:
@@ -65,7 +63,9 @@ class PathSearch:
         self._goal = goal
         self._options = options
         self._rng = np.random.default_rng(seed)
-        self._looks = 1 if environment.reproduction else max(1, round(LOOKS_PER_MM * options.sub_step_mm))
+        # Collision is tested this often a mm of advance: the body moves by less than a voxel between two
+        # poses.
+        self._looks = 1 if environment.reproduction else max(1, round(4 * options.sub_step_mm))
         self._least = min(options.sub_step_mm, float(environment.lumen.grid.spacing_mm.min()))
 
     def run(self, start: ScopeState) -> ScopePath:

@@ -17,10 +17,6 @@ from stages.scope.route.kernels import lumen as kernel
 
 LONGEST_EDGE_MM = 0.75
 """The longest edge is about a voxel of a CT, so that radii follow the wall."""
-SAME_POINT_MM = 1e-3
-"""Points of a file that are nearer are one point, written twice with rounding."""
-THIN_VOXELS = 6.0
-"""Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to half."""
 TINY_MM = 1e-9
 """The rounding of lengths is less."""
 
@@ -148,9 +144,8 @@ def from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) ->
         edges: (E, 2) int64.
     """
     points, radius = np.asarray(points_lps, dtype=np.float64), np.asarray(radius_mm, dtype=np.float64)
-    _same, first, merged = np.unique(
-        np.round(points / SAME_POINT_MM), axis=0, return_index=True, return_inverse=True
-    )
+    # Points of a file that are nearer are one point, written twice with rounding.
+    _same, first, merged = np.unique(np.round(points / 1e-3), axis=0, return_index=True, return_inverse=True)
     widest = np.zeros(len(first))
     np.maximum.at(widest, merged.ravel(), radius)
     pairs = np.unique(np.sort(merged.ravel()[np.asarray(edges, dtype=np.int64)], axis=1), axis=0)
@@ -329,7 +324,9 @@ class _Walls:
         self._labels = np.asfortranarray(wall.astype(np.uint16))
         self._geometry = corner_geometry(grid, half_voxels)
         self._lost = float(np.linalg.norm(grid.spacing_mm)) + ROUNDING_MM + 1.0 / 256.0
-        self._thin_mm = THIN_VOXELS * float(grid.spacing_mm.min())
+        # Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to
+        # half.
+        self._thin_mm = 6.0 * float(grid.spacing_mm.min())
         self._taken_off = 0.0 if half_voxels == SOLID else 0.5 * float(grid.spacing_mm.min())
 
     def depth_mm(self, points: Float) -> Float:

@@ -17,13 +17,9 @@ from stages.scope.route.kernels.spline import take_samples
 from stages.scope.route.proof import Proof, prove
 from stages.scope.route.settings import RouteLimits
 
-CENTRING = 0.02
-"""Weight of the squared distance from the guide path, in radii; small against the limits."""
 BENDING = 0.02
 """Weight of the squared curvature, in limits."""
 ROUNDS, STEPS = 12, 30
-SOLVED = 2e-3
-"""Violation that counts as none; the spares are larger, so that the limits themselves hold."""
 ANY_CURVATURE = 1e9
 
 Stage = tuple[float, float, int, int]
@@ -128,14 +124,16 @@ def repaired(
     take_samples(control, curve.knots, begin, end, level.per_span, along, with_radius, first, rows, samples)
     limit, worst, ends = limits.max_curvature_per_mm, np.inf, guide.points_mm[[0, -1]]
     for bending, times, rounds, steps in (*start, FINAL_STAGE):
+        # Weight of the squared distance from the guide path, in radii; small against the limits.
         weights = np.array((
-            CENTRING, bending / limit**2, times * limit, limits.needed_mm, level.spare_curvature,
+            0.02, bending / limit**2, times * limit, limits.needed_mm, level.spare_curvature,
             level.spare_mm, limits.end_tolerance_mm,
         ))  # fmt: skip
         program = Program(
             low, high, first, rows, samples, lumen.cones, *lumen.cells, guide.cones, weights, ends
         )
-        worst, _taken = repair(control, program, rounds, steps, SOLVED)
+        # Violation that counts as none; the spares are larger, so that the limits themselves hold.
+        worst, _taken = repair(control, program, rounds, steps, 2e-3)
     return Curve(control_mm=control, knots=curve.knots), float(worst)
 
 

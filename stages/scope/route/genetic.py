@@ -28,8 +28,6 @@ BROKEN = 1e4
 """Cost of a broken limit, the paper's 10000."""
 FEASIBLE = 1e3
 """Costs below this break no limit: the other terms stay far below it."""
-AROUND_MM = 10.0
-"""A segment keeps the nodes of the centreline this near: fits do not move farther."""
 
 
 @settings
@@ -136,7 +134,8 @@ def cut_segments(
 
 def _around(points: Float, centreline: Centreline) -> Bool:
     """Tell which nodes may be nearest to a point inside the lumen near these points."""
-    margin = AROUND_MM + 2.0 * float(centreline.radius_mm.max())
+    # A segment keeps the nodes of the centreline this near: fits do not move farther.
+    margin = 10.0 + 2.0 * float(centreline.radius_mm.max())
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     nodes = centreline.nodes_mm
     return np.asarray(((nodes >= low) & (nodes <= high)).all(axis=1))

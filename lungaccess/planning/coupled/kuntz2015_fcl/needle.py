@@ -14,8 +14,6 @@ from stages.needle.kernels import least_cosine
 
 SPREAD = 1.2
 """Samples lie up to so many times the distance of the goal ahead of the start."""
-SHORTEST_ARC_MM = 1e-6
-"""A shorter arc leads to the state itself."""
 
 
 @frozen_record
@@ -75,7 +73,8 @@ class Tree:
         curvature = np.where(straight, 0.0, 2.0 * aside / squared)
         bend = np.where(straight, 1.0, curvature)
         length = np.where(straight, ahead, 2.0 * np.arctan2(aside, ahead) / bend)
-        impossible = (curvature > max_curvature) | (length < SHORTEST_ARC_MM)
+        # A shorter arc leads to the state itself.
+        impossible = (curvature > max_curvature) | (length < 1e-6)
         return Controls(
             length_mm=np.where(impossible, np.inf, length),
             curvature_per_mm=curvature,

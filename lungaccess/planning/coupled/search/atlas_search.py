@@ -27,11 +27,6 @@ from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from stages.needle import successive_halving
 
-TRIES = 50
-"""Variations of an iteration, which takes about a millisecond."""
-FUTILE_ITERATIONS = 1000
-"""So many iterations without a deployment that has the target in its needle's workspace end the search."""
-
 
 class LocalSearchRounds:
     """Shares iterations among local searches."""
@@ -80,7 +75,8 @@ class LocalSearchRounds:
     def _advanced(self, run: LocalSearchRun, iterations: int) -> Iterator[Step]:
         """Advance a run by iterations; the last step has what it has found."""
         for n in range(1, iterations + 1):
-            self._local_search.advance(run, TRIES)
+            # Variations of an iteration, which takes about a millisecond.
+            self._local_search.advance(run, 50)
             yield self._evaluated(run) if n == iterations else Step(iteration=0, phase=self.phase)
 
     def _evaluated(self, run: LocalSearchRun) -> Step:
@@ -119,7 +115,9 @@ class AtlasSearch(SearchInParts):
         """Tell whether there is no candidate, and the target has come into no needle's workspace."""
         if self.incumbent.step is not None or len(self.arcs.in_workspace):
             return False
-        return iteration >= FUTILE_ITERATIONS or not self.atlas.deployments.count
+        # So many iterations without a deployment that has the target in its needle's workspace end the
+        # search.
+        return iteration >= 1000 or not self.atlas.deployments.count
 
     def take_part(self, number: int, parts: int) -> None:
         """Do one part of the work of several processes, with random numbers of its own."""

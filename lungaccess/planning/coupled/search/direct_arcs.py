@@ -20,8 +20,6 @@ from stages.tube import Deployments, shapes_of
 
 CHUNK = 1000
 """Arcs that are evaluated in one call of a kernel: between two calls the caller can end the search."""
-FINALISTS = 3
-"""Proved arcs of a chunk: the estimated costs by which they are chosen may be in the wrong order."""
 
 
 class DirectArcs:
@@ -243,7 +241,8 @@ class DirectArcSearch:
             found.append(chunk[clear])
             estimates.append(costs[clear])
             yield Step(iteration=0, phase=self.phase)
-            left = FINALISTS
+            # Proved arcs of a chunk: the estimated costs by which they are chosen may be in the wrong order.
+            left = 3
             for n in clear[np.argsort(costs[clear], kind="stable")].tolist():
                 if not left or costs[n] > ESTIMATE_SLACK * self._incumbent.cost:
                     break

@@ -7,8 +7,6 @@ from stages.tube import Deployments
 
 CELL_MM = 5.0
 """Size of the cells within which tips of the tubes count as similar: about the reach of a local search."""
-DIRECTIONS = 2.0
-"""Tangents are similar if each component, times this, rounds to the same whole number."""
 
 
 def different(entries: Deployments, ordered: Int) -> Int:
@@ -21,7 +19,8 @@ def different(entries: Deployments, ordered: Int) -> Int:
         ordered ((N,) int64): Which of them, the best first.
     """
     places = np.floor(entries.positions[ordered] / CELL_MM)
-    towards = np.rint(entries.tangents[ordered] * DIRECTIONS)
+    # Tangents are similar if each component, times this, rounds to the same whole number.
+    towards = np.rint(entries.tangents[ordered] * 2.0)
     keys = np.column_stack([entries.branch[ordered], places, towards]).astype(np.int64)
     _groups, first = np.unique(keys, axis=0, return_index=True)
     return ordered[np.sort(first)]

@@ -60,8 +60,6 @@ def random_placements(task: Task, atlas: Atlas, number: int = 0) -> Iterator[Pla
         )
 
 
-RRT_ITERATIONS = 300
-"""Iterations of each RRT; the paper gives it 0.05 s, but a run by time cannot be repeated exactly."""
 PLANNER = "rrt"
 """The planner of line 9 where none is named: the paper's."""
 
@@ -100,5 +98,6 @@ class KuntzSearch(SearchInParts):
         )
         if isinstance(deployment, str) or (self._rejects and not evaluator.reaches(deployment.lps_from_tip)):
             return None
-        path = self._needle_planner.path(deployment, seed=placement.needle_seed, iterations=RRT_ITERATIONS)
+        # Iterations of each RRT; the paper gives it 0.05 s, but a run by time cannot be repeated exactly.
+        path = self._needle_planner.path(deployment, seed=placement.needle_seed, iterations=300)
         return None if path is None else Candidate(tip=tip, deployment=deployment, path=path)

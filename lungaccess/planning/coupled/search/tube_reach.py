@@ -29,8 +29,6 @@ FIRST_MM, LAST_MM = 6.0, 12.0
 one; then those up to the second distance, beyond which there are too many to try for every point."""
 STEP_MM = 0.25
 """Spacing of the points at which the clearance of the tubes is looked up; half of it is taken off."""
-CLEARANCE_CAP_MM = 5.0
-"""Clearances below this are exact: larger ones never limit a plan."""
 
 
 class TubeReachScan:
@@ -114,10 +112,9 @@ def tubes_clearance_mm(atlas: Atlas, path: ArcPath, branch: int) -> float:
     """Return a lower bound of the clearance of tubes in tissue, the pierced branch passed over."""
     points, _mm = path.sample(STEP_MM)
     names = ("airway", "vessel", "pleura", *(("fissure",) if atlas.with_fissures else ()))
+    # Clearances below this are exact: larger ones never limit a plan.
     least = min(
-        atlas.lung.least_clearance_mm(
-            points, name, FIELD_BITS[name], cap_mm=CLEARANCE_CAP_MM, exempt_branch=branch
-        )
+        atlas.lung.least_clearance_mm(points, name, FIELD_BITS[name], cap_mm=5.0, exempt_branch=branch)
         for name in names
     )
     return max(least - 0.5 * STEP_MM, 0.0)

@@ -17,8 +17,6 @@ from stages.scope import evenly
 
 CHUNK = 200
 """Scope tips from which the tubes are aimed in one call, some 10 ms: then the caller may end the search."""
-FINALISTS = 3
-"""Proved deployments of a chunk: the estimated costs by which they are chosen may be in the wrong order."""
 ROWS_MM = (evenly(0.25, 4.0), evenly(0.02, 0.26))
 """How much farther the scope may stop: a fraction of the 1 mm between the tips of an atlas and several times
 as far as the next, then between the best of these and its neighbours."""
@@ -59,7 +57,9 @@ class TubeSearch(SearchInParts):
 
     def _finalists(self, phase: str, entries: Int, found: Float) -> Iterator[Step]:
         """Evaluate the cheapest in full, as long as one may be better than all before."""
-        left = FINALISTS
+        # Proved deployments of a chunk: the estimated costs by which they are chosen may be in the wrong
+        # order.
+        left = 3
         for entry, row in zip(entries.tolist(), found, strict=True):
             if not left or row[COST] > ESTIMATE_SLACK * self.incumbent.cost:
                 return

@@ -37,16 +37,8 @@ STEPS = 200
 """Windows that differ by less than half a percent of the breath count as equally wide: then cost decides."""
 OUTSIDE_COST = 1e9
 """Cost of a breath without a window: half a percent of it is more than any path costs."""
-FAR_MM = 20.0
-"""An aim for phases without that of the masks may lie so far from the target: no lung moves by more."""
-TOWARDS = 0.15
-"""Standard deviation of the first variations of the phase about which an aim is made."""
 VARY_EVERY = 3
 """Steps of the other phases of the search for each variation of the window."""
-VARIATIONS = 200
-"""Variations with which the search of tubes alone ends, a few seconds: several times from wide to small."""
-SHRINK = 0.9
-"""Variations become smaller with every one that fails, and are wide again when one succeeds."""
 _SETTINGS = SearchSettings(kept_slack=100.0)
 """The cheapest arcs need not be those that stay clear: nearly all of them may be starts."""
 
@@ -138,7 +130,8 @@ class WindowAims:
         """Return those of the scope tips of an atlas."""
         motion, phases = require_motion(evaluator.task.lung), evaluator.phases
         held = phases is None or phases[0] <= motion.masks_phase <= phases[1]
-        near = _ending_near(evaluator, atlas, 2.0 * TOLERANCE_MM if held else FAR_MM)
+        # An aim for phases without that of the masks may lie so far from the target: no lung moves by more.
+        near = _ending_near(evaluator, atlas, 2.0 * TOLERANCE_MM if held else 20.0)
         found = np.full((atlas.motions.count, 6), np.nan)
         for site in np.unique(atlas.deployments.site[near]).tolist():
             aim = evaluator.aim_from(np.ascontiguousarray(atlas.motions.tips[site, :3]))
@@ -247,7 +240,9 @@ class WindowTubeSearch(TubeSearch):
     def further_steps(self) -> Iterator[Step]:
         """Look along the motions, then vary the best; each motion and each variation is an iteration."""
         varied_too = _variations(self.window_evaluator, self.incumbent, self.share[0])
-        steps = chain(super().further_steps(), islice(varied_too, VARIATIONS))
+        # Variations with which the search of tubes alone ends, a few seconds: several times from wide to
+        # small.
+        steps = chain(super().further_steps(), islice(varied_too, 200))
         for iteration, step in enumerate(steps, start=1):
             yield self.incumbent.improved(replace(step, iteration=iteration))
 
@@ -279,11 +274,13 @@ def _variations(evaluator: WindowEvaluator, incumbent: Incumbent, number: int) -
             continue
         size = size if size >= SMALLEST else 1.0
         turn, *shifts = random_change(rng, size, task.system.tubes)
-        towards = min(max(middle + TOWARDS * size * float(rng.standard_normal()), 0.0), 1.0)
+        # Standard deviation of the first variations of the phase about which an aim is made.
+        towards = min(max(middle + 0.15 * size * float(rng.standard_normal()), 0.0), 1.0)
         aim = evaluator.moving.aim(best.tip.lps_from_scope_tip[:3, 3], towards)
         before = incumbent.cost
         made = varied(evaluator, best, turn, shifts, np.array(aim.point_lps))
         step = evaluated_step(evaluator, phase, made)
         yield step
         better = step.cost < before
-        size, middle = (1.0, towards) if better else (SHRINK * size, middle)
+        # Variations become smaller with every one that fails, and are wide again when one succeeds.
+        size, middle = (1.0, towards) if better else (0.9 * size, middle)

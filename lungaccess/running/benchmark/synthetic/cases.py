@@ -42,11 +42,6 @@ from lungaccess.running.benchmark.synthetic.phantoms import (
     phantom_named,
 )
 
-SPACING_MM = 5.0
-"""The tips lie this far apart along the airway: a handful in every segmental bronchus."""
-DIGITS = 7
-"""States are rounded to so many in mm and rad: the check allows a micrometre at the tip."""
-
 BENCHMARK, CASE = "benchmark.json", "case.json"
 RULES = (
     "A query is a phantom, a device and a target; a planner may use all files of FOLDER but no other answer.",
@@ -175,11 +170,13 @@ def scope_tips(lung: Lung, system: str) -> dict[str, Any]:
     `lps_from_entry` is one for all; each of `tips` has `lps_from_tip` (4x4, LPS mm) and `states` of advance
     in mm, twist and bend in rad; see `lungaccess.plans.parts.ScopeInsertion`.
     """
-    motions = motions_of(lung, load_system(system), SPACING_MM)
+    # The tips lie this far apart along the airway: a handful in every segmental bronchus.
+    motions = motions_of(lung, load_system(system), 5.0)
     found = []
     for number in range(motions.count):
         motion = motions.motion(number)
-        states = motion.states.round(DIGITS).tolist()
+        # States are rounded to so many in mm and rad: the check allows a micrometre at the tip.
+        states = motion.states.round(7).tolist()
         found.append({"lps_from_tip": motion.lps_from_tip.tolist(), "states": states})
     return {"frame": "lps", "lps_from_entry": motions.lps_from_entry.tolist(), "tips": found}
 

@@ -171,7 +171,10 @@ def beyond_carina_mm(motion: Motion, tree: AirwayTree) -> float:
 
 @frozen_record
 class Cells:
-    """Places of a moving section: C cells.
+    """Places of a moving section: C cells, pieces of arc, or also of time where the section twists or bends.
+
+    A cell is measured at its middle: no other place of it is farther from there than its length and its
+    motion say, so that a cell that may come too near is cut in two, until it is seen whether it does.
 
     Args:
         state ((C,) int64): State from which on the scope moves.

@@ -61,16 +61,12 @@ class Finding:
 class Limit:
     """Between which values a figure of the masks is usual, and between which it is possible.
 
-    Parameters
-    ----------
-    check : str
-        A key of `CHECKS`.
-    words, form : str
-        The sentence with a place for the figure, and how the figure is written: without a form it is a share.
-    usual, possible : (least, greatest)
-        Beyond the one is a warning, beyond the other a refusal.
-    reason : str
-        Where the limits are from.
+    Args:
+        check: A key of `CHECKS`.
+        words, form: The sentence with a place for the figure, and how the figure is written: without a form
+            it is a share.
+        usual, possible ((least, greatest)): Beyond the one is a warning, beyond the other a refusal.
+        reason: Where the limits are from.
     """
 
     check: str
@@ -299,10 +295,8 @@ def with_accepted(findings: Iterable[Finding], names: Collection[str]) -> tuple[
 def require_plausible(findings: Collection[Finding], accepted: Collection[str]) -> tuple[str, ...]:
     """Return the names of the checks that failed and are accepted.
 
-    Raises
-    ------
-    AnatomyError
-        If a check failed that is not.
+    Raises:
+        AnatomyError: If a check failed that is not.
     """
     failed = [each for each in findings if each.verdict in (REFUSED, ACCEPTED)]
     refused = [each for each in with_accepted(failed, accepted) if each.verdict == REFUSED]

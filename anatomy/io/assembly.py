@@ -22,21 +22,14 @@ MAY_BE_EMPTY = ("fissures", "nodules")
 def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any) -> PatientImages:
     """Make the `PatientImages` of masks that were read, after checking that none is missing or empty.
 
-    Parameters
-    ----------
-    masks : MaskSet
-    name, kind : str
-        As in `PatientImages`.
-    where : Path
-        The patient's folder, for messages.
-    others
-        Further fields of `PatientImages`; `warnings` and `sources` are added to.
+    Args:
+        name, kind: As in `PatientImages`.
+        where: The patient's folder, for messages.
+        others: Further fields of `PatientImages`; `warnings` and `sources` are added to.
 
-    Raises
-    ------
-    AnatomyError
-        If lumen, vessels or lung is missing, or a mask is empty.  An empty mask of fissures or nodules
-        only causes a warning.
+    Raises:
+        AnatomyError: If lumen, vessels or lung is missing, or a mask is empty.  An empty mask of fissures or
+            nodules only causes a warning.
     """
     masks = with_contents(with_lobes(masks))
     missing = [words for role, words in LUNG_ROLES.items() if role not in masks.masks]
@@ -74,10 +67,8 @@ def describe_yourself() -> str:
 def volumes_of(masks: MaskSet) -> tuple[dict[str, Volume], list[str]]:
     """Return the masks that are not empty as volumes, and a warning for each that is.
 
-    Raises
-    ------
-    AnatomyError
-        If a mask is empty that is neither of fissures nor of nodules.
+    Raises:
+        AnatomyError: If a mask is empty that is neither of fissures nor of nodules.
     """
     volumes: dict[str, Volume] = {}
     warnings: list[str] = []

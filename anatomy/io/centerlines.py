@@ -22,21 +22,15 @@ _VTK_LINE, _VTK_POLY_LINE = 3, 4
 def read_centerlines(path: str | Path, *, frame: Frame | None = None) -> AirwayTree:
     """Read a centreline file as an airway tree.
 
-    Parameters
-    ----------
-    path : path of a .vtp or .vtu file in mm
-        Lines with one of the point arrays `RADIUS_NAMES`, mm.
-    frame : "ras" or "lps", optional
-        The frame to assume if, and only if, the file states none in a field array `SPACE`.
+    Args:
+        path (path of a .vtp or .vtu file in mm): Lines with one of the point arrays `RADIUS_NAMES`, mm.
+        frame ("ras" or "lps"): The frame to assume if, and only if, the file states none in a field array
+            `SPACE`.
 
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged, holds no lines or no radius.
-    FrameError
-        If the file states no frame and none is given, or another one than is given.
-    AnatomyError
-        If the lines hold no trachea.
+    Raises:
+        FileError: If the file is missing, damaged, holds no lines or no radius.
+        FrameError: If the file states no frame and none is given, or another one than is given.
+        AnatomyError: If the lines hold no trachea.
     """
     return tree_from_graph(*read_centerline_graph(path, frame=frame))
 
@@ -44,15 +38,12 @@ def read_centerlines(path: str | Path, *, frame: Frame | None = None) -> AirwayT
 def read_centerline_graph(path: str | Path, *, frame: Frame | None = None) -> tuple[Float, Float, Int]:
     """Read the lines of a centreline file of any tubes, airways or vessels; see `read_centerlines`.
 
-    Returns
-    -------
-    (N, 3) float64, (N,) float64, (E, 2) int64
-        Points in LPS mm, radii in mm, and pairs of points that follow each other on a line.
+    Returns:
+        (N, 3) float64, (N,) float64, (E, 2) int64: Points in LPS mm, radii in mm, and pairs of points that
+            follow each other on a line.
 
-    Raises
-    ------
-    FileError, FrameError
-        As `read_centerlines`.
+    Raises:
+        FileError, FrameError: As `read_centerlines`.
     """
     file = read_vtk_xml(path)
     lps_from_file = LPS_FROM[_frame(file, path, frame)]
@@ -146,10 +137,8 @@ def write_centerlines(path: str | Path, tree: AirwayTree) -> None:
 
     Every branch after the first begins with the point it hangs on.  No digit is lost.
 
-    Raises
-    ------
-    FileError
-        If the name does not end in .vtp, or the file cannot be written.
+    Raises:
+        FileError: If the name does not end in .vtp, or the file cannot be written.
     """
     require_suffix(path, ".vtp")
     lines = []

@@ -23,10 +23,8 @@ def pieces(path: Path, offset: int = 0, *, compressed: bool | None = None) -> It
 
     Whether they are compressed is found out at the beginning of the file if it is not stated.
 
-    Raises
-    ------
-    FileError
-        At the end of a compressed file whose checksum is wrong or that was cut short.
+    Raises:
+        FileError: At the end of a compressed file whose checksum is wrong or that was cut short.
     """
     with path.open("rb") as stream:
         stream.seek(offset)
@@ -43,10 +41,8 @@ def plain_pieces(stream: BinaryIO) -> Iterator[bytes]:
 def inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
     """Yield the decompressed rest of `stream` (gzip, also several members, or zlib).
 
-    Raises
-    ------
-    FileError
-        If the stream is damaged or ends early; `path` is named.
+    Raises:
+        FileError: If the stream is damaged or ends early; `path` is named.
     """
     decoder, pending = zlib.decompressobj(_ANY_HEADER), b""
     try:

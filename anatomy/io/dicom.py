@@ -61,10 +61,8 @@ class SeriesInfo:
 def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
     """List the DICOM series of a folder and its subfolders, ordered by UID.
 
-    Raises
-    ------
-    FileError
-        If there is no folder, or no DICOM image in it.
+    Raises:
+        FileError: If there is no folder, or no DICOM image in it.
     """
     by_uid, _ = _headers_by_series(Path(folder))
     with _reading(folder):
@@ -74,24 +72,16 @@ def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
 def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
     """Read a CT series in Hounsfield units.
 
-    Parameters
-    ----------
-    folder : path
-    series_uid : str, optional
-        Which series to read; it must be given when the folder holds more than one.
+    Args:
+        series_uid: Which series to read; it must be given when the folder holds more than one.
 
-    Returns
-    -------
-    Volume
+    Returns:
         Hounsfield units, (ni, nj, nk); k runs along the normal of the slices.
 
-    Raises
-    ------
-    FileError
-        If the choice of series is open, slices are missing, damaged, empty, doubled or unevenly spaced, or
-        the files do not state Hounsfield units.
-    FrameError
-        If the gantry was tilted, so that the voxels do not form a rectangular grid.
+    Raises:
+        FileError: If the choice of series is open, slices are missing, damaged, empty, doubled or unevenly
+            spaced, or the files do not state Hounsfield units.
+        FrameError: If the gantry was tilted, so that the voxels do not form a rectangular grid.
     """
     by_uid, others = _headers_by_series(Path(folder))
     uid = _choose(by_uid, series_uid, folder)
@@ -108,10 +98,8 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
 def series_headers(folder: Path, series_uid: str | None = None) -> list[FileDataset]:
     """Return the headers of the slices of a series, by the names of their files.
 
-    Raises
-    ------
-    FileError
-        If the choice of series is open, or a slice cannot be read.
+    Raises:
+        FileError: If the choice of series is open, or a slice cannot be read.
     """
     by_uid, _others = _headers_by_series(folder)
     chosen = by_uid[_choose(by_uid, series_uid, folder)]

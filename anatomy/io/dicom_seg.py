@@ -51,10 +51,8 @@ veins, right and left lung, neoplasm; mass."""
 def highdicom() -> Any:
     """Return the library that reads and writes the objects of DICOM.
 
-    Raises
-    ------
-    SettingsError
-        If it is not installed.
+    Raises:
+        SettingsError: If it is not installed.
     """
     try:
         return importlib.import_module("highdicom")
@@ -208,12 +206,9 @@ def _opened(path: Path) -> Iterator[_Segments | _Contours]:
 def read_segments(path: Path) -> tuple[Volume, Mapping[int, str]]:
     """Read masks as a label map, in which later ones cover earlier ones, and their labels by number.
 
-    Raises
-    ------
-    FileError
-        If the file is no Segmentation object or Structure Set, or damaged.
-    SettingsError
-        If the extra `dicom` is not installed.
+    Raises:
+        FileError: If the file is no Segmentation object or Structure Set, or damaged.
+        SettingsError: If the extra `dicom` is not installed.
     """
     with _opened(path) as found:
         return found.label_map(), found.names
@@ -224,12 +219,9 @@ def read_segment_masks(path: Path, parts: Sequence[tuple[str, Sequence[int]]]) -
 
     A file with one segment is a mask by itself.
 
-    Raises
-    ------
-    AnatomyError
-        If no segment has a number, or several segments are there and none means the role.
-    FileError, SettingsError
-        As `read_segments`.
+    Raises:
+        AnatomyError: If no segment has a number, or several segments are there and none means the role.
+        FileError, SettingsError: As `read_segments`.
     """
     with _opened(path) as found:
         volumes = [found.mask(_numbers(path, found.roles, found.names, *part)) for part in parts]

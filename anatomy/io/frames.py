@@ -23,19 +23,15 @@ LPS_FROM: dict[str, Float] = {"lps": read_only(np.eye(4)), "ras": LPS_FROM_RAS}
 def parse_point(text: str) -> Float:
     """Read a point with a stated frame, `ras:x,y,z` or `lps:x,y,z`, in mm.
 
-    Returns
-    -------
-    (3,) float64, LPS mm
+    Returns:
+        (3,) float64, LPS mm.
 
-    Raises
-    ------
-    FrameError
-        If the frame is missing or unknown, or there are not three finite numbers.
+    Raises:
+        FrameError: If the frame is missing or unknown, or there are not three finite numbers.
 
-    Examples
-    --------
-    >>> parse_point("ras:10,-20,30").tolist()
-    [-10.0, 20.0, 30.0]
+    Examples:
+        >>> parse_point("ras:10,-20,30").tolist()
+        [-10.0, 20.0, 30.0]
     """
     frame, separator, numbers = text.strip().partition(":")
     frame = frame.strip().lower()
@@ -61,22 +57,16 @@ def _point_error(text: str, problem: str) -> FrameError:
 def read_pose(path: str | Path, frame: Frame | None) -> Float:
     """Read a 4x4 pose whose +z column is the direction of insertion.
 
-    Parameters
-    ----------
-    path : path of a text file of 16 numbers
-    frame : "ras" or "lps"
-        The frame of the numbers, because the file cannot state it; None is refused.
+    Args:
+        path: path of a text file of 16 numbers.
+        frame ("ras" or "lps"): The frame of the numbers, because the file cannot state it; None is refused.
 
-    Returns
-    -------
-    lps_from_tip : (4, 4) float64, LPS mm
+    Returns:
+        lps_from_tip ((4, 4) float64, LPS mm)
 
-    Raises
-    ------
-    FileError
-        If the file does not hold 4x4 finite numbers.
-    FrameError
-        If the frame is not stated, or the matrix is not a right-handed rigid pose.
+    Raises:
+        FileError: If the file does not hold 4x4 finite numbers.
+        FrameError: If the frame is not stated, or the matrix is not a right-handed rigid pose.
     """
     matrix = _numbers(path)
     if frame is None:
@@ -98,10 +88,8 @@ def read_pose(path: str | Path, frame: Frame | None) -> Float:
 def read_points(path: str | Path, frame: Frame) -> Float:
     """Read points from a text file of three numbers a point; return `(N, 3)` float64, LPS mm.
 
-    Raises
-    ------
-    FileError
-        If the file does not hold a multiple of three finite numbers.
+    Raises:
+        FileError: If the file does not hold a multiple of three finite numbers.
     """
     values = _numbers(path).ravel()
     if values.size == 0 or values.size % 3:

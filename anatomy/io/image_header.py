@@ -37,22 +37,15 @@ A_FIELD = (
 class ImageHeader:
     """What is needed to read the voxels of a file.
 
-    Parameters
-    ----------
-    grid : Grid
-    is_reversed : bool
-        Whether the file counts the first index the other way; see `right_handed_grid`.
-    dtype : dtype of the voxels on disk, with byte order
-    slope, intercept : float
-        The value of a voxel is `slope * stored + intercept`.
-    labels : mapping of int to str
-        Names of label values, empty if there are none.
-    components : int
-        Numbers a voxel: 1, or 3 for a displacement field.
-    components_first : bool
-        Whether the numbers of a voxel follow each other in the file, instead of one image after the other.
-    vectors_are_ras : bool
-        Whether vectors have the axes of RAS instead of LPS.
+    Args:
+        is_reversed: Whether the file counts the first index the other way; see `right_handed_grid`.
+        dtype: dtype of the voxels on disk, with byte order.
+        slope, intercept: The value of a voxel is `slope * stored + intercept`.
+        labels: Names of label values, empty if there are none.
+        components: Numbers a voxel: 1, or 3 for a displacement field.
+        components_first: Whether the numbers of a voxel follow each other in the file, instead of one image
+            after the other.
+        vectors_are_ras: Whether vectors have the axes of RAS instead of LPS.
     """
 
     grid: Grid
@@ -90,10 +83,9 @@ def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes:
 
     `itemsize` is the number of bytes of a voxel.
 
-    Raises
-    ------
-    FileError
-        If there are not three positive sizes, or the file is too short for them, or they are absurd.
+    Raises:
+        FileError: If there are not three positive sizes, or the file is too short for them, or they are
+            absurd.
     """
     if len(sizes) != 3 or min(sizes) < 1:
         raise FileError(
@@ -136,10 +128,8 @@ def not_begun(path: Path, format_name: str, expected: str) -> FileError:
 def require_lengths(values: Sequence[float], name: str, path: Path) -> Float:
     """Return the distances of voxels, or of vectors' ends, that a header states, as `(n,)` float64.
 
-    Raises
-    ------
-    FrameError
-        If one is not positive: programs differ in what they then read.
+    Raises:
+        FrameError: If one is not positive: programs differ in what they then read.
     """
     stated = np.array(values, dtype=np.float64)
     if not (stated > 0.0).all():
@@ -192,10 +182,8 @@ def fields_once(pairs: Iterable[tuple[str, str]], path: Path) -> dict[str, str]:
 def named_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> Grid:
     """Make a grid; a `FrameError` names the file it came from.
 
-    Raises
-    ------
-    FrameError
-        If the matrix is none of a grid, or a corner lies absurdly far away.
+    Raises:
+        FrameError: If the matrix is none of a grid, or a corner lies absurdly far away.
     """
     try:
         grid = Grid(shape=shape, lps_from_ijk=lps_from_ijk)
@@ -216,10 +204,9 @@ def right_handed_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Pa
 
     Many programs store images so; nothing is mirrored as long as voxels and matrix agree.
 
-    Returns
-    -------
-    tuple of (Grid, bool)
-        The right-handed grid, and whether the voxels must be reversed along their first axis.
+    Returns:
+        tuple of (Grid, bool): The right-handed grid, and whether the voxels must be reversed along their
+            first axis.
     """
     if not np.linalg.det(lps_from_ijk[:3, :3]) < 0.0:
         return named_grid(shape, lps_from_ijk, path), False

@@ -69,24 +69,17 @@ def read_grid(path: str | Path, *, frame: Frame | None = None) -> Grid:
 def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
     """Read an image in its own type of voxel.
 
-    Parameters
-    ----------
-    path : path of a .nii, .nii.gz (or .gz), .nrrd, .seg.nrrd, .mha or .mhd file, or a DICOM segmentation
-    frame : "ras" or "lps", optional
-        The frame to assume if, and only if, the file states none.
+    Args:
+        path: path of a .nii, .nii.gz (or .gz), .nrrd, .seg.nrrd, .mha or .mhd file, or a DICOM segmentation.
+        frame ("ras" or "lps"): The frame to assume if, and only if, the file states none.
 
-    Returns
-    -------
-    Volume
-        `array[i, j, k]` with the grid in LPS mm; the first index of a file with left-handed axes is
-        counted the other way.
+    Returns:
+        `array[i, j, k]` with the grid in LPS mm; the first index of a file with left-handed axes is counted
+        the other way.
 
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged, truncated, absurdly large or no image of three dimensions.
-    FrameError
-        If the file states no frame and none is given, or its axes are not perpendicular.
+    Raises:
+        FileError: If the file is missing, damaged, truncated, absurdly large or no image of three dimensions.
+        FrameError: If the file states no frame and none is given, or its axes are not perpendicular.
     """
     path = require_file(path)
     if _holds_segments(path):
@@ -106,23 +99,16 @@ def read_mask(
 ) -> Volume:
     """Read an image as a bool mask: of one label, of two values, of fractions, or of labels that are named.
 
-    Parameters
-    ----------
-    path, frame
-        As in `read_volume`.
-    role, labels
-        What the mask shows, and the labels that count, as in `anatomy.io.mask_values.mask_of`.
-    say : callable
-        Receives what a user should know of how the values were understood, such as that of fractions those
-        of at least a half count, and how the volume changes.
+    Args:
+        path, frame: As in `read_volume`.
+        role, labels: What the mask shows, and the labels that count, as in `anatomy.io.mask_values.mask_of`.
+        say: Receives what a user should know of how the values were understood, such as that of fractions
+            those of at least a half count, and how the volume changes.
 
-    Raises
-    ------
-    AnatomyError
-        If a voxel is not a number, several labels occur and none is named, or the values are those of no
-        mask.
-    FileError, FrameError
-        As `read_volume`.
+    Raises:
+        AnatomyError: If a voxel is not a number, several labels occur and none is named, or the values are
+            those of no mask.
+        FileError, FrameError: As `read_volume`.
     """
     grid, masks, said = read_parts(path, [(role, labels)], frame=frame)
     for each in said:
@@ -161,11 +147,9 @@ def read_parts(
 def read_labels(path: str | Path) -> Mapping[int, str]:
     """Read the names of label values that a file carries in its header.
 
-    Returns
-    -------
-    dict of label value to name
-        From the label table in the header extension of NIfTI, or the segments of .seg.nrrd or DICOM; empty if
-        there is none.
+    Returns:
+        dict of label value to name: From the label table in the header extension of NIfTI, or the segments of
+            .seg.nrrd or DICOM; empty if there is none.
     """
     path = require_file(path)
     if _holds_segments(path):
@@ -213,20 +197,12 @@ def write_volume(
 
     The file appears complete or not at all.
 
-    Parameters
-    ----------
-    path : path
-    volume : Volume
-    header : mapping of str to str, optional
-        `key:=value` lines of a .nrrd file, such as those that name the segments of .seg.nrrd.
+    Args:
+        header: `key:=value` lines of a .nrrd file, such as those that name the segments of .seg.nrrd.
+        note: What the header of a NIfTI file says of its voxels, at most 79 letters.
 
-    note : str
-        What the header of a NIfTI file says of its voxels, at most 79 letters.
-
-    Raises
-    ------
-    FileError
-        If the ending is unknown or the folder cannot be written to.
+    Raises:
+        FileError: If the ending is unknown or the folder cannot be written to.
     """
     path = Path(path)
     if image_suffix(path) not in (".nii", ".nii.gz", ".nrrd", ".seg.nrrd"):
@@ -249,10 +225,8 @@ def write_image(image: SimpleITK.Image, path: Path, components: int = 1) -> None
 
     ITK says nothing where the disk is full: what was written is read through once, up to its checksum.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written to, or the disk is full.
+    Raises:
+        FileError: If the folder cannot be written to, or the disk is full.
     """
     import SimpleITK
 

@@ -19,20 +19,14 @@ _HEADER_LIMIT = 1 << 20
 def input_hashes(path: str | Path) -> dict[str, str]:
     """Return the SHA-256 of every file a patient may be read from, by its path in the patient's folder.
 
-    Parameters
-    ----------
-    path : str or Path
-        What `anatomy.io.load_patient` takes.
+    Args:
+        path: What `anatomy.io.load_patient` takes.
 
-    Returns
-    -------
-    dict of str to str
+    Returns:
         Which file was stated as the label map is told apart by an entry of its own.
 
-    Raises
-    ------
-    FileError
-        If there is nothing at `path`, or a file cannot be read.
+    Raises:
+        FileError: If there is nothing at `path`, or a file cannot be read.
     """
     path = Path(path)
     if path.is_dir() and (path / DESCRIPTION).is_file():

@@ -33,10 +33,8 @@ def stored_names(path: Path) -> dict[int, str]:
     A side-car of the folder counts only for files that hold no other values than it names, because a
     CT may lie beside the label map.
 
-    Raises
-    ------
-    FileError
-        If a side-car is no JSON object.
+    Raises:
+        FileError: If a side-car is no JSON object.
     """
     names = dict(read_labels(path))
     stem = image_stem(path)
@@ -84,25 +82,17 @@ def _sidecar_names(path: Path) -> dict[int, str]:
 def published_names(stem: str, values: set[float], path: Path) -> tuple[dict[int, str], str]:
     """Name the labels of a TotalSegmentator file that stores no names, and say so.
 
-    Parameters
-    ----------
-    stem : str
-        File name without ending; a name that begins with "total" belongs to the task total.
-    values : set of numbers
-        The label values that occur.
-    path : Path
-        For messages.
+    Args:
+        stem: File name without ending; a name that begins with "total" belongs to the task total.
+        values (set of numbers): The label values that occur.
+        path: For messages.
 
-    Returns
-    -------
-    names : dict of label value to name
-    statement : str
-        A warning which table was used.
+    Returns:
+        - names (dict of label value to name)
+        - statement - A warning which table was used.
 
-    Raises
-    ------
-    AnatomyError
-        If the values fit more than one published table.
+    Raises:
+        AnatomyError: If the values fit more than one published table.
     """
     if stem.startswith("total") and max(values, default=0) > _LAST_LABEL_OF_TOTAL_1:
         table, title = TOTAL_LOBES, "task total, version 2"

@@ -35,13 +35,9 @@ _LARGEST_BYTES = 1 << 28
 class ControlPoint:
     """A point of a markup.
 
-    Parameters
-    ----------
-    label : str
-    lps_from_point : (4, 4) float64
-        Its place, LPS mm, and the frame that 3D Slicer keeps at it.
-    oriented : bool
-        Whether that frame was stated: 3D Slicer gives every point that of its screen, RAS.
+    Args:
+        lps_from_point ((4, 4) float64): Its place, LPS mm, and the frame that 3D Slicer keeps at it.
+        oriented: Whether that frame was stated: 3D Slicer gives every point that of its screen, RAS.
     """
 
     label: str
@@ -61,14 +57,10 @@ class ControlPoint:
 class Markup:
     """A list of points or a curve, as 3D Slicer saved it.
 
-    Parameters
-    ----------
-    name : str
-        As in the scene, or in its file where there is no scene.
-    kind : str
-        "Fiducial", "Curve", "Line" or another of 3D Slicer's types.
-    points : tuple of ControlPoint
-        Those that are placed.
+    Args:
+        name: As in the scene, or in its file where there is no scene.
+        kind: "Fiducial", "Curve", "Line" or another of 3D Slicer's types.
+        points: Those that are placed.
     """
 
     name: str
@@ -103,12 +95,9 @@ def parse_reference(text: str) -> Reference | None:
 def read_named_point(reference: Reference) -> ControlPoint:
     """Return the point of a label, or the only point of a list or curve of that name.
 
-    Raises
-    ------
-    FileError
-        If the file is none of 3D Slicer's, or holds not exactly one such point.
-    FrameError
-        If its frame is not stated, or a transform moves it that is not hardened.
+    Raises:
+        FileError: If the file is none of 3D Slicer's, or holds not exactly one such point.
+        FrameError: If its frame is not stated, or a transform moves it that is not hardened.
     """
     markups = read_markups(reference.file)
     by_label = [point for each in markups for point in each.points if point.label == reference.name]
@@ -119,10 +108,8 @@ def read_named_point(reference: Reference) -> ControlPoint:
 def read_named_pose(reference: Reference) -> Float:
     """Return the pose `(4, 4)` LPS mm of a point that has a direction of its own, see `read_named_point`.
 
-    Raises
-    ------
-    FrameError
-        If the point states no direction, or its frame is not that of a rigid body.
+    Raises:
+        FrameError: If the point states no direction, or its frame is not that of a rigid body.
     """
     point = read_named_point(reference)
     if not point.oriented:
@@ -155,13 +142,10 @@ def _only(found: list[Kind], reference: Reference, what: str, names: Iterable[st
 def read_markups(path: str | Path) -> tuple[Markup, ...]:
     """Return all lists of points and curves of a `.mrk.json`, a scene `.mrml` or a bundle `.mrb`.
 
-    Raises
-    ------
-    FileError
-        If it is none of these, or damaged.
-    FrameError
-        If the frame of its points is not stated or not one of a rigid body, or a transform moves them that
-        is not hardened.
+    Raises:
+        FileError: If it is none of these, or damaged.
+        FrameError: If the frame of its points is not stated or not one of a rigid body, or a transform moves
+            them that is not hardened.
     """
     path = require_file(path)
     kind = path.suffix.lower()

@@ -28,24 +28,17 @@ def mask_of(
 ) -> tuple[Mask, tuple[str, ...]]:
     """Return the mask that the values of an image stand for, and what has to be said of it.
 
-    Parameters
-    ----------
-    values : (ni, nj, nk) of numbers
-    name : str
-        The file, for messages.
-    voxel_mm3 : float
-        Volume of a voxel.
-    role : str
-        What the mask shows, see `PARTS`; empty for a mask of one label.
-    labels : sequence of int
-        The labels that count; if there are none, the image has to be a mask by itself: of two values, or
-        fractions, of which those of at least a half count.
+    Args:
+        values: (ni, nj, nk) of numbers.
+        name: The file, for messages.
+        voxel_mm3: Volume of a voxel.
+        role: What the mask shows, see `PARTS`; empty for a mask of one label.
+        labels: The labels that count; if there are none, the image has to be a mask by itself: of two values,
+            or fractions, of which those of at least a half count.
 
-    Raises
-    ------
-    AnatomyError
-        If a value is not a number, several labels occur and none is named, or the values are those of no
-        mask.
+    Raises:
+        AnatomyError: If a value is not a number, several labels occur and none is named, or the values are
+            those of no mask.
     """
     require_numbers(values, name)
     if labels:

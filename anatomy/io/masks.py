@@ -68,10 +68,9 @@ def read_masks(
     The grid is that of the first file, of the lumen if there is one, continued as far as the files of the
     roles in `extent` reach.  A file on another grid is placed by its own header, and a statement says how.
 
-    Raises
-    ------
-    AnatomyError, FileError, FrameError
-        As `read_mask`; or if a file of the lungs or lumen lies far from the others.
+    Raises:
+        AnatomyError, FileError, FrameError: As `read_mask`; or if a file of the lungs or lumen lies far from
+            the others.
     """
     paths = list(dict.fromkeys(source.path for source in sources))
     if not paths:
@@ -226,16 +225,11 @@ _BEYOND = {
 def placement(name: str, role: str, mask: Mask, grid: Grid, target: Grid, found: Placed) -> str:
     """Say how a mask on another grid was placed by its header.
 
-    Parameters
-    ----------
-    name, role : str
-        The file, and what it shows.
-    mask, grid : Mask, Grid
-        The mask on its own grid.
-    target : Grid
-        The common grid of the patient.
-    found : Placed
-        The mask on it.
+    Args:
+        name, role: The file, and what it shows.
+        mask, grid: The mask on its own grid.
+        target: The common grid of the patient.
+        found: The mask on it.
     """
     if found.n_voxels and found.n_lost == found.n_voxels:
         return (

@@ -50,10 +50,8 @@ def is_med_rad(folder: Path) -> bool:
 def require_no_brain(folder: Path) -> None:
     """Refuse a brain of Med-RAD in words.
 
-    Raises
-    ------
-    FileError
-        If the folder is one.
+    Raises:
+        FileError: If the folder is one.
     """
     found = [name for name in _BRAIN if name in by_name(folder)]
     if "brain" in found and (len(found) > 1 or "vessels" in by_name(folder)):
@@ -70,10 +68,9 @@ def load_med_rad(folder: Path) -> PatientImages:
     `pleuralBoundary` is, despite its name, a filled mask of both lungs; the respiratory part has lobes
     instead.  The collection does not tell the airway wall from the lumen, and does not state the breath hold.
 
-    Raises
-    ------
-    FrameError
-        If a start or target lies outside the images: its numbers are not RAS, or of another patient.
+    Raises:
+        FrameError: If a start or target lies outside the images: its numbers are not RAS, or of another
+            patient.
     """
     sources = lung_sources(folder)
     require_roles(folder, sources)
@@ -150,12 +147,9 @@ def text_poses(folder: Path, grid: Grid) -> TextPoses:
 
     A name that holds both, such as `target1_start2.txt`, is a start.
 
-    Raises
-    ------
-    FileError
-        If a file holds no pose or point.
-    FrameError
-        If a position lies outside `grid`.
+    Raises:
+        FileError: If a file holds no pose or point.
+        FrameError: If a position lies outside `grid`.
     """
     texts = sorted(folder.glob("*.[tT][xX][tT]"), key=_natural)
     start_files = [path for path in texts if re.search(r"start_?\d*$", path.stem.lower())]
@@ -186,10 +180,8 @@ def _natural(path: Path) -> tuple[list[int], str]:
 def require_roles(folder: Path, sources: list[MaskSource]) -> None:
     """Refuse a folder that lacks a mask, and say which file is missing and which one looks like it.
 
-    Raises
-    ------
-    AnatomyError
-        If lumen, vessels, or lungs and lobes are missing.
+    Raises:
+        AnatomyError: If lumen, vessels, or lungs and lobes are missing.
     """
     found = {"lung" if source.role == "lobes" else source.role for source in sources}
     missing = [role for role in LUNG_ROLES if role not in found]

@@ -30,12 +30,10 @@ def open_metaimage(path: Path, components: int = 1) -> tuple[image_header.ImageH
 
     `components` is how many numbers a voxel must have.
 
-    Raises
-    ------
-    FileError
-        If it is no MetaImage of three dimensions, or its data lie elsewhere than in one plain file beside it.
-    FrameError
-        If its axes are not perpendicular.
+    Raises:
+        FileError: If it is no MetaImage of three dimensions, or its data lie elsewhere than in one plain file
+            beside it.
+        FrameError: If its axes are not perpendicular.
     """
     fields, offset = _text(path)
     _require_plain(fields, path)

@@ -93,21 +93,15 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
     RAS on disk.)  Landmark pairs are lines of six numbers: a place at end-exhale and the same tissue at
     end-inhale.
 
-    Parameters
-    ----------
-    masks : Grid
-        Of the masks; a transform is evaluated over it.
+    Args:
+        masks: Of the masks; a transform is evaluated over it.
 
-    Raises
-    ------
-    SettingsError
-        If the keys contradict each other, or the phase of the masks or the direction is not stated.
-    FileError
-        If a file is missing, damaged or of another kind.
-    FrameError
-        If a file states no frame, or one in which vectors are not LPS.
-    AnatomyError
-        If a file holds numbers that are not finite.
+    Raises:
+        SettingsError: If the keys contradict each other, or the phase of the masks or the direction is not
+            stated.
+        FileError: If a file is missing, damaged or of another kind.
+        FrameError: If a file states no frame, or one in which vectors are not LPS.
+        AnatomyError: If a file holds numbers that are not finite.
     """
     phase = _require_phase(keys)
     kinds = [bool(keys.file), bool(keys.end_exhale or keys.end_inhale), keys.population]
@@ -177,10 +171,8 @@ def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
 
     Lines that begin with a letter or # are headings.
 
-    Raises
-    ------
-    FileError
-        If a line does not hold six finite numbers.
+    Raises:
+        FileError: If a line does not hold six finite numbers.
     """
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -205,14 +197,10 @@ def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
 def read_vectors(path: Path) -> tuple[Grid, Float]:
     """Return the grid and the vectors `(ni, nj, nk, 3)` LPS mm of an image of displacements.
 
-    Raises
-    ------
-    FileError
-        If it is no complete image of three dimensions with three numbers a voxel.
-    FrameError
-        If it states no frame, its vectors may not be LPS, or its axes are not perpendicular.
-    AnatomyError
-        If a number is not finite.
+    Raises:
+        FileError: If it is no complete image of three dimensions with three numbers a voxel.
+        FrameError: If it states no frame, its vectors may not be LPS, or its axes are not perpendicular.
+        AnatomyError: If a number is not finite.
     """
     with reading(path):
         header, stream = open_image(path, None, components=3)
@@ -225,12 +213,9 @@ def read_vectors(path: Path) -> tuple[Grid, Float]:
 def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
     """Return grid and displacements of an ITK transform, evaluated over the grid of the masks.
 
-    Raises
-    ------
-    FileError
-        If it is no transform of three dimensions that ITK reads.
-    AnatomyError
-        If it moves nothing, or farther than a lung is large.
+    Raises:
+        FileError: If it is no transform of three dimensions that ITK reads.
+        AnatomyError: If it moves nothing, or farther than a lung is large.
     """
     if path.suffix.lower() not in TRANSFORMS:
         raise FileError(
@@ -275,10 +260,8 @@ def _finite(vectors: Array, path: Path) -> Float:
 def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
     """Write a displacement field, `(ni, nj, nk, 3)` LPS mm, in single precision, as `read_vectors` reads it.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written to.
+    Raises:
+        FileError: If the folder cannot be written to.
     """
     write_image(itk_image(vectors.astype(np.float32), grid), Path(path), components=3)
 
@@ -289,17 +272,12 @@ def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
     CTs are compared by correlation; two masks by the distance to their borders, which tells nothing of the
     motion inside but what the border implies.
 
-    Returns
-    -------
-    Grid, (ni, nj, nk, 3) float64
-        LPS mm.
+    Returns:
+        Grid, (ni, nj, nk, 3) float64: LPS mm.
 
-    Raises
-    ------
-    AnatomyError
-        If an image is constant, or one is a mask and the other is not, or nothing is found.
-    FileError, FrameError
-        As `anatomy.io.read_volume`.
+    Raises:
+        AnatomyError: If an image is constant, or one is a mask and the other is not, or nothing is found.
+        FileError, FrameError: As `anatomy.io.read_volume`.
     """
     import SimpleITK
 

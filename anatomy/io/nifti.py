@@ -62,21 +62,15 @@ def open_nifti(
 ) -> tuple[image_header.ImageHeader, Iterator[bytes]]:
     """Read everything before the voxels, and return it with the bytes of the voxels.
 
-    Parameters
-    ----------
-    path : Path
-        A plain or compressed file.
-    frame : "ras" or "lps", optional
-        The frame to assume if the file states none (both transform codes 0).
-    components : int
-        Numbers a voxel: 1, or 3 for a displacement field, which has five dimensions (ni, nj, nk, 1, 3).
+    Args:
+        path: A plain or compressed file.
+        frame ("ras" or "lps"): The frame to assume if the file states none (both transform codes 0).
+        components: Numbers a voxel: 1, or 3 for a displacement field, which has five dimensions (ni, nj, nk,
+            1, 3).
 
-    Raises
-    ------
-    FileError
-        If it is no NIfTI image of three dimensions with plain numbers.
-    FrameError
-        If no frame is stated and none given, or the axes are not perpendicular.
+    Raises:
+        FileError: If it is no NIfTI image of three dimensions with plain numbers.
+        FrameError: If no frame is stated and none given, or the axes are not perpendicular.
     """
     stream = pieces(path)
     start = _at_least(b"", _HEADER_BYTES, stream)

@@ -57,12 +57,11 @@ def open_nrrd(
     `components` is how many numbers a voxel must have; those of a displacement field stand on the first axis
     or on the last, which has no direction.
 
-    Raises
-    ------
-    FileError
-        If it is no NRRD file of three dimensions, or its data lie in another file or in an unknown encoding.
-    FrameError
-        If it states no frame and none is given, its axes are not perpendicular, or vectors may not be LPS.
+    Raises:
+        FileError: If it is no NRRD file of three dimensions, or its data lie in another file or in an unknown
+            encoding.
+        FrameError: If it states no frame and none is given, its axes are not perpendicular, or vectors may
+            not be LPS.
     """
     fields, keys, offset = _text(path)
     dtype = _dtype(fields, path)

@@ -33,16 +33,11 @@ NUMBER_TOLERANCE = 10.0 * ORTHONORMAL_TOLERANCE
 class Received:
     """A message that was read.
 
-    Parameters
-    ----------
-    name : str
-        Name of the device that it is of.
-    time_s : float
-        When it was sent, seconds since 1970 by the sender's clock; 0 if it did not say.
-    lps_from_device : (4, 4) float64 or None
-        The pose of a TRANSFORM, LPS mm.
-    text : str
-        The text of a STRING.
+    Args:
+        name: Name of the device that it is of.
+        time_s: When it was sent, seconds since 1970 by the sender's clock; 0 if it did not say.
+        lps_from_device ((4, 4) float64 or None): The pose of a TRANSFORM, LPS mm.
+        text: The text of a STRING.
     """
 
     name: str
@@ -54,10 +49,8 @@ class Received:
 def require_pyigtl() -> Any:
     """Return the module that makes and reads messages.
 
-    Raises
-    ------
-    SettingsError
-        If pyigtl is not installed.
+    Raises:
+        SettingsError: If pyigtl is not installed.
     """
     try:
         from pyigtl import messages
@@ -105,10 +98,8 @@ def _name(name: str) -> str:
 class Decoder:
     """Reads messages out of the bytes of one connection, in whatever pieces they come.
 
-    Attributes
-    ----------
-    dropped : Counter of str
-        How many messages were dropped, by reason.
+    Attributes:
+        dropped: How many messages were dropped, by reason.
     """
 
     def __init__(self) -> None:
@@ -119,11 +110,9 @@ class Decoder:
     def feed(self, data: bytes) -> Iterator[Received]:
         """Take some bytes, and yield the messages that they complete.
 
-        Raises
-        ------
-        FileError
-            If the bytes are no messages of OpenIGTLink: then nothing after them can be read, and the
-            connection is of no further use.
+        Raises:
+            FileError: If the bytes are no messages of OpenIGTLink: then nothing after them can be read, and
+                the connection is of no further use.
         """
         self._left += data
         while len(self._left) >= HEADER_BYTES:

@@ -81,12 +81,9 @@ def load_own_masks(description: Path) -> PatientImages:
 
     `file#label` takes one label of a label map, by its value or its stored name, and `file#1,2` several.
 
-    Raises
-    ------
-    SettingsError
-        If the file is no TOML, a key is unknown or missing, or a value is not allowed.
-    AnatomyError, FileError, FrameError, GridMismatchError
-        As `load_patient`.
+    Raises:
+        SettingsError: If the file is no TOML, a key is unknown or missing, or a value is not allowed.
+        AnatomyError, FileError, FrameError, GridMismatchError: As `load_patient`.
     """
     keys = _read_description(description)
     folder = description.parent
@@ -122,10 +119,8 @@ def load_own_masks(description: Path) -> PatientImages:
 def motion_alone(description: Path) -> MotionFile | None:
     """Return the motion that a `patient.toml` names; None if it names anything else, such as masks.
 
-    Raises
-    ------
-    SettingsError
-        If the file is no TOML, or a key of the motion is unknown.
+    Raises:
+        SettingsError: If the file is no TOML, or a key of the motion is unknown.
     """
     content = _read_content(description)
     return parse(MotionFile, content["motion"], description.name) if [*content] == ["motion"] else None
@@ -134,10 +129,8 @@ def motion_alone(description: Path) -> MotionFile | None:
 def with_motion(images: PatientImages, keys: MotionFile, description: Path) -> PatientImages:
     """Return images with a motion that a `patient.toml` in their folder names.
 
-    Raises
-    ------
-    AnatomyError, FileError, FrameError, SettingsError
-        As `load_own_masks`.
+    Raises:
+        AnatomyError, FileError, FrameError, SettingsError: As `load_own_masks`.
     """
     folder = description.parent
     hashes = {description.name: sha256(description)}
@@ -149,10 +142,8 @@ def with_motion(images: PatientImages, keys: MotionFile, description: Path) -> P
 def thick_slices_mm(path: str | Path) -> float:
     """Return the distance of the slices of a patient's CT if its description marks them as thick, else 0.
 
-    Raises
-    ------
-    SettingsError
-        If there is a description, and it is wrong.
+    Raises:
+        SettingsError: If there is a description, and it is wrong.
     """
     path = Path(path)
     description = path / DESCRIPTION if path.is_dir() else path

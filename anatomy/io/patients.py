@@ -29,34 +29,24 @@ AIR_HU = -500.0
 def load_patient(path: str | Path) -> PatientImages:
     """Read a patient's lungs from disk.
 
-    Parameters
-    ----------
-    path : str or Path
-        A folder with a `patient.toml`, a lung of Med-RAD, a folder with output of TotalSegmentator, beside
-        which a `patient.toml` may name the motion alone; or a
-        `.toml` file, or a label map of TotalSegmentator with the lobes beside it.
+    Args:
+        path: A folder with a `patient.toml`, a lung of Med-RAD, a folder with output of TotalSegmentator,
+            beside which a `patient.toml` may name the motion alone; or a `.toml` file, or a label map of
+            TotalSegmentator with the lobes beside it.
 
-    Returns
-    -------
-    PatientImages
+    Raises:
+        AnatomyError: If a mask is missing, empty, or holds NaN.
+        FileError: If the path is of none of these kinds, or a file is damaged.  The message names what the
+            folder looks like: a liver, a case without masks of vessels, the folder of a data set and its
+            cases.
+        FrameError: If a file states no frame, or one whose axes are not perpendicular, or lies far from the
+            others.
+        SettingsError: If a `patient.toml` is wrong.
 
-    Raises
-    ------
-    AnatomyError
-        If a mask is missing, empty, or holds NaN.
-    FileError
-        If the path is of none of these kinds, or a file is damaged.  The message names what the folder looks
-        like: a liver, a case without masks of vessels, the folder of a data set and its cases.
-    FrameError
-        If a file states no frame, or one whose axes are not perpendicular, or lies far from the others.
-    SettingsError
-        If a `patient.toml` is wrong.
-
-    Examples
-    --------
-    >>> load_patient("nowhere")
-    Traceback (most recent call last):
-    anatomy.base.errors.FileError: There is no patient at nowhere. ...
+    Examples:
+        >>> load_patient("nowhere")
+        Traceback (most recent call last):
+        anatomy.base.errors.FileError: There is no patient at nowhere. ...
     """
     path = Path(path)
     if path.is_file():

@@ -19,14 +19,11 @@ LARGEST_GROWTH = 4.0
 class Placed:
     """An image on the grid it was placed on.
 
-    Parameters
-    ----------
-    array : Array
-        With the fill value beyond the image.
-    n_voxels, n_lost : int
-        How many voxels of the image are not zero, and how many of these lie outside the grid.
-    is_resampled : bool
-        Whether the voxels of the two grids do not coincide.
+    Args:
+        array: With the fill value beyond the image.
+        n_voxels, n_lost: How many voxels of the image are not zero, and how many of these lie outside the
+            grid.
+        is_resampled: Whether the voxels of the two grids do not coincide.
     """
 
     array: Array
@@ -38,15 +35,11 @@ class Placed:
 def place(array: Array, source: Grid, target: Grid, *, solid: bool = False, fill: float = 0) -> Placed:
     """Place an image on another grid by the nearest position.
 
-    Parameters
-    ----------
-    array : (ni, nj, nk), of any type
-        The image on `source`.
-    solid : bool
-        Whether every voxel that is not zero must remain: a voxel of the grid is also set if the centre of one
-        lies in it, so that thin obstacles leave no holes in coarser voxels.
-    fill : float
-        The value beyond the image.
+    Args:
+        array ((ni, nj, nk), of any type): The image on `source`.
+        solid: Whether every voxel that is not zero must remain: a voxel of the grid is also set if the centre
+            of one lies in it, so that thin obstacles leave no holes in coarser voxels.
+        fill: The value beyond the image.
     """
     target_from_source = target.ijk_from_lps @ source.lps_from_ijk
     source_from_target = source.ijk_from_lps @ target.lps_from_ijk
@@ -73,10 +66,8 @@ def place(array: Array, source: Grid, target: Grid, *, solid: bool = False, fill
 def union_grid(reference: Grid, others: list[tuple[str, Grid]]) -> Grid:
     """Return the voxels of `reference` continued to the box that holds the other grids as well.
 
-    Raises
-    ------
-    FrameError
-        If one of them lies so far away that its header, or that of the reference, must be wrong.
+    Raises:
+        FrameError: If one of them lies so far away that its header, or that of the reference, must be wrong.
     """
     low, high = np.zeros(3), np.array(reference.shape, dtype=np.float64)
     for name, grid in others:

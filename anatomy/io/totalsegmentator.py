@@ -50,18 +50,13 @@ def has_lobes(folder: Path) -> bool:
 def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> PatientImages:
     """Read the masks of tasks lung_vessels and total from one folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Holds one mask a structure (`lung_airways.nii.gz`, ...), or label maps whose labels are named
-        in the header or a side-car, or both.
-    label_map : Path, optional
-        A file of the folder to read as a label map even if it names no labels.
+    Args:
+        folder: Holds one mask a structure (`lung_airways.nii.gz`, ...), or label maps whose labels are named
+            in the header or a side-car, or both.
+        label_map: A file of the folder to read as a label map even if it names no labels.
 
-    Raises
-    ------
-    AnatomyError
-        If a structure is missing or empty, or labels cannot be told apart.
+    Raises:
+        AnatomyError: If a structure is missing or empty, or labels cannot be told apart.
     """
     sources, statements = mask_sources(folder, label_map)
     masks = read_masks(sources)

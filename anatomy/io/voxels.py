@@ -22,10 +22,8 @@ def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Arra
 
     They are float32 where the header scales.
 
-    Raises
-    ------
-    FileError
-        If there are fewer or many more bytes than the header says, or they are damaged.
+    Raises:
+        FileError: If there are fewer or many more bytes than the header says, or they are damaged.
     """
     values = np.zeros(header.stored_shape, np.float32 if header.is_scaled else header.dtype, order="F")
     flat = values.reshape(-1, order="F")

@@ -48,10 +48,9 @@ class VtkFile:
 def read_vtk_xml(path: str | Path) -> VtkFile:
     """Read a PolyData (lines only) or UnstructuredGrid file.
 
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged, truncated, of another kind or compressed otherwise than by zlib.
+    Raises:
+        FileError: If the file is missing, damaged, truncated, of another kind or compressed otherwise than by
+            zlib.
     """
     path = require_file(path)
     with reading(path):

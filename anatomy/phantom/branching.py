@@ -93,20 +93,16 @@ class Sprouts:
 class Centerlines:
     """Ground-truth centrelines of one tree (N points, B branches).
 
-    Parameters
-    ----------
-    points_lps : (N, 3) float64
-        Points of a branch are consecutive; its first point repeats the last point of its parent.
-    radius_mm, outer_radius_mm : (N,) float64
-        Radius of the lumen and of the outside of the wall (equal for vessels).
-    branch_start : (B + 1,) int64
-        Points of branch b are `branch_start[b]:branch_start[b + 1]`.
-    branch_parent : (B,) int64
-        -1 at the root; parents come before children.  Blood of a vein flows from child to parent.
-    lobe : (B,) int64
-        The lobe (1 to 5) a branch supplies, 0 where it supplies more than one.
-    names : tuple of str
-        Name of the anatomical branch, empty for the nameless ones.
+    Args:
+        points_lps ((N, 3) float64): Points of a branch are consecutive; its first point repeats the last
+            point of its parent.
+        radius_mm, outer_radius_mm ((N,) float64): Radius of the lumen and of the outside of the wall (equal
+            for vessels).
+        branch_start ((B + 1,) int64): Points of branch b are `branch_start[b]:branch_start[b + 1]`.
+        branch_parent ((B,) int64): -1 at the root; parents come before children.  Blood of a vein flows from
+            child to parent.
+        lobe ((B,) int64): The lobe (1 to 5) a branch supplies, 0 where it supplies more than one.
+        names: Name of the anatomical branch, empty for the nameless ones.
     """
 
     points_lps: Float

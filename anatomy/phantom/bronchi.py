@@ -3,9 +3,8 @@
 Lengths, directions and the names B1 to B10 follow anatomy; diameters follow from the lung volume that
 a bronchus supplies.
 
-References
-----------
-[Horsfield1971], [Weibel1963]
+References:
+    [Horsfield1971], [Weibel1963]
 """
 
 from dataclasses import replace

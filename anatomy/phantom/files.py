@@ -44,15 +44,11 @@ def write_phantom(
     as well, and `patient.toml` names it.  `patient.toml` is written last, so that a folder that has it is
     complete.
 
-    Returns
-    -------
-    Path
+    Returns:
         The folder.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written to.
+    Raises:
+        FileError: If the folder cannot be written to.
     """
     folder = require_writable_folder(folder)
     images = phantom.images
@@ -130,12 +126,9 @@ def _tree(lines: Centerlines) -> dict[str, Any]:
 class PhantomBreathing:
     """The true motion of a phantom, whose masks show end-inhale.
 
-    Parameters
-    ----------
-    apex_z_mm, height_mm : float
-        The apex at end-exhale, where nothing moves, and the height of the lungs then.
-    right_mm, left_mm : float
-        A of each lung; the carina is at x = 0.
+    Args:
+        apex_z_mm, height_mm: The apex at end-exhale, where nothing moves, and the height of the lungs then.
+        right_mm, left_mm: A of each lung; the carina is at x = 0.
     """
 
     apex_z_mm: float

@@ -1,8 +1,7 @@
 """Volume-filling growth: a branch end and the points it must supply split, again and again.
 
-References
-----------
-[Kitaoka1999] flow-splitting diameters and lengths; [Tawhai2000] splitting of a cloud of points.
+References:
+    [Kitaoka1999] flow-splitting diameters and lengths; [Tawhai2000] splitting of a cloud of points.
 """
 
 from collections import deque

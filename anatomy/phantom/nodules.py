@@ -93,10 +93,8 @@ def place_nodules(
 
     The surface of a nodule is at least 5 mm and its centre at most 30 mm (times `scale`) from the pleura.
 
-    Raises
-    ------
-    AnatomyError
-        If three do not fit.
+    Raises:
+        AnatomyError: If three do not fit.
     """
     from scipy.spatial import cKDTree
 

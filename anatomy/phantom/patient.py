@@ -45,25 +45,14 @@ GREATEST_NOISE_HU = 200.0
 class Phantom:
     """A synthetic patient with the truth about it; all volumes lie on one grid, LPS mm.
 
-    Parameters
-    ----------
-    seed : int
-    size : str
-        "adult" or "small".
-    images : PatientImages
-        The masks as a segmentation would give them, of kind "phantom".
-    render : callable
-        Makes the CT; `ct` calls it once.
-    labels : Volume
-        uint8, one of `LABELS` for every voxel.
-    lobes : Volume
-        uint8, 1 to 5 by `LOBES` within the lungs, also where airways and vessels run; 0 elsewhere.
-    centerlines : mapping of str to Centerlines
-        "airway", "artery", "vein": what was drawn, with the radii that were drawn.
-    nodules : tuple of Nodule
-    traits : Traits
-    bullae : tuple of Bulla
-        Empty without emphysema; they are not part of the lung mask.
+    Args:
+        size: "adult" or "small".
+        images: The masks as a segmentation would give them, of kind "phantom".
+        render: Makes the CT; `ct` calls it once.
+        labels: uint8, one of `LABELS` for every voxel.
+        lobes: uint8, 1 to 5 by `LOBES` within the lungs, also where airways and vessels run; 0 elsewhere.
+        centerlines: "airway", "artery", "vein": what was drawn, with the radii that were drawn.
+        bullae: Empty without emphysema; they are not part of the lung mask.
     """
 
     seed: int
@@ -108,42 +97,27 @@ def make_phantom(
     The same arguments give the same voxels, bit for bit, on the same kind of processor.  +x is the patient's
     left, +y posterior, +z superior; the carina is the origin.
 
-    Parameters
-    ----------
-    seed : int
-        Not negative.
-    spacing_mm : float, optional
-        Edge of the cubic voxels, 0.3 to 2.5; by default 1 mm for the adult and 1.25 mm for the small patient.
-    size : str
-        "adult", or "small": 0.7 times an adult, about a child of seven.
-    noise_hu : float
-        Standard deviation of the noise in the CT.
-    traits : Traits
-        Build, disease and operation.
-    precise : bool
-        Draw the body in double precision: the last digit, in which kinds of processors differ, then decides
-        no voxel.
+    Args:
+        seed: Not negative.
+        spacing_mm: Edge of the cubic voxels, 0.3 to 2.5; by default 1 mm for the adult and 1.25 mm for the
+            small patient.
+        size: "adult", or "small": 0.7 times an adult, about a child of seven.
+        noise_hu: Standard deviation of the noise in the CT.
+        traits: Build, disease and operation.
+        precise: Draw the body in double precision: the last digit, in which kinds of processors differ, then
+            decides no voxel.
 
-    Returns
-    -------
-    Phantom
+    Raises:
+        SettingsError: If an argument is out of its range.
+        AnatomyError: If the lungs of this seed are too narrow for what belongs in them.
 
-    Raises
-    ------
-    SettingsError
-        If an argument is out of its range.
-    AnatomyError
-        If the lungs of this seed are too narrow for what belongs in them.
+    References:
+        [Kitaoka1999], [Tawhai2000], [Weibel1963]
 
-    References
-    ----------
-    [Kitaoka1999], [Tawhai2000], [Weibel1963]
-
-    Examples
-    --------
-    >>> patient = make_phantom(seed=1, size="small")
-    >>> patient.images.kind
-    'phantom'
+    Examples:
+        >>> patient = make_phantom(seed=1, size="small")
+        >>> patient.images.kind
+        'phantom'
     """
     scale, spacing_mm = _require_settings(seed, spacing_mm, size, noise_hu)
     rng = np.random.default_rng(seed)

@@ -68,10 +68,8 @@ def plan_patient(
 ) -> PatientPlan:
     """Plan trees and nodules for a territory of `scale` times adult size and voxels of `spacing_mm`.
 
-    Raises
-    ------
-    AnatomyError
-        If three nodules do not fit.
+    Raises:
+        AnatomyError: If three nodules do not fit.
     """
     bullae = place_bullae(territory, traits.emphysema, scale, rng)
     # The diameter at which vessels end: in small patients later, in coarse voxels earlier.
@@ -180,20 +178,14 @@ def ends_below_pleura(
 
     A vessel that has not yet left the rim, on its way from the mediastinum, goes on.
 
-    Parameters
-    ----------
-    sprouts : Sprouts
-        B branches, N points.
-    radius_mm : (N,) float64
-    freedom : (B,) uint8
-        Nameless branches have 0, see `paint_tree`.
-    rim_mm : float
-        Depth of the rim.
+    Args:
+        sprouts: B branches, N points.
+        radius_mm: (N,) float64.
+        freedom ((B,) uint8): Nameless branches have 0, see `paint_tree`.
+        rim_mm: Depth of the rim.
 
-    Returns
-    -------
-    Sprouts, (M,) float64, (B,) bool
-        The tree that is left, its radii, and which branches those are.
+    Returns:
+        Sprouts, (M,) float64, (B,) bool: The tree that is left, its radii, and which branches those are.
     """
     start = np.concatenate([[0], np.cumsum(sprouts.counts)])
     outside_rim = territory.depth_mm(np.vstack(sprouts.points)) >= rim_mm

@@ -15,18 +15,13 @@ MAP_SPACING_MM = 3.0
 class Territory:
     """A coarse map of the lobes.
 
-    Parameters
-    ----------
-    origin : (3,) float64
-        LPS mm of the centre of voxel 0, 0, 0.
-    spacing_mm : float
-    lobes : (ni, nj, nk) uint8
-        1 to 5, 0 outside the lungs.
-    lobe_depth_mm, pleura_depth_mm : (ni, nj, nk) float32
-        Distance to the border of the lobe and to the nearest position outside the lungs.
-    points_lps : (N, 3) float64
-        Points spread evenly, each standing for the same volume of tissue.
-    lobe_of_point : (N,) uint8
+    Args:
+        origin ((3,) float64): LPS mm of the centre of voxel 0, 0, 0.
+        lobes ((ni, nj, nk) uint8): 1 to 5, 0 outside the lungs.
+        lobe_depth_mm, pleura_depth_mm ((ni, nj, nk) float32): Distance to the border of the lobe and to the
+            nearest position outside the lungs.
+        points_lps ((N, 3) float64): Points spread evenly, each standing for the same volume of tissue.
+        lobe_of_point: (N,) uint8.
     """
 
     origin: Float
@@ -77,10 +72,8 @@ def _spread_points(
 def make_territory(chest: Chest, rng: np.random.Generator) -> Territory:
     """Map the lobes of a chest at `MAP_SPACING_MM` times its scale and spread points in them.
 
-    Raises
-    ------
-    AnatomyError
-        If a lobe is empty.
+    Raises:
+        AnatomyError: If a lobe is empty.
     """
     import edt
 

@@ -27,41 +27,28 @@ GREATEST_RIM_MM, GREATEST_HILAR_VESSEL_MM = 10.0, 25.0
 class Traits:
     """The traits of a phantom; the default ones are those of `make_phantom` without any.
 
-    Parameters
-    ----------
-    stature : float
-        Factor of all lengths, beside that of the size: 0.85 to 1.2.
-    flow_exponent : float
-        The flow of a tube goes with this power of its diameter: 1.5 to 3.2.  2.8 is what casts of lungs show
-        [Kitaoka1999]; masks of patients' CTs show 1.6 to 2, since thin airways are lost or drawn too thin.
-    slenderness : float
-        Lengths of grown branches in diameters that are aimed at: 1 to 10.
-    vessel_calibre : float
-        Diameter of a vessel by that of the airway lumen that supplies as much tissue: 1 to 3.
-    vessel_limit_mm : float
-        Diameter at which vessels end, in an adult: at most 4.
-    bronchus_length : float
-        Factor of the lengths of main and lobar bronchi: 0.8 to 1.5.
-    vessel_rim_mm : float
-        Depth of the rim below the pleura, in an adult, into which no vessel runs: at most 10.
-    hilar_vessel_mm : float
-        Diameter, in an adult, from which vessels count as mediastinum, as in most segmentations: they are
-        in neither the mask of the vessels nor that of the lungs, and the mask of the vessels ends with the
-        lungs.  At most 25; 0: all vessels are in the mask.
-    open_fissures : float
-        Share of each lung's fissures that is missing, from the hilum outwards: 0 to 1.
-    resected : str
-        A lobe of `anatomy.phantom.LOBES` that was taken out: its bronchus ends in a stump, its neighbour
-        fills the room, and the diaphragm stands higher; "" for none.
-    emphysema : float
-        0 for none to 1 for severe: a deeper chest with a flat diaphragm, fewer thin vessels, and bullae below
-        the pleura, into which no vessel grows.  Bullae are not part of the lung mask: a needle must not enter
-        them.
+    Args:
+        stature: Factor of all lengths, beside that of the size: 0.85 to 1.2.
+        flow_exponent: The flow of a tube goes with this power of its diameter: 1.5 to 3.2.  2.8 is what casts
+            of lungs show [Kitaoka1999]; masks of patients' CTs show 1.6 to 2, since thin airways are lost or
+            drawn too thin.
+        slenderness: Lengths of grown branches in diameters that are aimed at: 1 to 10.
+        vessel_calibre: Diameter of a vessel by that of the airway lumen that supplies as much tissue: 1 to 3.
+        vessel_limit_mm: Diameter at which vessels end, in an adult: at most 4.
+        bronchus_length: Factor of the lengths of main and lobar bronchi: 0.8 to 1.5.
+        vessel_rim_mm: Depth of the rim below the pleura, in an adult, into which no vessel runs: at most 10.
+        hilar_vessel_mm: Diameter, in an adult, from which vessels count as mediastinum, as in most
+            segmentations: they are in neither the mask of the vessels nor that of the lungs, and the mask of
+            the vessels ends with the lungs.  At most 25; 0: all vessels are in the mask.
+        open_fissures: Share of each lung's fissures that is missing, from the hilum outwards: 0 to 1.
+        resected: A lobe of `anatomy.phantom.LOBES` that was taken out: its bronchus ends in a stump, its
+            neighbour fills the room, and the diaphragm stands higher; "" for none.
+        emphysema: 0 for none to 1 for severe: a deeper chest with a flat diaphragm, fewer thin vessels, and
+            bullae below the pleura, into which no vessel grows.  Bullae are not part of the lung mask: a
+            needle must not enter them.
 
-    Raises
-    ------
-    SettingsError
-        If a trait is out of its range.
+    Raises:
+        SettingsError: If a trait is out of its range.
     """
 
     stature: float = 1.0

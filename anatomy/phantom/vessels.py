@@ -160,10 +160,8 @@ def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: floa
 
     Positions move in place, branchings included.
 
-    Returns
-    -------
-    (N,) float64
-        Radius at every point: that of the branch, or less where it must squeeze through.
+    Returns:
+        (N,) float64: Radius at every point: that of the branch, or less where it must squeeze through.
     """
     from scipy.spatial import cKDTree
 

@@ -62,25 +62,17 @@ class Airways:
 def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] | None = None) -> Airways:
     """Segment lumen and wall of the airways.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units.
-    lungs : Lungs
-        Both lungs, with a seed in the trachea and the rough central airway, on the grid of `ct`.
-    progress : callable, optional
-        Told what is being done.
+    Args:
+        ct: Hounsfield units.
+        lungs: Both lungs, with a seed in the trachea and the rough central airway, on the grid of `ct`.
+        progress: Told what is being done.
 
-    Raises
-    ------
-    AnatomyError
-        If there is no air at the seed.
-    GridMismatchError
-        If `lungs` lie on another grid.
+    Raises:
+        AnatomyError: If there is no air at the seed.
+        GridMismatchError: If `lungs` lie on another grid.
 
-    References
-    ----------
-    [Fu2018], III-A.2; [Aykac2003]
+    References:
+        [Fu2018], III-A.2; [Aykac2003]
     """
     tell = progress or (lambda text: None)
     inside = lungs.mask
@@ -170,10 +162,8 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
 def _piece_at(air: Mask, seed: tuple[int, int, int]) -> Mask:
     """Return the piece of air that a voxel lies in.
 
-    Raises
-    ------
-    AnatomyError
-        If it lies in none.
+    Raises:
+        AnatomyError: If it lies in none.
     """
     from scipy import ndimage
 
@@ -219,24 +209,17 @@ def local_minima_map(hu: Int16, spacing_mm: Float, upright: int) -> Int16:
     Of one direction of slices it is the map of the paper.  Where the voxels are near to cubes, it is the
     median of the maps of all three directions.
 
-    Parameters
-    ----------
-    hu : (nk, nj, ni) int16, C-contiguous
-        Hounsfield units.
-    spacing_mm : (3,) float64
-        Voxel size along these axes.
-    upright : int
-        The axis along which a CT is sliced, used alone where the voxels are not near to cubes.
+    Args:
+        hu ((nk, nj, ni) int16, C-contiguous): Hounsfield units.
+        spacing_mm ((3,) float64): Voxel size along these axes.
+        upright: The axis along which a CT is sliced, used alone where the voxels are not near to cubes.
 
-    Returns
-    -------
-    (nk, nj, ni) int16, C-contiguous
-        Not negative, HU.
+    Returns:
+        (nk, nj, ni) int16, C-contiguous: Not negative, HU.
 
-    Notes
-    -----
-    The paper takes the maximum over the scales 1 to N.  A closing with a larger diamond is nowhere lower,
-    nor is what is reconstructed from it: the largest scale alone gives that maximum.
+    Notes:
+        The paper takes the maximum over the scales 1 to N.  A closing with a larger diamond is nowhere lower,
+        nor is what is reconstructed from it: the largest scale alone gives that maximum.
     """
     # Slices are used in the directions in which their pixels are squarer than this.
     if spacing_mm.max() > 1.5 * spacing_mm.min():

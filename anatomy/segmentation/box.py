@@ -43,10 +43,8 @@ class Box:
     def whole(cls, ct_grid: Grid, voxel_mm: float) -> Self:
         """Return the finer voxels of a whole CT.
 
-        Raises
-        ------
-        SettingsError
-            If the size of the voxels is out of its range.
+        Raises:
+            SettingsError: If the size of the voxels is out of its range.
         """
         if not VOXEL_RANGE_MM[0] <= voxel_mm <= VOXEL_RANGE_MM[1]:
             raise SettingsError(
@@ -120,10 +118,8 @@ class Box:
     def placed(self, volume: Volume, name: str) -> Array:
         """Return an image whose voxels are those of the CT, or its finer ones, on the voxels of the box.
 
-        Raises
-        ------
-        GridMismatchError
-            If its voxels are neither.
+        Raises:
+            GridMismatchError: If its voxels are neither.
         """
         try:
             return onto_grid(volume, self.grid, name).array
@@ -133,10 +129,8 @@ class Box:
     def placed_on_ct(self, volume: Volume, name: str) -> Volume:
         """Return such an image on the voxels of the CT; the finer voxels are looked at in the box alone.
 
-        Raises
-        ------
-        GridMismatchError
-            If its voxels are neither.
+        Raises:
+            GridMismatchError: If its voxels are neither.
         """
         try:
             return onto_grid(volume, self.ct_grid, name)
@@ -210,18 +204,14 @@ def between(values: Array, places: Sequence[Float], *, cubic: bool = True) -> Ar
     A cubic spline swings beyond its voxels at sharp edges: it draws dark rims around vessels.  It is cut off
     at the values of the two voxels beside a place, axis by axis.  Axes whose places are voxels are copied.
 
-    Parameters
-    ----------
-    values : (ni, nj, nk)
-        float32 if any axis is interpolated.
-    places : three (N,) float64
-        Where along each axis, in voxels; beyond the ends the image goes on as it ends.
-    cubic : bool
-        Else linear.
+    Args:
+        values ((ni, nj, nk)): float32 if any axis is interpolated.
+        places (three (N,) float64): Where along each axis, in voxels; beyond the ends the image goes on as it
+            ends.
+        cubic: Else linear.
 
-    Returns
-    -------
-    (Ni, Nj, Nk) of the same dtype, Fortran-contiguous
+    Returns:
+        (Ni, Nj, Nk) of the same dtype, Fortran-contiguous.
     """
     planes = values.T
     across = np.zeros((len(planes), len(places[1]), len(places[0])), dtype=values.dtype)

@@ -50,18 +50,12 @@ def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) 
 
     An image with much noise is smoothed if nothing else helps.
 
-    Parameters
-    ----------
-    ct : CoarseCt
-    outside : (Ni, Nj, Nk) bool
-        Air around the patient.
-    seed_lps : (3,) float64, optional
-        A point in the trachea, LPS mm, in place of the automatic search.
+    Args:
+        outside ((Ni, Nj, Nk) bool): Air around the patient.
+        seed_lps ((3,) float64): A point in the trachea, LPS mm, in place of the automatic search.
 
-    Raises
-    ------
-    AnatomyError
-        If there is no column of air like a trachea, or the point does not lie in air.
+    Raises:
+        AnatomyError: If there is no column of air like a trachea, or the point does not lie in air.
     """
     found, first = False, None
     for image in (ct, None):
@@ -114,10 +108,8 @@ def _long_enough(ct: CoarseCt, found: CentralAirway) -> CentralAirway:
 def grow_from(ct: CoarseCt, outside: Mask, seed_lps: Float) -> CentralAirway:
     """Follow the large airways from a point in them, staying out of `outside`.
 
-    Raises
-    ------
-    AnatomyError
-        If the point does not lie in air, or that air is not enclosed by a wall.
+    Raises:
+        AnatomyError: If the point does not lie in air, or that air is not enclosed by a wall.
     """
     seed = _given_seed(ct, seed_lps)
     grown = grow(ct, seed, outside)
@@ -287,20 +279,13 @@ def without_throat(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]
     Vocal cords that are closed while the breath is held taper the airway to a point, which
     would be too narrow for any scope, although a scope passes them in fact.
 
-    Parameters
-    ----------
-    lumen : (ni, nj, nk) bool
-        In the order of voxels of `canonical`.
-    seed_ijk : (3,) int64
-        A voxel in the trachea.
-    grid : Grid
+    Args:
+        lumen ((ni, nj, nk) bool): In the order of voxels of `canonical`.
+        seed_ijk ((3,) int64): A voxel in the trachea.
 
-    Returns
-    -------
-    lumen : (ni, nj, nk) bool
-        One flat end at the top; the same array if there is no throat.
-    length_mm : float
-        How much was cut off.
+    Returns:
+        - lumen ((ni, nj, nk) bool) - One flat end at the top; the same array if there is no throat.
+        - length_mm - How much was cut off.
     """
     slice_mm = float(grid.spacing_mm[2])
     level = throat_level(lumen, seed_ijk, slice_mm)

@@ -15,18 +15,12 @@ def closed(mask: Mask, radius_mm: float, spacing_mm: ArrayLike) -> Mask:
     Every gap is filled into which no ball of this radius fits.  Beyond the edge of the array the mask is
     taken to go on as it ends there.
 
-    Parameters
-    ----------
-    mask : (ni, nj, nk) bool
-        Fortran-contiguous.
-    radius_mm : float
-    spacing_mm : (3,) float64
-        Voxel size along the axes.
+    Args:
+        mask ((ni, nj, nk) bool): Fortran-contiguous.
+        spacing_mm ((3,) float64): Voxel size along the axes.
 
-    Returns
-    -------
-    (ni, nj, nk) bool
-        Contains `mask`.
+    Returns:
+        (ni, nj, nk) bool: Contains `mask`.
     """
     if not mask.any():
         return mask.copy(order="F")

@@ -21,20 +21,13 @@ nothing."""
 class CoarseCt:
     """Means over blocks of a CT's voxels; axis 0 runs most nearly to the left, 1 to the back, 2 up.
 
-    Parameters
-    ----------
-    hu : (Ni, Nj, Nk) float32
-        Hounsfield units, not below -1200; contiguous along axis 0.
-    grid : Grid
-        The grid of `hu`.
-    fine_shape : (3,) int
-        Shape of the CT.
-    step : (3,) int
-        Voxels in a block, along the axes of the CT.
-    order : (3,) int
-        Axis of the CT that each axis here follows.
-    flipped : (3,) bool
-        Whether an axis here runs against that axis of the CT.
+    Args:
+        hu ((Ni, Nj, Nk) float32): Hounsfield units, not below -1200; contiguous along axis 0.
+        grid: The grid of `hu`.
+        fine_shape ((3,) int): Shape of the CT.
+        step ((3,) int): Voxels in a block, along the axes of the CT.
+        order ((3,) int): Axis of the CT that each axis here follows.
+        flipped ((3,) bool): Whether an axis here runs against that axis of the CT.
     """
 
     hu: Float32

@@ -23,38 +23,27 @@ def cost_map(
 
     Obstacles are all voxels outside the lung, the lumen and wall of the airways, and the large vessels.
 
-    Parameters
-    ----------
-    vessels : Vessels
-    airways : Airways
-    lung_mask : (ni, nj, nk) bool
-        Both lungs, filled.
-    grid : Grid
-        The grid of all of them.
-    total_radius_mm : float
-        Radius of the needle and safety margin by which obstacles are grown, the paper's `r_total`.  The
-        default of 0 leaves them as they are: the planners keep their clearance by a proved distance.
+    Args:
+        lung_mask ((ni, nj, nk) bool): Both lungs, filled.
+        grid: The grid of all of them.
+        total_radius_mm: Radius of the needle and safety margin by which obstacles are grown, the paper's
+            `r_total`.  The default of 0 leaves them as they are: the planners keep their clearance by a
+            proved distance.
 
-        Growing is not conservative as printed.  It moves by whole voxels, and the step bound
-        `2 sqrt(min(a_i s_i)^2 - r_total^2)` takes the tip for the centre of its voxel: a tip in a corner is
-        up to half a voxel's diagonal nearer to the obstacle.  Where `r_total` is a multiple of the voxel size
-        the bound is 0.  Maps grown this way are for comparison with the paper alone.
+            Growing is not conservative as printed.  It moves by whole voxels, and the step bound `2
+            sqrt(min(a_i s_i)^2 - r_total^2)` takes the tip for the centre of its voxel: a tip in a corner is
+            up to half a voxel's diagonal nearer to the obstacle.  Where `r_total` is a multiple of the voxel
+            size the bound is 0.  Maps grown this way are for comparison with the paper alone.
 
-    Returns
-    -------
-    Volume
+    Returns:
         float32 in [0, 1], or infinite.
 
-    Raises
-    ------
-    GridMismatchError
-        If a mask has another shape.
-    SettingsError
-        If the radius is negative or not finite.
+    Raises:
+        GridMismatchError: If a mask has another shape.
+        SettingsError: If the radius is negative or not finite.
 
-    References
-    ----------
-    [Fu2018, sec. IV-A and IV-B]
+    References:
+        [Fu2018, sec. IV-A and IV-B]
     """
     parts = {
         "vesselness": vessels.vesselness,

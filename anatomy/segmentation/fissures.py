@@ -30,14 +30,10 @@ NOISE_PERCENTILE = 90.0
 class Fissureness:
     """How likely each cubic voxel is of a fissure, `(nk, nj, ni)`.
 
-    Parameters
-    ----------
-    likelihood : float32
-        In [0, 1); 0 where no sheet is.
-    looked : bool
-        Where a fissure could be seen: in the lung, away from vessels, airways and the pleura.
-    noise : float
-        The response that noise gives.
+    Args:
+        likelihood (float32): In [0, 1); 0 where no sheet is.
+        looked: Where a fissure could be seen: in the lung, away from vessels, airways and the pleura.
+        noise: The response that noise gives.
     """
 
     likelihood: Float32
@@ -53,13 +49,10 @@ class Fissureness:
 def fissureness(hu: Float32, lung: Mask, barred: Mask) -> Fissureness:
     """Return where sheets like fissures are, on cubic voxels of 1 mm.
 
-    Parameters
-    ----------
-    hu : (nk, nj, ni) float32
-    lung : (nk, nj, ni) bool
-        Both lungs, filled.
-    barred : (nk, nj, ni) bool
-        Vessels and airways, whose walls look like plates.
+    Args:
+        hu: (nk, nj, ni) float32.
+        lung ((nk, nj, ni) bool): Both lungs, filled.
+        barred ((nk, nj, ni) bool): Vessels and airways, whose walls look like plates.
     """
     from scipy import ndimage
 
@@ -127,12 +120,9 @@ def blocks_of(image: Array) -> Array:
 class Cubic:
     """Cubic voxels over the same box as a grid; their arrays are `(nk, nj, ni)` and C-contiguous.
 
-    Parameters
-    ----------
-    grid : Grid
-        The grid of the CT.
-    shape : tuple of int
-        (nk, nj, ni) of the cubic voxels.
+    Args:
+        grid: The grid of the CT.
+        shape: (nk, nj, ni) of the cubic voxels.
     """
 
     grid: Grid

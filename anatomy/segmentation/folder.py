@@ -43,25 +43,17 @@ class SegmentationFolder:
     `corrections`, and count until they are removed from there.  The record is written before a file gets
     its name, so that a run that was killed at any moment leaves no made file that looks corrected.
 
-    Parameters
-    ----------
-    folder : path
-        Made if needed.
-    grid : Grid
-        The grid of the CT, which all images get.
-    ct_digest : str
-        Content of the CT.
-    inputs : sequence of path
-        Files that are read: none of them may lie where an image is written or looked for.
-    force : bool
-        Whether files of others may lie there; masks then count as corrections.
+    Args:
+        folder: Made if needed.
+        grid: The grid of the CT, which all images get.
+        ct_digest: Content of the CT.
+        inputs: Files that are read: none of them may lie where an image is written or looked for.
+        force: Whether files of others may lie there; masks then count as corrections.
 
-    Raises
-    ------
-    AnatomyError
-        If the folder holds corrections made for another CT.
-    FileError
-        If the folder cannot be written to, its record is damaged, or it holds inputs or files of others.
+    Raises:
+        AnatomyError: If the folder holds corrections made for another CT.
+        FileError: If the folder cannot be written to, its record is damaged, or it holds inputs or files of
+            others.
     """
 
     def __init__(
@@ -92,10 +84,8 @@ class SegmentationFolder:
     def correction(self, name: str) -> Path | None:
         """Return the file that a person put in place of an image, or None.
 
-        Raises
-        ------
-        AnatomyError
-            If there are two of them.
+        Raises:
+            AnatomyError: If there are two of them.
         """
         paths = [self.path / CORRECTIONS / f"{name}{suffix}" for suffix in SUFFIXES]
         found = [path for path in paths if path.is_file()]
@@ -204,10 +194,8 @@ class SegmentationFolder:
 def _read_record(path: Path) -> dict[str, Any]:
     """Return the record of a folder; empty if there is none, or of another format.
 
-    Raises
-    ------
-    FileError
-        If it is damaged: nothing else tells which images a person corrected.
+    Raises:
+        FileError: If it is damaged: nothing else tells which images a person corrected.
     """
     if not path.is_file():
         return {"format": FORMAT}
@@ -243,10 +231,8 @@ def digest_of_ct(ct: Volume) -> str:
 def segmented_ct(folder: Path) -> dict[str, Any] | None:
     """Return path, UID of the series and digest of the CT of a segmentation; None if they are not recorded.
 
-    Raises
-    ------
-    FileError
-        If the record of the segmentation is damaged.
+    Raises:
+        FileError: If the record of the segmentation is damaged.
     """
     if not (folder / STATE).is_file():
         return None
@@ -268,10 +254,8 @@ def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
 
     Its voxels may be stored in another order; those of `grid` are in that of `canonical`.
 
-    Raises
-    ------
-    GridMismatchError
-        If the voxels do not coincide.
+    Raises:
+        GridMismatchError: If the voxels do not coincide.
     """
     volume = canonical(volume)
     if volume.grid.is_close(grid):

@@ -26,22 +26,14 @@ def plausibility(
 ) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
     """Check lungs and airway by anatomy, with the limits and signs that masks of any source have to meet.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units, in the order of voxels of `canonical`.
-    lungs : Lungs
-    tree : AirwayTree or AnatomyError
-        Of the lumen of the airway, or why there is none.
-    slices_mm : float
-        How far the slices of the scan lie apart.
+    Args:
+        ct: Hounsfield units, in the order of voxels of `canonical`.
+        tree: Of the lumen of the airway, or why there is none.
+        slices_mm: How far the slices of the scan lie apart.
 
-    Returns
-    -------
-    tuple of Finding
-        The checks that failed.
-    tuple of str
-        Warnings.
+    Returns:
+        - tuple of Finding - The checks that failed.
+        - tuple of str - Warnings.
     """
     median_hu = float(np.median(ct.array[lungs.mask]))
     found = [*_sizes(ct, lungs, median_hu)]

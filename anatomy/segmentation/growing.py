@@ -52,22 +52,14 @@ _MARGIN = 3
 class Ground:
     """What the airway grows in; arrays `(nk, nj, ni)`, C-contiguous.
 
-    Parameters
-    ----------
-    hu : int16
-        The CT.
-    smooth : int16
-        The CT with less noise.
-    depth : int16
-        Its map of local minima.
-    lung : bool
-        Where thin airways may go on.
-    spacing_mm : (3,) float64
-        Voxel size along these axes.
-    lung_hu, dark_hu : float
-        The tissue of the lung, and half-way between air and it.
-    least_depth : float
-        Shallower minima are noise.
+    Args:
+        hu (int16): The CT.
+        smooth (int16): The CT with less noise.
+        depth (int16): Its map of local minima.
+        lung: Where thin airways may go on.
+        spacing_mm ((3,) float64): Voxel size along these axes.
+        lung_hu, dark_hu: The tissue of the lung, and half-way between air and it.
+        least_depth: Shallower minima are noise.
     """
 
     hu: Int16
@@ -203,15 +195,13 @@ def follow_thin_airways(
 ) -> Tubes:
     """Add to the lumen the thin airways that go on from its ends.
 
-    Parameters
-    ----------
-    hu, smooth, state, lung : (nk, nj, ni) int16, int16, uint8, bool
-        The CT, the CT with less noise, what is lumen and what is banned (changed), and the lung; with a
-        border of two voxels or more that is not lung.
-    spacing_mm : (3,) float64
-    lumen : (V,) int64
-        Its first `count` entries are the flat indices of the lumen, the first `known` of them of trachea and
-        main bronchi; what is added follows.
+    Args:
+        hu, smooth, state, lung ((nk, nj, ni) int16, int16, uint8, bool): The CT, the CT with less noise, what
+            is lumen and what is banned (changed), and the lung; with a border of two voxels or more that is
+            not lung.
+        spacing_mm: (3,) float64.
+        lumen ((V,) int64): Its first `count` entries are the flat indices of the lumen, the first `known` of
+            them of trachea and main bronchi; what is added follows.
     """
     per_mm = 1.0 / spacing_mm
     voxel_mm = float(np.prod(spacing_mm) ** (1.0 / 3.0))

@@ -52,22 +52,15 @@ def has_thick_slices(ct: Volume) -> bool:
 def require_chest_ct(ct: Volume, *, thick_slices: bool = False) -> tuple[str, ...]:
     """Refuse images that cannot be a CT of the chest in Hounsfield units.
 
-    Parameters
-    ----------
-    ct : Volume
-    thick_slices : bool
-        Whether slices of more than 3 mm are accepted.
+    Args:
+        thick_slices: Whether slices of more than 3 mm are accepted.
 
-    Returns
-    -------
-    tuple of str
+    Returns:
         Warnings.
 
-    Raises
-    ------
-    AnatomyError
-        If a voxel is not a number, the values are no Hounsfield units, air or tissue are missing, the
-        image is too small, or its slices are too thick.
+    Raises:
+        AnatomyError: If a voxel is not a number, the values are no Hounsfield units, air or tissue are
+            missing, the image is too small, or its slices are too thick.
     """
     _require_numbers(ct.array)
     _require_hounsfield(ct.array)

@@ -74,10 +74,8 @@ class Network:
 def read_network(path: Path) -> Network:
     """Read the settings of a network from the TOML file of the same name beside it, if there is one.
 
-    Raises
-    ------
-    FileError, SettingsError
-        If there is no such file, or its settings are wrong.
+    Raises:
+        FileError, SettingsError: If there is no such file, or its settings are wrong.
     """
     if path.suffix != SUFFIX or not path.is_file():
         raise FileError(
@@ -100,18 +98,12 @@ def read_network(path: Path) -> Network:
 def learned_airway(ct: Volume, network: Network) -> Mask:
     """Return the largest piece of what a network takes for airway, `(ni, nj, nk)`.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units, in the order of voxels of `canonical`.
-    network : Network
+    Args:
+        ct: Hounsfield units, in the order of voxels of `canonical`.
 
-    Raises
-    ------
-    SettingsError
-        If onnxruntime is missing, or the network does not take a CT.
-    AnatomyError
-        If it finds no airway.
+    Raises:
+        SettingsError: If onnxruntime is missing, or the network does not take a CT.
+        AnatomyError: If it finds no airway.
     """
     how = network.settings
     scaled = (ct.array.astype(np.float32) - np.float32(how.low_hu)) / np.float32(how.high_hu - how.low_hu)

@@ -36,18 +36,13 @@ ROUNDS = 5
 class Regions:
     """What lies nearest to each of the B branches of a tree in one lung.
 
-    Parameters
-    ----------
-    volume : (B,) float64
-        In voxels.
-    moment : (B, 3) float64
-        Sum of the places of the voxels, LPS mm.
-    likelihood, faces : (B, B) float64
-        Sum of the likelihood of a fissure over the faces between two regions, and their number.
-    below : (B, B) bool
-        Whether the second branch descends from the first, or is it.
-    used : (B,) bool
-        Branches that have a region.
+    Args:
+        volume ((B,) float64): In voxels.
+        moment ((B, 3) float64): Sum of the places of the voxels, LPS mm.
+        likelihood, faces ((B, B) float64): Sum of the likelihood of a fissure over the faces between two
+            regions, and their number.
+        below ((B, B) bool): Whether the second branch descends from the first, or is it.
+        used ((B,) bool): Branches that have a region.
     """
 
     volume: Float
@@ -75,11 +70,8 @@ def lobes_of_branches(regions: Regions, lobes: tuple[int, ...]) -> Int:
     where that is better, because a lobe can have several bronchi.  Good is a parting whose parts meet where
     fissures are seen, and have about usual shares of the lung.
 
-    Parameters
-    ----------
-    regions : Regions
-    lobes : tuple of int
-        Numbers of `anatomy.lobes.LOBES` in this lung.
+    Args:
+        lobes: Numbers of `anatomy.lobes.LOBES` in this lung.
     """
     count = len(regions.volume)
     whole = regions.volume[regions.used].sum()

@@ -49,15 +49,12 @@ OUTER_VOXELS = 2
 class Lobes:
     """Lobes of both lungs on the grid of the CT.
 
-    Parameters
-    ----------
-    lobes : (ni, nj, nk) uint8
-        Numbers of `anatomy.lobes.LOBES`, 0 outside the lungs; 0 everywhere if lobes could not be told apart.
-    fissures : (ni, nj, nk) uint8
-        Both sides of the borders between lobes: `SEEN` where a fissure is seen, else `BORDER`.
-    seen : mapping of str to float
-        Share of each border at which a fissure is seen.
-    warnings : tuple of str
+    Args:
+        lobes ((ni, nj, nk) uint8): Numbers of `anatomy.lobes.LOBES`, 0 outside the lungs; 0 everywhere if
+            lobes could not be told apart.
+        fissures ((ni, nj, nk) uint8): Both sides of the borders between lobes: `SEEN` where a fissure is
+            seen, else `BORDER`.
+        seen: Share of each border at which a fissure is seen.
     """
 
     lobes: UInt8
@@ -71,20 +68,14 @@ def segment_lobes(
 ) -> Lobes:
     """Return the lobes and fissures of a CT.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units.
-    lungs, airways
-        On the grid of the CT.
-    vessels : (ni, nj, nk) bool
-        All vessels.
-    tree : AirwayTree or AnatomyError
-        Of the lumen of the airways, or why there is none.
+    Args:
+        ct: Hounsfield units.
+        lungs, airways: On the grid of the CT.
+        vessels ((ni, nj, nk) bool): All vessels.
+        tree: Of the lumen of the airways, or why there is none.
 
-    References
-    ----------
-    [Lassen2013], [Ukil2009], [Wiemker2005]
+    References:
+        [Lassen2013], [Ukil2009], [Wiemker2005]
     """
     if isinstance(tree, AnatomyError):
         nothing = np.zeros(ct.grid.shape, dtype=np.uint8, order="F")

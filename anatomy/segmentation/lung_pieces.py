@@ -41,16 +41,12 @@ def outside_air(hu: Float32, air: Mask) -> Mask:
     of view cuts off the skin, a lung may touch the edge too; the lung holds tissue, so its median is
     higher than that of air.
 
-    Parameters
-    ----------
-    hu : (Ni, Nj, Nk) float32
-        Coarse CT, axis 2 along the body.
-    air : (Ni, Nj, Nk) bool
-        Voxels of air and lung.
+    Args:
+        hu ((Ni, Nj, Nk) float32): Coarse CT, axis 2 along the body.
+        air ((Ni, Nj, Nk) bool): Voxels of air and lung.
 
-    Returns
-    -------
-    (Ni, Nj, Nk) bool
+    Returns:
+        (Ni, Nj, Nk) bool.
     """
     from scipy import ndimage
 
@@ -73,18 +69,12 @@ def outside_air(hu: Float32, air: Mask) -> Mask:
 def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
     """Keep the pieces of air that are as large as a lung and lie at the bronchi.
 
-    Parameters
-    ----------
-    coarse : CoarseCt
-    air : (Ni, Nj, Nk) bool
-        What is as thin as lung, without the airway and the outside.
-    airway : (Ni, Nj, Nk) bool
-        Trachea and bronchi as far as they could be followed.
+    Args:
+        air ((Ni, Nj, Nk) bool): What is as thin as lung, without the airway and the outside.
+        airway ((Ni, Nj, Nk) bool): Trachea and bronchi as far as they could be followed.
 
-    Raises
-    ------
-    AnatomyError
-        If there is none.
+    Raises:
+        AnatomyError: If there is none.
     """
     from scipy import ndimage
 
@@ -113,18 +103,13 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
 def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> tuple[Mask, Mask]:
     """Tell gas that no tissue runs through, a pneumothorax, a bulla or bowel, from lung.
 
-    Parameters
-    ----------
-    coarse : CoarseCt
-    lung : (Ni, Nj, Nk) bool
-        What was taken for lung.
-    air_hu : float
-        What air measures in the trachea, where scatter raises it as it raises gas beside it.
+    Args:
+        lung ((Ni, Nj, Nk) bool): What was taken for lung.
+        air_hu: What air measures in the trachea, where scatter raises it as it raises gas beside it.
 
-    Returns
-    -------
-    gas, lung : (Ni, Nj, Nk) bool
-        The gas, and what is left of the lung: pieces that are gas for the most part are none.
+    Returns:
+        gas, lung ((Ni, Nj, Nk) bool): The gas, and what is left of the lung: pieces that are gas for the most
+            part are none.
     """
     from scipy import ndimage
 
@@ -211,25 +196,17 @@ def coarse_lung_ex_vivo(
     The background is grown from the edge of the image until the lung is encountered [Fu2018, III-A.1]: the
     threshold lies halfway between the air around and the lung.
 
-    Parameters
-    ----------
-    ct : CoarseCt
-    seed_lps : (3,) float64, optional
-        A point in the main bronchus or trachea, LPS mm.
+    Args:
+        seed_lps ((3,) float64): A point in the main bronchus or trachea, LPS mm.
 
-    Returns
-    -------
-    threshold : float
-        What is denser is not lung, HU.
-    airway : CentralAirway
-    sides : (Ni, Nj, Nk) int32
-        1 right lung, 2 left lung; one lung alone is labelled 1.
-    warnings : tuple of str
+    Returns:
+        - threshold - What is denser is not lung, HU.
+        - airway
+        - sides ((Ni, Nj, Nk) int32) - 1 right lung, 2 left lung; one lung alone is labelled 1.
+        - warnings
 
-    Raises
-    ------
-    AnatomyError
-        If there is no lung or no airway.
+    Raises:
+        AnatomyError: If there is no lung or no airway.
     """
     background = _background(ct)
     tissue = (ct.hu < GREATEST_LUNG_HU) & ~background

@@ -36,19 +36,14 @@ WALL_MM = 2.0
 class Lungs:
     """Both lungs of a CT.
 
-    Parameters
-    ----------
-    left, right : (ni, nj, nk) bool
-        The patient's left and right lung on the grid of the CT, filled: vessels and small airways belong
-        to them, trachea and main bronchi with their walls do not.  They share no voxel.
-    trachea_seed_ijk : (3,) int64
-        A voxel in the air of the trachea.
-    central_airway : (ni, nj, nk) bool
-        Lumen of trachea and main bronchi, roughly.
-    threshold_hu : float
-        What was taken for lung lies below.
-    scale : Scale
-        How the values of the CT become Hounsfield units.
+    Args:
+        left, right ((ni, nj, nk) bool): The patient's left and right lung on the grid of the CT, filled:
+            vessels and small airways belong to them, trachea and main bronchi with their walls do not.  They
+            share no voxel.
+        trachea_seed_ijk ((3,) int64): A voxel in the air of the trachea.
+        central_airway ((ni, nj, nk) bool): Lumen of trachea and main bronchi, roughly.
+        threshold_hu: What was taken for lung lies below.
+        scale: How the values of the CT become Hounsfield units.
     """
 
     left: Mask
@@ -73,21 +68,15 @@ def segment_lungs(
 ) -> Lungs:
     """Segment both lungs by region growing and closing.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units.
-    ex_vivo : bool
-        The image shows an inflated lung in air, not a patient.
-    seed_lps : (3,) float64, optional
-        A point in the trachea (of a lung ex vivo: in its main bronchus), LPS mm; found by itself if None.
-    progress : callable, optional
-        Told each step as it begins.
+    Args:
+        ct: Hounsfield units.
+        ex_vivo: The image shows an inflated lung in air, not a patient.
+        seed_lps ((3,) float64): A point in the trachea (of a lung ex vivo: in its main bronchus), LPS mm;
+            found by itself if None.
+        progress: Told each step as it begins.
 
-    Raises
-    ------
-    AnatomyError
-        If there is no trachea or no lung.
+    Raises:
+        AnatomyError: If there is no trachea or no lung.
     """
     tell = progress or (lambda _step: None)
     tell("lungs: coarse image")
@@ -135,10 +124,8 @@ def segment_lungs(
 def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | None = None) -> Lungs:
     """Make `Lungs` of masks from elsewhere: closed and filled like our own, and with our own trachea.
 
-    Raises
-    ------
-    AnatomyError
-        If there is no trachea.
+    Raises:
+        AnatomyError: If there is no trachea.
     """
     seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
     coarse, _, scale, airways = in_hounsfield(CoarseCt.of(ct), seed)
@@ -195,10 +182,8 @@ def in_hounsfield(
     """Return the coarse CT in Hounsfield units, the air around the patient, how its values became them, and
     what may be its `central_airways`.
 
-    Raises
-    ------
-    AnatomyError
-        If there is no trachea.
+    Raises:
+        AnatomyError: If there is no trachea.
     """
     outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
     airways = central_airways(coarse, outside, seed)

@@ -35,12 +35,10 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
     In every section across the chest this is the convex hull of both lungs and their mirror images about the
     `midline`.  What is missing on both sides alike is told by how far the lungs reach back and down.
 
-    Parameters
-    ----------
-    left, right : (ni, nj, nk) bool
-    grid : Grid
-        In the order of voxels of `canonical`.
-    carina_lps : (3,) float64
+    Args:
+        left, right: (ni, nj, nk) bool.
+        grid: In the order of voxels of `canonical`.
+        carina_lps: (3,) float64.
     """
     points = sampled(left | right, grid, SAMPLE_MM)
     points[:, 0] -= midline(points, carina_lps)

@@ -58,24 +58,17 @@ SURFACE_STEPS, BELOW_WEIGHT = 30, 0.15
 def outline_nodule(ct: Volume, lungs: Mask, point_lps: ArrayLike) -> Mask:
     """Outline the nodule at a point.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units.
-    lungs : (ni, nj, nk) bool
-        Both lungs on the voxels of the CT; they may leave the nodule out.
-    point_lps : (3,) float64
-        A point in the nodule, LPS mm.
+    Args:
+        ct: Hounsfield units.
+        lungs ((ni, nj, nk) bool): Both lungs on the voxels of the CT; they may leave the nodule out.
+        point_lps ((3,) float64): A point in the nodule, LPS mm.
 
-    Returns
-    -------
-    (ni, nj, nk) bool
+    Returns:
+        (ni, nj, nk) bool.
 
-    Raises
-    ------
-    AnatomyError
-        If there is no lung around the point, nothing there is denser than lung, or what is there cannot be
-        told from a vessel or the chest wall.
+    Raises:
+        AnatomyError: If there is no lung around the point, nothing there is denser than lung, or what is
+            there cannot be told from a vessel or the chest wall.
     """
     point = np.asarray(point_lps, dtype=np.float64)
     for voxel_mm, reach_mm, radius_mm in CUBES:

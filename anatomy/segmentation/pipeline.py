@@ -69,23 +69,15 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     Steps whose inputs, settings and results are unchanged since the last run are not repeated; images that
     a person replaced in the folder are kept.  `patient.toml` is away while images change.
 
-    Parameters
-    ----------
-    request : SegmentationRequest
-    progress : callable, optional
-        Told each step as it begins.
+    Args:
+        progress: Told each step as it begins.
 
-    Raises
-    ------
-    AnatomyError
-        If the CT cannot be segmented, what was found cannot be a patient's lungs and airways, or the folder
-        holds corrections of another CT.
-    GridMismatchError
-        If a given mask does not fit the CT.
-    SettingsError
-        If a check that is accepted is none, or vessels cannot be told by the radius.
-    FileError
-        If a file cannot be read or written, or the folder holds inputs or files of others.
+    Raises:
+        AnatomyError: If the CT cannot be segmented, what was found cannot be a patient's lungs and airways,
+            or the folder holds corrections of another CT.
+        GridMismatchError: If a given mask does not fit the CT.
+        SettingsError: If a check that is accepted is none, or vessels cannot be told by the radius.
+        FileError: If a file cannot be read or written, or the folder holds inputs or files of others.
     """
     tell = progress or (lambda _step: None)
     tell("checking the CT")
@@ -190,16 +182,13 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
 def read_ct(path: str | Path, series_uid: str | None = None) -> tuple[Volume, dict[str, str]]:
     """Read a CT from an image file or a folder of DICOM files, in the order of voxels of `canonical`.
 
-    Returns
-    -------
-    Volume
-    dict of str to str
-        The files read, and their SHA-256.
+    Returns:
+        - Volume
+        - dict of str to str - The files read, and their SHA-256.
 
-    Raises
-    ------
-    FileError, FrameError
-        If there is no CT, or it cannot be read; see `anatomy.io.read_dicom` and `anatomy.io.read_volume`.
+    Raises:
+        FileError, FrameError: If there is no CT, or it cannot be read; see `anatomy.io.read_dicom` and
+            `anatomy.io.read_volume`.
     """
     from anatomy.base.errors import FileError
     from anatomy.base.files import sha256

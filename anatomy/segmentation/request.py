@@ -61,24 +61,16 @@ class _Read:
 def read_given(files: Mapping[str, Path], folder: Path | None, grid: Grid) -> GivenImages:
     """Read masks of other programs.
 
-    Parameters
-    ----------
-    files : mapping of str to Path
-        By the name of the image, a key of `ROLES`: a mask, a label map, `file#1,2` for some of its labels, a
-        folder of TotalSegmentator or a case of AeroPath.
-    folder : Path or None
-        Output of TotalSegmentator, for all images that it holds.
-    grid : Grid
-        The voxels of the CT, in the order of `canonical`.
+    Args:
+        files: By the name of the image, a key of `ROLES`: a mask, a label map, `file#1,2` for some of its
+            labels, a folder of TotalSegmentator or a case of AeroPath.
+        folder: Output of TotalSegmentator, for all images that it holds.
+        grid: The voxels of the CT, in the order of `canonical`.
 
-    Raises
-    ------
-    FileError
-        If a file is missing or damaged, or a folder holds nothing of the kind.
-    AnatomyError
-        If a mask is empty, or its values do not say what is what.
-    GridMismatchError
-        If a mask lies in another frame than the CT.
+    Raises:
+        FileError: If a file is missing or damaged, or a folder holds nothing of the kind.
+        AnatomyError: If a mask is empty, or its values do not say what is what.
+        GridMismatchError: If a mask lies in another frame than the CT.
     """
     found = {} if folder is None else _all_of_folder(folder)
     for image, path in files.items():
@@ -241,29 +233,19 @@ def _onto_ct(volume: Volume, grid: Grid, name: str, *, solid: bool) -> tuple[Vol
 class Given:
     """Files in place of steps, and the target; all optional.
 
-    Parameters
-    ----------
-    lungs : Path
-        Label map (1 right, 2 left; or lobes, see `lobes`) or one mask of both lungs.
-    airway, airway_wall, vessels : Path
-        Masks, label maps that name their labels, `file#1,2` for some labels, or folders of TotalSegmentator.
-    lobes : Path
-        Label map: see `anatomy.segmentation.labels.lobe_numbers`; or a folder of TotalSegmentator.
-    fissures : Path
-        Mask; or 1 where a fissure is inferred, and 2 where it is seen.
-    onnx_airway : Path
-        Network for the airway, see `anatomy.segmentation.learned`.
-    totalsegmentator : Path
-        Folder with output of TotalSegmentator's tasks lung_vessels and total, or one of them: all that it
-        holds is taken.
-    nodule_contours : Path
-        Contours of radiologists, see `anatomy.segmentation.nodules.nodule_from_contours`.
-    nodule_mask : Path
-        Mask of one or more nodules.
-    nodules : tuple of str
-        Points in nodules, which are outlined by `anatomy.segmentation.outlining.outline_nodule`.
-    target : str
-        A point with its frame, `ras:x,y,z` or `lps:x,y,z`.
+    Args:
+        lungs: Label map (1 right, 2 left; or lobes, see `lobes`) or one mask of both lungs.
+        airway, airway_wall, vessels: Masks, label maps that name their labels, `file#1,2` for some labels, or
+            folders of TotalSegmentator.
+        lobes: Label map: see `anatomy.segmentation.labels.lobe_numbers`; or a folder of TotalSegmentator.
+        fissures: Mask; or 1 where a fissure is inferred, and 2 where it is seen.
+        onnx_airway: Network for the airway, see `anatomy.segmentation.learned`.
+        totalsegmentator: Folder with output of TotalSegmentator's tasks lung_vessels and total, or one of
+            them: all that it holds is taken.
+        nodule_contours: Contours of radiologists, see `anatomy.segmentation.nodules.nodule_from_contours`.
+        nodule_mask: Mask of one or more nodules.
+        nodules: Points in nodules, which are outlined by `anatomy.segmentation.outlining.outline_nodule`.
+        target: A point with its frame, `ras:x,y,z` or `lps:x,y,z`.
     """
 
     lungs: Path | None = None
@@ -302,35 +284,22 @@ class Given:
 class SegmentationRequest:
     """What to segment, and what is given.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units.
-    out : Path
-        The patient folder to write.
-    name : str
-        How reports call the patient; the folder's name if empty.
-    sources : mapping of str to str
-        Files the CT was read from, and their SHA-256.
-    ct_path : path, optional
-        The image or folder of DICOM that holds the CT; it is recorded, so that others can show the CT.
-    ct_series : str, optional
-        UID of its series, where the folder holds several.
-    ex_vivo : bool
-        The image shows an inflated lung in air.
-    thick_slices : bool
-        Accept slices of more than 3 mm; the folder is marked, and planning on it must be allowed too.
-    large_radius_mm : float
-        Vessels of this radius or more are obstacles, thinner ones costs.
-    accept : tuple of str
-        Checks of `anatomy.plausibility.CHECKS` whose failure a person accepts; it is recorded.
-    seed_lps : (3,) float64, optional
-        A point in the trachea, LPS mm.
-    given : Given
-    voxel_mm : float
-        Axes along which the CT has larger voxels are interpolated to about this size.
-    force : bool
-        Whether the folder may hold masks and a description of others, which then count as corrections.
+    Args:
+        ct: Hounsfield units.
+        out: The patient folder to write.
+        name: How reports call the patient; the folder's name if empty.
+        sources: Files the CT was read from, and their SHA-256.
+        ct_path: The image or folder of DICOM that holds the CT; it is recorded, so that others can show the
+            CT.
+        ct_series: UID of its series, where the folder holds several.
+        ex_vivo: The image shows an inflated lung in air.
+        thick_slices: Accept slices of more than 3 mm; the folder is marked, and planning on it must be
+            allowed too.
+        large_radius_mm: Vessels of this radius or more are obstacles, thinner ones costs.
+        accept: Checks of `anatomy.plausibility.CHECKS` whose failure a person accepts; it is recorded.
+        seed_lps ((3,) float64): A point in the trachea, LPS mm.
+        voxel_mm: Axes along which the CT has larger voxels are interpolated to about this size.
+        force: Whether the folder may hold masks and a description of others, which then count as corrections.
     """
 
     ct: Volume

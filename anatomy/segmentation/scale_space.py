@@ -27,18 +27,12 @@ LOST_WEIGHT = 1e-5
 class ScaleSpace:
     """The box around a lung; arrays are `(nk, nj, ni)` and C-contiguous: the transposes of images.
 
-    Parameters
-    ----------
-    box : 3 slices
-        The voxels of the whole image, along i, j, k.
-    spacing_mm : (3,) float64
-        Voxel size along i, j, k.
-    hu : (nk, nj, ni) int16 or float32
-        The CT, not below -1024.
-    n_scales : (nk, nj, ni) uint8
-        How many of `SIGMAS_MM` apply at a voxel; 0 outside the lung.
-    threads : int
-        Threads that share the planes; the results do not depend on it.
+    Args:
+        box (3 slices): The voxels of the whole image, along i, j, k.
+        spacing_mm ((3,) float64): Voxel size along i, j, k.
+        hu ((nk, nj, ni) int16 or float32): The CT, not below -1024.
+        n_scales ((nk, nj, ni) uint8): How many of `SIGMAS_MM` apply at a voxel; 0 outside the lung.
+        threads: Threads that share the planes; the results do not depend on it.
     """
 
     box: Window
@@ -51,23 +45,15 @@ class ScaleSpace:
     def of(cls, hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, threads: int = 0) -> Self:
         """Cut the box around the lung out of a CT.
 
-        Parameters
-        ----------
-        hu : (ni, nj, nk) int16 or float32
-            Hounsfield units, in any memory order.
-        lung : (ni, nj, nk) bool
-            Where responses are wanted.
-        spacing_mm : (3,) float64
-            Voxel size along i, j, k.
-        threads : int
-            0 for all processors this process may use.
+        Args:
+            hu ((ni, nj, nk) int16 or float32): Hounsfield units, in any memory order.
+            lung ((ni, nj, nk) bool): Where responses are wanted.
+            spacing_mm ((3,) float64): Voxel size along i, j, k.
+            threads: 0 for all processors this process may use.
 
-        Raises
-        ------
-        GridMismatchError
-            If the shapes differ.
-        AnatomyError
-            If the lung is empty, or the CT is not of a real type.
+        Raises:
+            GridMismatchError: If the shapes differ.
+            AnatomyError: If the lung is empty, or the CT is not of a real type.
         """
         if hu.shape != lung.shape or hu.ndim != 3:
             raise GridMismatchError(
@@ -142,14 +128,12 @@ def share_axis(work: Callable[[int, int], None], length: int, threads: int) -> N
 def discrete_gaussian(variance: float) -> Float32:
     """Return the weights of the discrete analogue of the Gaussian, centre first: exp(-t) I_n(t).
 
-    Parameters
-    ----------
-    variance : float
-        t, in squared voxels.  The weights are cut where they lose `LOST_WEIGHT`, and scaled to the sum 1.
+    Args:
+        variance: t, in squared voxels.  The weights are cut where they lose `LOST_WEIGHT`, and scaled to the
+            sum 1.
 
-    References
-    ----------
-    [Lindeberg1990]
+    References:
+        [Lindeberg1990]
     """
     from scipy.special import ive
 

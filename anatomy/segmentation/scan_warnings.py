@@ -263,15 +263,11 @@ def _leaks(tree: AirwayTree) -> list[str]:
 class Fit:
     """What moving a mask by `STEP_MM` costs at least, HU.
 
-    Parameters
-    ----------
-    brighter : bool
-        Whether what is shown is brighter than what is around it.
-    least_hu, mean_hu : float
-        By how much it must be brighter, or darker, in place than moved: in the worst of six directions, and
-        on average.
-    doubt_hu : float
-        What the worst direction has in phantoms, halved.
+    Args:
+        brighter: Whether what is shown is brighter than what is around it.
+        least_hu, mean_hu: By how much it must be brighter, or darker, in place than moved: in the worst of
+            six directions, and on average.
+        doubt_hu: What the worst direction has in phantoms, halved.
     """
 
     brighter: bool
@@ -297,21 +293,15 @@ def misplaced(
 ) -> tuple[list[Finding], list[str]]:
     """Check masks from elsewhere by the CT.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units.
-    images : mapping of str to (ni, nj, nk) array
-        Masks and label maps from elsewhere, by the name of the image, on the voxels of the CT.
-    lungs, lumen : (ni, nj, nk) bool
-        Of the CT, wherever they come from.
+    Args:
+        ct: Hounsfield units.
+        images (mapping of str to (ni, nj, nk) array): Masks and label maps from elsewhere, by the name of the
+            image, on the voxels of the CT.
+        lungs, lumen ((ni, nj, nk) bool): Of the CT, wherever they come from.
 
-    Returns
-    -------
-    list of Finding
-        The check `masks`, for each image that fails it.
-    list of str
-        Warnings.
+    Returns:
+        - list of Finding - The check `masks`, for each image that fails it.
+        - list of str - Warnings.
     """
     failed, warnings = [], []
     for name, image in images.items():

@@ -65,29 +65,18 @@ def segment_vessels(
 ) -> Vessels:
     """Find the vessels inside the lungs.
 
-    Parameters
-    ----------
-    ct : Volume
-        Hounsfield units.
-    lungs : (ni, nj, nk) bool
-        Both lungs, filled.
-    airways : Airways
-        Its lumen and wall never become vessel.
-    large_radius_mm : float
-        Vessels of this radius or more are `large`.
-    threads : int
-        0 for all processors; the result does not depend on it.
-    progress : callable or None
-        Gets what is being done.
+    Args:
+        ct: Hounsfield units.
+        lungs ((ni, nj, nk) bool): Both lungs, filled.
+        airways: Its lumen and wall never become vessel.
+        large_radius_mm: Vessels of this radius or more are `large`.
+        threads: 0 for all processors; the result does not depend on it.
+        progress: Gets what is being done.
 
-    Raises
-    ------
-    GridMismatchError
-        If the shapes differ.
-    AnatomyError
-        If the lung is empty.
-    SettingsError
-        If the radius is none of `LARGE_RADII_MM` or between.
+    Raises:
+        GridMismatchError: If the shapes differ.
+        AnatomyError: If the lung is empty.
+        SettingsError: If the radius is none of `LARGE_RADII_MM` or between.
     """
     require_large_radius(large_radius_mm)
     shape = ct.array.shape
@@ -253,26 +242,18 @@ ALPHA, BETA, C_HU = 0.5, 0.5, 70.0
 def vesselness(hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, threads: int = 0) -> Float32:
     """Return the greatest response over the scales that apply at each voxel [Fu2018, eqs. 3-5].
 
-    Parameters
-    ----------
-    hu : (ni, nj, nk) int16 or float32
-        The CT in Hounsfield units.
-    lung : (ni, nj, nk) bool
-        Lungs with their vessels; the distance to its surface decides which scales apply.
-    spacing_mm : (3,) float64
-        Voxel size along i, j, k.
-    threads : int
-        0 for all processors; the result does not depend on it.
+    Args:
+        hu ((ni, nj, nk) int16 or float32): The CT in Hounsfield units.
+        lung ((ni, nj, nk) bool): Lungs with their vessels; the distance to its surface decides which scales
+            apply.
+        spacing_mm ((3,) float64): Voxel size along i, j, k.
+        threads: 0 for all processors; the result does not depend on it.
 
-    Returns
-    -------
-    (ni, nj, nk) float32
-        In [0, 1], Fortran-contiguous; 0 outside the lung.
+    Returns:
+        (ni, nj, nk) float32: In [0, 1], Fortran-contiguous; 0 outside the lung.
 
-    Raises
-    ------
-    GridMismatchError, AnatomyError
-        If the shapes differ; if the lung is empty.
+    Raises:
+        GridMismatchError, AnatomyError: If the shapes differ; if the lung is empty.
     """
     space = ScaleSpace.of(hu, lung, spacing_mm, threads=threads)
     best = np.zeros(space.hu.shape, dtype=np.float32)

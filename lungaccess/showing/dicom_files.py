@@ -52,20 +52,14 @@ def export_dicom(
 ) -> tuple[str, ...]:
     """Write segments, report and overview of a plan beside the CT it belongs to; return the files' names.
 
-    Parameters
-    ----------
-    ct : CtFile, optional
-        The DICOM series that the masks show; without one, nothing can be written.
-    anonymise : bool
-        Whether name, identity, dates and physicians of the CT are left empty.
+    Args:
+        ct: The DICOM series that the masks show; without one, nothing can be written.
+        anonymise: Whether name, identity, dates and physicians of the CT are left empty.
 
-    Raises
-    ------
-    FileError
-        If the series cannot be read, lacks the study or frame it belongs to, shows another patient, or the
-        folder cannot be written.
-    SettingsError
-        If the CT is no folder, or the extra `dicom` is not installed.
+    Raises:
+        FileError: If the series cannot be read, lacks the study or frame it belongs to, shows another
+            patient, or the folder cannot be written.
+        SettingsError: If the CT is no folder, or the extra `dicom` is not installed.
     """
     hd = highdicom()
     if ct is None or not ct.path.is_dir():

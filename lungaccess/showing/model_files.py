@@ -30,10 +30,8 @@ def export_models(plan: Plan, lung: Lung, folder: str | Path) -> tuple[str, ...]
     frame of glTF, metres with +y up.  `camera.json` has the eye of the bronchoscope for each picture of a
     film: `eye` and `target`, 10 mm ahead of it, LPS mm, and the direction `up` of the picture.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written.
+    Raises:
+        FileError: If the folder cannot be written.
     """
     import trimesh
 

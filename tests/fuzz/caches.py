@@ -23,10 +23,8 @@ VALUES: tuple[Any, ...] = (
 def tamper(rng: np.random.Generator, entry: Path, other: Path) -> str:
     """Change an entry of a cache (a folder or a file) and return what was done to it.
 
-    Parameters
-    ----------
-    other : Path
-        An intact entry of the same kind that belongs to another patient or design.
+    Args:
+        other: An intact entry of the same kind that belongs to another patient or design.
     """
     if entry.is_dir() and rng.random() < 0.2:
         of_all = (_other_entry, _emptied, _a_file_instead, _more_files, _swapped_files, _removed)

@@ -41,10 +41,8 @@ def replaced_number(rng: np.random.Generator, content: bytes) -> bytes:
 def mutated(rng: np.random.Generator, content: bytes, first_bytes: int | None = None) -> bytes:
     """Return damaged content.
 
-    Parameters
-    ----------
-    first_bytes : int, optional
-        Damage only what comes before this byte; everything if None.
+    Args:
+        first_bytes: Damage only what comes before this byte; everything if None.
     """
     head, rest = (content, b"") if first_bytes is None else (content[:first_bytes], content[first_bytes:])
     for _ in range(int(rng.integers(1, 4))):

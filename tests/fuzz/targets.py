@@ -26,17 +26,12 @@ GRID = Grid.from_spacing((12, 10, 8), [5.0, 4.0, 2.0], [-30.0, -20.0, 10.0])
 class Target:
     """A file to damage and how to read it.
 
-    Parameters
-    ----------
-    file : str
-        Name of the damaged file in the folder.
-    make : callable
-        Writes intact files into a folder.
-    read : callable
-        Given the folder; raises typed errors alone.
-    header_bytes : callable, optional
-        How many bytes of the content come before the voxels.  Damage to them that leaves the grid as it is
-        must leave the voxels as they are.
+    Args:
+        file: Name of the damaged file in the folder.
+        make: Writes intact files into a folder.
+        read: Given the folder; raises typed errors alone.
+        header_bytes: How many bytes of the content come before the voxels.  Damage to them that leaves the
+            grid as it is must leave the voxels as they are.
     """
 
     file: str

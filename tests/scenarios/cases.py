@@ -16,18 +16,12 @@ COST_TOLERANCE = 0.02
 class Anatomy:
     """A synthetic patient by seed, or a real one by name.
 
-    Parameters
-    ----------
-    name : str
-        For a real patient the name of its folder below med-rad.
-    seed : int or None
-        Of the synthetic patient; None for a real one.
-    spacing_mm : float or None
-        Voxel size of a synthetic patient, None for the default.
-    fissures_allowed : bool
-        Whether needles may cross fissures.
-    devices : tuple of str
-        Presets that plans are made for.
+    Args:
+        name: For a real patient the name of its folder below med-rad.
+        seed: Of the synthetic patient; None for a real one.
+        spacing_mm: Voxel size of a synthetic patient, None for the default.
+        fissures_allowed: Whether needles may cross fissures.
+        devices: Presets that plans are made for.
     """
 
     name: str

@@ -24,14 +24,10 @@ Cost = float | None
 class Answer:
     """What a search gave for one target.
 
-    Parameters
-    ----------
-    cost : float or None
-        Of the best plan or path; None if there is none.
-    digest : str
-        Changes with any byte of any plan, or of the reasons for having none.
-    faults : tuple of str
-        What is wrong with the best plan, or with the reasons.
+    Args:
+        cost: Of the best plan or path; None if there is none.
+        digest: Changes with any byte of any plan, or of the reasons for having none.
+        faults: What is wrong with the best plan, or with the reasons.
     """
 
     cost: Cost

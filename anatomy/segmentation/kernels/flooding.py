@@ -43,11 +43,9 @@ def flood(labels, cost):
 
     A step between two voxels that share a face costs the mean of theirs.
 
-    Parameters
-    ----------
-    labels : (nk, nj, ni) int32
-        Above 0 at seeds, 0 where a label is wanted, below 0 where no way leads.
-    cost : (nk, nj, ni) float32
+    Args:
+        labels ((nk, nj, ni) int32): Above 0 at seeds, 0 where a label is wanted, below 0 where no way leads.
+        cost: (nk, nj, ni) float32.
     """
     nk, nj, ni = labels.shape
     label, price = labels.ravel(), cost.ravel()
@@ -82,17 +80,13 @@ def flood(labels, cost):
 def diffuse(share, free, along_i, along_j, along_k, rounds, relaxation):
     """Bring shares nearer to their steady state by successive over-relaxation, in place.
 
-    Parameters
-    ----------
-    share : (nk, nj, ni) float32
-        Start, and fixed values at all voxels that are not free.
-    free : (F,) int64
-        Flat indices of the voxels to change, none in the outermost layer.
-    along_i, along_j, along_k : (nk, nj, ni) float32
-        Conductance from each voxel to the next along an axis.
-    rounds : int
-    relaxation : float32
-        1 to below 2.
+    Args:
+        share ((nk, nj, ni) float32): Start, and fixed values at all voxels that are not free.
+        free ((F,) int64): Flat indices of the voxels to change, none in the outermost layer.
+        along_i, along_j, along_k ((nk, nj, ni) float32): Conductance from each voxel to the next along an
+            axis.
+        rounds: int.
+        relaxation (float32): 1 to below 2.
     """
     _, nj, ni = share.shape
     value, row, plane = share.ravel(), ni, ni * nj

@@ -218,37 +218,26 @@ def grow_airway(
 ):
     """Add to the lumen, level by level, the pieces of a local minima map that branch off it.
 
-    Parameters
-    ----------
-    depth, hu, state : flat int16, int16, uint8
-        `state` holds LUMEN where growth starts, and is changed.
-    shape : (3,) int64
-        nk, nj, ni, with the border.
-    lumen : (R,) int64
-        Its first `count` entries list the lumen; the others are filled in.  Growth ends where it is full.
-    levels : (L,) int64
-        Falling and positive, at most 125; a voxel can join at a level if it is at least this deep.
-    least_layers : int
-        Pieces of fewer layers are roughness of the wall.
-    front_factor, front_slack : float
-        A piece bursts whose front is larger than the widest of its first layers by this factor and by so
-        many voxels more.
-    wide : float
-        Cross-sections of so many voxels or more are dark inside if they are an airway's.
-    rim : int
-        What lies within so many steps of one that is not dark is banned with it.
-    dark_hu : float
-        Below it is air, above it the tissue of the lung.
-    skin_share : float
-        Beside a voxel that joins, others join down to this share of its depth.
-    queue, parent, behind, layer_ends : (2 R,), (R,), (2, R), (R,) int64
-        Room to work in; a piece has at most R voxels.
+    Args:
+        depth, hu, state (flat int16, int16, uint8): `state` holds LUMEN where growth starts, and is changed.
+        shape ((3,) int64): nk, nj, ni, with the border.
+        lumen ((R,) int64): Its first `count` entries list the lumen; the others are filled in.  Growth ends
+            where it is full.
+        levels ((L,) int64): Falling and positive, at most 125; a voxel can join at a level if it is at least
+            this deep.
+        least_layers (int): Pieces of fewer layers are roughness of the wall.
+        front_factor, front_slack (float): A piece bursts whose front is larger than the widest of its first
+            layers by this factor and by so many voxels more.
+        wide (float): Cross-sections of so many voxels or more are dark inside if they are an airway's.
+        rim (int): What lies within so many steps of one that is not dark is banned with it.
+        dark_hu (float): Below it is air, above it the tissue of the lung.
+        skin_share (float): Beside a voxel that joins, others join down to this share of its depth.
+        queue, parent, behind, layer_ends ((2 R,), (R,), (2, R), (R,) int64): Room to work in; a piece has at
+            most R voxels.
 
-    Returns
-    -------
-    count : int
-    undone : int
-        Voxels that were grown and undone.
+    Returns:
+        - count (int)
+        - undone (int) - Voxels that were grown and undone.
     """
     near = box_offsets(shape, 1)
     undone = 0

@@ -50,16 +50,11 @@ def _vesselness(low, middle, high, strength, settings):
 def add_vesselness(image, first, last, n_scales, scale, factors, settings, best):
     """Raise `best` to R(x; sigma) in the planes `first <= k < last`, where more than `scale` scales apply.
 
-    Parameters
-    ----------
-    image, best : (nk, nj, ni) float32
-        The image smoothed to sigma; the greatest response so far.
-    n_scales : (nk, nj, ni) uint8
-        How many scales apply at a voxel; 0 outside the lung.
-    factors : (6,) float64
-        sigma^2 / (h_a h_b) for ii, jj, kk, ij, ik, jk.
-    settings : (3,) float64
-        alpha, beta, c.
+    Args:
+        image, best ((nk, nj, ni) float32): The image smoothed to sigma; the greatest response so far.
+        n_scales ((nk, nj, ni) uint8): How many scales apply at a voxel; 0 outside the lung.
+        factors ((6,) float64): sigma^2 / (h_a h_b) for ii, jj, kk, ij, ik, jk.
+        settings ((3,) float64): alpha, beta, c.
     """
     for k in range(first, last):
         for j in range(image.shape[1]):

@@ -56,31 +56,21 @@ def refine_edge(hu, state, faces, row, least_depth, lung_hu, lumen, count):
     is blurred into the lung behind it.  All voxels are judged before the first one joins.  None of the border
     does if `least_depth` is positive: there the closing is not above -1024 HU.
 
-    Parameters
-    ----------
-    hu, state : (V,) int16, uint8
-        `state` is 0 or LUMEN.
-    faces : (6,) int64
-        Flat steps to the neighbours that share a face.
-    row : int
-        Flat step from one row of a slice to the next.
-    least_depth : int
-        HU.
-    lung_hu : float
-        Tissue of the lung.
-    lumen : (V,) int64
-        Its first `count` entries list the lumen; what joins follows.
+    Args:
+        hu, state ((V,) int16, uint8): `state` is 0 or LUMEN.
+        faces ((6,) int64): Flat steps to the neighbours that share a face.
+        row (int): Flat step from one row of a slice to the next.
+        least_depth (int): HU.
+        lung_hu (float): Tissue of the lung.
+        lumen ((V,) int64): Its first `count` entries list the lumen; what joins follows.
 
-    Returns
-    -------
-    int
-        The new count.
+    Returns:
+        int: The new count.
 
-    Notes
-    -----
-    A wall of the thickness w and 0 HU between air and lung, blurred by a Gaussian of sigma, has at its inner
-    surface the share 0.93, 0.86, 0.76, 0.68, 0.57 of the way from air to its peak for w = 0.5, 1, 1.5, 2, 3
-    sigma.  `1 - (peak - lung) / (2 (0 - lung))` gives 0.94, 0.84, 0.74, 0.67, 0.57.
+    Notes:
+        A wall of the thickness w and 0 HU between air and lung, blurred by a Gaussian of sigma, has at its
+        inner surface the share 0.93, 0.86, 0.76, 0.68, 0.57 of the way from air to its peak for w = 0.5, 1,
+        1.5, 2, 3 sigma.  `1 - (peak - lung) / (2 (0 - lung))` gives 0.94, 0.84, 0.74, 0.67, 0.57.
     """
     known = count
     for s in range(known):

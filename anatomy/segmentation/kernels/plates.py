@@ -38,14 +38,11 @@ def plate_responses(image, where, strength, normal):
 
     The strength is |lambda_3| - |lambda_2| of the Hessian for lambda_3 < 0: a tube has none.
 
-    Parameters
-    ----------
-    image : (nk, nj, ni) float32
-        Smoothed, with cubic voxels of 1.
-    where : (nk, nj, ni) bool
-    strength : (nk, nj, ni) float32
-    normal : (3, nk, nj, ni) float32
-        Along i, j, k; no sense of direction.
+    Args:
+        image ((nk, nj, ni) float32): Smoothed, with cubic voxels of 1.
+        where: (nk, nj, ni) bool.
+        strength: (nk, nj, ni) float32.
+        normal ((3, nk, nj, ni) float32): Along i, j, k; no sense of direction.
     """
     factors = np.ones(6)
     for k in range(image.shape[0]):
@@ -72,15 +69,12 @@ def grow_sheets(response, normal, least, cosine, sheet, stack):
 
     Neighbours (26) of at least `least` belong together if the cosine between their normals is large.
 
-    Parameters
-    ----------
-    response : (nk, nj, ni) float32
-    normal : (3, nk, nj, ni) float32
-    least, cosine : float64
-    sheet : (nk, nj, ni) int32
-        Zeros; filled with the number of each voxel's sheet.
-    stack : (n,) int64
-        Room for every voxel of at least `least`.
+    Args:
+        response: (nk, nj, ni) float32.
+        normal: (3, nk, nj, ni) float32.
+        least, cosine: float64.
+        sheet ((nk, nj, ni) int32): Zeros; filled with the number of each voxel's sheet.
+        stack ((n,) int64): Room for every voxel of at least `least`.
     """
     nk, nj, ni = response.shape
     sizes = [0]

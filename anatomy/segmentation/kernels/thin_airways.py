@@ -111,30 +111,21 @@ def follow_tubes(
 ):  # fmt: skip
     """Add to the lumen the thin airways that go on from its ends.
 
-    Parameters
-    ----------
-    hu, state, lung : (nk, nj, ni) int16, uint8, bool
-        `state` holds LUMEN and BANNED, and is changed.
-    per_mm, spacing_mm : (3,) float64
-        Voxels in a mm, and mm of a voxel.
-    directions : (D, 3) float64
-        Unit vectors all around.
-    radii_mm : (R,) float64
-        Radii of the ring.
-    least_contrast : float
-        Contrast of the best stretch of an airway, HU.
-    least_ring_hu : float
-        What a wall has at least, HU.
-    starts, headings, others : (M, 3) float64
-        The first `n_starts` hold where a tube may begin, its direction, and one that it keeps away from, or
-        zero.  Both ends of new tubes are filled in, as long as there is room.
-    lumen : (V,) int64
-        Its first `count` entries list the lumen; the others are filled in.
+    Args:
+        hu, state, lung ((nk, nj, ni) int16, uint8, bool): `state` holds LUMEN and BANNED, and is changed.
+        per_mm, spacing_mm ((3,) float64): Voxels in a mm, and mm of a voxel.
+        directions ((D, 3) float64): Unit vectors all around.
+        radii_mm ((R,) float64): Radii of the ring.
+        least_contrast (float): Contrast of the best stretch of an airway, HU.
+        least_ring_hu (float): What a wall has at least, HU.
+        starts, headings, others ((M, 3) float64): The first `n_starts` hold where a tube may begin, its
+            direction, and one that it keeps away from, or zero.  Both ends of new tubes are filled in, as
+            long as there is room.
+        lumen ((V,) int64): Its first `count` entries list the lumen; the others are filled in.
 
-    Returns
-    -------
-    count : int
-    n_tubes : int
+    Returns:
+        - count (int)
+        - n_tubes (int)
     """
     work = np.zeros((8, ANGLES))
     begin, heading = np.zeros(3), np.zeros(3)

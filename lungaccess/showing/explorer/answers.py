@@ -38,10 +38,8 @@ TELL_EVERY_S = 0.25
 class Answers:
     """Holds the patient and the latest atlases, and answers questions.
 
-    Parameters
-    ----------
-    folder : path
-        Where files that the page may fetch are written.
+    Args:
+        folder: Where files that the page may fetch are written.
     """
 
     def __init__(self, source: PatientSource, folder: Path) -> None:
@@ -310,10 +308,8 @@ class Answers:
 def _place_of(atlas: Atlas, question: ask.PlanQuestion) -> ChosenPlace | None:
     """Return the place that a plan is asked to go through: the exit of a deployment, or a tip of the scope.
 
-    Raises
-    ------
-    SettingsError
-        If the atlas has no such deployment or tip.
+    Raises:
+        SettingsError: If the atlas has no such deployment or tip.
     """
     if question.entry is not None:
         _require_below(question.entry, atlas.deployments.count, "deployment")

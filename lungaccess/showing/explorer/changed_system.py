@@ -24,15 +24,12 @@ from lungaccess.showing.explorer.questions import PlanQuestion, WhatIf
 def system_of(what_if: WhatIf, own: Mapping[str, System]) -> System:
     """Return the system of a question.
 
-    Parameters
-    ----------
-    own : mapping of str to System
-        Systems by name that are no presets.
+    Args:
+        own: Systems by name that are no presets.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such system, it cannot have the change, or one device then does not fit the other.
+    Raises:
+        SettingsError: If there is no such system, it cannot have the change, or one device then does not fit
+            the other.
     """
     system = own.get(what_if.system)
     if system is None:
@@ -100,12 +97,9 @@ def plan_command(
 ) -> str:
     """Return the line that makes the same plan, byte for byte.
 
-    Parameters
-    ----------
-    own : mapping of str to path
-        Files of the systems that are no presets, by name.
-    place : ChosenPlace, optional
-        That the plan goes through.
+    Args:
+        own: Files of the systems that are no presets, by name.
+        place: That the plan goes through.
     """
     what_if = question.what_if
     if system.name in own:
@@ -139,11 +133,9 @@ DIGITS = 3
 class ChosenPlace:
     """A place, LPS mm, with the words of the command for it.
 
-    Parameters
-    ----------
-    kind : "exit" or "scope tip"
-    lps_mm : (3,) floats
-        As the command states them.
+    Args:
+        kind: "exit" or "scope tip".
+        lps_mm ((3,) floats): As the command states them.
     """
 
     kind: Literal["exit", "scope tip"]

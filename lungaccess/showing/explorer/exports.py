@@ -54,10 +54,8 @@ def export_file(
 ) -> Path:
     """Write one of `lungaccess.showing.explorer.questions.FileKind` into a new folder in a folder.
 
-    Raises
-    ------
-    FileError
-        If it cannot be written.
+    Raises:
+        FileError: If it cannot be written.
     """
     made = Path(tempfile.mkdtemp(dir=folder))
     file = made / what
@@ -121,10 +119,8 @@ def explanation_part(
 ) -> Part:
     """Return headline and sections of an explanation.
 
-    Raises
-    ------
-    SettingsError
-        If there is a plan.
+    Raises:
+        SettingsError: If there is a plan.
     """
 
     def on_part(name: str) -> None:

@@ -23,10 +23,8 @@ def frame(message: Message, arrays: Mapping[str, Array] | None = None) -> Frame:
     With arrays it is binary: the length of the JSON as a little-endian uint32, the JSON, whose "arrays" list
     name, kind ("u1", "u2", "i4" or "f4"), shape and offset of each, and the arrays, little-endian.
 
-    Raises
-    ------
-    ValueError
-        If a number of the message is not finite.
+    Raises:
+        ValueError: If a number of the message is not finite.
     """
     if not arrays:
         return _json(message)

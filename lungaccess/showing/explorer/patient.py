@@ -26,10 +26,8 @@ NODULE = "nodule"
 def target_of(lung: Lung, text: str) -> Target:
     """Return the target that a text names: `nodule N`, a point with its frame, or a published name.
 
-    Raises
-    ------
-    LungaccessError
-        As `lungaccess.problem.resolve_target`.
+    Raises:
+        LungaccessError: As `lungaccess.problem.resolve_target`.
     """
     kind, _, number = text.partition(" ")
     if kind == NODULE and number.isdecimal():
@@ -134,15 +132,12 @@ def ct_slice(
 ) -> Float32:
     """Return the values in HU at the pixels of a plane, between the eight voxels around each.
 
-    Parameters
-    ----------
-    origin, across, down : (3,) array_like, LPS mm
-        The place of the first pixel's centre, and the steps to the next column and row.
+    Args:
+        origin, across, down ((3,) array_like, LPS mm): The place of the first pixel's centre, and the steps
+            to the next column and row.
 
-    Returns
-    -------
-    values : (rows, columns) float32
-        nan beyond the centres of the outermost voxels.
+    Returns:
+        values ((rows, columns) float32): nan beyond the centres of the outermost voxels.
     """
     from scipy.ndimage import map_coordinates
 

@@ -27,10 +27,8 @@ def _work(connection: Connection, source: PatientSource, folder: Path) -> None:
 class Process:
     """One process from the side of the server; it is started when it is first asked, and again if it ends.
 
-    Parameters
-    ----------
-    given : callable
-        Gets each part of an answer, in a thread of this object.
+    Args:
+        given: Gets each part of an answer, in a thread of this object.
     """
 
     def __init__(self, source: PatientSource, folder: Path, given: Callable[[Given], None]) -> None:

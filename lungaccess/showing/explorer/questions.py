@@ -30,15 +30,12 @@ FileKind = Literal[
 class WhatIf:
     """A system, and what is changed of it; what is not stated is the system's own.
 
-    Parameters
-    ----------
-    system : str
-        Name of a preset, or of the system that the explorer was started with.
-    scope_diameter_mm, needle_radius_mm, needle_length_mm, margin_mm : float, optional
-        Outer diameter of the bronchoscope, least radius of curvature and greatest length of the needle, and
-        the margin for the border of the masks.
-    fissures_allowed : bool, optional
-        Whether fissures may be crossed.
+    Args:
+        system: Name of a preset, or of the system that the explorer was started with.
+        scope_diameter_mm, needle_radius_mm, needle_length_mm, margin_mm: Outer diameter of the bronchoscope,
+            least radius of curvature and greatest length of the needle, and the margin for the border of the
+            masks.
+        fissures_allowed: Whether fissures may be crossed.
     """
 
     system: Annotated[str, text("name of a system")] = "lung-default"
@@ -57,12 +54,9 @@ class WhatIf:
 class _Question:
     """What all questions have.
 
-    Parameters
-    ----------
-    id : int
-        By which the answers are told apart.
-    slot : str
-        A question takes the place of the one before with the same name and slot.
+    Args:
+        id: By which the answers are told apart.
+        slot: A question takes the place of the one before with the same name and slot.
     """
 
     id: Number
@@ -209,10 +203,9 @@ Question = Any
 def read_message(text_of_message: str) -> tuple[str, Question]:
     """Return the name of a question and the question, or CANCEL and the number of the question to end.
 
-    Raises
-    ------
-    SettingsError
-        If the message is too long, no JSON object, of an unknown kind, or a value in it is wrong.
+    Raises:
+        SettingsError: If the message is too long, no JSON object, of an unknown kind, or a value in it is
+            wrong.
     """
     if len(text_of_message) > MOST_CHARACTERS:
         raise SettingsError("The message is too long", expected=f"at most {MOST_CHARACTERS} characters")

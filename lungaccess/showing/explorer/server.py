@@ -98,11 +98,8 @@ class Page:
 class Explorer:
     """Serves the explorer of one patient until it is stopped.
 
-    Parameters
-    ----------
-    source : PatientSource
-    port : int
-        0 for any free one.
+    Args:
+        port: 0 for any free one.
     """
 
     def __init__(self, source: PatientSource, port: int = 0) -> None:
@@ -126,10 +123,8 @@ class Explorer:
     async def start(self) -> Address:
         """Begin to serve, and return where.
 
-        Raises
-        ------
-        SettingsError
-            If the port is taken.
+        Raises:
+            SettingsError: If the port is taken.
         """
         self._loop = asyncio.get_running_loop()
         self._loop.set_exception_handler(_without_failed_connections)

@@ -26,20 +26,13 @@ Key = tuple[str, str]
 class PatientSource:
     """Which patient is explored, and with what.
 
-    Parameters
-    ----------
-    folder : path
-        Of the patient.
-    system : str
-        Name of the preset that is shown first, or of `own`.
-    own : tuple of (path, System)
-        Systems from files, which the page offers beside the presets.
-    cache : path or None
-        Folder of prepared anatomy and atlases; the default one if None.
-    ct : CtFile or None
-        CT for the slices.
-    accept : tuple of str
-        Checks of the masks whose failure is accepted.
+    Args:
+        folder: Of the patient.
+        system: Name of the preset that is shown first, or of `own`.
+        own (tuple of (path, System)): Systems from files, which the page offers beside the presets.
+        cache: Folder of prepared anatomy and atlases; the default one if None.
+        ct: CT for the slices.
+        accept: Checks of the masks whose failure is accepted.
     """
 
     folder: Path
@@ -78,16 +71,11 @@ class Asked:
 class Given:
     """A part of an answer on its way to the page.
 
-    Parameters
-    ----------
-    sent : str or bytes
-        The message.
-    last : bool
-        Whether the question is answered with it.
-    plan : KeptPlan or None
-        A plan that the page may ask about.
-    file : path or None
-        A file that the page may fetch.
+    Args:
+        sent: The message.
+        last: Whether the question is answered with it.
+        plan: A plan that the page may ask about.
+        file: A file that the page may fetch.
     """
 
     page: str
@@ -127,11 +115,8 @@ class Part:
 class Turn:
     """What an answer may do within a slice of its work.
 
-    Parameters
-    ----------
-    worker : Worker
-    asked : Asked
-        The question that is being answered.
+    Args:
+        asked: The question that is being answered.
     """
 
     def __init__(self, worker: Worker, asked: Asked) -> None:
@@ -158,12 +143,9 @@ Answering = Callable[[Asked, Turn], Iterator[Part | None]]
 class Worker:
     """The loop of a process: it answers the questions of all pages by turns, a slice of each.
 
-    Parameters
-    ----------
-    connection : Connection
-        To the process of the server.
-    answering : callable
-        See `Answering`.
+    Args:
+        connection: To the process of the server.
+        answering: See `Answering`.
     """
 
     def __init__(self, connection: Connection, answering: Answering) -> None:

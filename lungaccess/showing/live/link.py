@@ -35,14 +35,10 @@ GAVE_WAY = "gave way to another program"
 class LinkCounts:
     """What a link has done so far.
 
-    Parameters
-    ----------
-    sent, received : int
-        Messages.
-    joined, left : int
-        Connections.
-    dropped : mapping of str to int
-        Messages and connections that were dropped, by reason.
+    Args:
+        sent, received: Messages.
+        joined, left: Connections.
+        dropped: Messages and connections that were dropped, by reason.
     """
 
     sent: int
@@ -66,19 +62,13 @@ class _Peer:
 class Link:
     """A server that programs connect to, or a client of one that it connects to again and again.
 
-    Parameters
-    ----------
-    host : str
-        Address to listen at or to connect to.
-    port : int
-        0 lets the system choose one to listen at; see `port`.
-    connects : bool
-        Whether it is a client.
+    Args:
+        host: Address to listen at or to connect to.
+        port: 0 lets the system choose one to listen at; see `port`.
+        connects: Whether it is a client.
 
-    Raises
-    ------
-    SettingsError
-        If pyigtl is missing, or the address cannot be listened at.
+    Raises:
+        SettingsError: If pyigtl is missing, or the address cannot be listened at.
     """
 
     def __init__(self, host: str = HOST, port: int = PORT, *, connects: bool = False) -> None:
@@ -135,10 +125,8 @@ class Link:
     def poll(self, wait_s: float = 0.0) -> list[Received]:
         """Let programs join, send what waits, and return what has come, in its order.
 
-        Parameters
-        ----------
-        wait_s : float
-            So long is waited if nothing comes.
+        Args:
+            wait_s: So long is waited if nothing comes.
         """
         if self._connects and not self._peers:
             self._connect(wait_s)

@@ -48,16 +48,12 @@ PATH_STEP_MM = 1.0
 class Answer:
     """What came of one tracked pose.
 
-    Parameters
-    ----------
-    name : str
-        Which pose it was.
-    words : str
-        What came of it, for people.
-    tubes_lps, needle_lps : (N, 3) float64 or None
-        Points of the way from there, LPS mm, proved clear; None for what is not left to do, or without one.
-    processor_s : float
-        Processor time that it took.
+    Args:
+        name: Which pose it was.
+        words: What came of it, for people.
+        tubes_lps, needle_lps ((N, 3) float64 or None): Points of the way from there, LPS mm, proved clear;
+            None for what is not left to do, or without one.
+        processor_s: Processor time that it took.
     """
 
     name: str
@@ -75,18 +71,13 @@ class Answer:
 class TrackedReplanner:
     """Plans the rest of a plan from tracked poses; nothing that a pose can be makes it fail.
 
-    Parameters
-    ----------
-    plan, lung
-        The plan that is followed, and its patient.
-    policy : Policy, optional
-        What then decides about the tracked poses of scope, tubes and needle, as long as the target is where
-        the plan has it; else the cheapest way is taken.
+    Args:
+        plan, lung: The plan that is followed, and its patient.
+        policy: What then decides about the tracked poses of scope, tubes and needle, as long as the target is
+            where the plan has it; else the cheapest way is taken.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another patient.
+    Raises:
+        PlanFileError: If the plan was made for another patient.
     """
 
     def __init__(self, plan: Plan, lung: Lung, policy: Policy | None = None) -> None:

@@ -34,19 +34,12 @@ BREATH_S = 4.0
 class LiveCounts:
     """What a session has done.
 
-    Parameters
-    ----------
-    ticks, overrun : int
-        Rounds, and how many of them took longer than the rate allows.
-    replans, found : int
-        Tracked poses that were planned from, and how many of them had a way.
-    superseded : int
-        Tracked poses that were passed over because a newer one had come.
-    unknown : int
-        Messages under names that mean nothing here.
-    replan_median_ms, replan_most_ms : float
-        Processor time of a replan; 0 without one.
-    link : LinkCounts
+    Args:
+        ticks, overrun: Rounds, and how many of them took longer than the rate allows.
+        replans, found: Tracked poses that were planned from, and how many of them had a way.
+        superseded: Tracked poses that were passed over because a newer one had come.
+        unknown: Messages under names that mean nothing here.
+        replan_median_ms, replan_most_ms: Processor time of a replan; 0 without one.
     """
 
     ticks: int
@@ -63,31 +56,19 @@ class LiveCounts:
 class LiveSession:
     """Sends a plan in motion and plans again from what is tracked, round by round.
 
-    Parameters
-    ----------
-    plan, lung
-        The plan, and the patient that it was made for.
-    link : Link
-        Where messages go and come from.
-    rate_hz : float
-        Rounds a second.
-    speeds : Speeds, optional
-        How fast the sent poses move along the plan.
-    loop : bool
-        Whether the motion begins again when it has ended; otherwise its end is sent on and on.
-    on_answer : callable, optional
-        Gets every `Answer`.
-    policy : Policy, optional
-        What decides about tracked poses, see `TrackedReplanner`.
-    wall_clock : callable
-        Returns the time since 1970 in seconds.
+    Args:
+        plan, lung: The plan, and the patient that it was made for.
+        link: Where messages go and come from.
+        rate_hz: Rounds a second.
+        speeds: How fast the sent poses move along the plan.
+        loop: Whether the motion begins again when it has ended; otherwise its end is sent on and on.
+        on_answer: Gets every `Answer`.
+        policy: What decides about tracked poses, see `TrackedReplanner`.
+        wall_clock: Returns the time since 1970 in seconds.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another patient.
-    SettingsError
-        If the rate is not above 0 or above 1000.
+    Raises:
+        PlanFileError: If the plan was made for another patient.
+        SettingsError: If the rate is not above 0 or above 1000.
     """
 
     def __init__(

@@ -34,14 +34,10 @@ _Turn = Annotated[float, quantity("speed of turning, degrees/s", above=0.0, at_m
 class Speeds:
     """How fast joints move; what is given here are assumptions, not properties of a device.
 
-    Parameters
-    ----------
-    scope_mm_per_s, scope_deg_per_s : float
-        Advance; twist and bend.
-    tube_mm_per_s, tube_deg_per_s : float
-        Insertion and rotation of every tube.
-    needle_mm_per_s, needle_deg_per_s : float
-        Insertion and roll.
+    Args:
+        scope_mm_per_s, scope_deg_per_s: Advance; twist and bend.
+        tube_mm_per_s, tube_deg_per_s: Insertion and rotation of every tube.
+        needle_mm_per_s, needle_deg_per_s: Insertion and roll.
     """
 
     scope_mm_per_s: _Speed = 10.0
@@ -56,20 +52,17 @@ class Speeds:
 class Trajectory:
     """A plan in time; T samples of J joints.
 
-    Parameters
-    ----------
-    joints : tuple of str
-        Names of the joints, with their units: "scope_advance_mm", "scope_twist_rad", "scope_bend_rad"; of
-        every tube, the outermost first, "outer_tube_insertion_mm" and "outer_tube_rotation_rad"; and
-        "needle_insertion_mm", "needle_roll_rad" and "needle_curvature_per_mm", which is commanded.
-    time_s : (T,) float64
-        Seconds from the begin, strictly rising.
-    values : (T, J) float64
-        Between two samples every joint moves at a steady rate; the curvature holds up to its sample.
-    stages : tuple of str
-        For each sample which device moves: "scope", "tubes" or "needle".
-    lps_from_scope_tip, lps_from_tube_tip, lps_from_needle_tip : (T, 4, 4) float64
-        Where the tips are, LPS mm; a device that is not out yet is at the tip of the one around it.
+    Args:
+        joints: Names of the joints, with their units: "scope_advance_mm", "scope_twist_rad",
+            "scope_bend_rad"; of every tube, the outermost first, "outer_tube_insertion_mm" and
+            "outer_tube_rotation_rad"; and "needle_insertion_mm", "needle_roll_rad" and
+            "needle_curvature_per_mm", which is commanded.
+        time_s ((T,) float64): Seconds from the begin, strictly rising.
+        values ((T, J) float64): Between two samples every joint moves at a steady rate; the curvature holds
+            up to its sample.
+        stages: For each sample which device moves: "scope", "tubes" or "needle".
+        lps_from_scope_tip, lps_from_tube_tip, lps_from_needle_tip ((T, 4, 4) float64): Where the tips are,
+            LPS mm; a device that is not out yet is at the tip of the one around it.
     """
 
     joints: tuple[str, ...]
@@ -96,17 +89,12 @@ def plan_trajectory(plan: Plan, speeds: Speeds | None = None, *, step_s: float =
     The scope goes through its states.  The tubes are turned at the tip of the scope, then go out together
     and stop one by one, as the plan's sweep is proved for.  The needle rolls, then bends along each arc.
 
-    Parameters
-    ----------
-    speeds : Speeds, optional
-        The default ones if None.
-    step_s : float
-        Largest time between two samples; there is one at every state, stop and arc, too.
+    Args:
+        speeds: The default ones if None.
+        step_s: Largest time between two samples; there is one at every state, stop and arc, too.
 
-    Raises
-    ------
-    SettingsError
-        If the step is not above 0, or the tubes of the plan snap on the way.
+    Raises:
+        SettingsError: If the step is not above 0, or the tubes of the plan snap on the way.
     """
     if not 0.0 < step_s < np.inf:
         raise SettingsError(f"The samples are {step_s} s apart", expected="a time above 0")

@@ -26,10 +26,8 @@ _SI = {"_mm": ("", M_PER_MM), "_rad": ("", 1.0), "_per_mm": ("", 1.0 / M_PER_MM)
 def write_trajectory(trajectory: Trajectory, folder: str | Path) -> tuple[str, ...]:
     """Write a trajectory as a table and as messages of ROS 2; return the names of the files.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written.
+    Raises:
+        FileError: If the folder cannot be written.
     """
     target = require_writable_folder(folder)
     write_text(target / TABLE_FILE, table_text(trajectory))

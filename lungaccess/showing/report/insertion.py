@@ -77,10 +77,8 @@ def draw_paths(axes: Any, lung: Lung, found: InsertionStudy) -> None:
 def insertions_png(found: InsertionStudy, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw the true paths of all needles, and how many of them end how near to the target.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     figure = style.new_figure(13.0, 5.2)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.5, 1.0]})
@@ -112,14 +110,11 @@ def insertion_webp(
     Shown are the true paths so far, the plan, the path that was planned last from where the tracker has the
     tip, and where the target is in the end.
 
-    Parameters
-    ----------
-    path : path of a WebP file in an existing folder
+    Args:
+        path: path of a WebP file in an existing folder.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image

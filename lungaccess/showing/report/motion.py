@@ -35,12 +35,9 @@ SLAB_MM = 6.0
 def motion_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw where places of the masks move from end-exhale to end-inhale, in their true length.
 
-    Raises
-    ------
-    AnatomyError
-        If nothing is known of the patient's breathing.
-    FileError
-        If the file cannot be written.
+    Raises:
+        AnatomyError: If nothing is known of the patient's breathing.
+        FileError: If the file cannot be written.
     """
     motion = lung.motion
     if motion is None:

@@ -39,10 +39,8 @@ def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) 
     and target.  Dashed are the tightest arcs of the needle, between which it reaches.  The right one shows
     what is blocked, else the start, with the needle's radius and the distance that it has to keep.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     from lungaccess.planning.one_stage import reason_in_words
 

@@ -21,22 +21,15 @@ def pack(values: ArrayLike, kind: str) -> Packed:
 
     The bytes are stored by significance (all lowest bytes first), which makes whole numbers deflate well.
 
-    Parameters
-    ----------
-    values : array_like of any shape
-        Its last axis runs fastest.
-    kind : str
-        "u1", "u2", "i4" or "f4": the type as which it is stored, little-endian.
+    Args:
+        values (array_like of any shape): Its last axis runs fastest.
+        kind: "u1", "u2", "i4" or "f4": the type as which it is stored, little-endian.
 
-    Returns
-    -------
-    dict
+    Returns:
         "kind", "shape" and "data": base64 of the zlib stream.
 
-    Raises
-    ------
-    AnatomyError
-        If a value is not finite, or too large for the type.
+    Raises:
+        AnatomyError: If a value is not finite, or too large for the type.
     """
     array = np.asarray(values)
     stored = np.ascontiguousarray(array, dtype=np.dtype(TYPES[kind]).newbyteorder("<"))
@@ -60,10 +53,8 @@ def unpack(packed: Packed) -> Array:
 def script_text(content: Any) -> str:
     """Return JSON that may be put into a script element: it holds no `<`.
 
-    Raises
-    ------
-    ValueError
-        If a number is not finite.
+    Raises:
+        ValueError: If a number is not finite.
     """
     text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")

@@ -35,10 +35,8 @@ AROUND_MM = 6.0
 def route_png(name: str, centreline: Centreline, route: Route, path: str | os.PathLike[str]) -> Path:
     """Draw a route in its tubes, the tentative curve beside it, and both along their length.
 
-    Raises
-    ------
-    anatomy.base.errors.FileError
-        If the file cannot be written.
+    Raises:
+        anatomy.base.errors.FileError: If the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     flat = bool(np.ptp(centreline.nodes_mm[:, 2]) == 0.0)

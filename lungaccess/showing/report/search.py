@@ -26,10 +26,8 @@ def cost_over_time_png(history: Sequence[CostPoint], path: str | os.PathLike[str
 
     Costs fall, and chances of success rise.
 
-    Raises
-    ------
-    anatomy.base.errors.FileError
-        If the file cannot be written.
+    Raises:
+        anatomy.base.errors.FileError: If the file cannot be written.
     """
     figure = style.new_figure(8.0, 4.5)
     axes = figure.add_axes((0.105, 0.135, 0.86, 0.77))
@@ -77,12 +75,9 @@ def _note(axes: Axes, x: float, y: float, text: str, shift: tuple[float, float],
 class CostPoint:
     """The state of a search at one moment.
 
-    Parameters
-    ----------
-    elapsed_s : float
-        Planning time since the search began.
-    best : float or None
-        Value of the goal for the best plan yet, in its unit; None before the first plan.
+    Args:
+        elapsed_s: Planning time since the search began.
+        best: Value of the goal for the best plan yet, in its unit; None before the first plan.
     """
 
     elapsed_s: float
@@ -93,10 +88,8 @@ class CostPoint:
 def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str]) -> Path:
     """Write one line a point: elapsed_s, iteration, best (empty before the first plan).
 
-    Raises
-    ------
-    anatomy.base.errors.FileError
-        If the file cannot be written.
+    Raises:
+        anatomy.base.errors.FileError: If the file cannot be written.
     """
     with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -116,14 +109,11 @@ def front_png(
 ) -> Path:
     """Draw each device that was tried on all targets as a point, and the front numbered, with what it bounds.
 
-    Parameters
-    ----------
-    criteria : sequence of str
-        Titles of one or two criteria; one alone is drawn over the order in which devices were counted.
-    values : mapping
-        The criteria of each device by its name, the device first with which the search began.
-    front : sequence of str
-        Names of the devices that no other one surpasses, in the order of their numbers.
+    Args:
+        criteria: Titles of one or two criteria; one alone is drawn over the order in which devices were
+            counted.
+        values: The criteria of each device by its name, the device first with which the search began.
+        front: Names of the devices that no other one surpasses, in the order of their numbers.
     """
     two = len(criteria) == 2
     places = {name: (each[1] if two else n, each[0]) for n, (name, each) in enumerate(values.items(), 1)}

@@ -30,15 +30,11 @@ def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[st
 
     Axial slices are seen from the feet, coronal ones from the front: the patient's right is on the left.
 
-    Parameters
-    ----------
-    parts : Parts or None
-        Its voxels run along those of the CT; None draws the whole CT alone.
+    Args:
+        parts: Its voxels run along those of the CT; None draws the whole CT alone.
 
-    Raises
-    ------
-    anatomy.base.errors.FileError
-        If the file cannot be written.
+    Raises:
+        anatomy.base.errors.FileError: If the file cannot be written.
     """
     low, high = _shown_lps(ct, parts)
     axis_of = [int(np.argmax(np.abs(ct.grid.lps_from_ijk[row, :3]))) for row in range(3)]

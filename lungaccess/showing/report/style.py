@@ -61,10 +61,8 @@ def heading(figure: Figure, text: str, *, size: float = 14.0) -> None:
 def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure to `path` in one step, so that no half-written picture can be seen.
 
-    Raises
-    ------
-    FileError
-        If the folder is missing or cannot be written.
+    Raises:
+        FileError: If the folder is missing or cannot be written.
     """
     target = Path(path)
     with atomic_write(target) as temporary:

@@ -51,23 +51,15 @@ def tubes_png(
 
     All coordinates are those of the scope tip: z forward, mm.
 
-    Parameters
-    ----------
-    equilibrium : Equilibrium
-        What to draw; at least one tube must be out of the scope.
-    path : str or path
-        PNG file to write.
-    deployed : DeployedSequence, optional
-        Its earlier steps are drawn as thin grey lines.
-    scope_diameter_mm : float, optional
-        Drawn around the tubes; a little more than the outermost tube's if None.
-    notes : sequence of str
-        Lines to print beside the picture.
+    Args:
+        equilibrium: What to draw; at least one tube must be out of the scope.
+        path: PNG file to write.
+        deployed: Its earlier steps are drawn as thin grey lines.
+        scope_diameter_mm: Drawn around the tubes; a little more than the outermost tube's if None.
+        notes: Lines to print beside the picture.
 
-    Raises
-    ------
-    anatomy.base.errors.FileError
-        If the file cannot be written.
+    Raises:
+        anatomy.base.errors.FileError: If the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     widest = scope_diameter_mm or 1.15 * equilibrium.mechanics.tubes[-1].outer_diameter_mm

@@ -13,10 +13,8 @@ LETTERS = (("R", "L"), ("A", "P"), ("I", "S"))
 class View:
     """A parallel projection onto the plane of two directions.
 
-    Parameters
-    ----------
-    right, up : (3,) float64
-        Unit LPS directions that point to the right and to the top of the picture.
+    Args:
+        right, up ((3,) float64): Unit LPS directions that point to the right and to the top of the picture.
     """
 
     name: str
@@ -46,12 +44,11 @@ STANDARD = (AXIAL, CORONAL, SAGITTAL)
 def letters(direction: Float) -> str:
     """Name an LPS direction by its main anatomical letters, the strongest first.
 
-    Examples
-    --------
-    >>> letters(np.array([1.0, 0.0, 0.0]))
-    'L'
-    >>> letters(np.array([0.4, -0.9, 0.0]))
-    'AL'
+    Examples:
+        >>> letters(np.array([1.0, 0.0, 0.0]))
+        'L'
+        >>> letters(np.array([0.4, -0.9, 0.0]))
+        'AL'
     """
     order = np.argsort(-np.abs(direction), kind="stable")
     strong = [axis for axis in order if abs(direction[axis]) > 0.35]

@@ -33,14 +33,10 @@ FRAMES_PER_S = 4
 class Mover:
     """A sequence of transforms.
 
-    Parameters
-    ----------
-    key : str
-        "tissue" or "devices"; its bundle is named after it.
-    kind : str
-        Node class of its transforms, without `vtkMRML` and `Node`.
-    suffix : str
-        Of the file of a transform.
+    Args:
+        key: "tissue" or "devices"; its bundle is named after it.
+        kind: Node class of its transforms, without `vtkMRML` and `Node`.
+        suffix: Of the file of a transform.
     """
 
     key: str
@@ -69,10 +65,8 @@ OF_MASKS = ("start_region_proved", "start_region_tried")
 def write_breathing(plan: Plan, lung: Lung, items: Sequence[Item], folder: Path) -> tuple[str, ...]:
     """Write a scene of items that breathe, beside their files; return the names of what was written.
 
-    Raises
-    ------
-    FileError
-        If the folder cannot be written.
+    Raises:
+        FileError: If the folder cannot be written.
     """
     moving = Moving.of(plan, lung)
     masks = moving.tissue.masks_phase

@@ -43,17 +43,12 @@ SAME_MM = 1e-6
 class EditedCurve:
     """An edited curve, and what is said of the plan with it.
 
-    Parameters
-    ----------
-    device : str
-        "scope", "tubes" or "needle".
-    words : str
-        What was edited, in a sentence.
-    plan : Plan
-        With the needle that runs through the points; as it was where there is none, or where another curve
-        was edited.
-    report : CheckReport
-        What was looked at, and what the independent check says; accepted only if all of it holds.
+    Args:
+        device: "scope", "tubes" or "needle".
+        words: What was edited, in a sentence.
+        plan: With the needle that runs through the points; as it was where there is none, or where another
+            curve was edited.
+        report: What was looked at, and what the independent check says; accepted only if all of it holds.
     """
 
     device: str
@@ -71,19 +66,14 @@ def check_curve(plan: Plan, lung: Lung, curve: Markup) -> EditedCurve:
     shape of the tubes follows from their mechanics, and the scope's from a motion.  Their curves have to lie
     on the planned ones.
 
-    Parameters
-    ----------
-    plan : Plan
-        The plan that the curve was exported from.
-    curve : Markup
-        Its name says of which device it is; any other is that of the needle.
+    Args:
+        plan: The plan that the curve was exported from.
+        curve: Its name says of which device it is; any other is that of the needle.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another patient.
-    SettingsError
-        If the curve is that of a needle and the plan has none, or has fewer than two separate points.
+    Raises:
+        PlanFileError: If the plan was made for another patient.
+        SettingsError: If the curve is that of a needle and the plan has none, or has fewer than two separate
+            points.
     """
     plan.require_lung(lung)
     named = curve.name.split(" ")[-1]
@@ -121,10 +111,8 @@ def path_of_points(points_lps: Float, lps_from_start: Float) -> ArcPath:
 
     Arcs that continue one another are joined.
 
-    Raises
-    ------
-    SettingsError
-        If fewer than two points are apart from each other.
+    Raises:
+        SettingsError: If fewer than two points are apart from each other.
     """
     frame = np.array(lps_from_start)
     frame[:3, 3] = points_lps[0]

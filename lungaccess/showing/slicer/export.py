@@ -56,12 +56,9 @@ Progress = Callable[[str, float], None]
 class Exported:
     """What was written.
 
-    Parameters
-    ----------
-    files : tuple of str
-        Names in the folder.
-    report : CheckReport
-        What the independent check says of the plan; the scene and the README repeat it.
+    Args:
+        files: Names in the folder.
+        report: What the independent check says of the plan; the scene and the README repeat it.
     """
 
     files: tuple[str, ...]
@@ -82,21 +79,14 @@ def export_slicer(
     Everything is in LPS mm and says so; every file appears complete or not at all.  A plan that the
     independent check refuses is written too, and named so in the scene.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient it was made for.
-    folder : path
-        Made if it is missing.
-    progress : callable, optional
-        Told each step and the share that is done.
+    Args:
+        lung: The patient it was made for.
+        folder: Made if it is missing.
+        progress: Told each step and the share that is done.
 
-    Raises
-    ------
-    PlanFileError
-        If the plan was made for another patient, or for other masks of this one.
-    FileError
-        If the folder cannot be written.
+    Raises:
+        PlanFileError: If the plan was made for another patient, or for other masks of this one.
+        FileError: If the folder cannot be written.
     """
     plan.require_lung(lung)
     target = require_writable_folder(folder)

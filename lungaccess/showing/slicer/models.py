@@ -40,12 +40,9 @@ SIDES = 16
 def structure_surface(lung: Lung, name: str, *, most: int = MOST_TRIANGLES) -> SurfaceMesh | None:
     """Return a surface of a structure with at most so many triangles, for display; None if there is nothing.
 
-    Parameters
-    ----------
-    name : str
-        "lung", "airway" (lumen and wall), "vessel", "fissure" or "nodule".
-    most : int
-        Vertices are merged in ever larger cubes until no more triangles are left.
+    Args:
+        name: "lung", "airway" (lumen and wall), "vessel", "fissure" or "nodule".
+        most: Vertices are merged in ever larger cubes until no more triangles are left.
     """
     volume = _mask(lung, name)
     if volume is None or not volume.array.any():
@@ -138,10 +135,8 @@ def _untwisted(lps_from_device: Float) -> Float:
 def write_ply(path: str | Path, mesh: SurfaceMesh) -> None:
     """Write a mesh as binary `.ply` in LPS mm with the comment `SPACE=LPS`, which 3D Slicer reads.
 
-    Raises
-    ------
-    FileError
-        If the name does not end in .ply, or the file cannot be written.
+    Raises:
+        FileError: If the name does not end in .ply, or the file cannot be written.
     """
     require_suffix(path, ".ply")
     header = "\n".join(
@@ -319,10 +314,8 @@ def label_map(lung: Lung) -> Volume:
 def write_segmentation(path: str | Path, lung: Lung) -> tuple[Segment, ...]:
     """Write the label map of a lung, and return the segments that are not empty.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     volume = label_map(lung)
     present = tuple(each for each in SEGMENTS if (volume.array == each.value).any())

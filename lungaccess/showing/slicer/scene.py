@@ -27,16 +27,11 @@ _STORAGE: dict[Kind, str] = {
 class Item:
     """One thing in a scene.
 
-    Parameters
-    ----------
-    kind : str
-        Its node class, without `vtkMRML` and `Node`.
-    name : str
-        As people see it.
-    file : str
-        Its file, beside the scene.
-    colour : tuple of float
-        Red, green, blue in [0, 1].
+    Args:
+        kind: Its node class, without `vtkMRML` and `Node`.
+        name: As people see it.
+        file: Its file, beside the scene.
+        colour: Red, green, blue in [0, 1].
     """
 
     kind: Kind

@@ -38,10 +38,8 @@ class Corridor:
 def drawn_corridor(rng: np.random.Generator, resolution: Resolution | None = None) -> Corridor | None:
     """Return a path in its corridor; None if it crosses its own wall, or comes to the border.
 
-    Parameters
-    ----------
-    resolution : Resolution, optional
-        The path is a word of it: steps of its length, in its directions, on the tightest circle.
+    Args:
+        resolution: The path is a word of it: steps of its length, in its directions, on the tightest circle.
     """
     kappa = 1.0 / float(rng.choice((20.0, 30.0, 50.0)))
     arcs = _drawn_arcs(rng, kappa, resolution)

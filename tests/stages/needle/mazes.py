@@ -30,17 +30,12 @@ SURE_MM = 0.5 * SAMPLE_MM + 0.01
 class Maze:
     """Blocks in a box of free space, a start and a target.
 
-    Parameters
-    ----------
-    low, high : (3,) float64, LPS mm
-        The box; beyond it all is an obstacle.
-    blocks : (B, 2, 3) float64, LPS mm
-        Lowest and highest corner of each block, on the voxel lattice of the box.
-    needle : Needle
-    start : (4, 4) float64
-    target : (3,) float64, LPS mm
-    goal_tolerance_mm : float
-    voxel_mm : float
+    Args:
+        low, high ((3,) float64, LPS mm): The box; beyond it all is an obstacle.
+        blocks ((B, 2, 3) float64, LPS mm): Lowest and highest corner of each block, on the voxel lattice of
+            the box.
+        start: (4, 4) float64.
+        target: (3,) float64, LPS mm.
     """
 
     low: Float
@@ -160,12 +155,9 @@ CostAt = Callable[[Float], Float]
 class Enumeration:
     """The least cost of all words, over those surely clear and over those that may be.
 
-    Parameters
-    ----------
-    sure, possible : float
-        Infinite if there is none.
-    words : int
-        Number of words from whose end the goal was tried.
+    Args:
+        sure, possible: Infinite if there is none.
+        words: Number of words from whose end the goal was tried.
     """
 
     sure: float
@@ -177,15 +169,11 @@ class Enumeration:
 class Curves:
     """N curves, sampled at S points each, as they lie one after the other on N paths.
 
-    Parameters
-    ----------
-    points, tangents : (N, S, 3) float64, LPS mm
-    lengths : (N, S) float64
-        Arc length from the start of the curve.
-    turns : (N, S) float64
-        Sum of all turning so far, rad.
-    frames : (N, 4, 4) float64
-        At the ends, carried along without twist.
+    Args:
+        points, tangents: (N, S, 3) float64, LPS mm.
+        lengths ((N, S) float64): Arc length from the start of the curve.
+        turns ((N, S) float64): Sum of all turning so far, rad.
+        frames ((N, 4, 4) float64): At the ends, carried along without twist.
     """
 
     points: Float
@@ -320,18 +308,11 @@ def enumerate_words(
 ) -> Enumeration:
     """Try the goal from the end of every word of up to `most_steps` single steps.
 
-    Parameters
-    ----------
-    maze : Maze
-    fine_mm : float
-        Length of a step.
-    rolls : int
-        Number of directions of bending.
-    most_steps : int
-    cost_at : function, optional
-        Cost of a mm at points `(..., 3)`; by default 1.
-    least : float
-        What a mm costs by which a path ends short of the target.
+    Args:
+        fine_mm: Length of a step.
+        rolls: Number of directions of bending.
+        cost_at: Cost of a mm at points `(..., 3)`; by default 1.
+        least: What a mm costs by which a path ends short of the target.
     """
     kappa = maze.needle.max_curvature_per_mm
     paths = Paths(maze.start[None], np.zeros(1), np.zeros(1), np.zeros(1), np.full(1, np.inf))

@@ -19,13 +19,10 @@ class TubeEnergy:
     plate a tube is a torsion spring from its base, which is held.  An equilibrium is where the gradient
     is 0; it is stable where the Hessian has no negative eigenvalue.
 
-    Parameters
-    ----------
-    tubes : sequence of Tube
-        n tubes, innermost first.
-    base_angles_rad, beta_mm : (n,) float64
-    cells : int
-        About how many cells; no landmark of a tube is inside one.
+    Args:
+        tubes: n tubes, innermost first.
+        base_angles_rad, beta_mm: (n,) float64.
+        cells: About how many cells; no landmark of a tube is inside one.
     """
 
     def __init__(

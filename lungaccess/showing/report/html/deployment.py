@@ -291,18 +291,14 @@ def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
 class TipSections:
     """Cross-sections at M poses of a tip, K directions each.
 
-    Parameters
-    ----------
-    border_mm : (M, K) float64
-        Distance from the axis of the tip to the first voxel that is no lumen, in its plane, clockwise from
-        the top of the picture; 0 where the axis itself is beyond the lumen, at most `FARTHEST_MM`.
-    gap_mm : (M,) float64
-        Least of them minus the radius of the scope: free on the side of `nearest`.
-    nearest : (M,) int64
-        Direction of the least.
-    depth_gap_mm : (M,) float64
-        What is free all around the tip, not only in the plane, and is proved: the lower bound of the depth of
-        the lumen minus the radius of the scope.
+    Args:
+        border_mm ((M, K) float64): Distance from the axis of the tip to the first voxel that is no lumen, in
+            its plane, clockwise from the top of the picture; 0 where the axis itself is beyond the lumen, at
+            most `FARTHEST_MM`.
+        gap_mm ((M,) float64): Least of them minus the radius of the scope: free on the side of `nearest`.
+        nearest ((M,) int64): Direction of the least.
+        depth_gap_mm ((M,) float64): What is free all around the tip, not only in the plane, and is proved:
+            the lower bound of the depth of the lumen minus the radius of the scope.
     """
 
     border_mm: Float

@@ -37,10 +37,8 @@ def bundle(names: Sequence[str]) -> str:
 def filled(template: str, parts: Mapping[str, str]) -> str:
     """Return a template with each `{{name}}` replaced by the part of that name, in one pass.
 
-    Raises
-    ------
-    KeyError
-        If a part is missing.
+    Raises:
+        KeyError: If a part is missing.
     """
     return _HOLE.sub(lambda hole: parts[hole.group(1)], template)
 
@@ -64,22 +62,15 @@ def write_page(
 ) -> Path:
     """Write a page, all or nothing.
 
-    Parameters
-    ----------
-    path : path of the HTML file
-    template : str
-        Name of the page's own HTML, which goes into the body.
-    modules : sequence of str
-        Scripts of this page, after `SHARED_MODULES`.
-    data : mapping
-        Plain JSON values; the scripts find them in the element "report-data".
-    parts : mapping of str to str
-        HTML for the holes of the template; "title" is plain text, escaped already.
+    Args:
+        path: path of the HTML file.
+        template: Name of the page's own HTML, which goes into the body.
+        modules: Scripts of this page, after `SHARED_MODULES`.
+        data: Plain JSON values; the scripts find them in the element "report-data".
+        parts: HTML for the holes of the template; "title" is plain text, escaped already.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     whole = filled(
         asset("frame.html"),

@@ -28,22 +28,14 @@ SHRINK, GROW = 0.5, -0.53
 class Look:
     """How a structure is shown.
 
-    Parameters
-    ----------
-    key, name : str
-        In the file, and for people.
-    colour : str
-        ``#rrggbb``.
-    opacity : float
-        Of a surface seen face on.
-    shown : bool
-        Whether it is switched on at first.
-    cell_mm : float
-        Vertices within a cell of this size are joined into one.
-    most_faces : int
-        The cells grow until there are no more triangles.
-    stride : int
-        Only so many voxels along each axis are looked at.
+    Args:
+        key, name: In the file, and for people.
+        colour: ``#rrggbb``.
+        opacity: Of a surface seen face on.
+        shown: Whether it is switched on at first.
+        cell_mm: Vertices within a cell of this size are joined into one.
+        most_faces: The cells grow until there are no more triangles.
+        stride: Only so many voxels along each axis are looked at.
     """
 
     key: str
@@ -181,10 +173,9 @@ def _thinned(volume: Volume, stride: int) -> Volume:
 def gathered(vertices: Float, faces: Int, cell_mm: float) -> tuple[Float, Int]:
     """Join the vertices in each cell into their mean, and drop triangles that are none any more.
 
-    Parameters
-    ----------
-    vertices : (V, 3) float64, mm
-    faces : (F, 3) int64
+    Args:
+        vertices: (V, 3) float64, mm.
+        faces: (F, 3) int64.
     """
     cells = np.floor((vertices - vertices.min(axis=0)) / cell_mm).astype(np.int64)
     shape = tuple((cells.max(axis=0) + 1).tolist())

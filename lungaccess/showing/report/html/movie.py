@@ -41,16 +41,12 @@ def bronchoscopy_webp(
     Up is where a positive bend turns the tip: the picture rolls with the twist.  The wall is where blurred
     lumen is half full, so that voxels do not show; no device is drawn.
 
-    Parameters
-    ----------
-    path : path of a WebP file in an existing folder
-    frames, pixels : int
-        Number of pictures, and their width and height.
+    Args:
+        path: path of a WebP file in an existing folder.
+        frames, pixels: Number of pictures, and their width and height.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     from PIL import Image
 
@@ -78,10 +74,9 @@ def camera_poses(plan: Plan, frames: int) -> list[Float]:
 class SmoothLumen:
     """The lumen around a route with a smooth wall, for rays.
 
-    Parameters
-    ----------
-    points_lps : (N, 3) float64, LPS mm
-        What lies farther than `AROUND_MM` from the box of these is not seen.
+    Args:
+        points_lps ((N, 3) float64, LPS mm): What lies farther than `AROUND_MM` from the box of these is not
+            seen.
     """
 
     def __init__(self, lung: Lung, points_lps: Float) -> None:
@@ -110,11 +105,9 @@ class SmoothLumen:
 
         A ray goes on by the distance that is free all around [Hart1996], near the wall by short steps.
 
-        Parameters
-        ----------
-        eye_lps : (3,) float64, LPS mm
-        rays : (N, 3) float64
-            Unit vectors.
+        Args:
+            eye_lps: (3,) float64, LPS mm.
+            rays ((N, 3) float64): Unit vectors.
         """
         away = np.full(len(rays), LEAST_STEP_MM)
         going = np.arange(len(rays))

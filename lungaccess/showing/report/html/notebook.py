@@ -30,23 +30,16 @@ class PageView:
 def view(plan: Plan, lung: Lung, options: PageOptions | None = None, *, height_px: int = 800) -> PageView:
     """Return the page of a plan for the last line of a cell: it plays in 3-D, with slices, charts and risk.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient that the plan was made for.
-    options : PageOptions, optional
-        As of `plan_page`.
-    height_px : int
-        Height of the frame in the notebook.
+    Args:
+        lung: The patient that the plan was made for.
+        options: As of `plan_page`.
+        height_px: Height of the frame in the notebook.
 
-    Raises
-    ------
-    PlanFileError, AnatomyError
-        As `plan_page`.
+    Raises:
+        PlanFileError, AnatomyError: As `plan_page`.
 
-    Examples
-    --------
-    >>> la.view(plan, lung)  # doctest: +SKIP
+    Examples:
+        >>> la.view(plan, lung)  # doctest: +SKIP
     """
     with tempfile.TemporaryDirectory() as folder:
         return PageView(

@@ -30,16 +30,12 @@ PLACES = '<label>Through <select id="place"></select></label>'
 def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Write the page of a search that found no plan to one HTML file that opens offline.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient of the explanation.
-    path : path of an HTML file in an existing folder
+    Args:
+        lung: The patient of the explanation.
+        path: path of an HTML file in an existing folder.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     rows = [(reason, count) for reason, count in explanation.failure.reasons.items() if count]
     parts = {

@@ -54,23 +54,16 @@ FOLLOW = '<label><input type="checkbox" id="follow" checked> follow the foremost
 class PageOptions:
     """What a plan's page shows besides the plan.
 
-    Parameters
-    ----------
-    alternatives : sequence of Plan
-        Other plans of the same lung, shown on demand.
-    ct : Volume or None
-        CT in HU; the slices show the structures without it.
-    ct_name : str
-        What the CT is, for people.
-    cost_over_time : path or None
-        CSV that `lungaccess plan` wrote beside the plan.
-    errors, procedure, risk_samples, risk_seed
-        Of the estimate of success, see `lungaccess.judging.appraisal.Appraiser`: 0 samples for none.  If all
-        are None, a plan that states its chance shows that, and its alternatives are estimated as it was.
-    instructions : bool
-        Whether the steps that bring the scope to its place are listed.
-    advice : sequence of Advice
-        What would lift the chance of success, see `lungaccess.judging.advice.advise`.
+    Args:
+        alternatives: Other plans of the same lung, shown on demand.
+        ct: CT in HU; the slices show the structures without it.
+        ct_name: What the CT is, for people.
+        cost_over_time: CSV that `lungaccess plan` wrote beside the plan.
+        errors, procedure, risk_samples, risk_seed: Of the estimate of success, see
+            `lungaccess.judging.appraisal.Appraiser`: 0 samples for none.  If all are None, a plan that states
+            its chance shows that, and its alternatives are estimated as it was.
+        instructions: Whether the steps that bring the scope to its place are listed.
+        advice: What would lift the chance of success, see `lungaccess.judging.advice.advise`.
     """
 
     alternatives: Sequence[Plan] = ()
@@ -93,20 +86,14 @@ def plan_page(
     The surfaces are smoothed and simplified and only for looking at; every number comes from the plan, the
     check and the exact distances.
 
-    Parameters
-    ----------
-    lung : Lung
-        The patient that the plan was made for.
-    path : path of an HTML file in an existing folder
+    Args:
+        lung: The patient that the plan was made for.
+        path: path of an HTML file in an existing folder.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
-    PlanFileError
-        If the plan was made for another lung.
-    AnatomyError
-        If the CT does not hold the plan.
+    Raises:
+        FileError: If the file cannot be written.
+        PlanFileError: If the plan was made for another lung.
+        AnatomyError: If the CT does not hold the plan.
     """
     chosen = options or PageOptions()
     plans = (plan, *chosen.alternatives)

@@ -35,16 +35,12 @@ SURFACES = {
 def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Write the page of one or several maps of a lung to one HTML file that opens offline.
 
-    Parameters
-    ----------
-    maps : sequence of ReachMap
-        All of one lung; each has its own system.
-    path : path of an HTML file in an existing folder
+    Args:
+        maps: All of one lung; each has its own system.
+        path: path of an HTML file in an existing folder.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
+    Raises:
+        FileError: If the file cannot be written.
     """
     first = maps[0]
     centre = fullest_point(first.kinds)

@@ -40,14 +40,10 @@ STORED_CT = ("ct.nii.gz", "ct.nii", "ct.nrrd", "ct.mha")
 class CtFile:
     """A CT on disk, to be shown beside the masks of a patient.
 
-    Parameters
-    ----------
-    path : path
-        An image file or a folder of DICOM slices.
-    series : str, optional
-        UID of the DICOM series, where the folder holds several.
-    digest : str
-        The `digest_of_ct` of the CT that was segmented; empty if the CT was chosen by a person.
+    Args:
+        path: An image file or a folder of DICOM slices.
+        series: UID of the DICOM series, where the folder holds several.
+        digest: The `digest_of_ct` of the CT that was segmented; empty if the CT was chosen by a person.
     """
 
     path: Path
@@ -57,10 +53,8 @@ class CtFile:
     def read(self) -> Volume:
         """Return the CT in HU.
 
-        Raises
-        ------
-        FileError
-            If it cannot be read, or is not the one that was segmented.
+        Raises:
+            FileError: If it cannot be read, or is not the one that was segmented.
         """
         from anatomy.io.dicom import read_dicom
         from anatomy.io.images import read_volume
@@ -90,10 +84,8 @@ def find_ct(patient: Path) -> CtFile | None:
 def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packed:
     """Return the voxels that the slices of a page show: structures, and a CT if there is one.
 
-    Raises
-    ------
-    AnatomyError
-        If the CT does not hold the devices.
+    Raises:
+        AnatomyError: If the CT does not hold the devices.
     """
     grid = lung.grid if ct is None else ct.grid
     return {
@@ -163,10 +155,8 @@ def _labels_on(lung: Lung, grid: Grid, low: Int, high: Int) -> Packed:
 def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
     """Return a CT, coarse and fine, for a page: as coarse as it must be to stay small.
 
-    Raises
-    ------
-    AnatomyError
-        If the CT does not hold the devices.
+    Raises:
+        AnatomyError: If the CT does not hold the devices.
     """
     if not ct.grid.contains(device_lps).all():
         raise AnatomyError(
@@ -189,11 +179,9 @@ def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
 def page_grids(grid: Grid, device_lps: Float, factor: float = 1.0) -> tuple[Grid, Grid]:
     """Return a coarse grid of the whole box and a fine one around points, both along the LPS axes.
 
-    Parameters
-    ----------
-    device_lps : (N, 3) float64, LPS mm
-    factor : float
-        Makes both voxels larger.
+    Args:
+        device_lps: (N, 3) float64, LPS mm.
+        factor: Makes both voxels larger.
     """
     steps = np.stack(np.meshgrid(*[(-0.5, n - 0.5) for n in grid.shape], indexing="ij"), axis=-1)
     corners = grid.lps(steps.reshape(-1, 3))

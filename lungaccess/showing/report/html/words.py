@@ -28,12 +28,9 @@ def number(value: float | None, digits: int = 3) -> str:
 def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[Cell]], kind: str = "") -> str:
     """Return a table; its cells are HTML already, the first one of each row is its heading.
 
-    Parameters
-    ----------
-    headings : sequence of str
-        Empty for a table of names and values.
-    kind : str
-        Class of the table for the style sheet.
+    Args:
+        headings: Empty for a table of names and values.
+        kind: Class of the table for the style sheet.
     """
     head = "".join(f'<th scope="col">{text(name)}</th>' for name in headings)
     head = f"<thead><tr>{head}</tr></thead>" if headings else ""

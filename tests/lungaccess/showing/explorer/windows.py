@@ -44,10 +44,9 @@ class Page(browser.Browser):
     def wait(self, condition: str) -> dict[str, Any]:
         """Wait until a condition of the state `s` holds, and return the state.
 
-        Raises
-        ------
-        AssertionError
-            If the condition fails, or does not hold within the time of a script; it says what is shown.
+        Raises:
+            AssertionError: If the condition fails, or does not hold within the time of a script; it says what
+                is shown.
         """
         try:
             problem = self.run_async(

@@ -36,14 +36,10 @@ def missing() -> str:
 class Browser:
     """One window; close it with `with`.
 
-    Parameters
-    ----------
-    width, height : int
-        Of the page, CSS pixels.
-    phone : bool
-        Whether the page is told that it is on a phone: touch, two pixels for one.
-    dark : bool
-        Whether the user prefers dark pages.
+    Args:
+        width, height: Of the page, CSS pixels.
+        phone: Whether the page is told that it is on a phone: touch, two pixels for one.
+        dark: Whether the user prefers dark pages.
     """
 
     def __init__(

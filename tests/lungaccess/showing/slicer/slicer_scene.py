@@ -17,12 +17,9 @@ RAS = np.array([-1.0, -1.0, 1.0])
 class SlicerScene:
     """A scene that 3D Slicer's classes have loaded.
 
-    Parameters
-    ----------
-    path : Path or None
-        A `.mrml`; None for an empty scene.
-    scratch : Path
-        Where bundles are unpacked.
+    Args:
+        path: A `.mrml`; None for an empty scene.
+        scratch: Where bundles are unpacked.
     """
 
     def __init__(self, path: Path | None, scratch: Path) -> None:

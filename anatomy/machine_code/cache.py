@@ -90,7 +90,11 @@ class KernelCache(caching._Cache):  # type: ignore[misc]
         if data.library.has_dynamic_globals:
             return
         key = self._key(sig, data.codegen)
-        made = serialize.dumps((key, data._reduce()))
+        try:
+            made = serialize.dumps((key, data._reduce()))
+        except RuntimeError:
+            # Numba has no object code of a library that runs, once in many thousands: it serves this process.
+            return
         folder = self._kept_in()
         try:
             if not folder.is_dir():

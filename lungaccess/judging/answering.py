@@ -169,7 +169,7 @@ def alternatives(
     """Return a diverse plan set, the best plan first, with its Pareto front.
 
     Args:
-        system, atlas, counterfactuals, on_progress, **asked: As of `plan`.
+        system, atlas, counterfactuals, on_progress, asked: As of `plan`.
         count, separation_mm: See `lungaccess.planning.diverse_plans.alternatives`.
 
     Raises:

@@ -49,9 +49,8 @@ class Motions:
 
     Args:
         lps_from_entry, states, lps_from_scope_tip: As in `lungaccess.plans.parts.ScopeInsertion`.
-        rotation_rad, outer_insertion_mm, inner_insertion_mm, shape, lateral_sweep_mm,
-            follow_the_leader_error_mm: As in `lungaccess.plans.parts.TubeDeployment`: what the mechanics make
-            of the insertions.
+        rotation_rad, outer_insertion_mm, inner_insertion_mm: As in `lungaccess.plans.parts.TubeDeployment`.
+        shape, lateral_sweep_mm, follow_the_leader_error_mm: What the mechanics make of the insertions.
         lps_from_tube_tip ((4, 4) float64): Where the needle leaves the inner tube; see
             `lungaccess.plans.parts.TubeDeployment`.
         arcs: At least one.

@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from lungaccess.problem.system import System, load_system, preset_names
+from lungaccess.problem.system import System, load_system, preset_names, with_tool
+from lungaccess.problem.tools import Tool
 
 
 class Invasiveness(NamedTuple):
@@ -51,15 +52,18 @@ def least_invasive_first(systems: Iterable[System]) -> tuple[System, ...]:
     return tuple(sorted(systems, key=lambda system: (*invasiveness(system), system.name)))
 
 
-def presets_by_invasiveness(*, fissures_allowed: bool | None = None) -> tuple[System, ...]:
+def presets_by_invasiveness(
+    *, fissures_allowed: bool | None = None, tool: Tool | None = None
+) -> tuple[System, ...]:
     """Return the systems that ship with the package, the least invasive first.
 
     Args:
         fissures_allowed: Whether fissures may be crossed, instead of what each system says.
+        tool: What is done at the target; with one, those without a needle are left out.
     """
-    return least_invasive_first(
-        load_system(name, fissures_allowed=fissures_allowed) for name in preset_names()
-    )
+    systems = (load_system(name, fissures_allowed=fissures_allowed) for name in preset_names())
+    able = (each for each in systems if tool is None or each.needle is not None)
+    return least_invasive_first(with_tool(each, tool) for each in able)
 
 
 def _area_mm2(diameter_mm: float) -> float:

@@ -119,8 +119,9 @@ class Explainer:
 
     def explanation(self, failure: NoPlan) -> Explanation:
         """Do all parts for which there is time, the most useful first."""
-        others = presets_by_invasiveness(fissures_allowed=self._task.system.fissures_allowed or None)
-        known = {self._task.system.name, *failure.attempts}
+        own = self._task.system
+        others = presets_by_invasiveness(fissures_allowed=own.fissures_allowed or None, tool=own.tool)
+        known = {own.name, *failure.attempts}
         untried = [each for each in others if each.name not in known]
         tried: list[Attempt] = []
         self._part_of_needle("what blocks the direct arcs", self._what_blocks)

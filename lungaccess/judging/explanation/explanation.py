@@ -146,7 +146,7 @@ class Explanation:
     def presets(self) -> Mapping[str, Attempt | None]:
         """The other presets, the least invasive first, and what became of each; None if it was not tried."""
         tried = {attempt.system.name: attempt for attempt in self.attempts}
-        names = (each.name for each in presets_by_invasiveness())
+        names = (each.name for each in presets_by_invasiveness(tool=self.system.tool))
         return {name: tried.get(name) for name in names if name in tried or name in self.untried}
 
     @property

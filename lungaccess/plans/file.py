@@ -186,11 +186,11 @@ def _encode(value: Any, where: str) -> Any:
 
 def _as_declared(annotation: object, value: Any) -> Any:
     """Write an integer given for a float as a float, so that a stored plan is stored the same again."""
-    if annotation == "float":
+    if annotation in (float, "float"):
         return float(value)
-    if annotation == "Mapping[str, float]":
+    if annotation in (Mapping[str, float], "Mapping[str, float]"):
         return {key: float(inner) for key, inner in value.items()}
-    if annotation == "Mapping[str, Mapping[str, float]]":
+    if annotation in (Mapping[str, Mapping[str, float]], "Mapping[str, Mapping[str, float]]"):
         return {key: {k: float(v) for k, v in inner.items()} for key, inner in value.items()}
     return value
 

@@ -81,14 +81,6 @@ def test_the_adapter_calls_and_overrides_nothing_that_crashes() -> None:
     used = names_in(tree)
     assert not used & crashing
     assert {"nextStart", "addSolutionPath"} <= used
-    requests = [
-        node for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "Request"
-    ]  # fmt: skip
-    assert len(requests) == 1
-    assert {"saveConsoleOutput": False, "displayProgress": False}.items() <= {
-        word.arg: word.value.value for word in requests[0].keywords if isinstance(word.value, ast.Constant)
-    }.items()
 
 
 def test_what_the_bindings_cannot_convert_is_still_not_needed(problem: NeedleProblem) -> None:

@@ -203,15 +203,21 @@ def _opened(path: Path) -> Iterator[_Segments | _Contours]:
         ) from error
 
 
-def read_segments(path: Path) -> tuple[Volume, Mapping[int, str]]:
-    """Read masks as a label map, in which later ones cover earlier ones, and their labels by number.
+def segment_names(path: Path) -> Mapping[int, str]:
+    """Read the labels of masks by their number, without voxels; errors are those of `read_segments`."""
+    with _opened(path) as found:
+        return found.names
+
+
+def read_segments(path: Path) -> Volume:
+    """Read masks as a label map, in which later ones cover earlier ones.
 
     Raises:
         FileError: If the file is no Segmentation object or Structure Set, or damaged.
         SettingsError: If the extra `dicom` is not installed.
     """
     with _opened(path) as found:
-        return found.label_map(), found.names
+        return found.label_map()
 
 
 def read_segment_masks(path: Path, parts: Sequence[tuple[str, Sequence[int]]]) -> tuple[Grid, list[Mask]]:

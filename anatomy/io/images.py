@@ -14,7 +14,7 @@ from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.files import DAMAGE, atomic_write, reading, reason, require_file
 from anatomy.base.typed import Array, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.io.dicom_seg import is_dicom, read_segment_masks, read_segments
+from anatomy.io.dicom_seg import is_dicom, read_segment_masks, read_segments, segment_names
 from anatomy.io.frames import Frame
 from anatomy.io.image_header import ImageHeader
 from anatomy.io.mask_values import mask_of
@@ -61,7 +61,7 @@ def read_grid(path: str | Path, *, frame: Frame | None = None) -> Grid:
     """Read the grid of an image from its header alone; parameters and errors as `read_volume`."""
     path = require_file(path)
     if _holds_segments(path):
-        return read_segments(path)[0].grid
+        return read_segments(path).grid
     with reading(path):
         return open_image(path, frame)[0].grid
 
@@ -83,7 +83,7 @@ def read_volume(path: str | Path, *, frame: Frame | None = None) -> Volume:
     """
     path = require_file(path)
     if _holds_segments(path):
-        return read_segments(path)[0]
+        return read_segments(path)
     with reading(path):
         header, stream = open_image(path, frame)
         return Volume(grid=header.grid, array=read_array(header, stream, path))
@@ -153,7 +153,7 @@ def read_labels(path: str | Path) -> Mapping[int, str]:
     """
     path = require_file(path)
     if _holds_segments(path):
-        return read_segments(path)[1]
+        return segment_names(path)
     with reading(path):
         return open_image(path, "lps")[0].labels
 

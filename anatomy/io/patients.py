@@ -21,7 +21,7 @@ _SHOWN = 12
 
 
 FILES_LOOKED_AT = 20
-"""So many files of a folder tell whether it holds DICOM; a few may be something else."""
+"""The first files of a folder, so many, tell whether it holds DICOM; a few may be something else."""
 AIR_HU = -500.0
 """A CT of the chest holds voxels of less density; masks and label maps hold none below 0."""
 

@@ -31,8 +31,8 @@ GREATEST_HU = 100.0
 SOLID_HU = -300.0
 """Ground glass is below this."""
 LEAST_CONTRAST_HU, LEAST_HALO_HU = 120.0, 170.0
-"""What differs less from the lung around it is no nodule; most of what is around a core must differ by the
-second to be ground glass, since the spikes of real nodules raise it by up to 150 HU."""
+"""Tissue that differs less from the lung around it is no nodule; most of what is around a core must differ by
+the second to be ground glass, since the spikes of real nodules raise it by up to 150 HU."""
 HALO_VOXELS = (1.6, 3.2)
 """Ground glass around a core is looked for between these distances from it, beyond the core's own blur."""
 SMOOTHING_MM = 0.6

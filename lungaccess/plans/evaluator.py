@@ -63,7 +63,7 @@ BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"
 """Names of obstacles; the first one of a voxel counts."""
 
 TOO_LITTLE = "too little of the nodule in the tool"
-"""What stops a path whose tool is at the target, and holds less of the nodule than it has to."""
+"""The reason that stops a path whose tool is at the target and holds less of the nodule than it has to."""
 TIP_OFF_MM = 1e-6
 """So far from the target may the tip of the tubes be by rounding where there is no needle."""
 

@@ -159,7 +159,7 @@ def _strained_mm(tube: Tube) -> float:
 
 
 SWEEP_TOLERANCE_MM = 0.02
-"""So much less may a replay at steps find than a planner that takes the largest sweep."""
+"""A replay at steps may find so much less than a planner, which takes the largest sweep."""
 
 
 def check_sweep(plan: Plan, sweep: float, leader: float, steps: int, found: Findings) -> float:

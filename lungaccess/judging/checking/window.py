@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 TIP_BALL_MM = 10.0
 """Tissue so near to the tip of the scope turns it."""
 STEPS = 50
-"""Of the fixed point that pulls a point back; each takes a third of the error or less in a lung."""
+"""The fixed point that pulls a point back has so many steps; each leaves a third of the error or less in a
+lung."""
 
 
 class Breath:

@@ -336,7 +336,7 @@ def bound_environment(
 SHELL_MM = 1.5
 """From shell to shell."""
 HALF_WIDTH = 0.8
-"""Of the window in the plane of directions: up to 77 degrees from the middle."""
+"""The window in the plane of directions reaches so far: 77 degrees from the middle."""
 THREADS = 2
 """Threads that fill a shell; their number changes nothing."""
 

@@ -23,8 +23,8 @@ from anatomy.base.files import DAMAGE
 from anatomy.base.records import frozen_value
 from anatomy.base.unfinished import SECONDS_PER_DAY, clear_abandoned, is_abandoned
 
-ARRAYS_PATTERN = re.compile(r"(atlas|shapes)-[0-9a-f]{64}\.npz")
-"""Files of arrays: deployment atlases, and the shapes of tubes."""
+ARRAYS_PATTERN = re.compile(r"(atlas|resting|shapes)-[0-9a-f]{64}\.npz")
+"""Files of arrays: deployment atlases, scopes at rest on the wall, and the shapes of tubes."""
 KEY_PATTERN = re.compile(r"[0-9a-f]{24}")
 UNFINISHED_PATTERN = re.compile(rf"({re.escape(BUILDING)}|{re.escape(REMOVED)}).*|\.[0-9a-f]{{12}}\.npz")
 
@@ -34,8 +34,9 @@ class CacheEntry:
     """Something in a cache.
 
     Args:
-        path: A folder, or the file of an atlas or of shapes.
-        kind: "anatomy", "atlas", "shapes", or "unfinished" for what is being written or was left behind.
+        path: A folder, or a file of arrays.
+        kind: "anatomy", "atlas", "resting", "shapes", or "unfinished" for what is being written or was left
+            behind.
         patient: Whose it is; empty if it does not say so.
         size_bytes: On disk, pictures included.
         pictures_bytes: Of that, what pictures and pages keep with an anatomy.

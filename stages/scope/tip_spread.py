@@ -1,5 +1,8 @@
 """Where the tip of a resting shaft lies and looks, over what is not known of scope, wall and friction."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from anatomy.base.records import frozen_record
@@ -81,12 +84,17 @@ def spread_of_tip(
     """Return the distribution of the resting tip of a motion about a pose, such as the planned one."""
     nominal, other = two_starts(shaft, motion)
     off, force, give, held = [], [], [], 0
-    for attempts in choices(contact):
+
+    def at_rest(chosen: Circumstances) -> RestingShape:
+        shape = shaft.rest(motion, chosen, start=nominal)
+        return shape if shape.settled else shaft.rest(motion, chosen)
+
+    # The kernels leave the interpreter alone, so that threads share the processors.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        rested = [list(pool.map(at_rest, attempts)) for attempts in choices(contact)]
+    for shapes in rested:
         group = []
-        for chosen in attempts:
-            shape = shaft.rest(motion, chosen, start=nominal)
-            if not shape.settled:
-                shape = shaft.rest(motion, chosen)
+        for shape in shapes:
             if not shape.settled:
                 continue
             group.append(off_pose(lps_from_pose, shape.lps_from_scope_tip))

@@ -25,7 +25,7 @@ cache = App(
 
 @cache.default
 def show(*, output: CacheOptions = CacheOptions()) -> ExitCode:
-    """List prepared anatomies, their pictures, atlases and shapes of tubes, the least recently used first."""
+    """List what is kept: anatomies, atlases, resting scopes, shapes of tubes, the longest unused first."""
     folder = output.cache or default_cache()
     entries, limit = _entries(folder), cache_limit_bytes()
     size = sum(entry.size_bytes for entry in entries)
@@ -73,11 +73,16 @@ def _entries(folder: Path) -> "tuple[CacheEntry, ...]":
     from anatomy.base.cache_entries import cache_entries
     from anatomy.store import stored_format
     from lungaccess.planning.coupled.atlas_store import atlas_format
+    from lungaccess.uncertainty.risk.resting import resting_format
     from stages.tube import shapes_format
 
-    return cache_entries(
-        folder, {"anatomy": stored_format(), "atlas": atlas_format(), "shapes": shapes_format()}
-    )
+    formats = {
+        "anatomy": stored_format(),
+        "atlas": atlas_format(),
+        "resting": resting_format(),
+        "shapes": shapes_format(),
+    }
+    return cache_entries(folder, formats)
 
 
 def _remove(entries: "Iterable[CacheEntry]", output: CacheOptions) -> ExitCode:

@@ -54,6 +54,7 @@ def report(
     A plan that states its chance of success shows that, unless errors, procedure, samples or seed are given.
     """
     from lungaccess.cli.plan_search import advised
+    from lungaccess.judging.appraisal import appraise
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.report.html import PageOptions, bronchoscopy_webp, plan_page
 
@@ -66,6 +67,9 @@ def report(
     stored.require_lung(lung)
     image = shown_ct(ct, patient)
     with progress("making the page"):
+        appraisal = appraise(
+            stored, lung, errors=model, procedure=followed, draws=samples, seed=seed, each_kind=True
+        )
         options = PageOptions(
             alternatives=_others(stored, lung, alternatives, output) if alternatives else (),
             ct=None if image is None else image.read(),
@@ -76,7 +80,8 @@ def report(
             risk_samples=samples,
             risk_seed=seed,
             instructions=instructions,
-            advice=advised(stored, lung, model, followed, output.cache),
+            appraisal=appraisal,
+            advice=advised(stored, lung, model, followed, output.cache, appraisal),
         )
         plan_page(stored, lung, page, options)
         if movie is not None:

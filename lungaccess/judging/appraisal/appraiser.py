@@ -134,7 +134,9 @@ class Appraiser:
         """Return how often a plan succeeds in open loop; None where its estimate says that already."""
         if risk is None or chance_of(risk).procedure == DEFAULT_PROCEDURE:
             return None
-        return assess(plan, self._lung, model=self._errors, samples=DRAWS, seed=self._seed).succeeds
+        return assess(
+            plan, self._lung, model=self._errors, samples=DRAWS, seed=self._seed, each_kind=False
+        ).succeeds
 
     def _estimated(self, plan: Plan, each_kind: bool) -> Estimate | None:
         """Return the estimate of a plan, or what it states of one."""

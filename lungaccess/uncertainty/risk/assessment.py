@@ -41,13 +41,16 @@ class Sensitivity:
 
 
 def sensitivities(
-    assessor: RiskAssessor, model: ErrorModel, samples: int, seed: int
+    assessor: RiskAssessor, model: ErrorModel, samples: int, seed: int, alone: Mapping[str, Share]
 ) -> tuple[Sensitivity, ...]:
     """Return the sensitivity of success to each kind of error that the model has, the greatest first.
 
     Success counts as 1 and failure as 0.  Where all draws succeed, or none, the indices are 0.
+
+    Args:
+        alone: Successes of the same draws with errors of one kind only, by kind.
     """
-    kinds = [kind for kind in assessor.kinds if model.term(kind).size]
+    kinds = [kind for kind in alone if model.term(kind).size]
     # The second set of numbers of [Saltelli2010], independent of the first, comes from the seed and this.
     second = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
     first_draws, second_draws = assessor.draws(samples, seed), assessor.draws(samples, second)
@@ -57,15 +60,15 @@ def sensitivities(
     variance = float(both.var())
     found = []
     for kind in kinds:
-        alone = first_draws.deviations(model.only(kind))
-        mixed = _with(base, kind, alone, second_draws.deviations(model.only(kind)))
+        own = first_draws.deviations(model.only(kind))
+        mixed = _with(base, kind, own, second_draws.deviations(model.only(kind)))
         outcome = assessor.successes(mixed)
         changes = share_of(outcome != from_base)
         explained = float(np.mean(from_other * (outcome.astype(float) - from_base)))
         found.append(
             Sensitivity(
                 kind=kind,
-                alone=share_of(assessor.successes(alone)),
+                alone=alone[kind],
                 first_order=explained / variance if variance else 0.0,
                 total=0.5 * changes.value / variance if variance else 0.0,
                 changes=changes,
@@ -205,7 +208,7 @@ def assess(
         alone=MappingProxyType(alone),
         tissue=assessor.tissue,
         with_needle=plan.needle is not None,
-        sensitivity=sensitivities(assessor, stated, samples, seed) if each_kind else (),
+        sensitivity=sensitivities(assessor, stated, samples, seed, alone) if each_kind else (),
         rare=MappingProxyType({name: each for name, each in weighted.items() if each.is_exact}),
     )
 

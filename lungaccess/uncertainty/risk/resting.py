@@ -1,15 +1,20 @@
 """Errors about where the shaft of the scope comes to rest on the wall, instead of about the plan."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from anatomy.base.records import frozen_value
+from anatomy.base.settings import to_mapping
 from anatomy.base.typed import Float
+from anatomy.kept_records import kept_record
 from anatomy.lung import Lung
+from anatomy.machine_code.sources import kernel_digest
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import NORMAL, OF_SHAFT, RESTING, ErrorModel, Term
 from stages.scope import (
@@ -30,6 +35,13 @@ MOST = 50.0
 _Asked = tuple[bytes, bytes, Bronchoscope, WallContact]
 _SPREADS: WeakKeyDictionary[Lung, dict[_Asked, TipSpread]] = WeakKeyDictionary()
 """What was found in a lung: plans with one motion of the scope, and all the errors of each, ask again."""
+FORMAT = 1
+"""Raise it when the same motion comes to rest elsewhere with the same kernels: what is kept is made anew."""
+
+
+def resting_format() -> str:
+    """Return what tells scopes at rest of this version and these kernels from all others."""
+    return f"{FORMAT}-{kernel_digest('anatomy', 'stages.scope')}"
 
 
 def resting_tip(plan: Plan, lung: Lung, wall: WallContact) -> TipSpread:
@@ -37,13 +49,35 @@ def resting_tip(plan: Plan, lung: Lung, wall: WallContact) -> TipSpread:
     scope, known = plan.scope, _SPREADS.setdefault(lung, {})
     entry, states = np.asarray(scope.lps_from_entry), np.asarray(scope.states)
     asked = entry.tobytes(), states.tobytes(), plan.system.scope, wall
-    if asked not in known:
+
+    def make() -> TipSpread:
         motion = ScopeMotion(
             lps_from_entry=entry, states=states, bending_length_mm=plan.system.scope.bending_length_mm
         )
         shaft = RestingShaft(lumen_of(lung), plan.system.scope, wall)
-        known[asked] = spread_of_tip(shaft, motion, wall, np.asarray(scope.lps_from_scope_tip))
+        return spread_of_tip(shaft, motion, wall, np.asarray(scope.lps_from_scope_tip))
+
+    if asked not in known:
+        known[asked] = make() if lung.folder is None else _kept(plan, lung, lung.folder, wall, make)
     return known[asked]
+
+
+def _kept(
+    plan: Plan, lung: Lung, folder: Path, wall: WallContact, make: Callable[[], TipSpread]
+) -> TipSpread:
+    """Return what is kept of a motion in a lung of the cache: every command asks for the same plans again."""
+    depends_on = {
+        "lung": lung.key,
+        "entry": plan.scope.lps_from_entry,
+        "states": plan.scope.states,
+        "tip": plan.scope.lps_from_scope_tip,
+        "scope": to_mapping(plan.system.scope),
+        "wall": to_mapping(wall),
+    }
+    return kept_record(
+        "resting", resting_format(), depends_on, TipSpread, make=make, cache=folder.parent, name=lung.name,
+        in_use=(folder,),
+    )  # fmt: skip
 
 
 @frozen_value

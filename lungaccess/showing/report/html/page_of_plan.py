@@ -62,6 +62,7 @@ class PageOptions:
         errors, procedure, risk_samples, risk_seed: Of the estimate of success, see
             `lungaccess.judging.appraisal.Appraiser`: 0 samples for none.  If all are None, a plan that states
             its chance shows that, and its alternatives are estimated as it was.
+        appraisal: Of the plan; made with the former if None.
         instructions: Whether the steps that bring the scope to its place are listed.
         advice: What would lift the chance of success, see `lungaccess.judging.advice.advise`.
     """
@@ -74,6 +75,7 @@ class PageOptions:
     procedure: Procedure | None = None
     risk_samples: int | None = None
     risk_seed: int | None = None
+    appraisal: Appraisal | None = None
     instructions: bool = True
     advice: Sequence[Advice] = ()
 
@@ -157,7 +159,7 @@ def _appraised(plans: Sequence[Plan], lung: Lung, options: PageOptions) -> list[
     """Return the appraisals of a plan and its alternatives, whose chances are all of the same luck."""
     given = (options.errors, options.procedure, options.risk_samples, options.risk_seed)
     appraiser = Appraiser(lung, given[0], procedure=given[1], draws=given[2], seed=given[3])
-    first = appraiser.appraise(plans[0], each_kind=True)
+    first = options.appraisal or appraiser.appraise(plans[0], each_kind=True)
     if isinstance(first.risk, Chance) and len(plans) > 1:
         appraiser = _appraiser_like(first.risk, lung)
     return [first, *(appraiser.appraise(each) for each in plans[1:])]

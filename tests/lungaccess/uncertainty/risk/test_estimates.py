@@ -15,7 +15,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel, PositionError
 from lungaccess.uncertainty.risk import assess, rare_share, rare_touch
-from lungaccess.uncertainty.risk.assessment import sensitivities
+from lungaccess.uncertainty.risk.assessment import Sensitivity, sensitivities
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.rare import Luck
 
@@ -80,9 +80,15 @@ def test_weights_agree_with_counts(plan: Plan, small_lung: Lung) -> None:
         assert found.interval[0] <= high + 0.1 * high and found.interval[1] >= low - 0.1 * low
 
 
+def sensitivities_of(there: RiskAssessor, model: ErrorModel, samples: int) -> tuple[Sensitivity, ...]:
+    draws = there.draws(samples, 0)
+    alone = {kind: there.success(draws, model.only(kind)) for kind in there.kinds}
+    return sensitivities(there, model, samples, 0, alone)
+
+
 def test_errors_of_one_kind_explain_everything(plan: Plan, small_lung: Lung) -> None:
     there = RiskAssessor(plan, small_lung, radius_mm=2.0)
-    (only,) = sensitivities(there, ErrorModel(target_position=PositionError(attempt_mm=1.5)), 20_000, 0)
+    (only,) = sensitivities_of(there, ErrorModel(target_position=PositionError(attempt_mm=1.5)), 20_000)
     share = chi.cdf(2.0 / 1.5, 3)
     assert only.alone.value == pytest.approx(share, abs=0.015)
     assert only.total == pytest.approx(1.0, abs=0.03)
@@ -95,7 +101,7 @@ def test_two_errors_share_the_variance_as_computed(plan: Plan, small_lung: Lung)
     model = ErrorModel(
         target_position=PositionError(attempt_mm=1.0), needle_insertion=PositionError(attempt_mm=1.5)
     )
-    found = {each.kind: each for each in sensitivities(there, model, 40_000, 0)}
+    found = {each.kind: each for each in sensitivities_of(there, model, 40_000)}
     rng = np.random.default_rng(0)
     end = there.plan.needle
     assert end is not None
@@ -120,7 +126,7 @@ def test_two_errors_share_the_variance_as_computed(plan: Plan, small_lung: Lung)
 
 def test_without_errors_nothing_is_sensitive(plan: Plan, small_lung: Lung) -> None:
     there = RiskAssessor(plan, small_lung)
-    assert sensitivities(there, ErrorModel(), 100, 0) == ()
+    assert sensitivities_of(there, ErrorModel(), 100) == ()
     report = assess(plan, small_lung, samples=500)
     assert {each.kind for each in report.sensitivity} <= set(there.kinds)
     totals = [each.total for each in report.sensitivity]

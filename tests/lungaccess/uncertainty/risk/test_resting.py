@@ -123,6 +123,29 @@ def test_limits_that_are_exceeded_are_said() -> None:
     assert rows["tip turned"].words == ""
 
 
+@pytest.mark.parametrize("other", [None, shape_of(0.7)])
+def test_what_came_to_rest_in_a_lung_of_the_cache_is_kept(
+    other: RestingShape | None,
+    small_plan: Plan,
+    small_lung: Lung,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = spread_of(other=other)
+    monkeypatch.setattr(resting, "spread_of_tip", lambda *_: made)
+    monkeypatch.setattr(resting, "_SPREADS", {})
+    stored = replace(small_lung)
+    object.__setattr__(stored, "folder", tmp_path / "lung")
+    assert resting_tip(small_plan, stored, WallContact()) is made
+    monkeypatch.setattr(resting, "spread_of_tip", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(resting, "_SPREADS", {})
+    again = resting_tip(small_plan, stored, WallContact())
+    assert resting_rows(again, WallContact()) == resting_rows(made, WallContact())
+    assert again.nominal.settled and np.array_equal(again.nominal.frames, made.nominal.frames)
+    with pytest.raises(pytest.fail.Exception, match="made again"):
+        resting_tip(small_plan, stored, WallContact(max_friction=0.1))
+
+
 def test_a_plan_is_counted_about_where_its_scope_rests(small_plan: Plan, small_lung: Lung) -> None:
     preset = load_errors("resting")
     assert preset.wall is not None

@@ -1,10 +1,11 @@
 """Trachea and main bronchi on coarse voxels: found as a round column of air, followed to the lungs."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int, Mask
@@ -293,6 +294,20 @@ def without_throat(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]
     if level >= top:
         return lumen, 0.0
     return below(lumen, level), (top - level) * slice_mm
+
+
+def cut_to_tree(
+    lumen: Mask, seed_ijk: Int, grid: Grid, tree_of: Callable[[Mask], AirwayTree | AnatomyError]
+) -> tuple[Mask, float]:
+    """Return what `without_throat` does, cut where the airway is narrowest if only that gives it a tree."""
+    lumen, cut_mm = without_throat(lumen, seed_ijk, grid)
+    if isinstance(tree_of(lumen), AnatomyError):
+        level = narrowest_level(lumen, seed_ijk)
+        lower = below(lumen, level)
+        if not isinstance(tree_of(lower), AnatomyError):
+            top = int(np.flatnonzero(lumen.any(axis=(0, 1)))[-1]) + 1
+            return lower, cut_mm + (top - level) * float(grid.spacing_mm[2])
+    return lumen, cut_mm
 
 
 def below(lumen: Mask, level: int) -> Mask:

@@ -275,7 +275,7 @@ class Given:
         named = (self.totalsegmentator, self.onnx_airway, self.nodule_contours, self.nodule_mask)
         found: dict[str, str] = {}
         for path in (path for path in (*self.files().values(), *named) if path is not None):
-            file = path if path.exists() else path.with_name(path.name.rpartition("#")[0])
+            file = path if path.exists() else path.with_name(path.name.rpartition("#")[0] or path.name)
             found |= {str(each): sha256(each) for each in (images_in(file) if file.is_dir() else [file])}
         return found
 

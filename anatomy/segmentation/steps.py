@@ -17,7 +17,7 @@ from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
 from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
 from anatomy.segmentation.airway import Airways, wall_around
 from anatomy.segmentation.box import Box
-from anatomy.segmentation.central_airway import below, narrowest_level, without_throat
+from anatomy.segmentation.central_airway import cut_to_tree
 from anatomy.segmentation.folder import (
     IMAGES,
     Description,
@@ -189,9 +189,7 @@ class Steps:
                 lumen = learned_airway(self._ct, network)
             if lumen is None:
                 found = segment_airway(self._ct, lungs, progress=self._tell)
-                lumen, cut_mm = self._with_tree(
-                    *without_throat(found.lumen, lungs.trachea_seed_ijk, grid), lungs
-                )
+                lumen, cut_mm = cut_to_tree(found.lumen, lungs.trachea_seed_ijk, grid, self._tree_of)
                 # The wall of what was cut off stays: it is an obstacle.
                 wall = found.wall | (found.lumen & ~lumen) if wall is None else wall
                 if cut_mm:
@@ -205,16 +203,6 @@ class Steps:
             return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": [*said, *warnings]}
 
         return self._bring_up_to_date("airway", names, key, compute)[0]
-
-    def _with_tree(self, lumen: Mask, cut_mm: float, lungs: Lungs) -> tuple[Mask, float]:
-        """Return a lumen of which no tree can be made without its top, if that gives it a tree."""
-        if isinstance(self._tree_of(lumen), AnatomyError):
-            level = narrowest_level(lumen, lungs.trachea_seed_ijk)
-            lower = below(lumen, level)
-            if not isinstance(self._tree_of(lower), AnatomyError):
-                top = int(np.flatnonzero(lumen.any(axis=(0, 1)))[-1]) + 1
-                return lower, cut_mm + (top - level) * float(self.grid.spacing_mm[2])
-        return lumen, cut_mm
 
     def _tree_of(self, lumen: Mask) -> AirwayTree | AnatomyError:
         """Return the tree of the lumen, which is made once, or why there is none."""

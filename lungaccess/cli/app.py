@@ -200,6 +200,10 @@ def _answer(words: list[str]) -> int:
     except CycloptsError as error:
         return _explain(usage_error(error), as_json)
     except LungaccessError as error:
+        # What the library raises does not know the command that a person typed.
+        typed = [word for word in words if not word.startswith("-")]
+        command = next((each for each in (" ".join(typed[:2]), *typed[:1]) if each in EXAMPLES), "")
+        error.remedy = error.remedy or help_words(command)
         return _explain(error, as_json)
     except BrokenPipeError:
         raise
@@ -306,19 +310,21 @@ def usage_error(error: CycloptsError) -> UsageError:
     """Return what is wrong with the words of a command line, and which words would be right."""
     error.verbose = False
     command = " ".join(error.command_chain or ())
-    example = EXAMPLES.get(command)
     found, expected = _found_and_expected(error)
     found = _AVAILABLE.sub("", found)
     guess = _GUESS.search(found)
-    explained = (
-        f"`lungaccess {command} --help` explains every option; an example: {example}"
-        if example
-        else f"`{' '.join(('lungaccess', *command.split()))} --help` lists the commands"
-    )
+    explained = help_words(command)
     remedy = f"{guess.group(1)} {explained}" if guess else explained
     return UsageError(
         _one_line(_GUESS.sub("", found)), expected=_one_line(expected), remedy=_one_line(remedy)
     )
+
+
+def help_words(command: str) -> str:
+    """Return where a command such as "study run" is explained; "" is the program itself."""
+    if example := EXAMPLES.get(command):
+        return f"`lungaccess {command} --help` explains every option; an example: {example}"
+    return f"`{' '.join(('lungaccess', *command.split()))} --help` lists the commands"
 
 
 def _found_and_expected(error: CycloptsError) -> tuple[str, str]:

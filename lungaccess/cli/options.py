@@ -119,6 +119,9 @@ class PatientOptions(CacheOptions):
 
     def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> Organ:
         """Return a patient's lung, or a liver of Med-RAD; see `load_organ`."""
+        from anatomy.plausibility import require_known_checks
+
+        require_known_checks(self.accept)
         return load_organ(patient, self.cache, thick_slices, self.accept if refuse else None)
 
 

@@ -13,14 +13,7 @@ from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LOBES
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_arc
-from lungaccess.plans.picture import (
-    STRAIGHT_AHEAD,
-    Picture,
-    branches_beyond,
-    clock_hour,
-    clock_words,
-    lps_from_camera,
-)
+from lungaccess.plans.picture import STRAIGHT_AHEAD, Picture, branches_beyond, clock_words, lps_from_camera
 from lungaccess.problem.system import System
 from stages.scope import ScopeMotion, prover_of
 
@@ -264,8 +257,7 @@ def _places(tree: AirwayTree, last: int, tips_lps: Float) -> Int:
 
 def _openings(lung: Lung, lps_from_eye: Float, points: list[int]) -> tuple[Opening, ...]:
     holes = Picture(lung, lps_from_eye, SHOWN_PIXELS).holes(points)
-    hours = [clock_hour(lps_from_eye, hole.place_lps) for hole in holes]
-    sides = [_side_of_picture(hour) for hour in hours]
+    sides = [hole.side(lps_from_eye) for hole in holes]
     made = []
     for n, (point, hole, side) in enumerate(zip(points, holes, sides, strict=True)):
         branch, (x, y, z) = int(lung.tree.branch_of_point[point]), hole.place_lps.tolist()
@@ -276,7 +268,7 @@ def _openings(lung: Lung, lps_from_eye: Float, points: list[int]) -> tuple[Openi
                 label=branch_label(lung.tree, branch),
                 name=branch_name(lung, branch),
                 place_lps=(x, y, z),
-                hour=hours[n],
+                hour=hole.hour(lps_from_eye),
                 side=side,
                 order=same.index((hole.rim_mm, n)) + 1 if len(same) > 1 else 0,
                 in_view=hole.share > 0.0,
@@ -284,11 +276,3 @@ def _openings(lung: Lung, lps_from_eye: Float, points: list[int]) -> tuple[Openi
             )
         )
     return tuple(made)
-
-
-def _side_of_picture(hour: int) -> str:
-    if hour == 0:
-        return STRAIGHT_AHEAD
-    if hour in (6, 12):
-        return "at the top" if hour == 12 else "at the bottom"
-    return "on the right" if hour < 6 else "on the left"

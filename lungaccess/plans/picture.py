@@ -23,6 +23,9 @@ HALF_BRIGHT_MM = math.sqrt(520.0)
 """At this distance the light has half its brightness, as the pages draw it."""
 STRAIGHT_RAD = math.radians(4.0)
 """What lies nearer to the middle of the picture is straight ahead."""
+ROUND_MIDDLE_RAD = math.radians(12.0)
+"""An opening that holds the middle of the picture is straight ahead if its own middle is as near: its hour
+would be that of a small part of it."""
 STRAIGHT_AHEAD = "straight ahead"
 
 
@@ -40,19 +43,8 @@ def lps_from_camera(system: System, lps_from_tip: Float) -> Float:
     return np.asarray(lps_from_tip @ aside)
 
 
-def clock_hour(lps_from_eye: Float, point_lps: Float) -> int:
-    """Return where a point is in the picture of a camera on a clock, 1 to 12; 0 if it is straight ahead.
-
-    The top of the picture is +x of the camera, and its right is +y.
-    """
-    up, right, ahead = lps_from_eye[:3, :3].T @ (point_lps - lps_from_eye[:3, 3])
-    if math.atan2(math.hypot(up, right), ahead) < STRAIGHT_RAD:
-        return 0
-    return round(math.degrees(math.atan2(right, up)) / 30.0) % 12 or 12
-
-
 def clock_words(hour: int) -> str:
-    """Say where in the picture an hour of `clock_hour` is."""
+    """Say where in the picture an hour of `Hole.hour` is."""
     return f"at {hour} o'clock" if hour else STRAIGHT_AHEAD
 
 
@@ -62,12 +54,37 @@ class Hole:
 
     `place_lps` (3,) is behind its rim and seen in its middle, LPS mm, or on the centreline if it is not seen;
     `share` is how much of the picture it darkens, less at the border, 0 if it is not seen; `rim_mm` is the
-    distance of its nearest part from the camera.
+    distance of its nearest part from the camera; `holds_middle` tells whether the middle of the picture is in
+    it.
     """
 
     place_lps: Float
     share: float = 0.0
     rim_mm: float = math.inf
+    holds_middle: bool = False
+
+    def hour(self, lps_from_eye: Float) -> int:
+        """Return where it is in the picture of its camera on a clock, 1 to 12; 0 if it is straight ahead."""
+        turn = self._turn_deg(lps_from_eye)
+        return 0 if turn is None else round(turn / 30.0) % 12 or 12
+
+    def side(self, lps_from_eye: Float) -> str:
+        """Return in words on which side of the picture it is."""
+        turn = self._turn_deg(lps_from_eye)
+        if turn is None:
+            return STRAIGHT_AHEAD
+        # Left and right of what is nearly above or below the middle would depend on a few pixels.
+        if not 30.0 <= abs(turn) <= 150.0:
+            return "at the top" if abs(turn) < 30.0 else "at the bottom"
+        return "on the right" if turn > 0.0 else "on the left"
+
+    def _turn_deg(self, lps_from_eye: Float) -> float | None:
+        """Return its angle clockwise from the top, +x of the camera; None for straight ahead."""
+        up, right, ahead = lps_from_eye[:3, :3].T @ (self.place_lps - lps_from_eye[:3, 3])
+        near = ROUND_MIDDLE_RAD if self.holds_middle else STRAIGHT_RAD
+        if math.atan2(math.hypot(up, right), ahead) < near:
+            return None
+        return math.degrees(math.atan2(right, up))
 
 
 class Picture:
@@ -128,6 +145,7 @@ class Picture:
             place_lps=self._eye + min(away, self._away_mm[shown]) * self._rays[shown],
             share=float(dark @ whole / len(rays)),
             rim_mm=float(self._away_mm[own].min()),
+            holds_middle=bool(np.hypot(*across.T).min() < 2.0 * math.tan(HALF_ANGLE_RAD) / len(square)),
         )
 
 

@@ -12,7 +12,7 @@ from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from lungaccess.plans.bifurcations import route_bifurcations
 from lungaccess.plans.insertion import scope_motion, shown_motion
-from lungaccess.plans.picture import STRAIGHT_AHEAD, Picture, clock_hour, lps_from_camera
+from lungaccess.plans.picture import STRAIGHT_AHEAD, Picture, lps_from_camera
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion, prover_of
@@ -264,9 +264,9 @@ def _goes_on(lung: Lung, route: Int, lps_from_eye: Float) -> str:
     ahead = min(int(np.searchsorted(depth, depth[here] + 12.0)), len(route) - 1)
     # A picture of 48 pixels along each edge shows where the lumen goes on.
     (hole,) = Picture(lung, lps_from_eye, 48).holes([int(route[ahead])])
-    return goes_on_words(clock_hour(lps_from_eye, hole.place_lps))
+    return goes_on_words(hole.hour(lps_from_eye))
 
 
 def goes_on_words(hour: int) -> str:
-    """Say that the airway goes on at an hour of `lungaccess.plans.picture.clock_hour`."""
+    """Say that the airway goes on at an hour of `lungaccess.plans.picture.Hole.hour`."""
     return f"towards {hour} o'clock in the picture" if hour else STRAIGHT_AHEAD

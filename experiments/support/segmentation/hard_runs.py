@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
-from anatomy.base.errors import LungaccessError
+from anatomy.airway_tree import AirwayTree
+from anatomy.base.errors import AnatomyError, LungaccessError
 from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Mask
 from anatomy.grid import Volume
@@ -17,6 +18,7 @@ from anatomy.plausibility import require_plausible
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.canonical import canonical
+from anatomy.segmentation.central_airway import cut_to_tree
 from anatomy.segmentation.gate import plausibility
 from anatomy.segmentation.input import require_chest_ct
 from anatomy.segmentation.lungs import Lungs, segment_lungs
@@ -105,8 +107,12 @@ def segmented(
     found = segment_lungs(ct)
     box = Box.whole(ct.grid, VOXEL_MM).around(found)
     finer, lungs = box.image(found.scale.image(ct)), box.lungs(found)
-    lumen = segment_airway(finer, lungs).lumen
-    tree = tree_or_error(Volume(grid=finer.grid, array=lumen))
+
+    def tree_of(mask: Mask) -> AirwayTree | AnatomyError:
+        return tree_or_error(Volume(grid=finer.grid, array=mask))
+
+    lumen, _ = cut_to_tree(segment_airway(finer, lungs).lumen, lungs.trachea_seed_ijk, finer.grid, tree_of)
+    tree = tree_of(lumen)
     failed, further = plausibility(finer, lungs, tree)
     said = (
         *warnings,

@@ -132,7 +132,11 @@ def self_test(
     names = list(dict.fromkeys(kinds or KINDS))
     for name in names:
         if name not in KINDS:
-            raise SettingsError(f"There is no kind of proof named {name!r}", expected=", ".join(KINDS))
+            raise SettingsError(
+                f"There is no kind of proof named {name!r}",
+                expected=", ".join(KINDS),
+                remedy="Name one of these, or none to test all",
+            )
     found = []
     with nullcontext() if numba.config.DISABLE_JIT else _plain(names) as plain:
         for name in names:

@@ -17,7 +17,7 @@ from lungaccess.cli.plan_tables import steps_table
 from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.space import not_lumen
 from lungaccess.plans.insertion import scope_insertion, scope_motion, with_simplest_motion
-from lungaccess.plans.picture import clock_hour
+from lungaccess.plans.picture import Hole
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.scope_steps import (
     goes_on_words,
@@ -49,7 +49,7 @@ def steps(moving: ScopeMotion, decimals: int = 0) -> tuple[Any, ...]:
     allowed = np.tile([0.25, np.radians(3.0), np.radians(120.0)], (len(moving.states) - 1, 1))
 
     def goes_on(state: int) -> str:
-        return goes_on_words(clock_hour(moving.tips[state], moving.tips[-1, :3, 3]))
+        return goes_on_words(Hole(place_lps=moving.tips[-1, :3, 3]).hour(moving.tips[state]))
 
     return steps_of(moving.written(decimals), TREE, allowed, goes_on)
 

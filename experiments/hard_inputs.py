@@ -1,6 +1,6 @@
 """Wrong and hard inputs of the segmentation: each right, warned of or refused.
 
-    python -m experiments.hard_inputs [--only PATTERN] [--record FILE] [--page FILE] [--ct FILE]
+    python -m experiments.hard_inputs [--only PATTERN] [--record FILE] [--page FILE] [--ct FILE] [--seed N]
 
 Each case of `experiments.support.segmentation.hard_cases` is made of the CT of the small phantom, segmented
 up to the airways, and compared with the truth.  Cases in the record are not run again, so that a study that
@@ -50,12 +50,12 @@ def ct_image(path: Path) -> HardImage:
     )
 
 
-def outcomes(record: Path, pattern: str, ct: Path | None) -> dict[str, Outcome]:
+def outcomes(record: Path, pattern: str, ct: Path | None, seed: int) -> dict[str, Outcome]:
     """Run the cases whose name fits and that the record does not hold, and return all in the record."""
     known = {}
     if record.is_file():
         known = {name: Outcome(**row) for name, row in json.loads(record.read_text()).items()}
-    image = phantom_image(make_phantom(seed=SEED, size="small")) if ct is None else ct_image(ct)
+    image = phantom_image(make_phantom(seed=seed, size="small")) if ct is None else ct_image(ct)
     plain = plain_tree(image)
     for name, case in CASES.items():
         anywhere = ct is None or case.group in ANYWHERE
@@ -96,9 +96,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--only", default="", metavar="PATTERN", help="cases whose name fits")
     parser.add_argument("--record", type=Path, default=Path(".studies/hard_inputs.json"))
     parser.add_argument("--ct", type=Path, help="a real CT instead of the phantom")
+    parser.add_argument(
+        "--seed", type=int, default=SEED, help="the phantom, of which each has its own record"
+    )
     parser.add_argument("--page", type=Path, help="page with the two marks; the table is printed if left out")
     options = parser.parse_args(arguments)
-    made = table(outcomes(options.record, options.only, options.ct))
+    made = table(outcomes(options.record, options.only, options.ct, options.seed))
     if options.page is None:
         print(made)
         return

@@ -115,6 +115,7 @@ def build_lung(
         start_names=images.start_names,
         target_names=images.target_names,
         breath_hold=images.breath_hold,
+        vessel_border_mm=images.vessel_border_mm,
         sources=images.sources,
         warnings=(*warnings, *warnings_of_findings(findings)),
         findings=findings,

@@ -42,6 +42,7 @@ class Organ:
             patient.
         start_names, target_names: How users name them.
         breath_hold: In which breath-hold the image was taken, if stated.
+        vessel_border_mm: See `PatientImages`.
         sources: SHA-256 of every input file.
         warnings: What was assumed or repaired on the way in.
         findings: What the checks of the masks found, see `anatomy.plausibility`; none for masks that were not
@@ -66,6 +67,7 @@ class Organ:
     target_names: tuple[str, ...] = ()
     nodule_labels: Volume | None = None
     breath_hold: str | None
+    vessel_border_mm: tuple[float, ...] = ()
     sources: Mapping[str, str]
     warnings: tuple[str, ...]
     findings: tuple[Finding, ...] = ()

@@ -36,6 +36,8 @@ class PatientImages:
         start_names, target_names: How users name them; "start1", "target1", ... if not given.
         breath_hold: In which state of breathing the image was taken, if that is stated.
         motion: What is known of the breathing.
+        vessel_border_mm: Mean and standard deviation of how far the true vessels reach out of their mask, as
+            far as that is known; empty if not, as for masks that came without their CT.
         sources: File name to the SHA-256 of its bytes.
         warnings: What was unusual about the input but did not prevent reading it.
         accepted: Checks of `anatomy.plausibility.CHECKS` whose failure a person has accepted.
@@ -63,6 +65,7 @@ class PatientImages:
     target_names: tuple[str, ...] = ()
     breath_hold: str | None = None
     motion: MotionSource | None = None
+    vessel_border_mm: tuple[float, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     accepted: tuple[str, ...] = ()
@@ -74,6 +77,7 @@ class PatientImages:
             numbers = getattr(self, name)
             if numbers is not None:
                 self.grid.require_same(numbers.grid, f"the {name.replace('_', ' ')}")
+        _require_border(self.vessel_border_mm)
         if self.cost is not None:
             _require_cost(self.cost, self.grid)
         object.__setattr__(self, "starts", tuple(read_only(np.array(p, float)) for p in self.starts))
@@ -91,6 +95,17 @@ def _require_mask(volume: Volume | None, role: str, grid: Grid) -> None:
     grid.require_same(volume.grid, f"the mask {role}")
     if volume.array.dtype != np.bool_:
         raise AnatomyError(f"The mask {role} has the type {volume.array.dtype}", expected="bool voxels")
+
+
+def _require_border(border_mm: tuple[float, ...]) -> None:
+    # No border that is known lies a centimetre off; so far off the mask is of something else.
+    mean, spread = border_mm or (0.0, 0.0) if len(border_mm) in (0, 2) else (np.nan, np.nan)
+    if not (abs(mean) <= 10.0 and 0.0 <= spread <= 10.0):
+        raise AnatomyError(
+            f"The border of the vessels is {list(border_mm)}",
+            expected="two numbers in mm: a mean from -10 to 10, and a standard deviation from 0 to 10",
+            remedy="Correct vessel_border_mm in patient.toml, or leave it out",
+        )
 
 
 def _require_cost(cost: Volume, grid: Grid) -> None:

@@ -67,6 +67,9 @@ class PatientFile:
         float,
         quantity("Radius from which a segmented vessel is an obstacle; thinner ones are costs", at_least=0.0),
     ] = 0.0
+    vessel_border_mm: Annotated[
+        tuple[float, ...], _key("Mean and standard deviation of how far true vessels reach out of their mask")
+    ] = ()
     accepted: Annotated[
         tuple[str, ...], _key("Checks of the segmentation that failed and were overruled by --accept")
     ] = ()
@@ -104,6 +107,7 @@ def load_own_masks(description: Path) -> PatientImages:
         cost=cost,
         targets_lps=targets,
         breath_hold=keys.breath_hold or None,
+        vessel_border_mm=keys.vessel_border_mm,
         sources=hashes,
         accepted=keys.accepted,
         warnings=(

@@ -324,8 +324,8 @@ def throat_level(air: Mask, seed_ijk: Int, slice_mm: float) -> int:
     """Return the first axial level of the throat above a seed in the trachea; the image's end if none.
 
     The trachea narrows at the glottis, and above it the airway ends or becomes wider than the trachea.  Where
-    it does neither, it is only narrow, as at mucus or a stenosis, and goes on.  An airway that does not narrow
-    and stays much wider than the trachea is a throat, too.
+    it does neither, it is only narrow, as at mucus or a stenosis, and goes on.  An airway that does not
+    narrow and stays much wider than the trachea is a throat, too.
     """
     reach = max(1, round(USUAL_REACH_MM / slice_mm))
     first, count = int(seed_ijk[2]), int(air.shape[2])

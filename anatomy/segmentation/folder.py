@@ -321,6 +321,7 @@ def description_text(
     thick_slices_mm: float,
     accepted: tuple[str, ...] = (),
     large_radius_mm: float = 0.0,
+    vessel_border_mm: tuple[float, ...] = (),
     sources: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
     """Return the `patient.toml` of a segmentation.
@@ -329,7 +330,7 @@ def description_text(
     them; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that were accepted
     although they are thick, else 0; `accepted` are checks that failed and were overruled; `sources` tells
     what images were taken from elsewhere, by their names; `large_radius_mm`, from which vessels are
-    obstacles, is 0 if a given mask says what they are.
+    obstacles, is 0 if a given mask says what they are, and of their border nothing is known then.
     """
     lines = [f"name = {_quoted(name)}"] if name else []
     lines += [
@@ -354,6 +355,8 @@ def description_text(
         lines.append(f"thick_slices_mm = {thick_slices_mm:.3f}")
     if large_radius_mm:
         lines.append(f"large_radius_mm = {large_radius_mm:.3f}")
+    if vessel_border_mm:
+        lines.append("vessel_border_mm = [{:.2f}, {:.2f}]".format(*vessel_border_mm))
     if accepted:
         lines.append(f"accepted = {_quoted(list(accepted))}")
     if sources:

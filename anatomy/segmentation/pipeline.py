@@ -24,7 +24,7 @@ from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.parts import Parts
 from anatomy.segmentation.request import SegmentationRequest
 from anatomy.segmentation.steps import VERSION, Steps
-from anatomy.segmentation.vessels import require_large_radius
+from anatomy.segmentation.vessels import border_mm, require_large_radius
 
 Progress = Callable[[str], None]
 
@@ -113,6 +113,7 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
         thick_slices_mm=thick_mm,
         accepted=steps.accepted,
         large_radius_mm=large_mm,
+        vessel_border_mm=border_mm(large_mm, slice_mm(request.ct)) if large_mm else (),
         sources=steps.from_elsewhere,
     )
     return Segmentation(

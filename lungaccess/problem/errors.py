@@ -11,7 +11,7 @@ from anatomy.base.words import did_you_mean
 from anatomy.lobes import LOBES, lobe_named
 from stages.scope import WallContact
 
-CURVATURE, BREATHING = "needle_curvature", "breathing"
+CURVATURE, BREATHING, VESSEL_BORDER = "needle_curvature", "breathing", "vessel_border"
 UNITS: dict[str, str] = {
     "scope_position": "mm",
     "scope_direction": "deg",
@@ -22,6 +22,7 @@ UNITS: dict[str, str] = {
     "needle_insertion": "mm",
     "target_position": "mm",
     BREATHING: "mm",
+    VESSEL_BORDER: "mm",
 }
 """Kinds of error and the unit in which their size is stated; "ln" is the natural logarithm of a factor."""
 AXES: dict[str, int] = {
@@ -32,9 +33,11 @@ AXES: dict[str, int] = {
     "needle_roll": 1,
     "needle_insertion": 1,
     "target_position": 3,
+    VESSEL_BORDER: 1,
 }
 """How many numbers the bias of a kind has: along x, y, z of the scope's tip, about its x and y, LPS for the
-target, and one where the devices have one axis.  The curvature has its median instead."""
+target, one where the devices have one axis, and one for the vessels' border.  The curvature has its median
+instead."""
 OF_NEEDLE = (CURVATURE, "needle_roll", "needle_insertion")
 """The kinds that only a needle has."""
 ASSUMPTION = "assumption"
@@ -263,6 +266,7 @@ class Place:
     needle_insertion: PositionError | None = None
     target_position: PositionError | None = None
     breathing: BreathingError | None = None
+    vessel_border: PositionError | None = None
 
     def __post_init__(self) -> None:
         if self.lobe and not lobe_named(self.lobe):
@@ -301,6 +305,8 @@ class ErrorModel:
         needle_roll: Angle of the needle about its axis at each arc.
         needle_insertion: Insertion at which each arc ends.
         target_position: Position of the target, along each axis.
+        vessel_border: How far the vessels reach out of their masks, all of them alike; where it is 0, it is
+            what the patient's own segmentation states, see `lungaccess.uncertainty.risk.breathing.model_for`.
         wall: What is known of the contact of shaft and wall, which errors of the distribution "resting" need;
             see `lungaccess.uncertainty.risk.resting`.
         place: Other errors by the place of the scope's tip; of several that hold the last one counts.
@@ -321,6 +327,7 @@ class ErrorModel:
     needle_insertion: PositionError = PositionError()
     target_position: PositionError = PositionError()
     breathing: BreathingError = BreathingError()
+    vessel_border: PositionError = PositionError()
     wall: WallContact | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     place: tuple[Place, ...] = _optional()
 
@@ -384,10 +391,11 @@ class ErrorModel:
             f"{100.0 * size[CURVATURE]:.0f} %{f' ({100.0 * straight:g} % go straight)' if straight else ''}, "
         )
         breathing = f", breathing {size[BREATHING]:.1f} mm" if size[BREATHING] else ""
+        border = f", border of vessels {size[VESSEL_BORDER]:.1f} mm" if size[VESSEL_BORDER] else ""
         return (
             f"scope tip {size['scope_position']:g} mm and {size['scope_direction']:g}°, "
             f"tubes {size['tube_insertion']:g} mm and {size['tube_rotation']:g}°, "
-            f"{of_needle if with_needle else ''}target {size['target_position']:g} mm{breathing}"
+            f"{of_needle if with_needle else ''}target {size['target_position']:g} mm{breathing}{border}"
             f"{f', bias of {means}' if means else ''}"
             f"{', about where the shaft rests on the wall' if self.rests else ''}"
             f"{', others in some places' if self.place else ''}"

@@ -216,6 +216,7 @@ class _Inserter:
             name=errors.name, description=errors.description, needle_curvature=errors.needle_curvature,
             needle_roll=errors.needle_roll, needle_insertion=errors.needle_insertion,
             target_position=errors.target_position, breathing=errors.breathing,
+            vessel_border=errors.vessel_border,
         )  # fmt: skip
         # The needle begins where the plan has it, which is known.
         self._unknown = unknown_of(believed, steering, np.zeros((6, 6)))
@@ -275,7 +276,8 @@ class _Inserter:
         start = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
         chain = np.concatenate([tubes, needle])
         moved = (attempt.target_lps - self.query.target)[None]
-        flags = int(self._assessor.follow(start[None], chain[None], len(tubes), moved).touched[0])
+        border_mm = attempt.errors.border_mm
+        flags = int(self._assessor.follow(start[None], chain[None], len(tubes), moved, border_mm).touched[0])
         structures = self._assessor.structures
         touched = tuple(name for name in self._assessor.forbidden if flags & structures[name])
         frames, lengths = poses.poses_on_pieces(end, needle[:, :3], SHOWN_STEP_MM)

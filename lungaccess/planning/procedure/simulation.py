@@ -223,13 +223,17 @@ class _Run:
             pieces = as_pieces(arcs, plan.system.track_radius_mm)
             pieces[:, 0, kernel.ROLL] -= rolled
             pieces = np.concatenate([tubes, pieces], axis=1)
-        outcomes = self.assessor.follow(went.starts, pieces, n_tube, errors.target_mm)
+        outcomes = self.assessor.follow(went.starts, pieces, n_tube, errors.target_mm, errors.border_mm)
         touched = outcomes.touched.copy()
         back = np.flatnonzero(~done)
         if len(back):
             # Tubes that were drawn back again may have stayed in the airway: nothing came of it.
             alone = self.assessor.follow(
-                went.starts[back], np.ascontiguousarray(tubes[back]), n_tube, errors.target_mm[back]
+                went.starts[back],
+                np.ascontiguousarray(tubes[back]),
+                n_tube,
+                errors.target_mm[back],
+                errors.border_mm[back],
             ).touched
             touched[back] = alone & ~kernel.STAYS_INSIDE
         found.touched[at] |= touched

@@ -129,13 +129,15 @@ class RiskAssessor:
         _in_threads(find, count)
         return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken)
 
-    def follow(self, starts: Float, pieces: Float, n_tube: int, target_mm: Float) -> Outcomes:
-        """Return what becomes of chains whose target has moved by `target_mm` `(N, 3)`; see `Outcomes`."""
+    def follow(
+        self, starts: Float, pieces: Float, n_tube: int, target_mm: Float, border_mm: Float
+    ) -> Outcomes:
+        """Return what becomes of chains whose target has moved, `(N, 3)`; see `Outcomes` and `Deviations`."""
         count = len(starts)
         touched, miss_mm, taken = np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count)
         follow_chains(
-            starts, pieces, n_tube, self._obstacles, self._judging, self.wanted, target_mm, touched, miss_mm,
-            taken,
+            starts, pieces, n_tube, self._obstacles, self._judging, self.wanted,
+            np.column_stack([target_mm, border_mm]), touched, miss_mm, taken,
         )  # fmt: skip
         return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken)
 

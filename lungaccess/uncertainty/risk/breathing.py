@@ -1,11 +1,12 @@
-"""Motion of the lung by breathing: how much more the target moves than the scope's tip.
+"""What a patient adds to the errors: its motion by breathing, and the border of its vessels.
 
 A place at height h of its lung (0 at the apex, 1 at the base) moves to the feet by `A g(h)` from end-exhale
 to end-inhale, A being the patient's.  Scope and target move in the same phase.  The tip of the scope goes
 along with the airway that holds it, so that only the difference of the two counts: in the frame of the
 reference image the scope stays, and the target moves by `A f (g(h_target) - g(h_scope))`.  The phase f runs
 from 0 at end-exhale, where the image was taken, to 1; the procedure is at any time of the cycle.  g is that
-of `anatomy.motion.source`.  Where the motion of the patient is known, it takes the place of this model.
+of `anatomy.motion.source`.  Where the motion of the patient is known, it takes the place of this model.  The
+border of the vessels is that which the patient's segmentation states.
 """
 
 from dataclasses import replace
@@ -17,7 +18,7 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.motion import LEFT, Motion
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.errors import IN_WINDOW, BreathingError, ErrorModel
+from lungaccess.problem.errors import IN_WINDOW, BreathingError, ErrorModel, PositionError
 from lungaccess.uncertainty.breathing.window import carrier
 from lungaccess.uncertainty.risk.resting import about_resting_tip
 
@@ -32,7 +33,7 @@ def phase(share_of_time: Float) -> Float:
 
 
 def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
-    """Return an error model at the place of a plan, with the patient's own breathing where that is known.
+    """Return an error model at the place of a plan, with the patient's own breathing and vessels.
 
     Errors about the resting shaft are stated about the plan.
 
@@ -42,7 +43,7 @@ def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     Raises:
         SettingsError: If the errors depend on the lobe and the patient came without lobes.
     """
-    model = about_resting_tip(_at_place(model, plan, lung), plan, lung)
+    model = _with_border(about_resting_tip(_at_place(model, plan, lung), plan, lung), lung)
     motion, window, stated = lung.motion, plan.window, model.breathing
     if motion is None or motion.warning_only:
         return model
@@ -56,6 +57,15 @@ def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
         source=f"the patient's own: {motion.source}; spread over breaths [Liang2018]",
     )
     return replace(model, breathing=term)
+
+
+def _with_border(model: ErrorModel, lung: Lung) -> ErrorModel:
+    """Return the errors with the border of the patient's own vessels, unless the model states another."""
+    if not lung.vessel_border_mm or model.vessel_border.rms:
+        return model
+    mean, spread = lung.vessel_border_mm
+    source = "the patient's own: `vessel_border_mm`, see `anatomy.segmentation.vessels.border_mm`"
+    return replace(model, vessel_border=PositionError(patient_mm=spread, bias_mm=(mean,), source=source))
 
 
 def _at_place(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:

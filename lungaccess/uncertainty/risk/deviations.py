@@ -9,6 +9,7 @@ from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.errors import VESSEL_BORDER
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES, Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import N_START, Judging, find_pieces, find_starts
@@ -20,6 +21,7 @@ COLUMNS = (
     "rotation_rad",
     "factor",
     "target_mm",
+    "border_mm",
     "insertion_mm",
     "roll_rad",
     "stop_mm",
@@ -44,6 +46,7 @@ class Deviations:
         roll_rad, stop_mm ((N, A) float64): Added to the needle's angle in each arc, and to its insertion
             where the arc ends.
         target_mm ((N, 3) float64, LPS mm): Shift of the target.
+        border_mm ((N,) float64): How far all vessels reach out of their masks.
     """
 
     scope_mm: Float
@@ -55,6 +58,7 @@ class Deviations:
     roll_rad: Float
     stop_mm: Float
     target_mm: Float
+    border_mm: Float
 
     @property
     def count(self) -> int:
@@ -78,6 +82,7 @@ def no_deviations(count: int, n_arcs: int, n_twisted: int = 0) -> dict[str, Floa
         "roll_rad": np.zeros((count, n_arcs)),
         "stop_mm": np.zeros((count, n_arcs)),
         "target_mm": np.zeros((count, 3)),
+        "border_mm": np.zeros(count),
     }
 
 
@@ -89,6 +94,7 @@ FIELD_OF: dict[str, str] = {
     "needle_roll": "roll_rad",
     "needle_insertion": "stop_mm",
     "target_position": "target_mm",
+    VESSEL_BORDER: "border_mm",
 }
 """The field of `Deviations` that holds each kind of error."""
 

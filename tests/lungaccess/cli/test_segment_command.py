@@ -13,6 +13,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
 from anatomy.io.images import write_volume
 from anatomy.phantom import Phantom
+from anatomy.segmentation.vessels import LARGE_RADIUS_MM, border_mm
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.showing.report.html.volumes import find_ct
@@ -65,6 +66,8 @@ def test_a_ct_becomes_a_patient_that_info_reads(
     assert quality["airway"]["ends"] >= 10
     assert len(load_patient(out).targets_lps) == 1
     assert "large_radius_mm = 2.828\n" in (out / "patient.toml").read_text()
+    stated = border_mm(LARGE_RADIUS_MM, float(small_phantom.grid.spacing_mm[2]))
+    assert load_patient(out).vessel_border_mm == pytest.approx(stated, abs=0.005)
     assert cli.main(["info", str(out), "--cache", str(tmp_path / "cache")]) == ExitCode.OK
 
 

@@ -30,7 +30,7 @@ from lungaccess.planning.procedure.kernels.spread import (
     tube_margin,
     unit,
 )
-from lungaccess.uncertainty.risk.kernels.chain import TARGET, TILT, TUBE_PIECES, find_end, set_planar
+from lungaccess.uncertainty.risk.kernels.chain import BORDER, TARGET, TILT, TUBE_PIECES, find_end, set_planar
 from lungaccess.uncertainty.risk.kernels.deviation import N_PIECE, follow
 from stages.needle.kernels import Limits, Obstacles, blocker_on_arc, single_arc_exceeds
 from stages.tube.kernels import ACCEPTED, BRANCH, N_TRACE, validate_arcs
@@ -296,7 +296,15 @@ def _share_clear(scene, choices, c, frame, places, target, of_needle, best, star
             good = math.sqrt(x * x + y * y + z * z) <= scene.radius
         if good:
             touched = follow(
-                scene.judged, depth, scene.mediastinal, start, pieces, TUBE_PIECES, 0.0, scene.forbidden
+                scene.judged,
+                depth,
+                scene.mediastinal,
+                start,
+                pieces,
+                TUBE_PIECES,
+                0.0,
+                scene.forbidden,
+                choices.errors[d, BORDER],
             )
             good = touched & scene.forbidden == 0
         failed += not good

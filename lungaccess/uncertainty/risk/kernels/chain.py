@@ -11,7 +11,7 @@ from lungaccess.uncertainty.risk.kernels.deviation import CURVATURE, LENGTH, RAD
 
 TUBE_PIECES = 4
 """Arcs of planar tubes: straight and bent within the outer tube, straight and bent beyond it."""
-SHIFT, TILT, ROTATION, FACTOR, TARGET, INSERTION = 0, 3, 5, 6, 7, 10
+SHIFT, TILT, ROTATION, FACTOR, TARGET, BORDER, INSERTION = 0, 3, 5, 6, 7, 10, 11
 """Where the errors of a draw begin in a row: behind the insertions of all tubes stand the roll and the stop
 of each arc of the needle."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import borrowing_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
-from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE
+from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 
 LENGTH = 0
 ROLL = 1
@@ -35,22 +35,31 @@ TOUCHES_MM = 1e-9
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)
 _LUMEN = np.int64(LUMEN)
+_VESSEL = np.int64(VESSEL)
 
 
 @borrowing_kernel
-def _touch(labels, geometry, bits, touched, x, y, z, radius, spared, lumen_mm):
+def _touch(labels, geometry, bits, touched, x, y, z, radius, spared, lumen_mm, border_mm):
     """Add what a ball touches, and return how far no structure that is not yet touched can be met.
 
     The airway of the branch `spared` counts for nothing (-1: none is spared), but the lumen of any airway
-    nearer than `lumen_mm` does (negative: it does not).
+    nearer than `lumen_mm` does (negative: it does not).  Vessels reach farther than their voxels by
+    `border_mm`; where that is negative, their voxels still count where the middle of the ball lies in one.
     """
     reach = radius + EXACT_REACH_MM
     gap = EXACT_REACH_MM
     left = bits & ~touched
+    if border_mm != 0.0 and left & VESSEL:
+        least = max(radius + border_mm, 0.0)
+        distance, _label = exact_distance(labels, geometry, x, y, z, _VESSEL, _NOBODY, least + EXACT_REACH_MM)
+        if distance < least - TOUCHES_MM or distance == 0.0:
+            touched |= VESSEL
+        gap = min(gap, distance - least)
+        left &= ~VESSEL
     while left != 0:
         distance, label = exact_distance(labels, geometry, x, y, z, left, spared, reach)
         if distance >= radius - TOUCHES_MM:
-            gap = distance - radius
+            gap = min(gap, distance - radius)
             break
         hit = label & left
         if hit != AIRWAY and (label >> BRANCH_SHIFT) - 1 == spared:
@@ -87,7 +96,7 @@ def _bend(pose, nx, ny, nz, roll, kappa):
 
 
 @borrowing_kernel
-def follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enough):
+def follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enough, border_mm):
     """Return what one chain touches.
 
     A device touches a structure where its axis is nearer to a voxel of it, as a solid box, than its
@@ -106,6 +115,7 @@ def follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enou
         n_tube: int.
         exempt_mm: float.
         enough (int): Flags of which one ends the search for more; 0 to find all that is touched.
+        border_mm (float): How far all vessels reach out of their voxels, see `_touch`.
 
     Returns:
         int: The bits of the structures touched, with STAYS_INSIDE where the chain was not judged.
@@ -141,7 +151,7 @@ def follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enou
                     continue
                 branch = here
             else:
-                step = distance_bound(clearance, geometry, x, y, z) - radius
+                step = distance_bound(clearance, geometry, x, y, z) - radius - max(border_mm, 0.0)
                 if step < MIN_GAP_MM:
                     spared = pierced if p < n_tube or done + at < tube_mm + exempt_mm else -1
                     lumen_mm = -1.0
@@ -149,7 +159,9 @@ def follow(obstacles, depth, mediastinal, start, pieces, n_tube, exempt_mm, enou
                         lumen_mm = radius
                     elif done + at > left_at + WALL_ZONE_MM:
                         lumen_mm = 0.0
-                    touched, step = _touch(labels, geometry, bits, touched, x, y, z, radius, spared, lumen_mm)
+                    touched, step = _touch(
+                        labels, geometry, bits, touched, x, y, z, radius, spared, lumen_mm, border_mm
+                    )
             if at >= length:
                 break
             at = min(at + step, length)

@@ -8,6 +8,7 @@ from anatomy.base.typed import Bool, Float, UInt16
 from anatomy.kernels.compiling import borrowing_kernel, kernel
 from lungaccess.plans.kernels.tissue import miss_of, tissue_taken
 from lungaccess.uncertainty.risk.kernels.chain import (
+    BORDER,
     ROTATION,
     TARGET,
     find_end,
@@ -62,10 +63,12 @@ def _shift(errors, n):
 
 
 @borrowing_kernel
-def _touched(obstacles, judging, start, pieces, n_tube, enough):
+def _touched(obstacles, judging, start, pieces, n_tube, enough, border_mm):
     """Return what a chain touches, see `deviation.follow`."""
     lumen = (judging.depth, judging.geometry)
-    return follow(obstacles, lumen, judging.mediastinal, start, pieces, n_tube, judging.exempt_mm, enough)
+    return follow(
+        obstacles, lumen, judging.mediastinal, start, pieces, n_tube, judging.exempt_mm, enough, border_mm
+    )
 
 
 @kernel(nogil=True)
@@ -89,7 +92,9 @@ def find_successes(devices, errors, which, obstacles, judging, wanted, forbidden
         _set_pieces(devices, errors, which, first + m, pieces)
         done[m] = tissue_taken(wanted, _shift(errors, first + m), find_end(start, pieces)) >= wanted.least
         if done[m]:
-            done[m] = _touched(obstacles, judging, start, pieces, devices.n_tube, forbidden) & forbidden == 0
+            border_mm = errors[first + m, BORDER]
+            touched = _touched(obstacles, judging, start, pieces, devices.n_tube, forbidden, border_mm)
+            done[m] = touched & forbidden == 0
 
 
 @kernel(nogil=True)
@@ -106,7 +111,7 @@ def find_outcomes(devices, errors, which, obstacles, judging, wanted, first, tou
         end = find_end(start, pieces)
         miss_mm[m] = miss_of(wanted, _shift(errors, first + m), end)
         taken[m] = tissue_taken(wanted, _shift(errors, first + m), end)
-        touched[m] = _touched(obstacles, judging, start, pieces, devices.n_tube, 0)
+        touched[m] = _touched(obstacles, judging, start, pieces, devices.n_tube, 0, errors[first + m, BORDER])
 
 
 @kernel(nogil=True)
@@ -124,12 +129,13 @@ def find_pieces(devices, errors, which, pieces):
 
 
 @kernel(nogil=True)
-def follow_chains(starts, pieces, n_tube, obstacles, judging, wanted, target_mm, touched, miss_mm, taken):
+def follow_chains(starts, pieces, n_tube, obstacles, judging, wanted, moved, touched, miss_mm, taken):
     """Note what chains touch, `(N,)` flags, how far they miss, `(N,)` mm, and what they take.
 
-    `target_mm` `(N, 3)` says how far the nodule lies from where it was planned; see `deviation.follow`.
+    `moved` `(N, 4)` says how far the nodule lies from where it was planned, and how far vessels reach out of
+    their voxels, in mm; see `deviation.follow`.
     """
     for n in range(starts.shape[0]):
-        touched[n] = _touched(obstacles, judging, starts[n], pieces[n], n_tube, 0)
-        end, shift = find_end(starts[n], pieces[n]), (target_mm[n, 0], target_mm[n, 1], target_mm[n, 2])
+        touched[n] = _touched(obstacles, judging, starts[n], pieces[n], n_tube, 0, moved[n, 3])
+        end, shift = find_end(starts[n], pieces[n]), (moved[n, 0], moved[n, 1], moved[n, 2])
         miss_mm[n], taken[n] = miss_of(wanted, shift, end), tissue_taken(wanted, shift, end)

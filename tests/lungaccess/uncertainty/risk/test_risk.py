@@ -36,6 +36,7 @@ from lungaccess.problem.errors import (
 )
 from lungaccess.uncertainty.risk.assessment import assess
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
 from lungaccess.uncertainty.risk.draws import Draws
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
@@ -168,6 +169,46 @@ def test_what_is_touched_agrees_with_distances_to_all_voxels(plan: Plan, small_l
             if on_tube.min() > pieces[n, :TUBE_PIECES, kernel.RADIUS].max() + 0.5 * SAMPLES_MM:
                 assert not outcomes.touched[n] & bit
     assert seen > 10
+
+
+def test_vessels_reach_out_of_their_voxels_as_far_as_their_border(plan: Plan, small_lung: Lung) -> None:
+    """A chain touches the voxels that lie nearer than its radius and the border; other structures stay."""
+    there, wide = RiskAssessor(plan, small_lung), ErrorModel(scope_direction=AngleError(attempt_deg=12.0))
+    border = replace(wide, vessel_border=PositionError(patient_mm=1.0, bias_mm=(0.5,)))
+    plain, moved = (Draws(80, there.n_arcs, 2).deviations(model) for model in (wide, border))
+    assert moved.border_mm.min() < -0.5 and moved.border_mm.max() > 1.5
+    before, after = there.outcomes(plain), there.outcomes(moved)
+    assert (before.touched & ~VESSEL == after.touched & ~VESSEL).all()
+    pieces, seen = deviated_pieces(plan, moved), {True: 0, False: 0}
+    for n in range(80):
+        points, lengths = chain(plan, small_lung, moved, n)
+        of_needle = lengths > pieces[n, :TUBE_PIECES, kernel.LENGTH].sum()
+        if after.touched[n] & kernel.STAYS_INSIDE or not of_needle.any():
+            continue
+        near = brute_clearance(small_lung.labels, small_lung.grid, points, VESSEL, 6.0)
+        reach = SYSTEM.needle.radius_mm + moved.border_mm[n]
+        hits = near[of_needle].min() < max(reach - UNSEEN_MM, 1e-9)
+        thick = pieces[n, :TUBE_PIECES, kernel.RADIUS].max() + max(moved.border_mm[n], 0.0)
+        misses = near[of_needle].min() > max(reach, 0.0) + SAMPLES_MM
+        misses &= near[~of_needle].min(initial=np.inf) > thick + SAMPLES_MM
+        if hits or misses:
+            assert bool(after.touched[n] & VESSEL) == hits
+            seen[bool(hits)] += 1
+    assert min(seen.values()) > 5
+    assert (before.touched & VESSEL != after.touched & VESSEL).any()
+
+
+def test_the_border_of_a_patients_vessels_is_drawn_unless_the_model_states_one(
+    plan: Plan, small_lung: Lung
+) -> None:
+    stated = ErrorModel(vessel_border=PositionError(patient_mm=0.2))
+    assert model_for(NOTHING, plan, small_lung).vessel_border == PositionError()
+    known = replace(small_lung, vessel_border_mm=(0.4, 0.6))
+    own = model_for(NOTHING, plan, known).vessel_border
+    assert (own.bias, own.patient, own.attempt) == ((0.4,), 0.6, 0.0)
+    assert model_for(stated, plan, known).vessel_border == stated.vessel_border
+    chances = [assess(plan, each, samples=2000, each_kind=False).succeeds for each in (small_lung, known)]
+    assert chances[1].count < chances[0].count
 
 
 def test_a_scope_goes_as_far_as_the_lumen_lets_it(plan: Plan, small_lung: Lung) -> None:

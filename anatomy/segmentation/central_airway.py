@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int, Mask
@@ -28,9 +27,6 @@ USUAL_REACH_MM = 20.0
 NARROW, CLOSED, WIDER = 0.75, 0.6, 1.15
 """Shares of the trachea's cross-section: an open glottis is below the first, a closed one and partial slices
 are below the second, and larynx, pharynx or mouth are above the third."""
-PHARYNX, PHARYNX_MM = 1.4, 10.0
-"""An airway wider than this share of the trachea over this length is pharynx or mouth, also where an open
-glottis below it is as wide as the trachea."""
 GREATEST_STEP_SHARE, GREATEST_STEP_ML = 0.5, 12.0
 """Growing by more than both from one threshold to the next is a leak into the lung."""
 
@@ -299,10 +295,21 @@ def without_throat(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]
     return below(lumen, level), (top - level) * slice_mm
 
 
-def cut_to_tree(
-    lumen: Mask, seed_ijk: Int, grid: Grid, tree_of: Callable[[Mask], AirwayTree | AnatomyError]
+def without_top(
+    lumen: Mask, seed_ijk: Int, grid: Grid, tree_of: Callable[[Mask], object]
 ) -> tuple[Mask, float]:
-    """Return what `without_throat` does, cut where the airway is narrowest if only that gives it a tree."""
+    """Cut the airway off at the throat; where no tree can be made of what is left, at its narrowest place.
+
+    A glottis may be as wide as the trachea: only the tree then tells that pharynx and mouth are there.
+
+    Args:
+        lumen, seed_ijk, grid: See `without_throat`.
+        tree_of: Makes the tree of a lumen, or an AnatomyError that says why there is none.
+
+    Returns:
+        - lumen ((ni, nj, nk) bool) - As it was where no cut gives it a tree.
+        - length_mm - How much was cut off.
+    """
     lumen, cut_mm = without_throat(lumen, seed_ijk, grid)
     if isinstance(tree_of(lumen), AnatomyError):
         level = narrowest_level(lumen, seed_ijk)
@@ -324,19 +331,16 @@ def throat_level(air: Mask, seed_ijk: Int, slice_mm: float) -> int:
     """Return the first axial level of the throat above a seed in the trachea; the image's end if none.
 
     The trachea narrows at the glottis, and above it the airway ends or becomes wider than the trachea.  Where
-    it does neither, it is only narrow, as at mucus or a stenosis, and goes on.  An airway that does not
-    narrow and stays much wider than the trachea is a throat, too.
+    it does neither, it is only narrow, as at mucus or a stenosis, and goes on.
     """
     reach = max(1, round(USUAL_REACH_MM / slice_mm))
     first, count = int(seed_ijk[2]), int(air.shape[2])
     lower = _areas(air, seed_ijk, range(first, max(first - reach, -1), -1))
     upper = _areas(air, seed_ijk, range(first, count))
     usual = float(np.median([*lower, *upper[1:reach]])) if lower else 0.0
-    long = max(1, round(PHARYNX_MM / slice_mm))
     for above, area in enumerate(upper):
-        most, least = max(upper[above:]), min(upper[above : above + long])
-        narrow = area < NARROW * usual and (most < CLOSED * usual or most > WIDER * usual)
-        if narrow or (usual and least > PHARYNX * usual):
+        most = max(upper[above:])
+        if area < NARROW * usual and (most < CLOSED * usual or most > WIDER * usual):
             return first + above
     return count
 

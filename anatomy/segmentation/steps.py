@@ -17,7 +17,7 @@ from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
 from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
 from anatomy.segmentation.airway import Airways, wall_around
 from anatomy.segmentation.box import Box
-from anatomy.segmentation.central_airway import cut_to_tree
+from anatomy.segmentation.central_airway import without_top
 from anatomy.segmentation.folder import (
     IMAGES,
     Description,
@@ -189,7 +189,7 @@ class Steps:
                 lumen = learned_airway(self._ct, network)
             if lumen is None:
                 found = segment_airway(self._ct, lungs, progress=self._tell)
-                lumen, cut_mm = cut_to_tree(found.lumen, lungs.trachea_seed_ijk, grid, self._tree_of)
+                lumen, cut_mm = without_top(found.lumen, lungs.trachea_seed_ijk, grid, self._tree_of)
                 # The wall of what was cut off stays: it is an obstacle.
                 wall = found.wall | (found.lumen & ~lumen) if wall is None else wall
                 if cut_mm:

@@ -18,7 +18,7 @@ from anatomy.plausibility import require_plausible
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.central_airway import cut_to_tree
+from anatomy.segmentation.central_airway import without_top
 from anatomy.segmentation.gate import plausibility
 from anatomy.segmentation.input import require_chest_ct
 from anatomy.segmentation.lungs import Lungs, segment_lungs
@@ -111,7 +111,8 @@ def segmented(
     def tree_of(mask: Mask) -> AirwayTree | AnatomyError:
         return tree_or_error(Volume(grid=finer.grid, array=mask))
 
-    lumen, _ = cut_to_tree(segment_airway(finer, lungs).lumen, lungs.trachea_seed_ijk, finer.grid, tree_of)
+    lumen = segment_airway(finer, lungs).lumen
+    lumen, _cut_mm = without_top(lumen, lungs.trachea_seed_ijk, finer.grid, tree_of)
     tree = tree_of(lumen)
     failed, further = plausibility(finer, lungs, tree)
     said = (

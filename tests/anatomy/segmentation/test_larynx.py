@@ -42,18 +42,6 @@ def test_an_open_glottis_below_a_wide_pharynx_is_the_end(share: float) -> None:
     assert _cut(lumen)[1] == pytest.approx(1.5 * 34)
 
 
-@pytest.mark.parametrize("share", [0.8, 0.9, 1.0])
-def test_a_pharynx_is_no_trachea_where_the_glottis_is_as_wide_as_that(share: float) -> None:
-    lumen = _trachea((42, 8.0), (4, 8.0 * share**0.5), (10, 9.0), (20, 12.0))
-    assert throat_level(lumen, SEED, 1.5) == 59
-    assert _cut(lumen)[1] == pytest.approx(1.5 * 20)
-
-
-def test_a_short_wide_place_of_a_trachea_stays() -> None:
-    lumen = _trachea((42, 8.0), (4, 10.0), (42, 8.0))
-    assert throat_level(lumen, SEED, 1.5) == lumen.shape[2]
-
-
 @pytest.mark.parametrize("above", [(42, 8.0), (42, 8.4)])
 def test_a_narrow_place_of_a_trachea_stays(above: tuple[int, float]) -> None:
     lumen = _trachea((42, 8.0), (4, 6.0), above)

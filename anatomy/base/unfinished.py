@@ -46,6 +46,10 @@ def _is_taken(folder: Path, stack: contextlib.ExitStack) -> bool:
     return False
 
 
+MARK = ".lungaccess"
+"""A folder of results holds this one: by it the folder is known, and in it lies the lock."""
+
+
 @contextlib.contextmanager
 def sole_writer(results: Path, folder: Path, name: str = LOCK) -> Iterator[None]:
     """Hold a lock in a folder as the one command that writes results.

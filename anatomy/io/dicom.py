@@ -14,7 +14,7 @@ import numpy as np
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.files import reading, reason
 from anatomy.base.records import frozen_value
-from anatomy.base.typed import Float
+from anatomy.base.typed import Float, Float32
 from anatomy.grid import Grid, Volume
 from anatomy.io.image_header import image_shape, named_grid, require_directions, require_lengths
 
@@ -44,13 +44,38 @@ MOST_NAMED = 5
 
 @frozen_value
 class SeriesInfo:
-    """One series of a folder: what a person needs to choose it, and its files (unsorted)."""
+    """One series of a folder: what a person needs to choose it, and its files (unsorted).
+
+    `slice_mm` is the mean distance of its slices, and 0 where they state no places; `middle` is the file of
+    the slice in the middle.
+    """
 
     uid: str
     number: int | None
     description: str
     modality: str
     paths: tuple[Path, ...]
+    slice_mm: float
+    middle: Path
+
+    @property
+    def length_mm(self) -> float:
+        """How much of the body it covers along its slices."""
+        return self.slice_mm * (len(self.paths) - 1)
+
+    def picture_hu(self) -> Float32:
+        """Return the slice in the middle in HU, `(rows, columns)`.
+
+        Raises:
+            FileError: If it cannot be read, or holds no picture of grey values.
+        """
+        from pydicom import dcmread
+
+        with _reading(self.middle):
+            slice_ = dcmread(self.middle)
+            _require_grey_values(slice_, str(self.middle))
+            values = slice_.pixel_array * float(slice_.RescaleSlope) + float(slice_.RescaleIntercept)
+            return np.asarray(values, dtype=np.float32)
 
     def describe(self) -> str:
         """Say what the series is in one line."""
@@ -186,12 +211,19 @@ def _likeness(path: Path) -> tuple[Path, str]:
 def _info(uid: str, files: Sequence[tuple[Path, FileDataset]]) -> SeriesInfo:
     first = files[0][1]
     number = first.get("SeriesNumber")
+    try:
+        places = np.array([header.ImagePositionPatient for _, header in files], dtype=np.float64)
+        along = places @ np.cross(*np.reshape(first.ImageOrientationPatient, (2, 3)).astype(np.float64))
+    except (AttributeError, TypeError, ValueError):  # A picture without a place, such as a report's.
+        along = np.zeros(len(files))
     return SeriesInfo(
         uid=uid,
         number=None if number is None else int(number),
         description=str(first.get("SeriesDescription", "")),
         modality=str(first.get("Modality", "?")),
         paths=tuple(path for path, _ in files),
+        slice_mm=float(np.ptp(along)) / max(len(files) - 1, 1),
+        middle=files[int(np.argsort(along, kind="stable")[len(files) // 2])][0],
     )
 
 

@@ -156,6 +156,21 @@ def thick_slices_mm(path: str | Path) -> float:
     return _read_description(description).thick_slices_mm
 
 
+def require_thin_slices(path: str | Path) -> None:
+    """Refuse a patient whose masks were made from thick slices.
+
+    Raises:
+        SettingsError: If they were, or the description is wrong.
+    """
+    distance_mm = thick_slices_mm(path)
+    if distance_mm:
+        raise SettingsError(
+            f"The masks of {path} were made from slices {distance_mm:.1f} mm apart",
+            expected="slices that show small airways and vessels: at most 3 mm",
+            remedy="Segment a thinner reconstruction; `lungaccess plan --thick-slices` plans all the same",
+        )
+
+
 def _thick_slices(distance_mm: float) -> tuple[str, ...]:
     if not distance_mm:
         return ()

@@ -174,6 +174,7 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
         "large_radius_mm": request.large_radius_mm,
         "accepted": list(steps.accepted),
         "seed_lps": None if request.seed_lps is None else request.seed_lps.tolist(),
+        "nodules": list(request.given.nodules),
         "corrected": steps.corrected,
         "from_elsewhere": steps.from_elsewhere,
         "warnings": warnings,

@@ -510,23 +510,12 @@ def load_lung(
         AnatomyError: If the masks fail a check that `accept` does not name.
         SettingsError: If the masks were made from thick slices, unless `thick_slices` accepts them.
     """
+    from anatomy.io.own_masks import require_thin_slices
     from lungaccess.problem.patients import load_patient
 
     if not thick_slices:
-        _refuse_thick_slices(patient)
+        require_thin_slices(patient)
     with progress(f"reading {patient}") as shown:
         return load_patient(
             patient, cache=cache, progress=lambda step: shown.step(step, STEP_SHARES.get(step)), accept=accept
-        )
-
-
-def _refuse_thick_slices(patient: Path) -> None:
-    from anatomy.io.own_masks import thick_slices_mm
-
-    distance_mm = thick_slices_mm(patient)
-    if distance_mm:
-        raise SettingsError(
-            f"The masks of {patient} were made from slices {distance_mm:.1f} mm apart",
-            expected="slices that show small airways and vessels: at most 3 mm",
-            remedy="Segment a thinner reconstruction; `lungaccess plan --thick-slices` plans all the same",
         )

@@ -13,11 +13,9 @@ from cyclopts import Parameter
 
 from anatomy.base.errors import FileError
 from anatomy.base.files import require_writable_folder
-from anatomy.base.unfinished import sole_writer
+from anatomy.base.unfinished import MARK, sole_writer
 from lungaccess.cli import terminal
 
-MARK = ".lungaccess"
-"""A folder of results holds this one: by it the folder is known, and in it lies the lock."""
 MOST_NAMED = 5
 """Files that a message names."""
 OUTPUTS = frozenset({"--out", "--page", "--film", "--movie", "--picture", "--csv", "--parquet"})

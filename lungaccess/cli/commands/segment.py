@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from anatomy.base.errors import AnatomyError
-from anatomy.base.files import write_json
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.frames import parse_point
 from anatomy.segmentation.box import VOXEL_MM
@@ -19,19 +18,8 @@ from lungaccess.cli.result_folder import claim_folder
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from anatomy.grid import Volume
     from anatomy.segmentation.pipeline import Segmentation
     from anatomy.segmentation.scan_warnings import Quality
-
-STEP_SHARES = {
-    "reading the CT": 0.02,
-    "checking the CT": 0.06,
-    "lungs: coarse image": 0.08,
-    "lungs: boundary": 0.14,
-    "lobes and fissures": 0.7,
-    "pictures": 0.95,
-}
-"""Share of the work that is done when a step begins, as measured on a CT of 512 x 512 x 275 voxels."""
 
 
 def segment(
@@ -104,9 +92,8 @@ def segment(
         json: Print JSON, the content of quality.json, instead of tables.
     """
     from anatomy.segmentation.pipeline import memory_estimate_gib, read_ct
-    from anatomy.segmentation.pipeline import segment as run
     from anatomy.segmentation.request import Given, SegmentationRequest
-    from anatomy.segmentation.scan_warnings import quality_of
+    from lungaccess.showing.report.segmented import REFUSED_PICTURE, segment_with_pictures
 
     for point in (target, seed, *nodule):
         if point is not None:
@@ -151,37 +138,19 @@ def segment(
             ),
         )
         try:
-            result = run(request, lambda step: shown.step(step, STEP_SHARES.get(step)))
-        except AnatomyError as error:
+            made = segment_with_pictures(request, shown.step, pictures=pictures)
+        except AnatomyError:
             if pictures:
-                _show_refused(volume, error, out / "refused.png")
+                found = out / REFUSED_PICTURE
+                terminal.progress_console.print(f"{found} shows what was found", highlight=False)
             raise
-        (out / "refused.png").unlink(missing_ok=True)
-        quality = quality_of(result.parts)
-        if pictures:
-            from lungaccess.showing.report.segmentation import segmentation_png
-
-            shown.step("pictures", STEP_SHARES["pictures"])
-            segmentation_png(volume, result.parts, out / "segmentation.png")
-    warnings = [*result.warnings, *quality.warnings]
-    record = quality.to_mapping() | {"warnings": warnings}
-    write_json(out / "quality.json", record)
     if output.json:
-        terminal.show_json(record)
+        terminal.show_json(made.record)
         return ExitCode.OK
-    terminal.show(_tables(result, quality))
-    terminal.show_warnings(warnings)
-    terminal.say(_written(result))
+    terminal.show(_tables(made.result, made.quality))
+    terminal.show_warnings(made.warnings)
+    terminal.say(_written(made.result))
     return ExitCode.OK
-
-
-def _show_refused(ct: "Volume", error: AnatomyError, path: Path) -> None:
-    """Draw the CT with what was found in it until it was refused."""
-    from anatomy.segmentation.parts import RefusedError
-    from lungaccess.showing.report.segmentation import segmentation_png
-
-    segmentation_png(ct, error.parts if isinstance(error, RefusedError) else None, path)
-    terminal.progress_console.print(f"{path} shows what was found", highlight=False)
 
 
 def _tables(result: "Segmentation", quality: "Quality") -> "list[Table]":

@@ -10,17 +10,18 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Port
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientOptions
+from lungaccess.cli.result_folder import held
 from lungaccess.cli.shown_ct import CtOption, shown_ct
 
 
 def view(
     patient: Annotated[
-        Path,
+        Path | None,
         Parameter(
             help="Folder of masks: Med-RAD, TotalSegmentator, or own masks with a patient.toml; or a CT, an "
-            "image file or a folder of DICOM, which is segmented first."
+            "image file or a folder of DICOM, which is segmented first. Without one the page lets you choose."
         ),
-    ],
+    ] = None,
     *,
     system: Annotated[
         str, Parameter(help="System that is shown first: name of a preset, or path of a TOML file.")
@@ -48,10 +49,10 @@ def view(
     import asyncio
     import webbrowser
 
-    from anatomy.io.images import image_stem
     from anatomy.io.patients import is_ct
     from lungaccess.cli.commands.segment import segment
     from lungaccess.problem import load_system, shipped_names
+    from lungaccess.showing.report.segmented import patient_folder
 
     try:
         from lungaccess.showing.explorer import Address, Explorer, PatientSource
@@ -62,19 +63,21 @@ def view(
             remedy="pip install 'lungaccess[view]'",
         ) from error
     first = load_system(system)
-    if is_ct(patient):
-        name = image_stem(patient) if patient.is_file() else patient.resolve().name
-        made = out or Path(f"{name}-patient")
+    if patient is not None and is_ct(patient):
+        made = out or patient_folder(patient)
         terminal.console.quiet |= output.json  # Only the address is printed then.
         segment(patient, out=made, series=series, thick_slices=thick_slices, accept=output.accept)
+        held.close()  # The explorer writes into the folder, too, when a nodule is added.
         patient = made
-    shown = shown_ct(ct, patient)
+    shown = None if patient is None else shown_ct(ct, patient)
     if shown is not None:
         shown.read()  # Here, where a file that is none is refused before anything is shown.
-    output.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
+    if patient is not None:
+        output.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
+        patient = patient.resolve()
     own = () if system in shipped_names() else ((Path(system).resolve(), first),)
     source = PatientSource(
-        folder=patient.resolve(), system=first.name, own=own, cache=output.cache,
+        folder=patient, system=first.name, own=own, cache=output.cache,
         ct=shown, accept=output.accept,
     )  # fmt: skip
 

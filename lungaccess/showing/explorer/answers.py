@@ -14,6 +14,7 @@ from anatomy.base.kernel_clock import working_cpu_s
 from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Float, Int
 from anatomy.base.words import plural
+from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.planning import ProgressEvent, run, tips_near
 from lungaccess.planning.coupled import Atlas, atlas_is_kept, feasible_exits, open_atlas
@@ -24,6 +25,7 @@ from lungaccess.problem.goals import Goal
 from lungaccess.problem.request import Request, goal_of
 from lungaccess.showing.explorer import questions as ask
 from lungaccess.showing.explorer.changed_system import ChosenPlace, plan_command, system_of
+from lungaccess.showing.explorer.opening import looked, opened, outlined, with_nodule
 from lungaccess.showing.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
 from lungaccess.showing.explorer.questions import WhatIf
 from lungaccess.showing.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
@@ -60,7 +62,7 @@ class Answers:
         """The patient, read when it is first needed."""
         if self._lung is None:
             self._lung = load_patient(
-                self._source.folder, cache=self._source.cache, accept=self._source.accept
+                self._source.patient, cache=self._source.cache, accept=self._source.accept
             )
         return self._lung
 
@@ -90,6 +92,27 @@ class Answers:
             self._atlases.popitem(last=False)
         return replace(self._atlases[key], system=system)
 
+    def _look(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
+        yield looked(asked.question)
+
+    def _open(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        yield from opened(asked.question, self._source, self._folder, turn)
+
+    def _outline(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        question, point = asked.question, np.array(asked.question.point)
+        if question.take:
+            yield with_nodule(point, self._source, turn)
+            return
+        shown, size = outlined(self.lung, self._ct(), point)
+        yield Part({"answer": "outline", **size, **image_parts(shown, self._source, question.point)})
+
+    def _ct(self) -> Volume:
+        """Return the CT of the patient."""
+        ct = patient_ct(self._source.ct)
+        if ct is None:
+            raise SettingsError("The patient came without a CT", remedy="Start the explorer with --ct")
+        return ct
+
     def _patient(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         yield Part({"answer": "patient", **patient_facts(self.lung, self._source)})
 
@@ -103,9 +126,7 @@ class Answers:
     def _slice(self, asked: Asked, _turn: Turn) -> Iterator[Part]:
         from lungaccess.showing.explorer.patient import ct_slice
 
-        question, ct = asked.question, patient_ct(self._source.ct)
-        if ct is None:
-            raise SettingsError("The patient came without a CT", remedy="Start the explorer with --ct")
+        question, ct = asked.question, self._ct()
         plane = question.origin, question.across, question.down
         yield Part({"answer": "slice"}, {"hu": ct_slice(ct, *plane, question.columns, question.rows)})
 
@@ -236,7 +257,7 @@ class Answers:
             "exit_lps": np.asarray(found.tube.exit.point_lps).tolist(),
             **_least_clearance(found),
             "command": plan_command(
-                self._source.folder, question, system, own, self._source.cache, place
+                self._source.patient, question, system, own, self._source.cache, place
             ),
         }  # fmt: skip
         if not known:

@@ -11,6 +11,7 @@ from anatomy.base.errors import LungaccessError
 from anatomy.base.typed import Float, Float32
 from anatomy.grid import Volume
 from anatomy.lung import Lung
+from anatomy.segmentation.folder import STATE
 from lungaccess.problem import System, Target, load_system, preset_names, resolve_target
 from lungaccess.problem.nodules import nodules_of
 from lungaccess.showing.explorer.worker import PatientSource
@@ -42,12 +43,13 @@ def patient_facts(lung: Lung, source: PatientSource) -> dict[str, Any]:
     low, high = _box(lung)
     return {
         "patient": lung.name,
-        "folder": str(source.folder),
+        "folder": str(source.patient),
         "warnings": list(lung.warnings),
         "breath_hold": lung.breath_hold,
         "breathing_known": lung.motion is not None,
         "has_fissures": lung.has_fissures,
         "has_ct": source.ct is not None,
+        "may_outline": source.ct is not None and (source.patient / STATE).is_file(),
         "low_lps": low.tolist(),
         "high_lps": high.tolist(),
         "carina_lps": np.asarray(lung.tree.carina_lps).tolist(),

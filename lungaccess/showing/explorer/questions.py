@@ -65,6 +65,41 @@ class _Question:
 
 
 @settings
+class LookQuestion(_Question):
+    """What lies in a folder of this machine; in the one where the explorer was started if none is named."""
+
+    path: Annotated[str, Len(0, 4096)] = ""
+    worker: ClassVar[str] = ANSWERS
+
+
+@settings
+class OpenQuestion(_Question):
+    """Explore a patient, or segment a CT; of several series in a folder the answer lists all.
+
+    Args:
+        path: Folder or file of this machine.
+        series: UID of the series.
+        accept: Checks of `anatomy.plausibility.CHECKS` whose failure a person accepts.
+        thick_slices: Whether slices of more than 3 mm are accepted.
+    """
+
+    path: Annotated[str, Len(1, 4096)]
+    series: Annotated[str, Len(0, 200)] = ""
+    accept: tuple[Annotated[str, Len(1, 40)], ...] = ()
+    thick_slices: bool = False
+    worker: ClassVar[str] = ANSWERS
+
+
+@settings
+class OutlineQuestion(_Question):
+    """The nodule at a point: outlined at once, or made part of the patient, which is then explored anew."""
+
+    point: Point
+    take: bool = False
+    worker: ClassVar[str] = ANSWERS
+
+
+@settings
 class PatientQuestion(_Question):
     """The patient, the systems and their limits."""
 
@@ -179,6 +214,9 @@ class ExportQuestion(_Question):
 
 
 QUESTIONS: Mapping[str, type[_Question]] = {
+    "look": LookQuestion,
+    "open": OpenQuestion,
+    "outline": OutlineQuestion,
     "patient": PatientQuestion,
     "scene": SceneQuestion,
     "image": ImageQuestion,

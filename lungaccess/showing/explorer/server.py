@@ -8,6 +8,7 @@ import secrets
 import shutil
 import signal
 import tempfile
+import threading
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Iterator
 from importlib import resources
@@ -37,7 +38,7 @@ MOST_OPEN = 64
 FOLDERS = {"explorer": "lungaccess.showing.explorer", "report": "lungaccess.showing.report"}
 """Packages whose folder `page` holds modules and style sheets, by the first part of their addresses."""
 KINDS = {".js": "text/javascript", ".css": "text/css"}
-PAGE = "explorer.html"
+PAGE, OPENING = "explorer.html", "opening.html"
 REACH = (
     '<label><input type="checkbox" id="reach-slices"> reach in the slices</label>'
     '<label><input type="checkbox" id="reach-scene"> reach in 3-D</label>'
@@ -96,7 +97,7 @@ class Page:
 
 
 class Explorer:
-    """Serves the explorer of one patient until it is stopped.
+    """Serves the explorer of a patient, or the page that opens one, until it is stopped.
 
     Args:
         port: 0 for any free one.
@@ -128,9 +129,10 @@ class Explorer:
         """
         self._loop = asyncio.get_running_loop()
         self._loop.set_exception_handler(_without_failed_connections)
-        self._processes = {name: Process(self._source, self._folder, self._given) for name in NAMES}
+        self._processes = self._new_processes()
         app = web.Application(middlewares=[self._guard], client_max_size=1)
         app.router.add_get("/", self._index)
+        app.router.add_get("/open", self._index)
         app.router.add_get("/socket", self._socket)
         app.router.add_get("/download/{ticket}/{name}", self._download)
         app.router.add_get("/{folder}/{name}", self._asset)
@@ -175,6 +177,19 @@ class Explorer:
                     each.force_close()
             waiting = connections - self._served
             await asyncio.sleep(REQUEST_S)
+
+    def _new_processes(self) -> dict[str, Process]:
+        return {name: Process(self._source, self._folder, self._given) for name in NAMES}
+
+    def _explore(self, source: PatientSource, asking: Page) -> None:
+        """Explore another patient; pages that show the one before are closed, and cannot ask of this one."""
+        self._source = source
+        ended, self._processes = self._processes, self._new_processes()
+        for process in ended.values():
+            threading.Thread(target=process.stop, daemon=True).start()
+        for page in self._pages.values():
+            if page is not asking:
+                page.closing = asyncio.create_task(page.socket.close(code=1012, message=b"another patient"))
 
     def _end_processes(self) -> None:
         for each in self._processes.values():
@@ -238,8 +253,10 @@ class Explorer:
         )
         return response
 
-    async def _index(self, _request: web.Request) -> web.StreamResponse:
-        return web.Response(text=index_text(), content_type="text/html")
+    async def _index(self, request: web.Request) -> web.StreamResponse:
+        is_open = self._source.folder is not None and request.path == "/"
+        text = index_text() if is_open else page_text("explorer", OPENING)
+        return web.Response(text=text, content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.StreamResponse:
         folder, name = request.match_info["folder"], request.match_info["name"]
@@ -307,6 +324,8 @@ class Explorer:
             return
         if given.plan is not None:
             page.keep(given.plan)
+        if given.source is not None:
+            self._explore(given.source, page)
         if given.last:
             page.asked.pop(given.number, None)
         page.waiting_bytes += len(given.sent)
@@ -330,6 +349,8 @@ class Explorer:
                     await page.socket.send_str(given.sent)
                 else:
                     await page.socket.send_bytes(given.sent)
+                if given.source is not None:
+                    await page.socket.close(code=1012, message=b"another patient")
             page.waiting_bytes -= len(given.sent)
 
     def _ticket(self, file: Path) -> str:

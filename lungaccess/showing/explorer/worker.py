@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from anatomy.base.errors import AnatomyError, LungaccessError
+from anatomy.base.errors import AnatomyError, LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
 from lungaccess.problem import System
 from lungaccess.showing.explorer.messages import Frame, error_message, frame
@@ -27,7 +27,7 @@ class PatientSource:
     """Which patient is explored, and with what.
 
     Args:
-        folder: Of the patient.
+        folder: Of the patient; None until one is chosen on the page.
         system: Name of the preset that is shown first, or of `own`.
         own (tuple of (path, System)): Systems from files, which the page offers beside the presets.
         cache: Folder of prepared anatomy and atlases; the default one if None.
@@ -35,12 +35,23 @@ class PatientSource:
         accept: Checks of the masks whose failure is accepted.
     """
 
-    folder: Path
+    folder: Path | None
     system: str
     own: tuple[tuple[Path, System], ...] = ()
     cache: Path | None = None
     ct: CtFile | None = None
     accept: tuple[str, ...] = ()
+
+    @property
+    def patient(self) -> Path:
+        """The folder of the patient.
+
+        Raises:
+            SettingsError: If none is chosen yet.
+        """
+        if self.folder is None:
+            raise SettingsError("No patient is open", remedy="Choose a CT or a patient on the page")
+        return self.folder
 
 
 @frozen_value
@@ -76,6 +87,7 @@ class Given:
         last: Whether the question is answered with it.
         plan: A plan that the page may ask about.
         file: A file that the page may fetch.
+        source: The patient that is explored from now on.
     """
 
     page: str
@@ -84,6 +96,7 @@ class Given:
     last: bool = False
     plan: KeptPlan | None = None
     file: Path | None = None
+    source: PatientSource | None = None
 
 
 @frozen_value
@@ -108,8 +121,10 @@ class Part:
         *,
         plan: KeptPlan | None = None,
         file: Path | None = None,
+        source: PatientSource | None = None,
     ) -> None:
         self.message, self.arrays, self.plan, self.file = message, arrays, plan, file
+        self.source = source
 
 
 class Turn:
@@ -253,6 +268,7 @@ class Worker:
                 last=last,
                 plan=part.plan,
                 file=part.file,
+                source=part.source,
             )
         )
 

@@ -146,6 +146,7 @@ class ExplorerPage extends DevicePage {
     });
     byId("nodule").addEventListener("change", (event) => event.target.value && this.chooseTarget(event.target.value));
     byId("cross-target").addEventListener("click", () => this.chooseTarget(lpsText(this.place)));
+    byId("outline").addEventListener("click", () => this.outline());
     byId("reach-slices").addEventListener("change", () => this.redrawSlices());
     byId("reach-scene").addEventListener("change", () => this.showReach());
     byId("exits-by").addEventListener("change", () => this.showExits());
@@ -187,8 +188,31 @@ class ExplorerPage extends DevicePage {
         (known ? [known.text, known.lobe] : [found.tissue, found.lobe]).filter(Boolean).join(", "), ...near, lpsText(found.lps_mm),
       ].join("; ");
       byId("cross-target").hidden = !found.may_be_target || Boolean(isTarget);
+      byId("outline").hidden = !this.facts.may_outline || found.tissue === "nodule";
+      if (this.outlined && norm(minus(this.place, this.outlined)) < 0.1) return;
+      this.outlined = null;
+      byId("outline").textContent = "Outline a nodule at the cross";
       this.placeFound = found;
     });
+  }
+
+  // Outline the nodule at the cross at once; a second press makes it part of the patient, which is opened anew.
+  async outline() {
+    const point = this.outlined || [...this.place], take = Boolean(this.outlined);
+    byId("target-error").hidden = true;
+    const last = await this.asker.latest("outline", { point, take }, async (found) => {
+      if (take) {
+        history.replaceState(null, "", `/#${new URLSearchParams({ target: found.target })}`);
+        location.reload();
+        return;
+      }
+      await this.takeFine(found.image);
+      this.outlined = point;
+      byId("outline").textContent = `Add this nodule of ${mm(found.diameter_mm)}, ${found.volume_ml.toFixed(2)} ml, and plan to it`;
+    });
+    if (last.answer !== "error") return;
+    byId("target-error").hidden = false;
+    byId("target-error").textContent = errorWords(last.error);
   }
 
   chooseTarget(text) {
@@ -272,14 +296,16 @@ class ExplorerPage extends DevicePage {
 
   // Fetch fine voxels around a point.
   fitImage(around) {
-    this.asker.latest("image", { around }, async ({ image }) => {
-      const [labels, ct] = await Promise.all([
-        placedVolume(image.labels[0]), image.ct ? placedVolume(image.ct[0], image.hounsfield) : null,
-      ]);
-      this.image.labels[1] = labels;
-      if (ct) this.image.ct[1] = ct;
-      this.redrawSlices();
-    });
+    this.asker.latest("image", { around }, ({ image }) => this.takeFine(image));
+  }
+
+  async takeFine(image) {
+    const [labels, ct] = await Promise.all([
+      placedVolume(image.labels[0]), image.ct ? placedVolume(image.ct[0], image.hounsfield) : null,
+    ]);
+    this.image.labels[1] = labels;
+    if (ct) this.image.ct[1] = ct;
+    this.redrawSlices();
   }
 
   async takePlan(found, key) {

@@ -1,0 +1,76 @@
+// The page on which a CT or a patient of this machine is chosen, segmented, and then explored.
+import { byId } from "../report/anatomy_page.js";
+import { made } from "../report/structures.js";
+import { Asker } from "./asker.js";
+import { Connection } from "./connection.js";
+import { button, errorWords } from "./widgets.js";
+
+let asker = null, busy = true;
+const say = (words) => (byId("status").textContent = words);
+const shown = (name) => (byId(name).hidden ? "" : byId(name).textContent);
+
+// Ask, and show an error beside the folder, in which another one can be chosen.
+async function ask(name, values, part) {
+  busy = true;
+  byId("problem").hidden = true;
+  const last = await asker.latest(name, values, part);
+  busy = false;
+  if (last.answer !== "error") return;
+  say("Choose another folder or file.");
+  byId("problem").textContent = errorWords(last.error);
+  byId("problem").hidden = false;
+}
+
+const look = (path) => ask("look", { path }, ({ path: shown, parent, folders, files, left_out: isCut }) => {
+  const separator = shown.includes("\\") ? "\\" : "/", inside = (name) => `${shown.replace(/[\\/]$/, "")}${separator}${name}`;
+  byId("path").value = shown;
+  byId("question").hidden = true;
+  byId("entries").replaceChildren(...[
+    button("..", "The folder above", () => look(parent)),
+    ...folders.map((name) => button(`${name}${separator}`, `Folder ${name}`, () => look(inside(name)))),
+    ...files.map((name) => button(name, `Open ${name}`, () => open(inside(name)))),
+    ...(isCut ? ["There are more: type the name."] : []),
+  ].map((each) => made("li", {}, each)));
+  say("Choose a folder or a file.");
+});
+
+// Show what is to be decided: sentences, and what can be done.
+function decide(words, choices) {
+  byId("words").replaceChildren(...words.filter(Boolean).map((each) => made("li", {}, each)));
+  byId("choices").replaceChildren(...choices);
+  byId("question").hidden = false;
+  say("Your decision is needed.");
+}
+
+function open(path, values = {}) {
+  byId("question").hidden = byId("picture").hidden = true;
+  byId("choices").replaceChildren();
+  ask("open", { path, ...values }, (part) => {
+    const { answer, accept, thick_slices: thick } = part;
+    if (answer === "link") byId("picture").src = part.address;
+    if (answer === "link") byId("picture").hidden = false;
+    if (answer === "opened") location.assign("/");
+    if (answer === "segmented") decide([`The masks are in ${part.folder}: look at them.`, ...part.warnings], [
+      button("The masks are right: explore", "Explore", () => open(part.folder, { thick_slices: Boolean(values.thick_slices) }))]);
+    if (answer === "refused") decide([part.found, `Expected: ${part.expected}`, "Whoever goes on all the same plans on masks that may be wrong; it is noted in the patient."], [
+      button("Go on all the same", "Go on all the same", () => open(path, { ...values, accept, thick_slices: thick }))]);
+    if (answer !== "series") return;
+    const { uid, words, proposed, arrays: { picture } } = part, [height, width] = part.shape;
+    const canvas = made("canvas", { width, height, role: "img", ariaLabel: `Middle slice of ${words}` });
+    canvas.getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(picture), width, height), 0, 0);
+    decide(["The folder holds several series: which one is it?"], [...byId("choices").children,
+      made("button", { type: "button", className: proposed ? "proposed" : "", onclick: () => open(path, { ...values, series: uid }) }, canvas, proposed ? `Proposed: ${words}` : words)]);
+  });
+}
+
+byId("place").addEventListener("submit", (event) => {
+  event.preventDefault();
+  look(byId("path").value);
+});
+byId("take").addEventListener("click", () => open(byId("path").value));
+async function start() {
+  asker = new Asker(await Connection.open(() => say("The explorer has ended: start `lungaccess view` again.")), say);
+  await look("");
+}
+
+window.lungaccessReport = { ready: start(), state: () => ({ busy, question: shown("question"), problem: shown("problem") }) };

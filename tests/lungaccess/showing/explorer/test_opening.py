@@ -1,0 +1,184 @@
+"""From an empty page to a plan: a folder is chosen, its CT segmented, a nodule outlined and planned to."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import aiohttp
+import numpy as np
+import pytest
+
+from anatomy.grid import Grid, Volume
+from anatomy.phantom import Phantom
+from lungaccess.showing.explorer import Explorer, PatientSource
+from tests.anatomy.io.series import write_series
+from tests.lungaccess.showing.explorer.client import Client, opened, with_client
+from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served
+from tests.lungaccess.showing.report import browser
+
+
+def thinned(volume: Volume, step: int) -> Volume:
+    """Return every so manieth slice of an image."""
+    matrix = volume.grid.lps_from_ijk @ np.diag([1.0, 1.0, float(step), 1.0])
+    array = np.ascontiguousarray(volume.array[:, :, ::step])
+    return Volume(grid=Grid(shape=array.shape, lps_from_ijk=matrix), array=array)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in which the explorer was started, without a patient."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def scanned(here: Path, small_phantom: Phantom) -> Path:
+    """The folder of a CT in DICOM: the whole scan, one in thick slices, and a few slices of another one."""
+    ct = small_phantom.ct
+    (here / "disc").mkdir()
+    few = Volume(grid=ct.grid.crop((0, 0, 20), (*ct.grid.shape[:2], 24)), array=ct.array[:, :, 20:24])
+    for number, volume in enumerate((thinned(ct, math.ceil(3.1 / ct.grid.spacing_mm[2])), ct, few), start=1):
+        write_series(here / "disc" / f"{number}", volume, number)
+    return here / "disc"
+
+
+def source(here: Path) -> PatientSource:
+    return PatientSource(folder=None, system="ultrathin", cache=here / "cache")
+
+
+def test_folders_are_listed_without_what_is_hidden(here: Path) -> None:
+    for name in ("b", "a", ".hidden"):
+        (here / name).mkdir()
+    for name in ("ct.nii.gz", "note.txt"):
+        (here / name).touch()
+
+    async def talk(client: Client, _explorer: Explorer) -> None:
+        shown, _ = await client.first("look")
+        assert shown["folders"] == ["a", "b"]
+        assert shown["files"] == ["ct.nii.gz"]
+        assert (shown["path"], shown["parent"]) == (str(here), str(here.parent))
+        assert (await client.first("look", path=str(here / "a")))[0]["folders"] == []
+        missing, _ = await client.first("look", path=str(here / "nowhere"))
+        assert missing["error"]["kind"] == "FileError"
+
+    with_client(source(here), talk)
+
+
+def test_what_is_no_ct_is_answered_in_words(here: Path, patient: Path) -> None:
+    (here / "empty").mkdir()
+
+    async def talk(client: Client, _explorer: Explorer) -> None:
+        for folder, found in ((here / "empty", "is no patient"), (patient.parent.parent, "")):
+            answer, _ = await client.first("open", path=str(folder))
+            assert answer["answer"] == "error"
+            assert found in answer["error"]["found"]
+            assert answer["error"]["remedy"]
+        unasked, _ = await client.first("patient")
+        assert unasked["error"]["found"] == "No patient is open"
+
+    with_client(source(here), talk)
+
+
+def test_of_several_series_the_thin_one_of_the_whole_chest_is_proposed(scanned: Path) -> None:
+    async def talk(client: Client, _explorer: Explorer) -> None:
+        found = [
+            each for each in await client.ask("open", path=str(scanned)) if each[0]["answer"] == "series"
+        ]
+        assert len(found) == 3
+        first, arrays = found[0]
+        assert [answer["proposed"] for answer, _ in found] == [True, False, False]
+        assert arrays["picture"].shape == (*first["shape"], 4)
+        assert np.ptp(arrays["picture"][..., 0]) > 100, "air and body differ"
+
+    with_client(source(scanned.parent), talk)
+
+
+def test_thick_slices_are_a_question_with_its_consequence(scanned: Path) -> None:
+    async def talk(client: Client, _explorer: Explorer) -> None:
+        found = [each for each, _ in await client.ask("open", path=str(scanned / "1"))]
+        drawn, answer = [each for each in found if each["answer"] != "progress"][:2]
+        assert drawn["address"].endswith("/refused.png")
+        assert answer["answer"] == "refused"
+        assert "apart" in answer["found"]
+        assert answer["thick_slices"] and answer["accept"] == []
+
+    with_client(source(scanned.parent), talk)
+
+
+def test_a_patient_that_is_opened_closes_the_pages_of_the_one_before(here: Path, patient: Path) -> None:
+    async def talk(client: Client, explorer: Explorer) -> None:
+        assert explorer.address is not None
+        async with opened(explorer.address) as other:
+            await client.send("open", path=str(patient))
+            while (answer := (await client.next())[0])["answer"] == "progress":
+                pass
+            assert (answer["answer"], answer["patient"]) == ("opened", "phantom small 3")
+            for each in (client, other):
+                closed = await each.socket.receive()
+                assert (closed.type, closed.data) == (aiohttp.WSMsgType.CLOSE, 1012)
+        async with opened(explorer.address) as anew:
+            assert (await anew.first("patient"))[0]["patient"] == "phantom small 3"
+
+    with_client(PatientSource(folder=None, system="ultrathin", cache=patient.parent / "cache"), talk)
+
+
+@pytest.fixture
+def empty(here: Path) -> Iterator[tuple[Served, Page]]:
+    """The page without a patient, in a window."""
+    served = Served(source(here))
+    try:
+        with Page(1440, 900) as window:
+            window.open(served.address.url)
+            yield served, window
+    finally:
+        served.stop()
+
+
+def press(page: Page, words: str) -> None:
+    """Press the button with these words."""
+    found = "[...document.querySelectorAll('button')].find((each) => each.textContent.includes(arguments[0]))"
+    page.run(f"{found}.click()", words)
+
+
+def explored(page: Page) -> None:
+    """Wait until another page than the one before has the patient."""
+    script = "return !window.before && Boolean(window.lungaccessExplorer && window.lungaccessExplorer.ready)"
+    while not page.run(script):
+        time.sleep(0.1)
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there")
+def test_from_an_empty_page_to_a_checked_plan(
+    scanned: Path, empty: tuple[Served, Page], small_phantom: Phantom
+) -> None:
+    """Three decisions: the series, the masks, the nodule."""
+    served, page = empty
+    press(page, "disc/")
+    page.wait("!s.busy")
+    page.click("take")
+    page.wait("s.question.includes('Proposed')")
+    press(page, "Proposed")
+    warned = page.wait(
+        "s.question.includes('The masks are in') && document.getElementById('picture').naturalWidth > 0"
+    )
+    assert str(scanned.parent / "disc-patient") in warned["question"]
+    press(page, "The masks are right")
+    explored(page)
+    centre = [float(value) for value in small_phantom.nodules[0].centre_lps]
+    page.run("window.lungaccessExplorer.moveTo(arguments[0])", centre)
+    page.wait("!document.getElementById('outline').hidden")
+    page.click("outline")
+    page.wait("document.getElementById('outline').textContent.startsWith('Add this nodule')")
+    page.run("window.before = true")
+    page.click("outline")
+    explored(page)
+    state = page.wait(f"s.asked && s.asked.target.startsWith('nodule') && {PLANNED}")
+    assert np.linalg.norm(np.subtract(state["target_lps"], centre)) < 3.0
+    assert page.messages() == []
+    hosts = {url.split("/")[2] for url in page.requests() if url.startswith(("http", "ws"))}
+    assert hosts == {f"127.0.0.1:{served.address.port}"}, "nothing is asked of anything else"

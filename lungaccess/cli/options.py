@@ -360,6 +360,9 @@ class SearchOptions(BudgetOptions):
             "that a package adds.",
         ),
     ] = SUCCESS.name
+    passes: Annotated[
+        int, Parameter(help="So many times at most the tool goes into the nodule; planned together.")
+    ] = 1
     phases: PhasesText = None
     least_clearance: Annotated[
         NotNegative,
@@ -424,7 +427,7 @@ class SearchOptions(BudgetOptions):
         return Asked(
             systems=systems,
             fields={
-                "goal": self.goal, "phases": stated_phases(self.phases),
+                "goal": self.goal, "passes": self.passes, "phases": stated_phases(self.phases),
                 "least_clearance_mm": self.least_clearance, "method": self.method,
                 "needle_planner": self.needle_planner or "", "processes": processes, "gap": self.gap,
                 "seed": self.seed, "iterations": self.iterations, "time_s": self.time_s,

@@ -180,3 +180,19 @@ class Exemption(Record):
     branch: int
     exit_point_lps: Float = field(metadata=shaped(3))
     needle_length_mm: float
+
+
+@frozen_record
+class Pass(Record):
+    """A further pass of the needle from where the scope stands: what differs from the first.
+
+    Args:
+        tube, needle, exemption, clearance_mm, costs, end_lps: As those of a plan and of its aim.
+    """
+
+    tube: TubeDeployment
+    needle: NeedlePath
+    exemption: Exemption
+    clearance_mm: Mapping[str, Mapping[str, float]]
+    costs: Mapping[str, float]
+    end_lps: Float = field(metadata=shaped(3))

@@ -2,8 +2,9 @@
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from functools import cached_property
+from itertools import pairwise, takewhile
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -24,7 +25,7 @@ from lungaccess.plans.curves import (
     pieces_beyond,
     tube_pieces,
 )
-from lungaccess.plans.parts import Exemption, NeedlePath, ScopeInsertion, TubeDeployment
+from lungaccess.plans.parts import Exemption, NeedlePath, Pass, ScopeInsertion, TubeDeployment
 from lungaccess.plans.record import Record, shaped
 from lungaccess.plans.window import BreathingAim, BreathingWindow
 from lungaccess.problem.system import System
@@ -73,6 +74,7 @@ class Plan(Record):
         cost_bound: Proved lower bound of the cost of every plan from a scope tip of the atlas, where the
             search was told to find one; 0 for any other.
         goals: Values of functions of the plan that it was made good at; see `lungaccess.problem.goals.Goal`.
+        further: The passes after the first, from the same place of the scope; see `passes`.
     """
 
     schema: str = plan_file.SCHEMA
@@ -106,6 +108,7 @@ class Plan(Record):
     aim: BreathingAim | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     cost_bound: float = field(default=0.0, metadata={LEFT_OUT_IF_EMPTY: True})
     goals: Mapping[str, float] = field(default_factory=dict, metadata={LEFT_OUT_IF_EMPTY: True})
+    further: tuple[Pass, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
@@ -122,6 +125,57 @@ class Plan(Record):
     def goal_lps(self) -> Float:
         """Where the devices have to end so that the tip, or its tool, is at the target, `(3,)` LPS mm."""
         return self.target_lps if self.system.tool is None else self.end_lps
+
+    @cached_property
+    def passes(self) -> tuple["Plan", ...]:
+        """Each pass as a plan of its own; a plan of one pass is its only one."""
+        if not self.further:
+            return (self,)
+        first = replace(self, further=())
+        alone = replace(first, chance=None, window=None, goals={}, cost_bound=0.0)
+        return first, *(
+            replace(
+                alone, tube=each.tube, needle=each.needle, exemption=each.exemption, costs=each.costs,
+                clearance_mm=each.clearance_mm,
+                aim=BreathingAim(point_lps=each.end_lps, phases=np.zeros((0, 2))),
+            )
+            for each in self.further
+        )  # fmt: skip
+
+    def with_further(self, others: Iterable["Plan"]) -> "Plan":
+        """Return the plan with the passes of other plans from the same place of the scope after its own."""
+        made = tuple(
+            Pass(
+                tube=each.tube, needle=needle, exemption=each.exemption, clearance_mm=each.clearance_mm,
+                costs=each.costs, end_lps=each.end_lps,
+            )
+            for each in others
+            if (needle := each.needle) is not None
+        )  # fmt: skip
+        return replace(self, further=made)
+
+    @property
+    def same_tubes(self) -> tuple[int, ...]:
+        """The first pass, counted from 0, with the tubes of each pass."""
+        tubes = [(each.tube.rotation_rad, each.tube.lps_from_tip.tobytes()) for each in self.passes]
+        return tuple(map(tubes.index, tubes))
+
+    @property
+    def redirections(self) -> tuple[str, ...]:
+        """What hands do between each pass and the next, in words."""
+        said, passes = [], self.passes
+        for before, after in pairwise(passes):
+            withdrawn, steered = redirection_mm(before, after)
+            back = f"withdraw the needle by {withdrawn:.1f} mm"
+            if before.tube.lps_from_tip.tobytes() == after.tube.lps_from_tip.tobytes():
+                said.append(f"{back}, and steer it {steered:.1f} mm anew from the same tubes")
+                continue
+            other = "" if before.tube.exit.branch == after.tube.exit.branch else " through another branch"
+            said.append(
+                f"{back}, draw the tubes into the scope, {after.rotations}, {after.insertions}{other}, and "
+                f"steer the needle {steered:.1f} mm"
+            )
+        return tuple(said)
 
     @property
     def insertions(self) -> str:
@@ -201,6 +255,7 @@ class Plan(Record):
             ("costs", f"{costs}; made small: {self.objective}"),
             ("made by", f"{self.method}, seed {self.seed}, {self.iterations} iterations"),
             ("digest", self.digest[:16]),
+            *((f"pass {n}", said) for n, said in enumerate(self.redirections, 2)),
             *((("best possible", self.gap_in_words),) if self.gap is not None else ()),
             *((("window of breathing", self.window.words),) if self.window else ()),
             *((("choice of the system", " ".join(self.system_choice)),) if self.system_choice else ()),
@@ -290,6 +345,19 @@ class Plan(Record):
             PlanFileError: If there is no such file or it is not an intact plan.
         """
         return plan_file.load(cls, path)
+
+
+def redirection_mm(before: Plan, after: Plan) -> tuple[float, float]:
+    """Return how far the needle is withdrawn between two passes, and how far it is then inserted, mm.
+
+    Arcs that both begin with from the same tubes stay in place.
+    """
+    if before.needle is None or after.needle is None:
+        return 0.0, 0.0
+    same = before.tube.lps_from_tip.tobytes() == after.tube.lps_from_tip.tobytes()
+    pairs = zip(before.needle.arcs, after.needle.arcs, strict=False) if same else ()
+    kept = sum(one.length_mm for one, _other in takewhile(lambda both: vars(both[0]) == vars(both[1]), pairs))
+    return before.needle.length_mm - kept, after.needle.length_mm - kept
 
 
 TARGET_COLOUR, EXIT_COLOUR = "#2ca02c", "#d62728"

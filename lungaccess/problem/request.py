@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 ATLAS = "atlas"
 """The method of whoever states none: the search over all that scope and tubes can do."""
+MOST_PASSES = 8
+"""Nobody reports more passes at one nodule: yield hardly grows after the sixth."""
 AUTO = "auto"
 """Stands for all presets, of which the least invasive that reaches the target is chosen."""
 
@@ -94,6 +96,7 @@ class Request:
         errors, procedure (optional): Under which success is counted; presets `breath-hold` and `measured-tip`
             if None.
         radius_mm: Radius within which a procedure has to end; see `lungaccess.uncertainty.risk.RiskAssessor`.
+        passes: So many times at most the tool goes into the nodule, from one place of the scope.
         phases (tuple of 2 floats): Phases of the breath, 0 end-exhale to 1 end-inhale, in all of which the
             plan is proved.
         gap: The search ends once the cost is proved to be at most this share above the least.
@@ -112,6 +115,7 @@ class Request:
     errors: ErrorModel | None = None
     procedure: Procedure | None = None
     radius_mm: float | None = None
+    passes: int = 1
     phases: tuple[float, float] | None = None
     place: StatedPlace | None = None
     gap: float | None = None
@@ -185,6 +189,15 @@ class Request:
                 f"A window of the breath is asked for with the {tools[0]}",
                 expected="no tool: a window promises where the tip is in moving tissue, not what it takes",
                 remedy="Leave out the tool, or plan for success, which counts breathing",
+            )
+        if not 1 <= self.passes <= MOST_PASSES:
+            raise SettingsError(f"{self.passes} passes are asked for", expected=f"1 to {MOST_PASSES}")
+        if self.passes > 1 and (len(tools) < len(self.systems) or self.goal is not SUCCESS):
+            raise SettingsError(
+                f"{self.passes} passes are asked for without a tool, or with the goal {self.goal.name}",
+                expected="a tool, which takes tissue in every pass, and the goal success: no cost says where "
+                "another pass helps",
+                remedy="Add --tool core, and leave out --goal",
             )
         self._require_bound()
         self._require_systems()

@@ -1,5 +1,6 @@
 """The independent check: it computes everything in a finished plan anew and accepts or refuses the plan."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +37,22 @@ class Checker:
     def check(
         self, plan: Plan, system: System | None = None, *, target_lps: ArrayLike | None = None
     ) -> CheckReport:
-        """Check one plan; see `lungaccess.judging.checking.check`."""
+        """Check one plan, each of its passes; see `lungaccess.judging.checking.check`."""
+        first, *others = (self._check_pass(each, system, target_lps) for each in plan.passes)
+        # What is known by the names of findings is that of the first pass.
+        named = (
+            replace(one, name=f"pass_{number}.{one.name}")
+            for number, report in enumerate(others, 2)
+            for one in report.findings
+        )
+        return replace(
+            first,
+            accepted=all(each.accepted for each in (first, *others)),
+            findings=(*first.findings, *named),
+        )
+
+    def _check_pass(self, plan: Plan, system: System | None, target_lps: ArrayLike | None) -> CheckReport:
+        """Check a plan of one pass."""
         found = Findings()
         target = None if target_lps is None else np.asarray(target_lps, dtype=np.float64)
         if check_record(plan, self._environment.lung, found, system, target):

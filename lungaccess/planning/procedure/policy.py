@@ -159,6 +159,8 @@ class Policy:
         *,
         radius_mm: float | None = None,
     ) -> None:
+        self.whole, (plan, *others) = plan, plan.passes
+        self.passes = (self, *(Policy(one, lung, errors, procedure, radius_mm=radius_mm) for one in others))
         self.plan, self.lung = plan, lung
         self.assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
         self.errors = model_for(errors or load_errors(), plan, lung)

@@ -1,6 +1,6 @@
 """Simulate a procedure many times: how often it succeeds, what fails, and what each stage corrects."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from multiprocessing.connection import Connection
 from types import MappingProxyType
 from typing import NamedTuple
@@ -29,11 +29,13 @@ from lungaccess.planning.procedure.truth import (
     turned_about,
     unknown_of,
 )
+from lungaccess.plans.kernels.tissue import Wanted
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.errors import ErrorModel
+from lungaccess.problem.errors import CURVATURE, ErrorModel
 from lungaccess.problem.procedures import Procedure
 from lungaccess.uncertainty.risk import MISSES, Deviations, Share
 from lungaccess.uncertainty.risk.assessment import MISS_QUANTILES
+from lungaccess.uncertainty.risk.assessor import drawn_anew, taken_together
 from lungaccess.uncertainty.risk.deviations import deviated_starts
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.statistics import share_of
@@ -59,15 +61,18 @@ class _Decided(NamedTuple):
     corrected_mm: Float
 
 
-class _Found(NamedTuple):
+class Found(NamedTuple):
     """What came of N procedures: flags touched, distance from the target, tissue in the tool, no path left,
-    placements of the scope; and what was decided, by stage, which is not in the order of the procedures."""
+    placements of the scope, where needles end and how far nodules have moved; and what was decided, by stage,
+    which is not in the order of the procedures."""
 
     touched: Int
     miss_mm: Float
     taken: Float
     stopped: Bool
     placements: Int
+    ends: Float
+    shifts_mm: Float
     decided: dict[str, list[_Decided]]
 
 
@@ -107,35 +112,67 @@ def simulated(policy: Policy, samples: int, seed: int, processes: int = 1) -> Pr
     """Return what comes of procedures under a policy, see `simulate_procedure`; it serves all draws."""
     if processes < 1:
         raise SettingsError(f"{processes} processes are asked for", expected="at least 1")
-    found = _Run(policy, samples, seed).all(processes)
-    return _report(policy, found, samples, seed)
+    found = passes_simulated(policy, samples, seed, processes)
+    return _report(policy, _together(found, policy.assessor.wanted), samples, seed)
+
+
+def passes_simulated(policy: Policy, samples: int, seed: int, processes: int = 1) -> list[Found]:
+    """Return what comes of each pass of procedures: they have in common what is not drawn anew."""
+    anew = drawn_anew(policy.whole)
+    runs = [_Run(one, samples, seed, own) for one, own in zip(policy.passes, anew, strict=True)]
+    return [each.all(processes) for each in runs]
+
+
+def _together(passes: Sequence[Found], wanted: Wanted) -> Found:
+    """Return what comes of procedures by what comes of each of their passes."""
+    if len(passes) == 1:
+        return passes[0]
+    return passes[0]._replace(
+        touched=np.bitwise_or.reduce([each.touched for each in passes]),
+        miss_mm=np.min([each.miss_mm for each in passes], axis=0),
+        taken=taken_together([each.taken for each in passes], wanted),
+        stopped=np.all([each.stopped for each in passes], axis=0),
+        placements=np.max([each.placements for each in passes], axis=0),
+        decided={stage: [one for each in passes for one in each.decided.get(stage, [])] for stage in STAGES},
+    )
 
 
 class _Run:
-    """Procedures of one plan with the draws of one seed."""
+    """Procedures of one pass with the draws of one seed, see `drawn_anew`."""
 
-    def __init__(self, policy: Policy, samples: int, seed: int) -> None:
+    def __init__(self, policy: Policy, samples: int, seed: int, anew: Mapping[str, int]) -> None:
         self._policy, self.assessor = policy, policy.assessor
         self.samples, self._seed = samples, seed
         plan, procedure = policy.plan, policy.procedure
         count = procedure.scope.placements if procedure.scope.measured or procedure.tubes.measured else 1
         n_arcs = ARCS if plan.needle is not None else 0
         self._attempts: list[Deviations] = [
-            policy.assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs).deviations(policy.errors)
+            policy.assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs)
+            .of_pass(n_arcs, anew)
+            .deviations(policy.errors)
             for number in range(count)
         ]
         self._starts = [deviated_starts(plan, policy.lung, each) for each in self._attempts]
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_MEASURING,)))
         self._noise = rng.standard_normal((samples, count, 3, 5))
+        number = anew[CURVATURE]
+        self._number = (number,) if number else ()
+        if number:
+            # The tip of the tubes is measured in every pass; scope and target are seen once.
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_MEASURING + number,)))
+            self._noise[:, :, 1] = rng.standard_normal((samples, count, 5))
 
-    def all(self, processes: int) -> _Found:
+    def all(self, processes: int) -> Found:
         """Return what comes of all procedures."""
         if self._policy.procedure.is_open_loop:
             # Carry out the plan as it stands, as `assess` does.
             outcomes = self.assessor.outcomes(fitted_to(self.assessor.n_arcs, self._attempts[0]))
             ones = np.ones(self.samples, dtype=np.int64)
             none = np.zeros(self.samples, dtype=bool)
-            return _Found(outcomes.touched, outcomes.miss_mm, outcomes.taken, none, ones, {})
+            shifts = self._attempts[0].target_mm
+            return Found(
+                outcomes.touched, outcomes.miss_mm, outcomes.taken, none, ones, outcomes.ends, shifts, {}
+            )
         parts = np.array_split(np.arange(self.samples), processes)
         if processes == 1 or not can_fork():
             return _joined(map(self._part, parts))
@@ -147,12 +184,13 @@ class _Run:
         end_with_parent()
         end.send(self._part(numbers))
 
-    def _part(self, numbers: Int) -> _Found:
+    def _part(self, numbers: Int) -> Found:
         """Go through some procedures: the scope is placed again where the policy says so."""
         count = len(numbers)
-        found = _Found(
+        found = Found(
             np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.zeros(count),
-            np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64), {stage: [] for stage in STAGES},
+            np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64), np.full((count, 9), np.nan),
+            np.zeros((count, 3)), {stage: [] for stage in STAGES},
         )  # fmt: skip
         active = np.arange(count)
         for attempt in range(len(self._attempts)):
@@ -160,7 +198,7 @@ class _Run:
                 active = active[~self._attempt(attempt, numbers, active, found)]
         return found
 
-    def _attempt(self, attempt: int, numbers: Int, active: Int, found: _Found) -> Bool:
+    def _attempt(self, attempt: int, numbers: Int, active: Int, found: Found) -> Bool:
         """Place the scope once in the active procedures; tell which `(N,)` are over."""
         policy, procedure, rows = self._policy, self._policy.procedure, numbers[active]
         errors, noise = rows_of(self._attempts[attempt], rows), self._noise[rows, attempt]
@@ -193,7 +231,7 @@ class _Run:
         planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip)) @ np.append(plan.end_lps, 1.0)
         return np.asarray(np.linalg.norm((likely @ planned)[:, :3] - plan.goal_lps, axis=1))
 
-    def _devices_out(self, went: "_Went", left: int, at: Int, found: _Found) -> Bool:
+    def _devices_out(self, went: "_Went", left: int, at: Int, found: Found) -> Bool:
         """Let tubes and needles out, and note what came of it; tell which needles were inserted."""
         policy, plan, procedure = self._policy, self._policy.plan, self._policy.procedure
         chosen, errors = went.chosen, went.errors
@@ -238,6 +276,7 @@ class _Run:
             touched[back] = alone & ~kernel.STAYS_INSIDE
         found.touched[at] |= touched
         found.miss_mm[at[done]], found.taken[at[done]] = outcomes.miss_mm[done], outcomes.taken[done]
+        found.ends[at[done]], found.shifts_mm[at[done]] = outcomes.ends[done], errors.target_mm[done]
         found.stopped[at[done]] &= went.stopped[done]
         return done
 
@@ -249,7 +288,7 @@ class _Run:
         true_tips: Float,
         targets: Float,
         at: Int,
-        found: _Found,
+        found: Found,
     ) -> Float:
         """Return the true arcs of needles that are measured on their way, and note where they stopped."""
         made: list[Float] = []
@@ -258,7 +297,7 @@ class _Run:
                 made.append(np.zeros((0, 3)))
                 continue
             path = ArcPath(lps_from_start=chosen.tips[n], arcs=chosen.arcs[n, : chosen.found[n, 1]])
-            key = (_MEASURING, int(went.rows[n]))
+            key = (_MEASURING, int(went.rows[n]), *self._number)
             errors = rows_of(went.errors, np.array([n]))
             attempt = Attempt(errors=errors, target_lps=self._policy.plan.goal_lps + errors.target_mm[0])
             one = steered(
@@ -284,16 +323,14 @@ class _Went:
         self.stopped = np.zeros(len(rows), dtype=bool)
 
 
-def _joined(parts: Iterable[_Found]) -> _Found:
+def _joined(parts: Iterable[Found]) -> Found:
     found = list(parts)
-    touched, miss_mm, taken, stopped, placements = (
-        np.concatenate([each[n] for each in found]) for n in range(5)
-    )
+    joined = (np.concatenate([each[n] for each in found]) for n in range(7))
     decided = {stage: [one for each in found for one in each.decided.get(stage, [])] for stage in STAGES}
-    return _Found(touched, miss_mm, taken, stopped, placements, decided)
+    return Found._make([*joined, decided])
 
 
-def _report(policy: Policy, found: _Found, samples: int, seed: int) -> ProcedureReport:
+def _report(policy: Policy, found: Found, samples: int, seed: int) -> ProcedureReport:
     assessor, procedure = policy.assessor, policy.procedure
     reaches = found.taken >= assessor.wanted.least
     touched = {name: (found.touched & flag) != 0 for name, flag in assessor.structures.items()}

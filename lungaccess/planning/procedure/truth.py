@@ -53,7 +53,7 @@ def fitted_to(n_arcs: int, errors: Deviations) -> Deviations:
 
 def rows_of(errors: Deviations, numbers: Int) -> Deviations:
     """Return the errors of some procedures, by their numbers."""
-    return Deviations(**{name: values[numbers] for name, values in vars(errors).items()})
+    return Deviations(**{name: values[numbers] for name, values in vars(errors).items() if name != "further"})
 
 
 def tube_pieces(plan: Plan, chosen: Chosen, errors: Deviations) -> tuple[Float, Float]:

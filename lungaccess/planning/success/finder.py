@@ -19,9 +19,10 @@ from lungaccess.planning import searches
 from lungaccess.planning.constraints import holds
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.search.base import AtlasBound, Step
-from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
 from lungaccess.planning.coupled.search.variation import SMALLEST, random_change, varied
 from lungaccess.planning.driver import Turn, no_plan_beside
+from lungaccess.planning.success.passes import with_passes
 from lungaccess.planning.success.ratings import (
     ChanceRating,
     FunctionRating,
@@ -272,10 +273,15 @@ class ContestFinder:
         self, contender: Contender, iteration: int, elapsed_s: float, most: int | None = None
     ) -> Plan:
         """Return the whole plan of a contender with what it states of the goal."""
-        made = searches.plan_of(
-            self._request, self._task, self._atlas, contender.candidate, iteration, elapsed_s
-        )
-        return self._rating.stated(made, most)
+
+        def make(candidate: Candidate) -> Plan:
+            return searches.plan_of(self._request, self._task, self._atlas, candidate, iteration, elapsed_s)
+
+        made, rating, direct = make(contender.candidate), self._rating, self._direct
+        if self._request.passes > 1 and isinstance(rating, ChanceRating):
+            ways = direct or direct_candidates(self._task, self._atlas)
+            made = with_passes(self._request, rating, ways, contender.candidate, make)
+        return rating.stated(made, most)
 
     def is_met(self, best: Plan, iteration: int) -> bool:
         """Tell that nothing is good enough: the best possible is not known."""

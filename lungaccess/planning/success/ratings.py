@@ -121,7 +121,7 @@ class ChanceRating:
 
             def deviated(batch: int, draws: int, factor: float) -> float:
                 errors = model if factor == 1.0 else model.scaled(factor)
-                return assessor.success(assessor.draws(draws, self._batch_seed(batch)), errors).count
+                return assessor.success(assessor.draws(draws, self.seed_of(batch)), errors).count
 
             return deviated
         policy = Policy(plan, self._lung, self.errors, self.procedure, radius_mm=self._given_mm)
@@ -129,11 +129,12 @@ class ChanceRating:
         def counted(batch: int, draws: int, _factor: float) -> float:
             # Procedures that several processes share: fewer take less time than to begin processes.
             processes = self._processes if draws >= 400 else 1
-            return simulated(policy, draws, self._batch_seed(batch), processes).succeeds.count
+            return simulated(policy, draws, self.seed_of(batch), processes).succeeds.count
 
         return counted
 
-    def _batch_seed(self, batch: int) -> int:
+    def seed_of(self, batch: int) -> int:
+        """Return the seed of a batch of draws."""
         # Distance between the seeds of two batches of draws: no seed of a search comes to that of another
         # batch.
         return self._seed + (1 << 24) * (batch + 1)

@@ -109,3 +109,27 @@ def taken_at(wanted, frame):
     ahead = frame[0, 2], frame[1, 2], frame[2, 2]
     end = (frame[0, 3], frame[1, 3], frame[2, 3], *ahead, frame[0, 0], frame[1, 0], frame[2, 0])
     return tissue_taken(wanted, (0.0, 0.0, 0.0), end)
+
+
+@kernel(nogil=True)
+def taken_in(wanted, shifts, ends, moved, taken):
+    """Note how much of nodules that lie `shifts` `(N, 3)` aside is in tools.
+
+    Args:
+        wanted: Wanted.
+        shifts: (N, 3) float64, mm.
+        ends ((N, 9) float64): Where tools are, before they are moved.
+        moved ((12,) float64): Rotation, row by row, and shift in mm, LPS, by which all of them are moved.
+        taken: (N,) float64.
+    """
+    m = moved
+    for n in range(ends.shape[0]):
+        x, y, z, tx, ty, tz, nx, ny, nz = ends[n]
+        end = (
+            x + m[9], y + m[10], z + m[11],
+            m[0] * tx + m[1] * ty + m[2] * tz, m[3] * tx + m[4] * ty + m[5] * tz,
+            m[6] * tx + m[7] * ty + m[8] * tz,
+            m[0] * nx + m[1] * ny + m[2] * nz, m[3] * nx + m[4] * ny + m[5] * nz,
+            m[6] * nx + m[7] * ny + m[8] * nz,
+        )  # fmt: skip
+        taken[n] = tissue_taken(wanted, (shifts[n, 0], shifts[n, 1], shifts[n, 2]), end)

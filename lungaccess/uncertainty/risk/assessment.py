@@ -79,6 +79,8 @@ def sensitivities(
 
 def _with(base: Deviations, kind: str, own: Deviations, other: Deviations) -> Deviations:
     """Return deviations in which the part of one kind is that of others."""
+    passes = zip(base.further, own.further, other.further, strict=True)
+    base = replace(base, further=tuple(_with(one, kind, *two) for one, *two in passes))
     if kind == CURVATURE:
         return replace(base, factor=other.factor)
     fields = ["target_mm" if kind == BREATHING else FIELD_OF[kind]]

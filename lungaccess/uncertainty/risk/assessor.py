@@ -1,8 +1,9 @@
 """A plan in its lung, ready to be deviated from: what becomes of many deviated plans, compiled."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from anatomy.motion.source import share_of_motion
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
+from lungaccess.plans.kernels.tissue import Wanted
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.tissue import goal_radius, wanted_in, wanted_of
 from lungaccess.problem.errors import OF_NEEDLE, UNITS, ErrorModel
@@ -42,17 +44,41 @@ THREADS = 2
 class Outcomes:
     """What became of N deviated plans, `(N,)` each.
 
-    `touched` holds flags of `STRUCTURES`, `miss_mm` how far the middle of the tool, or the last tip without
-    one, is from the deviated target, `taken` how much of the nodule is in the tool, see `wanted_of`.
+    Args:
+        touched: Flags of `STRUCTURES`.
+        miss_mm: How far the middle of the tool, or the last tip without one, is from the deviated target.
+        taken: How much of the nodule is in the tool, see `wanted_of`.
+        ends: (N, 9) float64; point, direction and normal of the last tip, LPS mm.
     """
 
     touched: Int
     miss_mm: Float
     taken: Float
+    ends: Float
+
+
+def taken_together(taken: Sequence[Float], wanted: Wanted) -> Float:
+    """Return how much several passes take together, `(N,)`: of a share of the nodule, what the best takes.
+
+    What two zones cover together is not known from their shares: the best of them is the least it can be.
+    """
+    return np.asarray(np.max(taken, axis=0) if len(wanted.covered) else np.sum(taken, axis=0))
+
+
+def drawn_anew(plan: Plan) -> tuple[Mapping[str, int], ...]:
+    """Return for each pass of a plan by kinds of error the pass whose numbers it has, 0 for the first.
+
+    The scope stands, registration stays wrong and the breath goes on as it does: only errors of the needle
+    are drawn in every pass, and those of the tubes where they have been moved.
+    """
+    return tuple(
+        dict.fromkeys(OF_NEEDLE, number) | dict.fromkeys(("tube_rotation", "tube_insertion"), tubes)
+        for number, tubes in enumerate(plan.same_tubes)
+    )
 
 
 class RiskAssessor:
-    """A plan in its lung, ready to be deviated from.
+    """A plan in its lung, ready to be deviated from; of several passes all are.
 
     Attributes:
         kinds: The kinds of error that the devices of the plan can have, and that of the target.
@@ -82,6 +108,8 @@ class RiskAssessor:
         self.stretch = share_of_motion(heights[0]) - share_of_motion(heights[1])
         known = lung.motion if lung.motion is not None and not lung.motion.warning_only else None
         self._motion = None if known is None else PatientMotion(plan, known)
+        self._others = tuple(RiskAssessor(each, lung, radius_mm=radius_mm) for each in plan.passes[1:])
+        self._anew = drawn_anew(plan)
         self.radius_mm, self.radius_origin = goal_radius(lung, plan.target_lps, radius_mm)
         tool = plan.system.tool
         self.wanted = wanted_of(lung, plan.target_lps, tool, radius_mm)
@@ -105,11 +133,13 @@ class RiskAssessor:
     def draws(self, count: int, seed: int, *, attempt: int = 0, n_arcs: int | None = None) -> Draws:
         """Return random numbers for `count` sets of errors, see `Draws`; the same seed gives the same.
 
-        They are for the arcs of the plan if `n_arcs` is None.
+        They are for the arcs and all passes of the plan if `n_arcs` is None.
         """
+        others = () if n_arcs is not None else self._others
         arcs = self.n_arcs if n_arcs is None else n_arcs
         return Draws(
             count, arcs, seed, self._n_twisted, stretch=self.stretch, motion=self._motion, attempt=attempt,
+            further=[(each.n_arcs, anew) for each, anew in zip(others, self._anew[1:], strict=False)],
             lps_from_scope_tip=self.plan.scope.lps_from_scope_tip,
         )  # fmt: skip
 
@@ -118,16 +148,31 @@ class RiskAssessor:
         return no_deviations(count, self.n_arcs, self._n_twisted)
 
     def outcomes(self, deviations: Deviations) -> Outcomes:
-        """Follow deviated plans through all three stages."""
+        """Follow deviated plans through all three stages, and all passes."""
+        further = deviations.further or [_fitted(each.n_arcs, deviations) for each in self._others]
+        passes = zip(self._others, further, strict=True)
+        every = [self._of_first(deviations), *(each.outcomes(own) for each, own in passes)]
+        return Outcomes(
+            touched=np.bitwise_or.reduce([each.touched for each in every]),
+            miss_mm=np.min([each.miss_mm for each in every], axis=0),
+            taken=taken_together([each.taken for each in every], self.wanted),
+            ends=every[0].ends,
+        )
+
+    def _of_first(self, deviations: Deviations) -> Outcomes:
+        """Follow the first pass of deviated plans."""
         count = deviations.count
         touched, miss_mm, taken = np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count)
+        ends = np.zeros((count, 9))
         inputs = self._inputs(deviations)
 
         def find(part: slice) -> None:
-            find_outcomes(*inputs, self.wanted, part.start, touched[part], miss_mm[part], taken[part])
+            find_outcomes(
+                *inputs, self.wanted, part.start, touched[part], miss_mm[part], taken[part], ends[part]
+            )
 
         _in_threads(find, count)
-        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken)
+        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken, ends=ends)
 
     def follow(
         self, starts: Float, pieces: Float, n_tube: int, target_mm: Float, border_mm: Float
@@ -135,11 +180,12 @@ class RiskAssessor:
         """Return what becomes of chains whose target has moved, `(N, 3)`; see `Outcomes` and `Deviations`."""
         count = len(starts)
         touched, miss_mm, taken = np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count)
+        ends = np.zeros((count, 9))
         follow_chains(
             starts, pieces, n_tube, self._obstacles, self._judging, self.wanted,
-            np.column_stack([target_mm, border_mm]), touched, miss_mm, taken,
+            np.column_stack([target_mm, border_mm]), touched, miss_mm, taken, ends,
         )  # fmt: skip
-        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken)
+        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken, ends=ends)
 
     def _inputs(self, deviations: Deviations) -> tuple[Any, ...]:
         """Return what both kernels take first; see `find_successes`."""
@@ -147,14 +193,19 @@ class RiskAssessor:
 
     def succeeded(self, outcomes: Outcomes) -> Bool:
         """Tell which `(N,)` take enough, leave the airway and touch nothing forbidden."""
-        enough = outcomes.taken >= self.wanted.least
-        return np.asarray(enough & ((outcomes.touched & self._forbidden_flags) == 0))
+        return np.asarray((outcomes.taken >= self.wanted.least) & self.touches_nothing(outcomes.touched))
+
+    def touches_nothing(self, touched: Int) -> Bool:
+        """Tell which flags `(N,)` are of nothing forbidden."""
+        return np.asarray((touched & self._forbidden_flags) == 0)
 
     def successes(self, deviations: Deviations) -> Bool:
         """Tell which `(N,)` of deviated plans succeed, as `succeeded` does of their outcomes.
 
         Those that miss the goal are not followed, and the others only up to the first forbidden touch.
         """
+        if self._others:
+            return self.succeeded(self.outcomes(deviations))
         done = np.zeros(deviations.count, dtype=bool)
         inputs = self._inputs(deviations)
 
@@ -183,6 +234,12 @@ class RiskAssessor:
     def success(self, draws: Draws, model: ErrorModel) -> Share:
         """Return the share of successes under a model."""
         return share_of(self.successes(draws.deviations(model)))
+
+
+def _fitted(n_arcs: int, errors: Deviations) -> Deviations:
+    """Return errors of a pass that are those of the first; of further arcs they are those of the last."""
+    columns = np.minimum(np.arange(n_arcs), errors.roll_rad.shape[1] - 1)
+    return replace(errors, roll_rad=errors.roll_rad[:, columns], stop_mm=errors.stop_mm[:, columns])
 
 
 def _in_threads(find: Callable[[slice], None], count: int) -> None:

@@ -1,6 +1,6 @@
 """Deviations from a plan, and the deviated devices as arcs."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Deviations:
             where the arc ends.
         target_mm ((N, 3) float64, LPS mm): Shift of the target.
         border_mm ((N,) float64): How far all vessels reach out of their masks.
+        further (tuple of Deviations): Those of the passes after the first.
     """
 
     scope_mm: Float
@@ -59,6 +60,7 @@ class Deviations:
     stop_mm: Float
     target_mm: Float
     border_mm: Float
+    further: Any = ()
 
     @property
     def count(self) -> int:

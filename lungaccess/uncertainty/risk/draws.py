@@ -1,6 +1,8 @@
 """Random numbers drawn once and scaled to any error model: the same luck for every plan and every model."""
 
+from collections.abc import Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +14,8 @@ from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, no_devi
 
 PATIENT, ATTEMPT = 0, 1
 """Levels at which errors are drawn."""
+OF_PASS = 10
+"""Streams of the levels of one pass and the next are so far apart."""
 DOWN = np.array([0.0, 0.0, -1.0])
 """Towards the feet, LPS."""
 
@@ -32,6 +36,8 @@ class Draws:
         motion: The patient's own.
         attempt: Number of the attempt on the same N patients: what is drawn for each attempt has other
             numbers.
+        further: Of each pass after the first the number of its arcs, and the pass whose numbers it has by the
+            kinds of which it has not those of the first.
         lps_from_scope_tip ((4, 4) float64): The axes along which a bias of the scope's position is stated; by
             default those of LPS.
 
@@ -49,6 +55,7 @@ class Draws:
         stretch: float = 0.0,
         motion: PatientMotion | None = None,
         attempt: int = 0,
+        further: Sequence[tuple[int, Mapping[str, int]]] = (),
         lps_from_scope_tip: Float | None = None,
     ) -> None:
         if count < 1:
@@ -62,6 +69,7 @@ class Draws:
         self._stretch, self._motion, self._attempt = stretch, motion, attempt
         self._axes = np.eye(3) if lps_from_scope_tip is None else np.asarray(lps_from_scope_tip)[:3, :3]
         self._made: dict[tuple[str, int], Float] = {}
+        self._further, self._pass_of = tuple(further), dict[str, int]()
 
     def deviations(self, model: ErrorModel) -> Deviations:
         """Return the deviations of all attempts under a model."""
@@ -79,7 +87,14 @@ class Draws:
         values["factor"] = self._factors(model)
         if model.breathing.size and (self._motion or self._stretch):
             values["target_mm"] = values["target_mm"] + self._breathed_mm(model)
-        return Deviations(**values)
+        made = Deviations(**values)
+        return replace(made, further=tuple(self.of_pass(*each).deviations(model) for each in self._further))
+
+    def of_pass(self, n_arcs: int, pass_of: Mapping[str, int]) -> "Draws":
+        """Return the draws of a further pass; numbers are kept with those of all others."""
+        own = copy(self)
+        own._n_arcs, own._pass_of, own._further = n_arcs, dict(pass_of), ()
+        return own
 
     def numbers(self, model: ErrorModel) -> dict[tuple[str, int], Float]:
         """Return the standard normal numbers `(N, ...)` that a model uses, by kind and level."""
@@ -143,6 +158,7 @@ class Draws:
 
     def _normal(self, kind: str, level: int, shape: tuple[int, ...]) -> Float:
         """Return the numbers of a kind at a level, the same at each call."""
+        level += OF_PASS * self._pass_of.get(kind, 0) * (level != PATIENT)
         if (kind, level) not in self._made:
             attempt = 0 if level == PATIENT else self._attempt
             key = (list(UNITS).index(kind), level, attempt)

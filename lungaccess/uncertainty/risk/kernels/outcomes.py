@@ -98,9 +98,9 @@ def find_successes(devices, errors, which, obstacles, judging, wanted, forbidden
 
 
 @kernel(nogil=True)
-def find_outcomes(devices, errors, which, obstacles, judging, wanted, first, touched, miss_mm, taken):
+def find_outcomes(devices, errors, which, obstacles, judging, wanted, first, touched, miss_mm, taken, ends):
     """Note all that deviated plans touch, `(N,)` flags, how far the middle of the tool misses the
-    target, `(N,)` mm, and what they take.
+    target, `(N,)` mm, what they take, and where they end, `(N, 9)`.
 
     The parameters are those of `find_successes`.
     """
@@ -111,6 +111,7 @@ def find_outcomes(devices, errors, which, obstacles, judging, wanted, first, tou
         end = find_end(start, pieces)
         miss_mm[m] = miss_of(wanted, _shift(errors, first + m), end)
         taken[m] = tissue_taken(wanted, _shift(errors, first + m), end)
+        ends[m] = end
         touched[m] = _touched(obstacles, judging, start, pieces, devices.n_tube, 0, errors[first + m, BORDER])
 
 
@@ -129,8 +130,8 @@ def find_pieces(devices, errors, which, pieces):
 
 
 @kernel(nogil=True)
-def follow_chains(starts, pieces, n_tube, obstacles, judging, wanted, moved, touched, miss_mm, taken):
-    """Note what chains touch, `(N,)` flags, how far they miss, `(N,)` mm, and what they take.
+def follow_chains(starts, pieces, n_tube, obstacles, judging, wanted, moved, touched, miss_mm, taken, ends):
+    """Note what chains touch, `(N,)` flags, how far they miss, `(N,)` mm, what they take and where they end.
 
     `moved` `(N, 4)` says how far the nodule lies from where it was planned, and how far vessels reach out of
     their voxels, in mm; see `deviation.follow`.
@@ -138,4 +139,4 @@ def follow_chains(starts, pieces, n_tube, obstacles, judging, wanted, moved, tou
     for n in range(starts.shape[0]):
         touched[n] = _touched(obstacles, judging, starts[n], pieces[n], n_tube, 0, moved[n, 3])
         end, shift = find_end(starts[n], pieces[n]), (moved[n, 0], moved[n, 1], moved[n, 2])
-        miss_mm[n], taken[n] = miss_of(wanted, shift, end), tissue_taken(wanted, shift, end)
+        miss_mm[n], taken[n], ends[n] = miss_of(wanted, shift, end), tissue_taken(wanted, shift, end), end

@@ -350,12 +350,12 @@ class Plan(Record):
 def redirection_mm(before: Plan, after: Plan) -> tuple[float, float]:
     """Return how far the needle is withdrawn between two passes, and how far it is then inserted, mm.
 
-    Arcs that both begin with from the same tubes stay in place.
+    Arcs that both begin with from the same tubes stay in place, but never the last one.
     """
     if before.needle is None or after.needle is None:
         return 0.0, 0.0
     same = before.tube.lps_from_tip.tobytes() == after.tube.lps_from_tip.tobytes()
-    pairs = zip(before.needle.arcs, after.needle.arcs, strict=False) if same else ()
+    pairs = zip(before.needle.arcs[:-1], after.needle.arcs[:-1], strict=False) if same else ()
     kept = sum(one.length_mm for one, _other in takewhile(lambda both: vars(both[0]) == vars(both[1]), pairs))
     return before.needle.length_mm - kept, after.needle.length_mm - kept
 

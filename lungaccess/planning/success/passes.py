@@ -4,7 +4,7 @@ Where passes of a plan at one point end is simulated once.  A pass that is aimed
 its tool is laid into the nodule as theirs were, moved by what was planned.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from lungaccess.planning.coupled.search.direct_candidates import DirectCandidate
 from lungaccess.planning.procedure import Policy
 from lungaccess.planning.procedure.simulation import passes_simulated
 from lungaccess.planning.success.ratings import ChanceRating
+from lungaccess.plans.assemble import with_devices
 from lungaccess.plans.candidate import Candidate, with_tool_in_place
 from lungaccess.plans.kernels.tissue import Wanted, taken_in
 from lungaccess.plans.plan import Plan
@@ -30,7 +31,7 @@ OTHER_TUBES = 6
 SWEEPS = 4
 """Each pass is chosen anew so many times while the others stay; it hardly ever takes three."""
 
-OPEN_DRAWS, MEASURED_DRAWS = 4096, 400
+OPEN_DRAWS, MEASURED_DRAWS = 1024, 400
 """Draws by which aims are chosen, and others of the same number by which plans compete."""
 CHOOSING, COMPARING = 14, 15
 """Batches of these draws: no round of the contest has such a number."""
@@ -58,10 +59,6 @@ class _Ended:
             wanted=assessor.wanted,
             clear=np.all([assessor.touches_nothing(each.touched) for each in found], axis=0),
         )
-
-    def share(self, taken: Sequence[Float]) -> float:
-        """Return how often passes that take `(N,)` each take enough together and touch nothing."""
-        return float((self.clear & (taken_together(taken, self.wanted) >= self.wanted.least)).mean())
 
     def taken(self, moved: Float) -> Float:
         """Return what each pass `(K, N)` takes if its tool is moved by a frame `(4, 4)`."""
@@ -91,9 +88,18 @@ def with_passes(
     reach_mm = goal_radius(request.lung, request.target.lps_mm, request.radius_mm)[0]
     ways = list(_ways(best, direct, reach_mm))
     frames = np.array([with_tool_in_place(request.system, each.path).frames()[-1] for each in ways])
+    clear = [ended.clear] * len(ways)
+    if rating.procedure.is_open_loop:
+        # Where nothing is planned again, a way touches what it touches, wherever the others go.
+        task = direct.evaluator.task
+        clear = [
+            rating.clear(with_devices(task, each, one), draws, rating.seed_of(CHOOSING)) for each in ways
+        ]
     # Passes with the same tubes follow each other: the tubes are moved no more often than they have to be.
     tubes = [id(each.deployment) for each in ways]
-    chosen = sorted(_together(count, ended, frames).tolist(), key=lambda way: tubes.index(tubes[way]))
+    chosen = sorted(
+        _together(count, ended, frames, np.array(clear)).tolist(), key=lambda way: tubes.index(tubes[way])
+    )
     first, *others = (one if way == 0 else make(ways[way]) for way in chosen)
     plans = [one, same, first.with_further(others)]
     gained = [rating.scorer(each)(COMPARING, draws, 1.0) for each in plans]
@@ -128,10 +134,14 @@ def _ways(best: Candidate, direct: DirectCandidates, reach_mm: float) -> Iterato
                 yield other
 
 
-def _together(count: int, ended: _Ended, frames: Float) -> Int:
+def _together(count: int, ended: _Ended, frames: Float, clear: Bool) -> Int:
     """Return which way each pass goes, `(count,)`, so that passes most often take enough together.
 
-    The first of the ways is the one at whose end passes were simulated; frames `(W, 4, 4)` are of their ends.
+    The first of the ways is the one at whose end passes were simulated.
+
+    Args:
+        frames ((W, 4, 4) float64): In which ways end.
+        clear ((W, N) bool): In which draws they touch nothing forbidden.
     """
     moved = np.tile(np.eye(4), (len(frames), 1, 1))
     moved[:, :3, :3] = frames[:, :3, :3] @ frames[0, :3, :3].T
@@ -140,10 +150,14 @@ def _together(count: int, ended: _Ended, frames: Float) -> Int:
     chosen, gained, best = np.zeros(count, dtype=np.int64), -1.0, 0.0
     for _sweep in range(SWEEPS):
         for number in range(count):
-            others = [taken[chosen[n], n] for n in range(count) if n != number]
-            shares = [ended.share([*others, own]) for own in taken[:, number]]
+            others = [n for n in range(count) if n != number]
+            kept, free = [taken[chosen[n], n] for n in others], clear[chosen[others]].all(axis=0)
+            enough = [
+                taken_together([*kept, own], ended.wanted) >= ended.wanted.least for own in taken[:, number]
+            ]
+            shares = (np.array(enough) & free & clear).mean(axis=1)
             # Of equals the first wins, which is nearest to where passes were simulated.
-            chosen[number], best = int(np.argmax(shares)), max(shares)
+            chosen[number], best = int(np.argmax(shares)), float(shares.max())
         if best <= gained:
             break
         gained = best

@@ -219,7 +219,7 @@ def advised(
     known = appraisal or appraise(plan, lung, errors=errors, procedure=procedure)
     return advise(
         plan, lung, known, errors=errors, procedure=procedure, atlas_of=partial(kept_atlas, lung, cache),
-        systems=presets_by_invasiveness() if plan.system.tool is None else (),
+        systems=presets_by_invasiveness(tool=plan.system.tool),
     )  # fmt: skip
 
 

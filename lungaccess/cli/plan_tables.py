@@ -67,6 +67,10 @@ def steps_table(plan: Plan, lung: Lung) -> Table:
 
     steps = scope_steps(plan, lung)
     rows = [(str(number), one.text) for number, one in enumerate(steps, start=1)]
+    rows += [
+        (f"pass {number}", f"{said[:1].upper()}{said[1:]}.")
+        for number, said in enumerate(plan.redirections, 2)
+    ]
     made = terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows)
     made.caption = f"{handle_words(plan)} {steps_note(plan, lung)}"
     made.caption_justify = "left"
@@ -74,6 +78,7 @@ def steps_table(plan: Plan, lung: Lung) -> Table:
 
 
 def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
+    from lungaccess.plans.view import view_words
     from lungaccess.problem.nodules import target_words
 
     scope, tube, place = plan.scope, plan.tube, target_words(lung, plan.target_lps)
@@ -90,6 +95,8 @@ def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
             f"through the wall of branch {lung.branch_words(tube.exit.branch)}",
         ),
         ("needle", way + (f": {place}" if place else "")),
+        *((f"pass {number}", said) for number, said in enumerate(plan.redirections, 2)),
+        *((("ultrasound", view),) if (view := view_words(plan, lung)) else ()),
     ]
 
 

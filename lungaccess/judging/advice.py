@@ -27,6 +27,8 @@ GOOD = 0.9
 """A plan that succeeds so often is left without advice."""
 DRAWS, SIMULATED = 2000, 250
 """Draws of each trial in open loop, and procedures of one that measures: a half is known to 1 and 3 %."""
+PASSES = 3
+"""So many passes are tried."""
 KNOWN = {
     "scope_position": 0.5,
     "scope_direction": 0.5,
@@ -87,6 +89,7 @@ class Adviser:
         """Yield what each trial shows, the quickest trials first; None where there is nothing to show."""
         yield from self._errors_known()
         yield from self._procedures()
+        yield from self._passes()
         yield from self._points()
         yield from self._presets()
 
@@ -119,6 +122,14 @@ class Adviser:
                 options=("--procedure", name),
             )
 
+    def _passes(self) -> Iterator[Advice | None]:
+        """Try more passes of the tool: planned together, or at the same point where no atlas is at hand."""
+        plan = self._plan
+        target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
+        for count in range(len(plan.passes) + 1, PASSES + 1) if plan.system.tool is not None else ():
+            found = self._planned(plan.system, target, count) or plan.with_further([plan] * (count - 1))
+            yield self._of_plan(found, f"{count} passes", ("--passes", str(count)))
+
     def _points(self) -> Iterator[Advice | None]:
         """Try other points of the nodule."""
         nodules, plan = self._lung.nodules, self._plan
@@ -143,7 +154,9 @@ class Adviser:
         for system in self._systems:
             if system.name != plan.system.name:
                 words = f"device {system.name}"
-                yield self._of_plan(self._planned(system, target), words, ("--system", system.name))
+                added = f" ({plan.system.tool.name})" if plan.system.tool is not None else ""
+                name = system.name.removesuffix(added)
+                yield self._of_plan(self._planned(system, target), words, ("--system", name))
 
     def _of_plan(self, found: Plan | None, words: str, options: tuple[str, ...]) -> Advice | None:
         if found is None or not self._checker.check(found).accepted:
@@ -151,13 +164,13 @@ class Adviser:
         success = self._estimated(found, self._errors, self._procedure)
         return Advice(words=words, success=success, options=options)
 
-    def _planned(self, system: System, target: Target) -> Plan | None:
+    def _planned(self, system: System, target: Target, passes: int = 1) -> Plan | None:
         """Return the plan of a short search for success, None without one or where no atlas is at hand."""
         atlas = self._atlas_of(system)
         if atlas is None:
             return None
         request = Request(
-            lung=self._lung, target=target, systems=(system,), errors=self._errors,
+            lung=self._lung, target=target, systems=(system,), errors=self._errors, passes=passes,
             # Seconds of the search with another device or to another point.
             procedure=load_procedure(), seed=self._plan.seed, limits=Limits(time_s=0.6),
         )  # fmt: skip

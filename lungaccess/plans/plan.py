@@ -1,7 +1,7 @@
 """The plan of all three stages: what each device does, why it is allowed, and where it came from."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from functools import cached_property
 from itertools import pairwise, takewhile
@@ -19,6 +19,7 @@ from lungaccess.plans import file as plan_file
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.curves import (
     STEP_MM,
+    DeviceCurve,
     DeviceCurves,
     device_curves,
     needle_pieces,
@@ -114,7 +115,9 @@ class Plan(Record):
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
 
         heading = f"Plan for {self.patient_name}, {self.system.name}"
-        return plan_html(heading, self.figures(), self.curves(), self.tube.exit.point_lps, self.target_lps)
+        return plan_html(
+            heading, self.figures(), self.shown_curves(), self.tube.exit.point_lps, self.target_lps
+        )
 
     @property
     def end_lps(self) -> Float:
@@ -280,6 +283,16 @@ class Plan(Record):
             return self._curves
         return device_curves(self.scope, self.tube, self.needle, self.system, step_mm)
 
+    def shown_curves(self, step_mm: float = STEP_MM) -> tuple[DeviceCurve, ...]:
+        """Return the curves of all devices; the names of those that only pass 2 has end in _2."""
+        found, seen = list(self.curves(step_mm).present), {*self.same_tubes[:1]}
+        for number, (each, tubes) in enumerate(zip(self.passes[1:], self.same_tubes[1:], strict=True), 2):
+            curves = each.curves(step_mm)
+            own = (curves.needle,) if tubes in seen else (curves.tubes, curves.needle)
+            found += [replace(curve, name=f"{curve.name}_{number}") for curve in own]
+            seen.add(tubes)
+        return tuple(found)
+
     @cached_property
     def _curves(self) -> DeviceCurves:
         """Return the curves at the usual step, which every picture asks for."""
@@ -365,7 +378,11 @@ TARGET_COLOUR, EXIT_COLOUR = "#2ca02c", "#d62728"
 
 
 def plan_html(
-    heading: str, rows: Iterable[tuple[str, str]], curves: DeviceCurves, exit_lps: Float, target_lps: Float
+    heading: str,
+    rows: Iterable[tuple[str, str]],
+    curves: Sequence[DeviceCurve],
+    exit_lps: Float,
+    target_lps: Float,
 ) -> str:
     """Return a plan as HTML.
 
@@ -377,9 +394,9 @@ def plan_html(
     return side_by_side(table(rows, heading), *drawings)
 
 
-def _drawing(view: str, curves: DeviceCurves, exit_lps: Float, target_lps: Float) -> str:
+def _drawing(view: str, curves: Sequence[DeviceCurve], exit_lps: Float, target_lps: Float) -> str:
     drawing = Drawing(view)
-    for curve in curves.present:
+    for curve in curves:
         red, green, blue = (round(255 * c) for c in curve.colour)
         # A thinner device is drawn this wide, so that it can be seen.
         width_mm = max(2.0 * float(curve.radius_mm.max()), 1.5)

@@ -249,6 +249,7 @@ def motion_record(plan: Plan, lung: Lung) -> dict[str, object]:
             {"advance_mm": float(a), "twist_deg": float(t), "bend_deg": float(b)}
             for a, t, b in zip(advance, twist, bend, strict=True)
         ],
+        "passes": list(plan.redirections),
         "note": steps_note(plan, lung),
         "lps_from_entry": plan.scope.lps_from_entry.tolist(),
         "bending_length_mm": plan.system.scope.bending_length_mm,

@@ -204,7 +204,7 @@ def _report(plan: Plan, appraisal: Appraisal, first: Any, uid: Callable[[str], s
             f"{curve.name.upper()}_LENGTH", f"Length of the {curve.name}", float(curve.arc_length_mm[-1]),
             graphic="POLYLINE", at=curve.points_lps,
         )
-        for curve in plan.curves(1.0).present
+        for curve in plan.shown_curves(1.0)
     ]  # fmt: skip
     places = (
         ("TARGET", "Target", plan.target_lps),

@@ -37,7 +37,7 @@ def export_models(plan: Plan, lung: Lung, folder: str | Path) -> tuple[str, ...]
 
     target = require_writable_folder(folder)
     surfaces: dict[str, tuple[SurfaceMesh, tuple[float, ...]]] = {
-        curve.name: (device_surface(curve), (*curve.colour, 1.0)) for curve in plan.curves(STEP_MM).present
+        curve.name: (device_surface(curve), (*curve.colour, 1.0)) for curve in plan.shown_curves(STEP_MM)
     }
     for name, (colour, opacity) in STRUCTURES.items():
         if (found := structure_surface(lung, name)) is not None:

@@ -33,6 +33,9 @@ def insert(
     lost: Annotated[NotNegative, Parameter(help="Share of the measurements that are lost, 0 to 1.")] = 0.0,
     speed: Annotated[Positive, Parameter(help="Speed of the insertion, mm/s.")] = 2.0,
     replan_every: Annotated[NotNegative, Parameter(help="Least insertion between two replans, mm.")] = 2.0,
+    number: Annotated[
+        int, Parameter(name="--pass", help="Which pass of the plan, where it has several.")
+    ] = 1,
     errors: ErrorsText = None,
     tolerance: Annotated[
         NotNegative, Parameter(help="A tip that ends no farther from the target has reached it, mm.")
@@ -55,7 +58,10 @@ def insert(
     from lungaccess.problem.procedures import NeedleSteering
     from lungaccess.showing.report.insertion import insertion_webp, insertions_png
 
-    stored = Plan.load(plan)
+    passes = Plan.load(plan).passes
+    if not 1 <= number <= len(passes):
+        raise SettingsError(f"--pass is {number}", expected=f"a pass of the plan, 1 to {len(passes)}")
+    stored = passes[number - 1]
     steering = NeedleSteering(
         closed_loop=True, measure_every_mm=speed / rate, replan_every_mm=replan_every, position_mm=noise,
         direction_deg=tilt, target_mm=noise, latency_mm=latency * speed, lost_share=lost,

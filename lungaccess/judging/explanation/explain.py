@@ -27,6 +27,7 @@ from lungaccess.planning.one_system import run
 from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.view import best_view_words
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.request import Limits, Request
 from lungaccess.problem.system import System
@@ -153,6 +154,7 @@ class Explainer:
             untried=tuple(each.name for each in untried if each.name not in done),
             changes=tuple(sorted(changes, key=lambda each: each.change.relative_change)),
             parts=tuple(self._parts),
+            ultrasound=best_view_words(self._task.lung, self._task.target.lps_mm, self._atlas.motions.tips),
             **self._found,
         )
         chances = {name: self._chance(each) for name, each in made.plans.items()}

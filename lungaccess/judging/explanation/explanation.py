@@ -62,6 +62,7 @@ class Explanation:
         chances: How many of the simulated procedures succeed with each of `plans`, by the names of their
             files, under the default errors.
         verdict: Whether the target is proved unreachable.
+        ultrasound: What radial ultrasound is expected to show of the nodule, in words.
         parts: What was done and what was not, in the order of doing.
         time_s: Seconds of processor time that it took, without getting kernels.
     """
@@ -83,6 +84,7 @@ class Explanation:
     shares: tuple[ReachedShare, ...] = ()
     chances: Mapping[str, Share] = field(default_factory=dict)
     verdict: ReachVerdict | None = None
+    ultrasound: str = ""
     parts: tuple[Part, ...] = ()
     time_s: float = 0.0
 

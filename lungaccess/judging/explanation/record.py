@@ -63,6 +63,7 @@ def explanation_record(explanation: Explanation) -> Record:
         "through_fissures": e.through_fissures,
         "reached_shares": [_share(each) for each in e.shares],
         "proved_unreachable": None if e.verdict is None else e.verdict.proved,
+        "radial_ultrasound": e.ultrasound or None,
         "proof_rests_on": "" if e.verdict is None else e.verdict.rests_on,
         "parts": [{"part": part.name, "outcome": part.outcome, "why": part.why} for part in e.parts],
         "chances_under_default_errors": {name: _chance(share) for name, share in e.chances.items()},

@@ -90,6 +90,8 @@ def _misses(e: Explanation) -> Iterator[Row]:
     if neighbour is not None:
         near = f"ends {neighbour.from_target_mm:.1f} mm from the target; {_file(e, neighbour.plan)}"
         yield f"nearest point found that {_by(e)}", near, point_in_words(neighbour.plan.target_lps)
+    if e.ultrasound:
+        yield "radial ultrasound", e.ultrasound, ""
 
 
 def _blocks(e: Explanation) -> Iterator[Row]:

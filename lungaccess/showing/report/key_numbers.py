@@ -9,6 +9,7 @@ import numpy as np
 from anatomy.base.words import plural
 from lungaccess.judging.appraisal.limits import SHOWN_LIMITS
 from lungaccess.plans.costs import costs_in_words, known_costs
+from lungaccess.plans.view import view_words
 from lungaccess.problem.nodules import target_words
 
 if TYPE_CHECKING:
@@ -29,7 +30,9 @@ def key_numbers(plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> l
 def figures_of_plan(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
     """Return headed rows of what the plan does and costs, without its limits."""
     costs = costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None))
-    return [("Plan", _general_rows(plan, lung)), *_stage_rows(plan, lung), ("Cost", costs)]
+    passes = [(f"pass {number}", said) for number, said in enumerate(plan.redirections, 2)]
+    more = [("Further passes", passes)] if passes else []
+    return [("Plan", _general_rows(plan, lung)), *_stage_rows(plan, lung), *more, ("Cost", costs)]
 
 
 def _general_rows(plan: Plan, lung: Lung) -> list[Row]:
@@ -40,6 +43,7 @@ def _general_rows(plan: Plan, lung: Lung) -> list[Row]:
         ("target, LPS mm", f"{x:.1f}, {y:.1f}, {z:.1f}"),
         ("target, RAS mm", f"{-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}"),
         *((("place of the target", place),) if (place := target_words(lung, plan.target_lps)) else ()),
+        *((("radial ultrasound", view),) if (view := view_words(plan, lung)) else ()),
         ("fissures", _fissures(plan)),
         ("breath hold", plan.breath_hold or "not stated"),
         ("method, seed", f"{plan.method}, {plan.seed}"),

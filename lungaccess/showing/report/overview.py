@@ -81,10 +81,10 @@ def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
 
 
 def _stages(axes: Axes, plan: Plan, view: View, scope: Float) -> None:
-    _scope, *others = plan.curves().present
+    _scope, *others = plan.shown_curves()
     drawing.curve(axes, scope, style.SCOPE, 3.4, 6)
-    looks = ((style.TUBE, 3.0), (style.NEEDLE, 2.2))
-    for order, (curve, (colour, width)) in enumerate(zip(others, looks, strict=False), start=7):
+    for order, curve in enumerate(others, start=7):
+        colour, width = (style.NEEDLE, 2.2) if curve.name.startswith("needle") else (style.TUBE, 3.0)
         drawing.curve(axes, view.project(curve.points_lps), colour, width, order)
 
 

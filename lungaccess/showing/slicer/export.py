@@ -94,7 +94,7 @@ def export_slicer(
     tell("checking the plan", 0.0)
     report = check(plan, lung)
     devices = plan.curves(STEP_MM)
-    items = _write_devices(plan, devices, target, refused=not report.accepted)
+    items = _write_devices(plan, target, refused=not report.accepted)
     region, why_none = _write_start_region(plan, lung, target) if report.accepted else ([], "")
     items += region
     items += _write_anatomy(lung, target, tell)
@@ -110,11 +110,11 @@ def export_slicer(
     return Exported(files=files, report=report)
 
 
-def _write_devices(plan: Plan, devices: DeviceCurves, folder: Path, *, refused: bool) -> list[Item]:
+def _write_devices(plan: Plan, folder: Path, *, refused: bool) -> list[Item]:
     """Write curves, tubes and points; a refused plan is named so wherever its devices show."""
     prefix = "REFUSED by the check: " if refused else ""
     items = []
-    for curve in devices.present:
+    for curve in plan.shown_curves(STEP_MM):
         curve_file, model_file = f"{curve.name}.mrk.json", f"{curve.name}.ply"
         _write_json(folder / curve_file, _named(curve_markup(curve), prefix))
         write_ply(folder / model_file, device_surface(curve))

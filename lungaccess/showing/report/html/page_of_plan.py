@@ -98,7 +98,7 @@ def plan_page(
         AnatomyError: If the CT does not hold the plan.
     """
     chosen = options or PageOptions()
-    plans = (plan, *chosen.alternatives)
+    plans = (plan, *plan.passes[1:], *chosen.alternatives)
     appraisals = _appraised(plans, lung, chosen)
     first = appraisals[0]
     region = start_region_of(plan, lung) if first.accepted else "Not computed for a refused plan"
@@ -200,7 +200,7 @@ def page_data(
         "patient": lung.name,
         "structures": structure_meshes(lung) + ([] if region is None else start_meshes(region)),
         "plans": [
-            {**packed_plan(each, lung, tables.plan_name(n)), **appraisal.to_mapping()}
+            {**packed_plan(each, lung, tables.plan_name(n, len(plans[0].passes))), **appraisal.to_mapping()}
             for n, (each, appraisal) in enumerate(zip(plans, appraisals, strict=True))
         ],
         **page_image(lung, near, options.ct),

@@ -119,7 +119,7 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
         headline, tightest, plan = appraisal.headline, appraisal.limits[:1], each.plan
         rows.append(
             (
-                words.text(plan_name(number)),
+                words.text(plan_name(number, len(found[0].plan.passes))),
                 words.grade(headline.grade, headline.chance_words),
                 words.text(headline.failures[0][0] if headline.failures else "–"),
                 words.number(each.criteria["length_in_tissue_mm"]),
@@ -146,9 +146,11 @@ def _window(plan: Plan) -> str:
     return "not computed" if plan.window is None else percent(plan.window.share)
 
 
-def plan_name(number: int) -> str:
-    """Return the name of a plan by its place on the page; the first is the one that was given."""
-    return "The plan" if number == 0 else f"Alternative {number}"
+def plan_name(number: int, passes: int) -> str:
+    """Return the name of a plan by its place on the page: the one that was given, and its further passes."""
+    if 0 < number < passes:
+        return f"Pass {number + 1} alone"
+    return "The plan" if number == 0 else f"Alternative {number - passes + 1}"
 
 
 def key_section(plan: Plan, lung: Lung) -> str:
@@ -163,6 +165,7 @@ def instructions_section(plan: Plan, lung: Lung) -> str:
     from lungaccess.plans.scope_steps import handle_words, scope_steps, steps_note
 
     texts = [*(one.text for one in scope_steps(plan, lung)), handle_words(plan)]
+    texts += [f"Pass {number}: {said}." for number, said in enumerate(plan.redirections, 2)]
     found = route_bifurcations(shown_motion(plan), plan.scope.branches, lung, plan.system)
     ways = [one.text for one in found]
     return (

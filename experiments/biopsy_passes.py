@@ -1,7 +1,7 @@
 """Several passes planned together, by size of the nodule and tool, and counted by brute force.
 
     python -m experiments.biopsy_passes [--quick] [--results FOLDER] [--procedure open-loop] [--tools core]
-        [--places 1] [--picture FILE]
+        [--places 1] [--lungs 3 Patient1] [--sizes 8] [--picture FILE]
 
 Nodules are drawn at peripheral targets: balls, and lumps whose radius varies by a quarter.  Of each, one pass
 at the centre, three passes at the same point, and three planned together are counted by the same draws, which
@@ -10,7 +10,7 @@ no search saw, under `breath-hold`.  In open loop, draws of another seed are cou
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -23,7 +23,7 @@ from anatomy.build import build_lung
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
-from experiments.support.anatomies import anatomy, data_folder
+from experiments.support.anatomies import anatomy
 from experiments.support.results import Result, setting_of, small_png, study_parser, write_result
 from lungaccess.judging.checking import check
 from lungaccess.planning.one_system import run
@@ -92,14 +92,11 @@ def planned(lung: Lung, atlas: la.Atlas, centre: Float, tool: str, procedure: st
     return list(run(request, atlas=atlas, counterfactuals=False))[-1]
 
 
-def cases(quick: bool, places: int) -> Iterator[tuple[str, Lung, la.Atlas, Float]]:
-    """Yield lungs with peripheral places."""
-    lungs = [
-        (f"phantom {seed}", build_lung(make_phantom(seed=seed, size="small").images)) for seed in (3, 21)
-    ]
-    if data_folder() is not None:
-        lungs.append(("Patient1", anatomy("Patient1")))
-    for name, lung in lungs[:1] if quick else lungs:
+def cases(names: Sequence[str], places: int) -> Iterator[tuple[str, Lung, la.Atlas, Float]]:
+    """Yield lungs with peripheral places; a name is the seed of a phantom, or a patient of the data."""
+    for name in names:
+        made = make_phantom(seed=int(name), size="small") if name.isdigit() else None
+        lung = anatomy(name) if made is None else build_lung(made.images)
         atlas = la.build_atlas(lung, la.load_system(SYSTEM))
         drawn = (
             each for each in la.peripheral_targets(lung, 10 * places, SEED) if reached(lung, atlas, each)
@@ -123,6 +120,7 @@ def main() -> None:
     parser.add_argument("--procedure", default="open-loop")
     parser.add_argument("--tools", nargs="+", default=["core"])
     parser.add_argument("--places", type=int, default=1)
+    parser.add_argument("--lungs", nargs="+", default=["3", "21", "8"])
     parser.add_argument("--sizes", type=float, nargs="+", default=SIZES_MM)
     parser.add_argument("--picture", default="")
     options = parser.parse_args()
@@ -134,7 +132,7 @@ def main() -> None:
     samples = DRAWS if options.procedure == "open-loop" else 1000
     shares: dict[tuple[str, float], list[list[float]]] = {}
     within = []
-    for where, lung, atlas, centre in cases(options.quick, options.places):
+    for where, lung, atlas, centre in cases(options.lungs[: 1 if options.quick else None], options.places):
         for tool in options.tools:
             for number, size in enumerate(options.sizes):
                 rng = np.random.default_rng(number) if number % 2 else None

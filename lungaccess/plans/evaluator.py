@@ -112,6 +112,13 @@ class CandidateEvaluator:
         """Return the cost of a candidate, infinite if its proof fails."""
         return self.cost(candidate) if self.accepts(candidate) else math.inf
 
+    def beside(self) -> "CandidateEvaluator":
+        """Return one for further passes of a plan, which may take less than is enough as planned."""
+        other = CandidateEvaluator(self.task)
+        if self.wanted is not None:
+            other.wanted = self.wanted._replace(least=0.0)
+        return other
+
     def aim(self, tip_lps: Float) -> Float:
         """Return where devices from a place of the scope's tip are to end, `(3,)` LPS mm: at the target."""
         return self.task.target.lps_mm

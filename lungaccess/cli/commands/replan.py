@@ -90,12 +90,6 @@ def replan(
 
     Objective.of(objective)
     stated, device = target.stated(), system.load()
-    if device.tool is not None:
-        raise SettingsError(
-            f"The system {device.name!r} has a tool, the {device.tool.name}",
-            expected="a system without [tool]: the rest of a plan ends at the target itself",
-            remedy="Leave out [tool], and name as the target the point where the plan ends, its aim",
-        )
     pose, of_plan = _measured(scope, tube, frame)
     lung = output.load(patient)
     if of_plan is not None:

@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike
 from lungaccess.judging.checking.completion import Motions, completed_plan
 from lungaccess.judging.checking.deployment import check_deployment
 from lungaccess.judging.checking.environment import Environment
-from lungaccess.judging.checking.findings import CheckReport, Findings
+from lungaccess.judging.checking.findings import CheckReport, Finding, Findings
 from lungaccess.judging.checking.needle_load import check_needle_load
 from lungaccess.judging.checking.outcome import check_tubes_at_target
 from lungaccess.judging.checking.record import check_record
 from lungaccess.judging.checking.scope import check_scope
 from lungaccess.judging.checking.steering import check_needle
+from lungaccess.judging.checking.tool import TISSUE
 from lungaccess.judging.checking.window import check_window
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.goals import goals
@@ -40,16 +41,11 @@ class Checker:
         """Check one plan, each of its passes; see `lungaccess.judging.checking.check`."""
         first, *others = (self._check_pass(each, system, target_lps) for each in plan.passes)
         # What is known by the names of findings is that of the first pass.
-        named = (
-            replace(one, name=f"pass_{number}.{one.name}")
-            for number, report in enumerate(others, 2)
-            for one in report.findings
-        )
-        return replace(
-            first,
-            accepted=all(each.accepted for each in (first, *others)),
-            findings=(*first.findings, *named),
-        )
+        named = [
+            _of_further(one, number) for number, report in enumerate(others, 2) for one in report.findings
+        ]
+        accepted = first.accepted and all(each.ok is not False for each in named)
+        return CheckReport(accepted=accepted, findings=(*first.findings, *named))
 
     def _check_pass(self, plan: Plan, system: System | None, target_lps: ArrayLike | None) -> CheckReport:
         """Check a plan of one pass."""
@@ -72,6 +68,14 @@ class Checker:
         """Return the plan that bare motions make; see `completion.completed_plan`."""
         target = np.asarray(target_lps, dtype=np.float64)
         return completed_plan(motions, self._environment, system, target, method=method)
+
+
+def _of_further(one: Finding, number: int) -> Finding:
+    """Return a finding of a further pass: the first takes enough as planned, and others may lie beside it."""
+    if one.name == TISSUE:
+        detail = "what this pass takes as planned, beside the first, which takes enough"
+        one = Finding(name=one.name, ok=True, value=one.value, unit=one.unit, detail=detail)
+    return replace(one, name=f"pass_{number}.{one.name}")
 
 
 def check(

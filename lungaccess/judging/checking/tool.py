@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.tools import Tool
 
+TISSUE = "tool.tissue"
+"""The name of the finding."""
 PARTS = 6
 """A voxel is cut into so many parts along each axis where a volume is counted."""
 BALL_RADIUS_MM = 5.0
@@ -40,7 +42,7 @@ def check_tool(plan: Plan, lung: Lung, lps_from_end: Float, found: Findings) -> 
         value = inside_mm3 if tool.unit == "mm3" else inside_mm3 / whole_mm3
         # Share of what is wanted by which volumes may differ: the planner counts few points of the tool.
         tolerance = 0.1 * tool.least
-    found.at_least("tool.tissue", value, tool.least, tool.unit, f"wanted: {tool.words}", tolerance)
+    found.at_least(TISSUE, value, tool.least, tool.unit, f"wanted: {tool.words}", tolerance)
 
 
 def _nodule(tool: Tool, lung: Lung, target: Float) -> tuple[Int, Float]:

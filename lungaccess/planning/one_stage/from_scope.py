@@ -11,6 +11,7 @@ from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.planning.coupled.search.direct_arcs import costs_of_tubes
 from lungaccess.planning.coupled.search.local_search import TubeChoice, path_through, tube_arguments
 from lungaccess.planning.one_stage.rest import RestOfPlan
+from lungaccess.plans.candidate import with_tool_in_place
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.task import Task
@@ -56,7 +57,7 @@ class ScopeReplanner:
             task=self._task,
             lps_from_measured=frame,
             deployment=deployment,
-            path=path,
+            path=with_tool_in_place(self._task.system, path),
             branch=deployment.branch,
         )
 

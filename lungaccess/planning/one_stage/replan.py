@@ -14,7 +14,11 @@ from lungaccess.planning.one_stage.from_scope import SEARCHED, TRIES, ScopeRepla
 from lungaccess.planning.one_stage.needle import needle_question
 from lungaccess.planning.one_stage.obstruction import reason_in_words
 from lungaccess.planning.one_stage.rest import RestOfPlan
+from lungaccess.plans.candidate import with_tool_in_place
+from lungaccess.plans.evaluator import TOO_LITTLE
+from lungaccess.plans.kernels.tissue import taken_at
 from lungaccess.plans.no_plan import NoPlan
+from lungaccess.plans.tissue import wanted_of
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
@@ -47,7 +51,8 @@ def replan_from_scope(
 ) -> RestOfPlan:
     """Plan tubes and needle from where the tip of the scope really is.
 
-    The deployments from this one pose are enumerated as in an atlas, as far as the target lies in the
+    With a tool the needle goes on until the tool is at the target, and takes enough of the nodule.  The
+    deployments from this one pose are enumerated as in an atlas, as far as the target lies in the
     needle's workspace; the cheapest clear direct arc is the first answer, or what the needle's own search
     finds, and a local search improves it.  Without a needle the tubes are aimed at the target.  The same
     input and seed give the same answer.
@@ -103,8 +108,18 @@ def replan_from_tube(
             if search.iterations == before:
                 break
         path = search.path
-    allowed = path is not None and math.isfinite(map_integral(lung.cost, path))
-    if path is None or not allowed or violation(asked.environment, asked.query, path):
+    if path is not None:
+        path = with_tool_in_place(system, path)
+        last = path.frames()[-1]
+        query = replace(asked.query, target=last[:3, 3]) if system.tool is not None else asked.query
+        proved = math.isfinite(map_integral(lung.cost, path)) and not violation(
+            asked.environment, query, path
+        )
+        path = path if proved else None
+    wanted = None if system.tool is None else wanted_of(lung, target.lps_mm, system.tool)
+    if path is not None and wanted is not None and taken_at(wanted, last) < wanted.least:
+        raise NoPlan("No needle path from the tube's tip as measured", reasons={f"needle: {TOO_LITTLE}": 1})
+    if path is None:
         blocked = blocked or easiest_obstruction(asked.environment, asked.query)
         why = "the search found no clear path" if blocked is None else reason_in_words(blocked)
         raise NoPlan(f"No needle path from the tube's tip as measured: {why}", reasons={f"needle: {why}": 1})
@@ -114,8 +129,6 @@ def replan_from_tube(
 
 
 def _task(lung: Lung, system: System, target: Target, objective: str | Objective, seed: int) -> Task:
-    # The rest of a plan ends where it is told to, which for a tool is the aim of the plan.
-    system = replace(system, tool=None)
     weighed = objective_of(lung, objective)
     return Task(lung=lung, system=system, target=target, objective=weighed, method="replan", seed=seed)
 

@@ -17,14 +17,14 @@ from lungaccess.planning.procedure.simulation import passes_simulated
 from lungaccess.planning.success.ratings import ChanceRating
 from lungaccess.plans.assemble import with_devices
 from lungaccess.plans.candidate import Candidate, with_tool_in_place
-from lungaccess.plans.kernels.tissue import Wanted, taken_in
+from lungaccess.plans.kernels.tissue import Wanted, taken_at, taken_in
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.tissue import goal_radius
 from lungaccess.problem.request import Request
 from lungaccess.uncertainty.risk.assessor import taken_together
 from stages.needle import direct_path
 
-RINGS = ((0.35, 6), (0.7, 8), (1.0, 8))
+RINGS = ((0.35, 6), (0.7, 8), (1.0, 8), (1.5, 8), (2.0, 8))
 """Distances of aims from the target across the needle, in radii of the nodule, and how many lie so far."""
 OTHER_TUBES = 6
 """So many other deployments from the place of the scope are tried: the first clear ones of the atlas."""
@@ -95,12 +95,13 @@ def with_passes(
         clear = [
             rating.clear(with_devices(task, each, one), draws, rating.seed_of(CHOOSING)) for each in ways
         ]
+    wanted = direct.evaluator.wanted
+    enough = np.array([wanted is None or taken_at(wanted, each) >= wanted.least for each in frames])
     # Passes with the same tubes follow each other: the tubes are moved no more often than they have to be.
     tubes = [id(each.deployment) for each in ways]
-    chosen = sorted(
-        _together(count, ended, frames, np.array(clear)).tolist(), key=lambda way: tubes.index(tubes[way])
-    )
-    first, *others = (one if way == 0 else make(ways[way]) for way in chosen)
+    lead, *rest = _together(count, ended, frames, np.array(clear), enough).tolist()
+    rest.sort(key=lambda way: (tubes[way] != tubes[lead], tubes.index(tubes[way])))
+    first, *others = (one if way == 0 else make(ways[way]) for way in (lead, *rest))
     plans = [one, same, first.with_further(others)]
     gained = [rating.scorer(each)(COMPARING, draws, 1.0) for each in plans]
     # Of equals the one with fewer passes wins.
@@ -110,7 +111,7 @@ def with_passes(
 def _ways(best: Candidate, direct: DirectCandidates, reach_mm: float) -> Iterator[Candidate]:
     """Yield proved ways from the place of the scope to aims about the target, the best one first."""
     yield best
-    evaluator, atlas = direct.evaluator, direct.atlas
+    evaluator, atlas = direct.evaluator.beside(), direct.atlas
     frame, target = best.path.frames()[-1], evaluator.task.target.lps_mm
     aims = [target]
     for far, number in RINGS:
@@ -134,7 +135,7 @@ def _ways(best: Candidate, direct: DirectCandidates, reach_mm: float) -> Iterato
                 yield other
 
 
-def _together(count: int, ended: _Ended, frames: Float, clear: Bool) -> Int:
+def _together(count: int, ended: _Ended, frames: Float, clear: Bool, enough: Bool) -> Int:
     """Return which way each pass goes, `(count,)`, so that passes most often take enough together.
 
     The first of the ways is the one at whose end passes were simulated.
@@ -142,6 +143,7 @@ def _together(count: int, ended: _Ended, frames: Float, clear: Bool) -> Int:
     Args:
         frames ((W, 4, 4) float64): In which ways end.
         clear ((W, N) bool): In which draws they touch nothing forbidden.
+        enough ((W,) bool): Which take enough as planned: the first pass does.
     """
     moved = np.tile(np.eye(4), (len(frames), 1, 1))
     moved[:, :3, :3] = frames[:, :3, :3] @ frames[0, :3, :3].T
@@ -152,10 +154,11 @@ def _together(count: int, ended: _Ended, frames: Float, clear: Bool) -> Int:
         for number in range(count):
             others = [n for n in range(count) if n != number]
             kept, free = [taken[chosen[n], n] for n in others], clear[chosen[others]].all(axis=0)
-            enough = [
+            take = [
                 taken_together([*kept, own], ended.wanted) >= ended.wanted.least for own in taken[:, number]
             ]
-            shares = (np.array(enough) & free & clear).mean(axis=1)
+            shares = (np.array(take) & free & clear).mean(axis=1)
+            shares = shares if number else np.where(enough, shares, -1.0)
             # Of equals the first wins, which is nearest to where passes were simulated.
             chosen[number], best = int(np.argmax(shares)), float(shares.max())
         if best <= gained:

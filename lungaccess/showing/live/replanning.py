@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +19,7 @@ from lungaccess.planning.one_stage import RestOfPlan, ScopeReplanner, measured_p
 from lungaccess.planning.procedure import WATCHED, Measurements, Policy
 from lungaccess.plans.curves import SHORTEST_MM, STEP_MM, needle_pieces, tube_pieces
 from lungaccess.plans.plan import Plan
+from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, point_target
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, Belief, Commands, Objective, Query, Replanner, Unknown, needle_environment
@@ -151,11 +153,16 @@ class TrackedReplanner:
         self._policy = None
         self.__dict__.pop("_scope_replanner", None)
 
+    @property
+    def _device(self) -> System:
+        """The devices without a tool: what is planned again ends where it is told to, at the plan's aim."""
+        return replace(self._plan.system, tool=None)
+
     @cached_property
     def _scope_replanner(self) -> ScopeReplanner:
         plan = self._plan
         task = Task(
-            lung=self._lung, system=plan.system, target=self._target, method="replan", seed=plan.seed,
+            lung=self._lung, system=self._device, target=self._target, method="replan", seed=plan.seed,
             objective=Objective.of(plan.objective),
         )  # fmt: skip
         return ScopeReplanner(task, tries=0, searches=SEARCHES)
@@ -165,7 +172,7 @@ class TrackedReplanner:
 
     def _from_tube(self, pose: Float) -> RestOfPlan:
         return replan_from_tube(
-            self._lung, self._plan.system, pose, self._target, objective=self._plan.objective,
+            self._lung, self._device, pose, self._target, objective=self._plan.objective,
             seed=self._plan.seed, iterations=ITERATIONS,
         )  # fmt: skip
 

@@ -273,13 +273,7 @@ class CrashError(LungaccessError):
 
 
 def write_report(error: Exception, words: Sequence[str], version: str) -> CrashError:
-    """Write what is known of a crash into a file of its own, and return the error that names the file.
-
-    Args:
-        error: Raised where no error of a user was expected.
-        words: The command line without the name of the program.
-        version: Of lungaccess.
-    """
+    """Write what is known of a crash into a file of its own, and return the error that names the file."""
     system = f"Python {platform.python_version()} on {platform.platform()}"
     lines = [f"lungaccess {version}, {system}", f"command: {list(words)!r}", ""]
     lines += traceback.format_exception(error)

@@ -49,7 +49,6 @@ class Advice:
     """One thing that lifts the chance of success.
 
     Args:
-        words: What it is.
         success: How many procedures succeed with it, on the draws of the trial.
         options: Words that the command `lungaccess plan` needs more for it.
     """
@@ -200,9 +199,7 @@ def advise(
 
     Args:
         appraisal: Of the plan: an accepted one whose chance of success is known.
-        errors, procedure: Under which it was estimated; as of `lungaccess.judging.appraisal.Appraiser`.
         atlas_of: Returns the atlas of a system if it is at hand, else None: making one takes too long.
-        systems: Other devices to try.
     """
     success = appraisal.headline.success
     if success is None or success.value >= GOOD:

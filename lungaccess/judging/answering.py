@@ -29,7 +29,6 @@ class Attempt:
     Args:
         plan: The first plan found, whether or not the check accepts it.
         report: What the independent check says of that plan.
-        failure: Why there is none.
     """
 
     system: System

@@ -56,7 +56,6 @@ class Alternative:
         on_front: Whether no other plan of the set is at least as good in all criteria of the front and better
             in one: success, length and clearance where the chances of success are known, else all others; and
             the window where every plan has one.
-        chance: The chance of success, where it is known.
     """
 
     plan: Plan
@@ -85,8 +84,6 @@ def alternatives(
 
     Args:
         request: For one system.
-        count: The most plans that are returned.
-        separation_mm: The least separation of the needles of two plans.
         atlas, counterfactuals, on_progress: See `lungaccess.planning.driver.run`.
 
     Raises:

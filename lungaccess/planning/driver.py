@@ -42,7 +42,6 @@ class Turn:
 
     Args:
         iteration: 0 for what comes before the iterations, then counted from 1.
-        phase, message: See `ProgressEvent`.
         make: Returns a plan that is better than all before, of the planning time in seconds.
     """
 

@@ -48,9 +48,7 @@ class TourAnswer:
 
     Args:
         lesions_lps: (M, 3) float64, LPS mm.
-        numbers: Their numbers, from 1, in the order in which the user gave them.
         left_out: Numbers of lesions without an exit, and why.
-        shortest: The shortest tour over all choices of exits.
         least_resistance: The shortest tour over the exits of the circuit with the least resistance [Pan2025];
             None if there are too many combinations.
         one_by_one_mm: Length of a tour in which the scope returns to the root between any two lesions, over
@@ -134,7 +132,6 @@ def plan_tour(
         lesions_lps: (M, 3) float64, LPS mm.
         rule: By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
         reading: How resistances are merged: "printed" or "reduced", see `stages.scope.tour.circuit`.
-        closed: Whether the tour returns to the root.
         tissue_weight: How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the
             shortest tour.
         atlas: If given, an exit counts only if a coupled plan from there was found: scope, tubes and needle,

@@ -32,7 +32,6 @@ class Opening:
 
     Args:
         branch: Of the airway tree; that of the parent where it goes on itself.
-        label: Short name for a picture.
         name: Number and generation, and what the tree and the lobes of the patient support beyond them.
         place_lps: A place in the opening that is seen in the middle of its dark region, LPS mm; in the lumen
             of the branch where the picture does not show it.
@@ -40,8 +39,6 @@ class Opening:
         side: "on the left", "on the right", "at the top" or "at the bottom" of the picture, or "straight
             ahead".
         order: Place among the openings of its side, the nearest to the camera first; 0 if it is alone there.
-        in_view: Whether the picture shows it.
-        taken: Whether the plan goes there.
     """
 
     branch: int

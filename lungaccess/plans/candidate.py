@@ -16,8 +16,6 @@ class Candidate:
     """The choices that make a plan.
 
     Args:
-        tip: Where the scope's tip is.
-        deployment: The tubes from there.
         path: What the costs are of: the needle from the tip of the tubes to the target; without a needle, the
             tubes from where they leave the lumen to their tip, which is at the target.
     """

@@ -15,7 +15,6 @@ class Chance(Record):
     Args:
         errors, procedure: What the error model and the procedure are called.
         corrections: What is measured and corrected on the way, in a sentence.
-        sizes: The sizes of the errors in words.
         assumed: Kinds of error whose size nobody has published.
         radius_mm, radius_origin: Radius of the goal about the target, and where it came from; of a tool,
             which nodule counts.

@@ -24,7 +24,6 @@ def path_cost(
     Args:
         lung: Without a cost map, the costs of the map are 0.
         objective: See `stages.needle.objective.Objective.of`.
-        with_fissures: Whether fissures are obstacles.
         wall_mm: Length at the beginning of the path that lies in the wall which the tubes pierce.  The costs
             of the map, which forbids walls, count beyond it.
         parts: All that lies in tissue, the path too; see `lungaccess.plans.candidate.parts_in_tissue`.  None

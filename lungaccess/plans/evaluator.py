@@ -69,12 +69,7 @@ TIP_OFF_MM = 1e-6
 
 
 class CandidateEvaluator:
-    """Proves and costs the candidates of one task, from the numbers that a plan will state.
-
-    Attributes:
-        tubes: Validates deployments of the tubes.
-        blocked: How many direct arcs were stopped, by what stopped them.
-    """
+    """Proves and costs the candidates of one task, from the numbers that a plan will state."""
 
     def __init__(self, task: Task) -> None:
         self.task = task

@@ -22,7 +22,6 @@ def scope_insertion(
     """Return the part of a plan that a motion makes.
 
     Args:
-        tree: The airway of the patient.
         tree_point: Its point nearest to the tip.
         min_lumen_margin_mm: Smallest lumen depth of the body's axis over the whole motion, minus the radius
             of the scope.

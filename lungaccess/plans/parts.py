@@ -24,7 +24,6 @@ class ScopeInsertion(Record):
         lps_from_scope_tip ((4, 4) float64): Frame of the working channel in the last state: +z is forward, +x
             the way a positive bend turns the tip, which is up in the camera's picture.
         branches ((B,) int64): Branches of the airway tree from the trachea to the one in which the tip is.
-        generation: Generation of the last branch; the trachea is 0.
         length_mm, length_from_carina_mm: Length of the body from the entry to the tip, and of its part beyond
             the place nearest to the carina.
         min_lumen_margin_mm: Smallest distance of the body's axis from the border of the lumen, in every state
@@ -49,7 +48,6 @@ class WallExit(Record):
     """Where the axis of the tube leaves the airway lumen for good.
 
     Args:
-        branch: Branch whose wall is pierced.
         point_lps: (3,) float64, LPS mm.
         arc_length_mm: Length of tube between the tip of the scope and that point.
         wall_angle_rad: Angle between tube and wall; pi/2 is perpendicular.

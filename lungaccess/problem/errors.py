@@ -297,11 +297,8 @@ class ErrorModel:
 
     Args:
         name: What the model is called where its results are shown, see `label`.
-        description: One sentence for people.
         scope_position: Position of the scope tip, along each axis.
-        scope_direction: Tilt of the scope tip about each of two axes across it.
         tube_rotation: Rotation of planar tubes together, or of each tube that is not planar.
-        tube_insertion: Insertion of each tube.
         needle_roll: Angle of the needle about its axis at each arc.
         needle_insertion: Insertion at which each arc ends.
         target_position: Position of the target, along each axis.

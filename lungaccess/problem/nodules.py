@@ -18,7 +18,6 @@ class Nodule:
     Args:
         number: Its label in the patient's files, where these tell nodules apart; else its rank by size, from
             1.
-        is_label: Whether the number is a label of the files.
         voxels ((N, 3) int64): On the grid of the organ.
         diameter_mm: Of the ball with its volume.
         centre_lps ((3,) float64): Mean of its voxels, LPS mm.

@@ -21,7 +21,6 @@ def load_patient(
     Args:
         path: A Med-RAD folder, a folder with a `patient.toml`, or output of TotalSegmentator.
         cache: Folder for prepared anatomies; `anatomy.base.cache.default_cache()` if None.
-        progress: Receives each step as it begins.
         accept (collection of str): Names of checks of `anatomy.plausibility.CHECKS` whose failure is
             accepted; None refuses nothing.
 

@@ -35,7 +35,6 @@ class ScopePlacing:
         placements: How often the scope may be placed.  It is moved away and placed again, at the same tip,
             where no path is left from the pose as measured, or a further placement promises more; each has
             errors of its own.
-        source: Where the errors of measuring come from.
     """
 
     measured: _Measured = False
@@ -109,7 +108,6 @@ class Procedure:
     """What is measured and corrected after each stage; without arguments nothing is.
 
     Args:
-        name, description: What it is, for people.
         least_margin_share: Share of the margins that a path from a measured pose has to keep where none keeps
             them whole; margins allow for errors that are known by then.
 

@@ -37,11 +37,9 @@ class System:
     """Everything a plan depends on besides the patient and the target.
 
     Args:
-        name, description: What it is, for people.
         sources: Where the numbers come from; what has no source says "assumption".
         tubes: The outer tube, or the only one, runs in the channel of the scope.
         needle: Runs inside the inner tube.  Without one the tip of the inner tube goes to the target itself.
-        margins: Kept around every device.
         needle_preloaded: Whether the needle's tip stays at that of the inner tube while the tubes are
             deployed.  Then it bends with them, and `tubes` know its shaft; else its stiffness is neglected.
         fissures_allowed: Whether tubes and needle may cross a fissure, which pierces the pleura twice.

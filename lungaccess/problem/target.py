@@ -65,7 +65,6 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
         text: A point with its frame, ``ras:x,y,z`` or ``lps:x,y,z``, mm; a point that 3D Slicer saved, such
             as ``scene.mrml#target``, see `anatomy.io.markups`; or the name or number of a target that came
             with the patient, such as ``target1``.
-        nodule: Number of a nodule.
 
     Raises:
         FrameError: If the text states no frame, or the point of 3D Slicer has none that is plain.

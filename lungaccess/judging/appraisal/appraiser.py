@@ -37,12 +37,10 @@ class Appraisal:
     """What is said of a plan before anything else.
 
     Args:
-        check: All findings of the independent check.
         risk: The estimate of success, or what the plan states of one; None for a refused plan and where no
             draws were asked for.
         without_measuring: How often it succeeds in open loop, where the estimate is of a procedure that
             measures.
-        limits: The limits of devices and distances, broken ones first, then the nearest.
     """
 
     check: CheckReport
@@ -86,12 +84,10 @@ class Appraiser:
     A plan that states its own chance of success is not estimated again if none of these is given.
 
     Args:
-        lung: The patient that the plans are for.
         errors: The errors of devices and target; the preset `breath-hold` if None.
         procedure: What is measured and planned again on the way; the preset `open-loop` if None.
         draws: Number of deviated plans or procedures of an estimate; `DRAWS` if None, or `MEASURED_DRAWS` of
             procedures that measure, and 0 for no estimate.
-        seed: Seed of the random numbers; `SEED` if None.
 
     Raises:
         SettingsError: If the number of draws is negative.
@@ -167,8 +163,6 @@ def appraise(
     A plan that the check refuses has no chance of success: it must not be used, so none is estimated.
 
     Args:
-        plan, lung: The plan, and the patient that it is for.
-        errors, procedure, draws, seed: See `Appraiser`.
         system, target_lps: What was asked for; see `lungaccess.judging.checking.check`.
         each_kind: Whether success under errors of one kind only is estimated, too.
 

@@ -13,7 +13,6 @@ class Boxes:
     """One structure of a lung as solid boxes.
 
     Args:
-        select: Tells from the labels which voxels belong to the structure.
         reach_mm: What lies farther counts as this far.
     """
 

@@ -89,7 +89,6 @@ def check(
     finding.  For many plans of one lung use `Checker`.
 
     Args:
-        lung: The patient that the plan is for.
         system: The devices that will be used; the plan's must be the same.  Without it only a plan whose
             system has the name of a preset is compared with something.
         target_lps ((3,) array_like): The target that was asked for, LPS mm; the plan's must be the same.

@@ -80,7 +80,6 @@ def completed_plan(
     Args:
         system: With a needle, and an outer and an inner tube or one tube.
         target_lps: (3,) float64, LPS mm.
-        method: What the plan says it was made by.
     """
     lung = environment.lung
     needle = system.require_needle("A plan of bare motions")

@@ -27,7 +27,6 @@ class Finding:
         value, limit: What was found and the bound it had to keep; None for what is not a number.
         side: Whether the value must be "at least" or "at most" the limit; None without a limit.
         tolerance: It is ok if it misses the limit by no more than this.
-        detail: What was compared, in words.
     """
 
     name: str

@@ -22,7 +22,6 @@ class Motion:
         states ((M, 3) float64): Advance in mm, twist in rad, bend in rad.
         bends ((M, 2) float64): Curvature of the section in the x and y directions of its base, 1/mm.
         bases ((M, 4, 4) float64): `lps_from_base`; none is rolled by the twist.
-        section_mm: Length of the section.
     """
 
     states: Float

@@ -25,9 +25,6 @@ SHAPE_TOLERANCE_MM = 1e-3
 def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
     """Record everything about the shape of the tubes; None if they snap.
 
-    Args:
-        curve: The stated arcs.
-
     Returns:
         What has to be free beside radius and margins: the sweep, and how far the arcs are from the tubes, mm.
     """

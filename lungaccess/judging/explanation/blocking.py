@@ -29,7 +29,6 @@ class Structure:
         kind: "a vessel", "the pleura", "a fissure" or "an airway".
         name: What is known of it besides: the branch of an airway, the side of the lung.
         lps_mm ((3,) float64, LPS mm): Where it is met.
-        from_target_mm: How far that is from the target.
     """
 
     kind: str
@@ -50,7 +49,6 @@ class Blocking:
     """How many of the direct arcs one kind of structure stops first, and where most of them are stopped.
 
     Args:
-        place: The place at which it stops most of them.
         arcs, arcs_at_place, of: Arcs that it stops; those within `NEAR_MM` of the place; arcs that were
             looked along in all.
     """

@@ -71,9 +71,7 @@ def explain_no_plan(
     the time goes.  Parts that were not done are named in `Explanation.parts`.
 
     Args:
-        failure: What the search with this system raised.
         atlas: The system's; made here if None.
-        objective, seed: As for `lungaccess.planning.one_system.run`.
         time_s: No part begins after so many seconds of processor time, and long ones end; None for no limit.
             Getting kernels does not count, and one preset is tried even if no time is left.
         atlas_of: Returns the atlas of a system, and tells a function the share of it made; `build_atlas` if
@@ -81,7 +79,6 @@ def explain_no_plan(
         is_kept: Tells whether `atlas_of` need not make the atlas of a system, as
             `lungaccess.planning.coupled.atlas_is_kept` does: such presets are tried first.  None is taken to
             be kept if it is not given.
-        on_part: Told the name of each part as it begins.
     """
     own = atlas or build_atlas(lung, system)
     task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective), seed=seed)
@@ -94,11 +91,7 @@ def explain_no_plan(
 
 
 class Explainer:
-    """Does the parts of one explanation, and keeps the time.
-
-    Args:
-        task: What was not achieved.
-    """
+    """Does the parts of one explanation, and keeps the time."""
 
     def __init__(
         self,

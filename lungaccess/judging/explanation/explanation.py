@@ -47,14 +47,11 @@ class Explanation:
 
     Args:
         with_fissures: Whether fissures are obstacles.
-        failure: The answer of the search, with its reasons counted.
         starts: Where needles can start, and why each start fails.
         blocking: What stops the direct arcs, most first.
         blocked_arc: The arc to the target that violates least, of those within the needle's limits.
         arc_beyond_limits: Where there is no such arc: the one that exceeds the limits least.
         neighbour: The nearest point to the target that was found to be reached, with its plan.
-        attempts: The presets that were tried, the least invasive first.
-        untried: Presets that were not tried.
         changes: Changes of one device parameter that reach the target, the smallest first.
         through_fissures: Whether a single arc reaches the target if fissures may be crossed; None if they may
             be or there are none.

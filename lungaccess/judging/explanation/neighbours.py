@@ -31,12 +31,7 @@ ORDER_SEED = 7
 
 @frozen_record
 class Neighbour:
-    """The nearest point to the target that was found to be reached.
-
-    Args:
-        plan: To that point.
-        from_target_mm: How far it is from the target.
-    """
+    """The nearest point to the target that was found to be reached."""
 
     plan: Plan
     from_target_mm: float

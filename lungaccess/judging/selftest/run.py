@@ -33,8 +33,6 @@ class Kind(NamedTuple):
     """One kind of proof.
 
     Args:
-        proves: What a case looks at, in words.
-        draw: Draws a case and has the kernels answer it.
         seeds: Of the cases: those in which bounds are close to the truth, and that take little time in
             Python.
     """
@@ -97,7 +95,6 @@ class Outcome:
         differences: Cases in which compiled kernels and plain Python differ; None if kernels were not
             compiled here.
         contradictions: Cases in which the answers contradict the truth.
-        seconds: For the compiled answers and the truth.
     """
 
     kind: str
@@ -122,7 +119,6 @@ def self_test(
 
     Args:
         kinds: Names of `KINDS`; all of them if empty.
-        progress: Told the kind that is computed now.
 
     Raises:
         SettingsError: If there is no such kind.

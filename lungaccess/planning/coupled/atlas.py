@@ -35,11 +35,9 @@ class Atlas:
     """All accepted deployments of a system in a lung; independent of any target and of the needle.
 
     Args:
-        with_fissures: Whether fissures are obstacles.
         motions: Every scope tip with the proved motion that brings the device there.
         deployments: `deployments.site` indexes the tips of `motions`.
         index: Made from the deployments: finds those with a target in the needle's workspace, for any needle.
-        build_s: Seconds it took.
     """
 
     lung: Lung
@@ -105,7 +103,6 @@ def build_atlas(
     Args:
         rotations: Evenly spaced rotations of the tubes, and further ones where tube or exit is near a limit.
         stop_spacing_mm, site_spacing_mm: Spacing of insertions and of scope tips along the airway.
-        progress: Called with the share of the work done.
     """
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)

@@ -40,9 +40,7 @@ class Counterfactual:
     """A change of one device parameter with which the target is reached.
 
     Args:
-        parameter: The parameter in words.
         present, needed: Its value, and the nearest one found with which a plan exists; mm.
-        plan: A plan with that change alone.
     """
 
     parameter: str

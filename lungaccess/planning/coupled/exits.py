@@ -95,7 +95,6 @@ def feasible_exits(
     answer shows most places already.  The same input gives the same answers.
 
     Args:
-        atlas: The deployments, made for this lung, scope and tubes.
         objective: By which the arcs are put in order, as for `lungaccess.planning.searches.CostFinder`.
         scope_tips ((T,) int64): Only exits from these tips of the atlas.
 

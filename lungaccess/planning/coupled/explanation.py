@@ -20,7 +20,6 @@ def explain(
 
     Args:
         blocked: How many direct arcs were stopped in the search, by what stopped them.
-        iterations: How many the search had.
         counterfactuals: Whether changes of the device are looked for; without them the advice is empty.
     """
     if task.system.needle is None:

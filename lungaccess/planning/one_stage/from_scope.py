@@ -25,11 +25,7 @@ TRIES = 400
 
 
 class ScopeReplanner:
-    """Plans tubes and needle from one tip of the scope after another; see `replan_from_scope`.
-
-    Args:
-        tries, searches: As those of `replan_from_scope`.
-    """
+    """Plans tubes and needle from one tip of the scope after another; see `replan_from_scope`."""
 
     def __init__(self, task: Task, *, tries: int = TRIES, searches: int = SEARCHED) -> None:
         self._task, self._evaluator = task, CandidateEvaluator(task)

@@ -44,8 +44,6 @@ class NeedleAnswer(PathSearch):
             first; none if no airway is near.
         at_wall: Whether the needle begins so near to the lumen that it pierces the wall itself.
         lobe: Where what stands in the way lies; "" if the lobes are not known.
-        environment: What the planner looked at.
-        query: What it was asked.
         objective: What it was asked to make small; planners of OMPL look at none.
     """
 

@@ -35,8 +35,6 @@ class PathSearch:
             found".
         path, first_path: The best path and the first one: proved clear and within all limits.
         cost: Of the path under the objective, as estimated within the search.
-        first_path_s: Time to the first path, by the clock of the search.
-        obstruction: What stands in the way, if there is no path.
         open_passage: Where a path would have to pass, if neither a path was found nor a proof that there is
             none.
     """

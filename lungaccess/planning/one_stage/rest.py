@@ -24,7 +24,6 @@ class RestOfPlan:
     """What is left to do from a measured pose: proved clear and within all limits.
 
     Args:
-        task: What was asked.
         lps_from_measured ((4, 4) float64): The pose as it was taken: that of the scope's tip, or of the
             tube's tip where there is no deployment.
         deployment: Of the tubes, where they are left to do.

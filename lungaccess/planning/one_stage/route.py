@@ -62,7 +62,6 @@ def open_source(
         lumen: Which vessel of a liver, a key of `anatomy.io.liver.LUMENS`; needed for one.
         frame: Frame of a centreline file or mask that states none.
         pixel_mm: Size of a pixel of a drawing; needed for one.
-        cache: Where prepared patients are kept.
         accept (collection of str): Checks of a patient's masks whose failure is accepted.
 
     Raises:

@@ -32,8 +32,6 @@ class ScopeAdvice:
     """The path of a scope to a lesion, with instructions.
 
     Args:
-        path: To the goal or to the nearest point that was reached.
-        instructions: What to do, branch by branch.
         why_stopped: Why it ends before the goal; "" if it does not.
         thinner: What thinner scopes would reach; empty if this one reaches the goal.
     """

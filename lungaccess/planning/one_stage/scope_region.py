@@ -74,7 +74,6 @@ def safe_scope_region(
     nothing.  The same input and seed give the same answer.
 
     Args:
-        lung: The patient that the plan was made for.
         offset_mm, tilt_deg: Largest distance and angle from the planned tip.
         poses: About how many are tried.
 

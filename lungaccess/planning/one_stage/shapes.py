@@ -17,7 +17,6 @@ def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] |
 
     Args:
         device: The limits are those of the system; bare tubes have those of `ShapeLimits()`.
-        cache: Folder of the cache.
 
     Raises:
         SettingsError, FileError: As `stages.tube.open_shapes`.

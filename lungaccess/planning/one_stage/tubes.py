@@ -60,7 +60,6 @@ class TubeAnswer:
 
     Args:
         system: None for bare tubes.
-        outer_mm, inner_mm, rotation_rad, relative_rad: What was asked for.
         final: The deployed tubes; if they snap before, an equilibrium that this sequence does not reach.
         deployed: All steps; None if the tubes snap.
     """

@@ -92,7 +92,6 @@ class Chosen:
         frames ((N, 4, 4) float64): Most likely poses of the scope's tip.
         tips ((N, 4, 4) float64): Where the needle is expected to start.
         found ((N, 3) int64): Number of the deployment, arcs of the needle's path, and pierced branch.
-        chances: (N,) float64.
         arcs ((N, A, 3) float64): Paths of the needle.
         changed ((N,) bool): Whether the path is another one than was planned before.
         tubes ((N, 11) float64): Planar tubes as kernels take them; none of others.
@@ -123,7 +122,6 @@ class OnTheWay(NamedTuple):
         rest ((A, 3) float64): Arcs that were to follow.
         inserted_mm, turned_rad: What lies behind, from the tip of the tubes.
         reference ((3,) float64): Direction of the needle at that tip.
-        branch: The pierced branch.
     """
 
     rest: Float
@@ -137,11 +135,9 @@ class Policy:
     """Tells what to do next in a procedure that carries out a plan; what it prepares serves all answers.
 
     Attributes:
-        assessor: Of the plan.
         errors: By which measurements are weighed against what was expected.
 
     Args:
-        plan, lung: The plan, and the patient that it is for.
         errors: The preset `breath-hold` if None.
         procedure: The preset `open-loop` if None: then nothing is measured, and nothing to decide.
         radius_mm: Radius of the goal; see `RiskAssessor`.

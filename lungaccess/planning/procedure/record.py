@@ -22,7 +22,6 @@ class ProcedureRecord:
     """What was measured and decided in one procedure, in its order.
 
     Attributes:
-        policy: What decides.
         steps: Of each step what was measured and what was decided, plain JSON values.
     """
 

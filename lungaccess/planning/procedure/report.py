@@ -16,7 +16,6 @@ class StageReport:
 
     Args:
         stage: "scope", "tube" or "needle": what was measured.
-        replans: How often the rest was planned again.
         without_path: Of these, how many found none.
         corrected_mm: Median distance from the target at which the plan so far would have ended if it had gone
             on from the pose as measured; nan where the stage was not measured.
@@ -36,7 +35,6 @@ class ProcedureReport(DrawnReport):
         ends: Every procedure once: "success", or the first that holds of pleura, vessel, airway, fissure,
             "stays in the airway", `NO_PATH`, and "misses the goal".
         placements: Mean number of times that the bronchoscope was placed.
-        stages: What was measured, in its order.
     """
 
     procedure: Procedure

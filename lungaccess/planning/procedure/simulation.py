@@ -95,7 +95,6 @@ def simulate_procedure(
     report, whatever the number of processes; without measuring it is that of `assess` with these draws.
 
     Args:
-        plan, lung: The plan, and the patient that it is for.
         errors: The preset `breath-hold` if None.
         procedure: The preset `open-loop` if None.
         radius_mm: Radius of the goal; see `RiskAssessor`.

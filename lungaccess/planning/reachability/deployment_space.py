@@ -26,12 +26,10 @@ class DeploymentSpace:
     """Boxes that hold all deployments of a system in a lung, M of P pieces of the airway.
 
     Args:
-        arrays: The same, as the kernels take them.
         boxes ((M, BOX_COLUMNS) float64): See `lungaccess.planning.reachability.kernels.deployment_boxes`.
         owners ((M,) int32): The piece of each.
         measures ((M,) float64): Of each: mm^3 of places x rad^2 of directions x rad of rotations x mm^2 of
             insertions.
-        looked: Boxes looked at to make it.
     """
 
     pieces: tuple[PlacePiece, ...]

@@ -50,7 +50,6 @@ def scan_layers(
     Args:
         counted ((ni, nj, nk) bool): Voxels whose centres are tried.
         store: Where finished slabs are kept; emptied at the end.
-        progress: Told the share of the layers done.
 
     Returns:
         - found ((4, ni, nj, nk) float32) - Kind, cost, clearance and share of the breath, see

@@ -80,17 +80,14 @@ class ReachMap:
     """What a system reaches in a lung.
 
     Args:
-        with_fissures: Whether fissures are obstacles.
         kinds (Volume of uint8): `NOT_COUNTED` or one of `KINDS` at each voxel, classified by its centre.
         cost, clearance_mm (Volume of float32): Estimated integral of 1 / clearance of the best path found,
             and the clearance that it keeps beyond the exempt length of the needle; 0 where there is none.
         deployment (Volume of int32): Number of the deployment of the atlas from which that path starts; -1
             where there is none.
         regions: Side and lobe of each voxel, on the same grid.
-        entries: Deployments of the atlas.
         trees: Random trees for each point, see `map_reach`.
         resumed_layers: Layers of voxels that an earlier run had finished.
-        scan_s, atlas_s: Seconds that the map and the atlas took.
         phases (tuple of 2 floats or None): Phases of the breath in all of which voxels count as reached; None
             for the masks' alone.
         window_share (Volume of float32 or None): With phases, the share of the breath in which the path found
@@ -234,7 +231,6 @@ def map_reach(
         atlas: Made with `build_atlas` beforehand; made here if None.
         work: Folder where finished layers are kept, so that a later call with the same inputs goes on from
             there.  Emptied of them when the map is complete.
-        progress: Told the share of the layers done.
 
     Raises:
         SettingsError: If spacing, arcs or trees are out of range, trees are asked for without a needle, or

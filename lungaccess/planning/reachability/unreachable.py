@@ -119,7 +119,6 @@ class ReachVerdict:
 
     Args:
         proved: If not, nothing is known of the target.
-        boxes: Boxes of deployments that were looked at.
         share_ruled_out: Share of the deployment space that is proved not to reach the target; 1 if all of it
             is.
         finished: Whether every box is ruled out or has a part that is too small to halve; else the budget was
@@ -232,7 +231,6 @@ class UnreachableProof:
             target_lps ((3,) float64): LPS mm.
             most_boxes: To look at, about.
             time_s: After so much time nothing more is begun; the same time need not give the same verdict.
-            progress: Told the share of the deployment space that is ruled out.
 
         Raises:
             TargetError: If the target is not a finite point of the image.

@@ -27,8 +27,6 @@ class Layout:
     """The shape of a program.
 
     Args:
-        arcs: Arcs of the needle.
-        with_map: Whether the objective looks at a cost map.
         tubes, turned: How many tubes there are, and how many of them are turned against the others.
         weighs_tubes: Whether the objective looks at the tubes, too.
         zone_points, tube_points, wall_points: Samples of the needle's exempt length, and of the tubes behind

@@ -83,7 +83,6 @@ class Problem:
 
     Args:
         candidate: With at most as many arcs as the last of ARC_COUNTS.
-        weights: See `program_weights`.
 
     Attributes:
         start ((n,) float64): The candidate as variables.

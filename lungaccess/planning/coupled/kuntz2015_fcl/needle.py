@@ -125,7 +125,6 @@ class NeedleRRT:
         Args:
             lps_from_start: (4, 4) float64.
             goal_lps: (3,) float64, LPS mm.
-            branch: Branch that the tube pierced.
             iterations: Samples drawn; each is followed by one step towards the goal.
             time_s: Processor time of this thread.
         """

@@ -72,7 +72,6 @@ class Obstacles:
     """The solids of one lung, each made when it is first asked for.
 
     Args:
-        with_fissures: Whether fissures are obstacles.
         reach_mm: `other_airways` is exact within this distance of the pierced branch.
     """
 

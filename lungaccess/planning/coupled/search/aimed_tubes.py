@@ -61,11 +61,7 @@ def aim_starts(tubes: ConcentricTubes, joints: Float, count: int) -> ManyShapes 
 
 
 class TubeAiming:
-    """Aims the tubes of a system at points in a lung.
-
-    Args:
-        objective: By which deployments are cheap.
-    """
+    """Aims the tubes of a system at points in a lung."""
 
     def __init__(self, lung: Lung, system: System, objective: Objective, *, with_fissures: bool) -> None:
         self._environment = tube_environment(lung, with_fissures=with_fissures)
@@ -142,12 +138,7 @@ def tips_of(atlas: Atlas, entries: Int) -> tuple[Int, Float, Int]:
 
 
 class AimedFromPose:
-    """The tubes aimed at the target of a task from one pose of the scope.
-
-    Attributes:
-        reasons: How many attempts each reason refused.
-        why: What prevents a plan, in words.
-    """
+    """The tubes aimed at the target of a task from one pose of the scope."""
 
     def __init__(self, evaluator: CandidateEvaluator, lps_from_scope_tip: Float) -> None:
         self._evaluator, self._frame = evaluator, lps_from_scope_tip

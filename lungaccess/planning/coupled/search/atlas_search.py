@@ -90,12 +90,7 @@ class LocalSearchRounds:
 
 
 class AtlasSearch(SearchInParts):
-    """Direct arcs from the whole atlas, then rounds of local search, sampling, needle search and refinement.
-
-    Attributes:
-        arcs: The direct arcs from the atlas, with the evaluator of candidates.
-        incumbent: The best candidate so far.
-    """
+    """Direct arcs of the whole atlas, then rounds of local search, sampling, needle search and refinement."""
 
     def __init__(
         self, task: Task, atlas: Atlas, settings: SearchSettings | None = None, arcs: DirectArcs | None = None

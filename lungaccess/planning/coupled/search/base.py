@@ -61,11 +61,7 @@ class AtlasBound(PlanSearch, Protocol):
 
 @runtime_checkable
 class ParallelSearch(PlanSearch, Protocol):
-    """A search that can be continued in several processes; see `lungaccess.planning.coupled.parallel`.
-
-    Attributes:
-        incumbent: The best candidate so far, shared between rounds.
-    """
+    """A search that can be continued in several processes; see `lungaccess.planning.coupled.parallel`."""
 
     incumbent: "Incumbent"
 

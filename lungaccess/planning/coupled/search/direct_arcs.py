@@ -72,7 +72,6 @@ class DirectArcs:
 
         Args:
             chosen: (N,) int64.
-            environment: Another one than the task's.
 
         Returns:
             - blockers ((N,) int64) - 0 for arcs that are proved clear, -1 where no arc keeps the needle's

@@ -91,7 +91,6 @@ class LocalSearchRun:
         goal (tuple of 3 floats): Where its paths end.
         vias ((MAX_VIAS, 3) float64): The best choice so far; see
             `lungaccess.planning.coupled.kernels.candidate`.
-        count: Number of vias in use.
         cost: Estimated cost of that choice; infinite before the search has begun.
         evaluated_cost: The estimated cost at which the choice was last evaluated in full.
     """

@@ -32,9 +32,6 @@ DOUBLINGS = 3
 class NamedNeedlePlanner:
     """Searches the needle's paths of one task with the planner that the task names.
 
-    Args:
-        default: The planner where the task names none.
-
     Raises:
         SettingsError: If it is a planner of OMPL and OMPL has been used in this process: it can be seeded
             once.

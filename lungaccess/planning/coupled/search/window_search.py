@@ -50,7 +50,6 @@ class WindowEvaluator(CandidateEvaluator):
         task: Of a patient with motion.
         phases (tuple of 2 floats or None): Phases that every window has to hold.
         widest: Whether a wider window counts before cost.
-        middle: See `MovingTarget`.
 
     Attributes:
         window: That of the last candidate, where the widest is wanted.

@@ -41,9 +41,7 @@ def load_errors(name_or_path: str | os.PathLike[str] = DEFAULT_ERRORS) -> ErrorM
     Args:
         name_or_path: Name of a preset (see `error_preset_names`), or path of a file that ends in ``.toml``.
 
-    Raises:
-        SettingsError: If there is no such preset, the file is not TOML, or a value in it is wrong.
-        FileError: If the file cannot be read.
+    What may be stated, and the errors, are those of `lungaccess.problem.system.load_system`.
 
     Examples:
         >>> load_errors("gated-ct").scope_position.attempt_mm

@@ -140,12 +140,7 @@ def procedure_names() -> tuple[str, ...]:
 def load_procedure(name_or_path: str | os.PathLike[str] = DEFAULT_PROCEDURE) -> Procedure:
     """Read a procedure from a preset or from a TOML file; tables that are left out measure nothing.
 
-    Args:
-        name_or_path: Name of a preset (see `procedure_names`), or path of a file that ends in ``.toml``.
-
-    Raises:
-        SettingsError: If there is no such preset, the file is not TOML, or a value in it is wrong.
-        FileError: If the file cannot be read.
+    What may be stated, and the errors, are those of `lungaccess.problem.system.load_system`.
     """
     given = os.fspath(name_or_path)
     stated = _FILES.read(name_or_path)

@@ -122,12 +122,7 @@ def tool_names() -> tuple[str, ...]:
 def load_tool(name_or_path: str | os.PathLike[str]) -> Tool:
     """Read a tool from a preset or from a TOML file.
 
-    Args:
-        name_or_path: Name of a preset (see `tool_names`), or path of a file that ends in ``.toml``.
-
-    Raises:
-        SettingsError: If there is no such preset, the file is not TOML, or a value in it is wrong.
-        FileError: If the file cannot be read.
+    What may be stated, and the errors, are those of `lungaccess.problem.system.load_system`.
 
     Examples:
         >>> load_tool("core").words

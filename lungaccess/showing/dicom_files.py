@@ -24,18 +24,13 @@ from lungaccess.judging.appraisal import Appraisal
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_version
 from lungaccess.showing.report.html.volumes import CtFile
-from lungaccess.showing.slicer.models import SEGMENTS
+from lungaccess.showing.slicer.models import SEGMENTS, Segment
 
 SEGMENTS_FILE, REPORT_FILE, PICTURE_FILE = "segments.dcm", "report.dcm", "overview.dcm"
 MAKER = "lungaccess"
 IDENTIFYING = ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "AccessionNumber", "StudyID",
                "ReferringPhysicianName", "StudyDate", "StudyTime")  # fmt: skip
 """These attributes of patient and study are copied from the CT, or left empty."""
-MASKS = {"lung tissue": "outside", "fissure": "fissure", "nodule": "nodule", "vessel": "vessel",
-         "airway wall": "airway", "airway lumen": "lumen"}  # fmt: skip
-ROLES = {"lung tissue": "lung", "fissure": "fissures", "nodule": "nodules", "vessel": "vessels",
-         "airway wall": "wall", "airway lumen": "lumen"}  # fmt: skip
-"""Mask of a lung, and role that gives the code, of each of `SEGMENTS`."""
 AIR_HU, AIR_SHARE, LOOKED_AT = -500.0, 0.8, 5000
 """The lumen of an airway is air: of so many of its voxels at least this share is below that density in the
 CT of the patient.  In a mirrored or foreign CT it is lung and soft tissue too."""
@@ -143,7 +138,7 @@ def _segments(lung: Lung, frame: str) -> tuple[Any, str, list[Any]]:
     """Return the voxels of the structures that a lung has, the type, and the descriptions of the segments."""
     hd = highdicom()
 
-    masks = {each.name: _mask(lung, each.name) for each in SEGMENTS}
+    masks = {each.name: _mask(lung, each) for each in SEGMENTS}
     present = [each for each in SEGMENTS if masks[each.name].any()]
     array = np.stack([np.swapaxes(masks[each.name], 0, 2) for each in present], axis=-1)
     affine = lung.grid.lps_from_ijk[:, [2, 1, 0, 3]]
@@ -155,7 +150,7 @@ def _segments(lung: Lung, frame: str) -> tuple[Any, str, list[Any]]:
     )
     described = [
         hd.seg.SegmentDescription(
-            number, each.name, category, hd.sr.CodedConcept(*CODES[ROLES[each.name]]), "SEMIAUTOMATIC",
+            number, each.name, category, hd.sr.CodedConcept(*CODES[each.role]), "SEMIAUTOMATIC",
             algorithm,
             display_color=hd.color.CIELabColor.from_rgb(*(round(255 * part) for part in each.colour)),
         )
@@ -169,14 +164,14 @@ def _segments(lung: Lung, frame: str) -> tuple[Any, str, list[Any]]:
     return volume, "BINARY", described
 
 
-def _mask(lung: Lung, name: str) -> Mask:
-    """Return the voxels of one of `SEGMENTS`, none where the lung has no such structure."""
-    if name == "nodule" and lung.nodules is None:
+def _mask(lung: Lung, segment: Segment) -> Mask:
+    """Return the voxels of a segment, none where the lung has no such structure."""
+    if segment.mask == "nodule" and lung.nodules is None:
         return np.zeros(lung.grid.shape, dtype=np.bool_)
-    mask = lung.mask(MASKS[name]).array
-    if name == "lung tissue":
+    mask = lung.mask(segment.mask).array
+    if segment.mask == "outside":
         return ~mask
-    return mask & ~lung.mask("lumen").array if name == "airway wall" else mask
+    return mask & ~lung.mask("lumen").array if segment.mask == "airway" else mask
 
 
 def _report(plan: Plan, appraisal: Appraisal, first: Any, uid: Callable[[str], str]) -> Any:

@@ -22,18 +22,21 @@ if TYPE_CHECKING:
         ADVICE_FILE,
         CAMERA_FILE,
         ScopeAdvice,
+        ScopeRegion,
         advise_scope,
+        safe_scope_region,
         save_advice,
     )
-    from lungaccess.planning.one_stage.scope_region import ScopeRegion, safe_scope_region
-    from lungaccess.planning.one_stage.shapes import design_shapes, save_shapes, shapes_record
     from lungaccess.planning.one_stage.tubes import (
         BareTubes,
         TubeAnswer,
         compare_sequences,
         deploy_tubes,
         design_choices,
+        design_shapes,
         load_tubes,
+        save_shapes,
+        shapes_record,
         tubes_record,
     )
 

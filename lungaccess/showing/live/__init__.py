@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from lungaccess.showing.live.link import HOST, PORT, Link, LinkCounts
     from lungaccess.showing.live.replanning import Answer, TrackedReplanner
     from lungaccess.showing.live.session import RATE_HZ, LiveCounts, LiveSession
-    from lungaccess.showing.live.trajectory import Speeds, Trajectory, plan_trajectory
-    from lungaccess.showing.live.trajectory_files import write_trajectory
+    from lungaccess.showing.live.trajectory import Speeds, Trajectory, plan_trajectory, write_trajectory
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

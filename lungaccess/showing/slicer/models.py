@@ -265,13 +265,18 @@ def _file(
 
 @frozen_value
 class Segment:
-    """One segment: value in the label map, name, colour in [0, 1], category and type (SNOMED CT)."""
+    """One segment: value in the label map, name, colour in [0, 1], category and type (SNOMED CT).
+
+    `mask` is the mask of a lung that shows it, and `role` a key of `anatomy.io.dicom_seg.CODES`.
+    """
 
     value: int
     name: str
     colour: tuple[float, float, float]
     category: str
     kind: str
+    mask: str
+    role: str
 
     @property
     def terminology(self) -> str:
@@ -281,16 +286,17 @@ class Segment:
 
 SEGMENTS: tuple[Segment, ...] = (
     Segment(value=1, name="lung tissue", colour=(0.77, 0.64, 0.58), category=_STRUCTURE,
-            kind="SCT^39607008^Lung"),
-    Segment(value=2, name="fissure", colour=(0.58, 0.40, 0.74), category=_TISSUE, kind=_TISSUE),
+            kind="SCT^39607008^Lung", mask="outside", role="lung"),
+    Segment(value=2, name="fissure", colour=(0.58, 0.40, 0.74), category=_TISSUE, kind=_TISSUE,
+            mask="fissure", role="fissures"),
     Segment(value=3, name="nodule", colour=(0.17, 0.63, 0.17), category=_ALTERED,
-            kind="SCT^27925004^Nodule"),
+            kind="SCT^27925004^Nodule", mask="nodule", role="nodules"),
     Segment(value=4, name="vessel", colour=(0.84, 0.15, 0.16), category=_STRUCTURE,
-            kind="SCT^59820001^Blood vessel"),
+            kind="SCT^59820001^Blood vessel", mask="vessel", role="vessels"),
     Segment(value=5, name="airway wall", colour=(0.52, 0.52, 0.52), category=_STRUCTURE,
-            kind="SCT^89187006^Airway structure"),
+            kind="SCT^89187006^Airway structure", mask="airway", role="wall"),
     Segment(value=6, name="airway lumen", colour=(0.62, 0.85, 0.90), category=_STRUCTURE,
-            kind="SCT^89187006^Airway structure"),
+            kind="SCT^89187006^Airway structure", mask="lumen", role="lumen"),
 )  # fmt: skip
 """From the weakest to the strongest: where two structures overlap, the voxel goes to the later one.
 
@@ -301,13 +307,9 @@ def label_map(lung: Lung) -> Volume:
     """Return the structures of a lung as one volume of the values of `SEGMENTS`, uint8, 0 outside."""
     outside = lung.mask("outside")
     labels = np.where(outside.array, 0, 1).astype(np.uint8)
-    masks = {"fissure": "fissure", "nodule": "nodule", "vessel": "vessel", "airway wall": "airway",
-             "airway lumen": "lumen"}  # fmt: skip
     for segment in SEGMENTS[1:]:
-        name = masks[segment.name]
-        if name == "nodule" and lung.nodules is None:
-            continue
-        labels[lung.mask(name).array] = segment.value
+        if segment.mask != "nodule" or lung.nodules is not None:
+            labels[lung.mask(segment.mask).array] = segment.value
     return Volume(grid=outside.grid, array=labels)
 
 

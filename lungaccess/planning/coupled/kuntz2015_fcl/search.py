@@ -1,5 +1,6 @@
 """Algorithm 1 of [Kuntz2015] as printed, with FCL on surface meshes instead of clearance fields."""
 
+import itertools
 import math
 import time
 from collections import Counter, defaultdict
@@ -10,17 +11,27 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
+from anatomy.base.typed import Bool, Float, Labels
+from anatomy.structures import AIRWAY, LUMEN, OUTSIDE
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT
-from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import Obstacles
-from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator, path_of
+from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, branch_of, chord_mm
 from lungaccess.planning.coupled.search.base import SearchInParts, Step
 from lungaccess.planning.coupled.search.kuntz2015 import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
+from lungaccess.problem.system import System
 from lungaccess.problem.task import Task
-from stages.needle import ArcPath
-from stages.tube import Deployment, design_arrays, shape_or_reason
+from stages.needle import ArcPath, arc_transform
+from stages.tube import (
+    REASONS,
+    Deployment,
+    TubeShape,
+    design_arrays,
+    kernels,
+    pieces_of_arcs,
+    shape_or_reason,
+)
 
 PHASE = "reference"
 FOUND = "found"
@@ -173,3 +184,167 @@ def obstacles_for(task: Task) -> Obstacles:
     return Obstacles(
         task.lung, with_fissures=task.with_fissures, reach_mm=reach + widest + system.margins.total_mm
     )
+
+
+NEAR_TISSUE = "the tube comes too near a vessel, the pleura or a fissure"
+"""The meshes of these are one solid, so that the reason does not tell them apart."""
+
+
+class TubeValidator:
+    """Validates shapes of the tubes by the rules of `stages.tube`, but none of its fields."""
+
+    def __init__(self, system: System, obstacles: Obstacles) -> None:
+        self._system = system
+        self._obstacles = obstacles
+        self._mediastinal = obstacles.lung.tree.mediastinal
+
+    def validate(self, lps_from_scope_tip: Float, rotation_rad: float, made: TubeShape) -> Deployment | str:
+        """Return the deployment of a shape from a scope tip, or the reason why it is refused."""
+        shape = path_of(lps_from_scope_tip, rotation_rad, made)
+        # Spacing of the samples whose voxels are looked up, about a tenth of a voxel.
+        points, at_mm = shape.sample(0.05)
+        labels = self._obstacles.lung.grid.values_at(self._obstacles.lung.labels, points, OUTSIDE)
+        first = self._first_outside(points, at_mm, (labels & LUMEN) != 0)
+        if first == 0:
+            return REASONS[kernels.NO_EXIT]
+        branch = int(branch_of(labels[first - 1 : first])[0])
+        if self._mediastinal[branch]:
+            return REASONS[kernels.LEAVES_MEDIASTINAL]
+        exit_mm = self._border_mm(points, at_mm, first)
+        refused = self._contained(labels[first:], at_mm[first:] - exit_mm, branch)
+        if refused:
+            return refused
+        lung, frame = self._obstacles.lung, frame_at(shape, exit_mm)
+        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
+        angle = float(kernels.wall_angle(lung.labels, lung.geometry, pose))
+        if angle < math.radians(self._system.tubes.min_wall_angle_deg):
+            return REASONS[kernels.FLAT_EXIT]
+        contact_mm = self._contact_mm(points[:first], at_mm[:first], made)
+        refused = self._clear(shape, made, contact_mm, exit_mm, branch)
+        if refused:
+            return refused
+        wall_run_mm = self._wall_run_mm(shape, made, exit_mm)
+        if wall_run_mm > self._system.tubes.max_wall_run_mm:
+            return REASONS[kernels.LONG_WALL_RUN]
+        return Deployment(
+            rotation_rad=rotation_rad,
+            outer_mm=float(made.insertions_mm[-1]),
+            inner_mm=float(made.insertions_mm[0]),
+            lps_from_tip=tip_of(shape, made),
+            branch=branch,
+            exit_mm=exit_mm,
+            wall_angle_rad=angle,
+            wall_run_mm=wall_run_mm,
+            lateral_sweep_mm=made.lateral_sweep_mm,
+            shape=made,
+        )
+
+    def _first_outside(self, points: Float, at_mm: Float, inside: Bool) -> int:
+        """Return the first sample beyond the lumen, behind corners of voxels; 0 if there is none."""
+        crossings = np.flatnonzero(inside[1:] != inside[:-1]) + 1
+        if not inside[0] or not len(crossings):
+            return 0
+        for left, back in itertools.zip_longest(crossings[::2], crossings[1::2]):
+            if back is None:
+                return int(left)
+            out_mm = self._border_mm(points, at_mm, back) - self._border_mm(points, at_mm, left)
+            if out_mm > kernels.CORNER_MM:
+                return int(left)
+        return 0
+
+    def _border_mm(self, points: Float, at_mm: Float, sample: int) -> float:
+        """Return the arc length at which the axis crosses the border of the lumen before a sample."""
+        # Points between two label samples among which the exit is found, about 0.001 mm from each other.
+        share = np.linspace(0.0, 1.0, 51)
+        begin, end = points[sample - 1 : sample + 1]
+        lung, points = self._obstacles.lung, begin + share[:, None] * (end - begin)
+        inside = (lung.grid.values_at(lung.labels, points, OUTSIDE) & LUMEN) != 0
+        last = int(np.argmax(inside != inside[0])) - 1
+        return float(at_mm[sample - 1] + share[last] * (at_mm[sample] - at_mm[sample - 1]))
+
+    def _contained(self, labels: Labels, beyond_mm: Float, branch: int) -> str:
+        """Return why the axis beyond the exit lies in something, or an empty text."""
+        own = branch_of(labels) == branch
+        if beyond_mm[-1] < kernels.WALL_ZONE_MM:
+            return REASONS[kernels.NO_EXIT]
+        if (labels & LUMEN).any():
+            return REASONS[kernels.REENTERS_LUMEN]
+        if (labels & self._obstacles.forbidden).any():
+            return NEAR_TISSUE
+        if (((labels & AIRWAY) != 0) & ~own).any():
+            return REASONS[kernels.NEAR_OTHER_BRANCH]
+        return ""
+
+    def _wall_run_mm(self, shape: ArcPath, made: TubeShape, exit_mm: float) -> float:
+        """Return how much of the tube beyond the exit is nearer to an airway than its radius, if not less."""
+        run, at, pieces = 0.0, exit_mm, pieces_of(made)
+        while at < shape.length_mm:
+            _begin, end, radius = next((piece for piece in pieces if at < piece[1]), pieces[-1])
+            beyond = self._obstacles.airways.distance_mm(frame_at(shape, at)[:3, 3]) - radius
+            step = min(
+                max(abs(beyond), kernels.RUN_STEP_MM),
+                shape.length_mm - at if end >= shape.length_mm else end - at,
+            )
+            run += step if beyond < kernels.RUN_STEP_MM else 0.0
+            at += step
+        return run
+
+    def _contact_mm(self, points: Float, at_mm: Float, made: TubeShape) -> float:
+        """Return the arc length from which on the tube is never clear of the wall, up to its exit."""
+        radii, ends = made.arcs[:, kernels.RADIUS], np.cumsum(made.arcs[:, kernels.LENGTH])
+        # Every so many samples it is asked whether the tube touches the wall from inside.
+        for n in range(len(points) - 1, 0, -5):
+            radius = radii[min(int(np.searchsorted(ends, at_mm[n])), len(radii) - 1)]
+            if self._obstacles.lumen.depth_mm(points[n]) >= radius:
+                return float(at_mm[n])
+        return 0.0
+
+    def _clear(self, shape: ArcPath, made: TubeShape, contact_mm: float, exit_mm: float, branch: int) -> str:
+        """Return what the tubes touch from their contact with the wall on, or an empty text."""
+        margin = self._system.margins.total_mm + made.required_beside_mm
+        for begin, end, radius in pieces_of(made):
+            distance = radius + margin + SAGITTA_MM
+            if max(begin, contact_mm) < end:
+                line = line_between(shape, max(begin, contact_mm), end)
+                if self._obstacles.tissue.is_near(line, distance):
+                    return NEAR_TISSUE
+            if max(begin, exit_mm) < end:
+                line = line_between(shape, max(begin, exit_mm), end)
+                if self._obstacles.other_airways(branch).is_near(line, distance):
+                    return REASONS[kernels.NEAR_OTHER_BRANCH]
+        return ""
+
+
+def path_of(lps_from_scope_tip: Float, rotation_rad: float, made: TubeShape) -> ArcPath:
+    """Return the centreline of a shape, all tubes turned by a rotation, from a scope tip."""
+    return ArcPath(lps_from_start=lps_from_scope_tip, arcs=pieces_of_arcs(made.arcs, rotation_rad))
+
+
+def pieces_of(made: TubeShape) -> list[tuple[float, float, float]]:
+    """Return begin and end in mm, and radius in mm, of each arc of a shape."""
+    lengths, radii = made.arcs[:, kernels.LENGTH], made.arcs[:, kernels.RADIUS]
+    ends = np.cumsum(lengths)
+    return list(zip((ends - lengths).tolist(), ends.tolist(), radii.tolist(), strict=True))
+
+
+def tip_of(path: ArcPath, made: TubeShape) -> Float:
+    """Return the frame `(4, 4)` at the end of a shape's path, carried there without turning."""
+    return np.asarray(path.frames()[-1] @ arc_transform(0.0, -float(made.arcs[-1, kernels.DIRECTION]), 0.0))
+
+
+def frame_at(path: ArcPath, at_mm: float) -> Float:
+    """Return the frame `(4, 4)` of a path at an arc length."""
+    frame = np.asarray(path.lps_from_start)
+    for length, roll, curvature in path.arcs:
+        here = min(float(length), at_mm)
+        frame = frame @ arc_transform(here, roll, curvature)
+        at_mm -= here
+    return frame
+
+
+def line_between(path: ArcPath, begin_mm: float, end_mm: float) -> Float:
+    """Return points `(N, 3)` of a path between two arc lengths, within SAGITTA_MM of it."""
+    points, at_mm = path.sample(chord_mm(float(path.arcs[:, 2].max())))
+    between = points[(at_mm > begin_mm) & (at_mm < end_mm)]
+    ends = [frame_at(path, at)[None, :3, 3] for at in (begin_mm, end_mm)]
+    return np.concatenate([ends[0], between, ends[1]])

@@ -61,7 +61,7 @@ class AtlasBound(PlanSearch, Protocol):
 
 @runtime_checkable
 class ParallelSearch(PlanSearch, Protocol):
-    """A search that can be continued in several processes; see `lungaccess.planning.coupled.parallel`."""
+    """A search that can be continued in several processes; see `lungaccess.planning.searches`."""
 
     incumbent: "Incumbent"
 

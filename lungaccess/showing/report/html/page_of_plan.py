@@ -26,7 +26,7 @@ from lungaccess.showing.report.html import breathing, tables, words
 from lungaccess.showing.report.html.deployment import device_points, packed_plan
 from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import start_meshes, structure_meshes
-from lungaccess.showing.report.html.risk import resting_section, risk_section
+from lungaccess.showing.report.html.tables import resting_section, risk_section
 from lungaccess.showing.report.html.trade_off import CAPTION, trade_off_svg
 from lungaccess.showing.report.html.volumes import image_words, page_image
 

@@ -23,8 +23,15 @@ from experiments import noplan_attack
 from lungaccess.planning.coupled import ReferenceSearch
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT, sample_ahead
 from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, Solid, chord_mm
-from lungaccess.planning.coupled.kuntz2015_fcl.search import FOUND, OUT_OF_WORKSPACE, obstacles_for
-from lungaccess.planning.coupled.kuntz2015_fcl.tubes import TubeValidator, frame_at, line_between, path_of
+from lungaccess.planning.coupled.kuntz2015_fcl.search import (
+    FOUND,
+    OUT_OF_WORKSPACE,
+    TubeValidator,
+    frame_at,
+    line_between,
+    obstacles_for,
+    path_of,
+)
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target

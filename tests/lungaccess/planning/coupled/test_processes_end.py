@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[4]
 SEARCH = """
 import itertools, signal, sys, time
-from lungaccess.planning.coupled.parallel import parallel_steps
+from lungaccess.planning.searches import parallel_steps
 from lungaccess.planning.coupled.search.base import Step
 
 class Incumbent:

@@ -11,7 +11,7 @@ import lungaccess as la
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from anatomy.poses import pose
-from lungaccess.planning.one_stage.scope_region import WORDS
+from lungaccess.planning.one_stage.scope import WORDS
 from lungaccess.plans.plan import Plan
 from stages.needle import REACHING
 

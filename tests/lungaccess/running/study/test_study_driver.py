@@ -18,7 +18,6 @@ import pytest
 from distributed import LocalCluster
 
 from anatomy.base.errors import FileError
-from lungaccess.running.study import cluster as cluster_of_study
 from lungaccess.running.study import driver, one_run
 from lungaccess.running.study.answers import Answer
 from lungaccess.running.study.driver import StudyDone, open_results, run_study
@@ -115,7 +114,7 @@ def test_a_run_that_cannot_be_made_is_stored_and_made_again(
     path, study = tmp_path / "r.db", study_of(content())
     done = run_study(study, path, scheduler=cluster, cache=cache)
     assert (done.added, done.failed) == (4, 2)
-    assert len(tries.read_text().split()) == 2 * (1 + cluster_of_study.RETRIES)
+    assert len(tries.read_text().split()) == 2 * (1 + driver.RETRIES)
     with ResultsFile(path) as results:
         query = "SELECT outcome, message FROM outcomes WHERE failed"
         assert list(results.rows(query)) == [("FileError", "The mask is not there.")] * 2
@@ -126,13 +125,13 @@ def test_a_run_that_cannot_be_made_is_stored_and_made_again(
 
 COUNT_THREADS = """
 import numba
-from lungaccess.running.study import cluster
+from lungaccess.running.study import driver
 
 def threads():
     return numba.config.NUMBA_NUM_THREADS
 
 if __name__ == "__main__":
-    with cluster.connect(None, 1) as client:
+    with driver.connect(None, 1) as client:
         print(client.submit(threads).result())
 """
 
@@ -200,7 +199,7 @@ def test_only_a_few_runs_wait_at_the_scheduler_and_nothing_of_the_others_stays(
         study = study_of(content(seeds=list(range(30))))
         assert run_study(study, tmp_path / "r.db", scheduler=cluster, cache=cache).added == 60
     assert len(waiting) == 60
-    assert max(waiting) <= cluster_of_study.LEAST_RUNS + 1
+    assert max(waiting) <= driver.LEAST_RUNS + 1
     assert beginnings[-1] == beginnings[0], "statistics that dask keeps for good"
 
 
@@ -234,7 +233,7 @@ def test_without_dask_the_error_says_what_to_install(
 
 
 def test_no_scheduler(tmp_path: Path, study: Study, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster_of_study, "CONNECT_S", 0.2)
+    monkeypatch.setattr(driver, "CONNECT_S", 0.2)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:abc"):
         with pytest.raises(StudyError, match="No dask scheduler answers"):
             run_study(study, tmp_path / "r.db", scheduler=address, cache=cache)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from anatomy.base.errors import SettingsError
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.live import Speeds, plan_trajectory, write_trajectory
-from lungaccess.showing.live.trajectory_files import joint_trajectory, table_text, tip_path, yaml_text
+from lungaccess.showing.live.trajectory import joint_trajectory, table_text, tip_path, yaml_text
 
 SPEEDS = Speeds(scope_mm_per_s=5.0, tube_mm_per_s=1.0, needle_mm_per_s=0.5, needle_deg_per_s=20.0)
 

@@ -22,7 +22,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
 from lungaccess.showing.report.html import page_of_plan, trade_off_svg
-from lungaccess.showing.report.html.risk import risk_section
+from lungaccess.showing.report.html.tables import risk_section
 from lungaccess.showing.slicer import export
 from lungaccess.uncertainty.risk import Share
 from tests.lungaccess.appraisals import make_check, make_risk

@@ -77,19 +77,25 @@ STEP_SHARES = {
 @Parameter(name="*")
 @frozen_value
 class OutputOptions:
-    """How a command answers."""
+    """How a command answers.
 
-    json: Annotated[bool, Parameter(help="Print JSON instead of text and tables.")] = False
+    Args:
+        json: Print JSON instead of text and tables.
+    """
+
+    json: bool = False
 
 
 @Parameter(name="*")
 @frozen_value
 class CacheOptions(OutputOptions):
-    """How a command answers, and where it keeps what it prepares."""
+    """How a command answers, and where it keeps what it prepares.
 
-    cache: Annotated[
-        Path | None, Parameter(help="Folder where the prepared anatomy is kept for the next command.")
-    ] = None
+    Args:
+        cache: Folder where the prepared anatomy is kept for the next command.
+    """
+
+    cache: Path | None = None
 
     def open_atlas(self, lung: Lung, system: System) -> Atlas:
         """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
@@ -102,16 +108,14 @@ class CacheOptions(OutputOptions):
 @Parameter(name="*")
 @frozen_value
 class PatientOptions(CacheOptions):
-    """How a command that reads a patient answers, and what of the masks is overruled."""
+    """How a command that reads a patient answers, and what of the masks is overruled.
 
-    accept: Annotated[
-        tuple[str, ...],
-        Parameter(
-            consume_multiple=True,
-            help="Checks of the masks that fail and are overruled, by the names in the message that refuses "
-            "them, such as gap or vessels.",
-        ),
-    ] = ()
+    Args:
+        accept: Checks of the masks that fail and are overruled, by the names in the message that refuses
+            them, such as gap or vessels.
+    """
+
+    accept: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
 
     def load(self, patient: Path, *, thick_slices: bool = False) -> Lung:
         """Return a patient's lung; see `load_lung`."""
@@ -128,23 +132,17 @@ class PatientOptions(CacheOptions):
 @Parameter(name="*")
 @frozen_value
 class TargetOptions:
-    """Where to go."""
+    """Where to go.
 
-    target: Annotated[
-        str | None,
-        Parameter(
-            help="Target point in mm with its frame, ras:x,y,z or lps:x,y,z; a point saved in 3D Slicer, "
-            "scene.mrml#name; or the name of a target that came with the patient, such as target1."
-        ),
-    ] = None
-    nodule: Annotated[
-        Whole | None,
-        Parameter(
-            metavar="[INT]",
-            help="Go to the centre of this nodule: its label in the nodule mask, else 1 for the largest and "
-            "so on, see info; the largest if no number follows.",
-        ),
-    ] = None
+    Args:
+        target: Target point in mm with its frame, ras:x,y,z or lps:x,y,z; a point saved in 3D Slicer,
+            scene.mrml#name; or the name of a target that came with the patient, such as target1.
+        nodule: Go to the centre of this nodule: its label in the nodule mask, else 1 for the largest and so
+            on, see info; the largest if no number follows.
+    """
+
+    target: str | None = None
+    nodule: Annotated[Whole | None, Parameter(metavar="[INT]")] = None
 
     def stated(self) -> StatedTarget:
         """Return what the user states, before any patient is read.
@@ -161,24 +159,20 @@ class TargetOptions:
 @Parameter(name="*")
 @frozen_value
 class PlaceOptions:
-    """Where the tubes leave the airway, or where the tip of the scope stands."""
+    """Where the tubes leave the airway, or where the tip of the scope stands.
 
-    exit: Annotated[
-        str | None,
-        Parameter(
-            help="Let the tubes leave the airway near this point: ras:x,y,z or lps:x,y,z, or one moved in 3D "
-            "Slicer, such as scene.mrml#exit through the wall."
-        ),
-    ] = None
-    exit_within: Annotated[
-        NotNegative, Parameter(help="How far from that point the tubes may leave the lumen, mm.")
-    ] = 5.0
-    scope_tip: Annotated[
-        str | None, Parameter(help="Let the tip of the scope stand near this point, stated as for --exit.")
-    ] = None
-    scope_tip_within: Annotated[
-        NotNegative, Parameter(help="How far from that point the tip may stand, mm.")
-    ] = 1.5
+    Args:
+        exit: Let the tubes leave the airway near this point: ras:x,y,z or lps:x,y,z, or one moved in 3D
+            Slicer, such as scene.mrml#exit through the wall.
+        exit_within: How far from that point the tubes may leave the lumen, mm.
+        scope_tip: Let the tip of the scope stand near this point, stated as for --exit.
+        scope_tip_within: How far from that point the tip may stand, mm.
+    """
+
+    exit: str | None = None
+    exit_within: NotNegative = 5.0
+    scope_tip: str | None = None
+    scope_tip_within: NotNegative = 1.5
 
     def stated(self) -> StatedPlace | None:
         """Return the place that the user states, None for none; errors as `TargetOptions`.
@@ -212,18 +206,16 @@ def _point(text: str) -> Float:
 @Parameter(name="*")
 @frozen_value
 class SystemOptions:
-    """With which devices."""
+    """With which devices.
 
-    system: Annotated[
-        str,
-        Parameter(
-            help="Name of a preset (see `lungaccess presets`), path of a TOML file, or auto: the least "
-            "invasive preset that reaches the target (`plan` and `alternatives` only)."
-        ),
-    ] = DEFAULT_SYSTEM
-    allow_fissures: Annotated[
-        bool | None, Parameter(help="Whether fissures may be crossed; as the system says if not given.")
-    ] = None
+    Args:
+        system: Name of a preset (see `lungaccess presets`), path of a TOML file, or auto: the least invasive
+            preset that reaches the target (`plan` and `alternatives` only).
+        allow_fissures: Whether fissures may be crossed; as the system says if not given.
+    """
+
+    system: str = DEFAULT_SYSTEM
+    allow_fissures: bool | None = None
 
     def load(self) -> System:
         """Return the system, with its rule about fissures replaced if the user states one.
@@ -270,25 +262,19 @@ ErrorsText = Annotated[
 @Parameter(name="*")
 @frozen_value
 class ErrorOptions:
-    """How large the errors of devices and target are assumed to be, and what a procedure measures of them."""
+    """How large the errors of devices and target are assumed to be, and what a procedure measures of them.
+
+    Args:
+        known: Kinds of error whose size is known better, such as scope_direction=0.5: mm or degrees, of
+            needle_curvature the logarithm of the factor.
+        procedure: What is measured and planned again on the way: a preset (closed-loop, measured-scope,
+            measured-tip, open-loop) or a TOML file; if not given, measured-tip for plans that are made for
+            success, and open-loop for others.
+    """
 
     errors: ErrorsText = None
-    known: Annotated[
-        tuple[str, ...],
-        Parameter(
-            consume_multiple=True,
-            help="Kinds of error whose size is known better, such as scope_direction=0.5: mm or degrees, of "
-            "needle_curvature the logarithm of the factor.",
-        ),
-    ] = ()
-    procedure: Annotated[
-        str | None,
-        Parameter(
-            help="What is measured and planned again on the way: a preset (closed-loop, measured-scope, "
-            "measured-tip, open-loop) or a TOML file; if not given, measured-tip for plans that are made for "
-            "success, and open-loop for others."
-        ),
-    ] = None
+    known: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
+    procedure: str | None = None
 
     def load(self) -> ErrorModel:
         """Return the error model, the default one if none is given."""
@@ -325,17 +311,17 @@ def _kind_and_size(stated: str) -> tuple[str, float]:
 @Parameter(name="*")
 @frozen_value
 class BudgetOptions:
-    """How long to search."""
+    """How long to search.
 
-    budget: Annotated[
-        Seconds | None,
-        Parameter(help="Planning time in seconds; 10 if neither this nor --iterations is given."),
-    ] = None
-    iterations: Annotated[
-        Count | None,
-        Parameter(help="Number of iterations instead of a time: the same seed then gives the same plan."),
-    ] = None
-    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0
+    Args:
+        budget: Planning time in seconds; 10 if neither this nor --iterations is given.
+        iterations: Number of iterations instead of a time: the same seed then gives the same plan.
+        seed: Seed of the random numbers.
+    """
+
+    budget: Seconds | None = None
+    iterations: Count | None = None
+    seed: Seed = 0
 
     @property
     def time_s(self) -> float | None:
@@ -346,60 +332,38 @@ class BudgetOptions:
 @Parameter(name="*")
 @frozen_value
 class SearchOptions(BudgetOptions):
-    """What a plan is to be good at, how to search for it, and how long."""
+    """What a plan is to be good at, how to search for it, and how long.
 
-    goal: Annotated[
-        GoalText,
-        Parameter(
-            name=("--goal", "--objective"),
-            help="What to make good. success: the chance that the procedure succeeds; window: the share of "
-            "the breath in which it is proved; or a cost of the needle to make small. inverse-clearance: "
-            "nearness to obstacles, 1/clearance along it; cost-map, voxel-sum: the patient's cost map along "
-            "it; length; tissue: nearness of tubes and needle, times their width; a weighted sum such as "
-            "length=1,cost-map=0.5; default is the first, and the second too where there is a map; or a goal "
-            "that a package adds.",
-        ),
-    ] = SUCCESS.name
-    passes: Annotated[
-        int, Parameter(help="So many times at most the tool goes into the nodule; planned together.")
-    ] = 1
+    Args:
+        goal: What to make good. success: the chance that the procedure succeeds; window: the share of the
+            breath in which it is proved; or a cost of the needle to make small. inverse-clearance: nearness
+            to obstacles, 1/clearance along it; cost-map, voxel-sum: the patient's cost map along it; length;
+            tissue: nearness of tubes and needle, times their width; a weighted sum such as
+            length=1,cost-map=0.5; default is the first, and the second too where there is a map; or a goal
+            that a package adds.
+        passes: So many times at most the tool goes into the nodule; planned together.
+        least_clearance: Every axis in tissue keeps at least so many mm from every obstacle, if not more.
+        method: Search for plans. atlas: over all that scope and tubes can do; kuntz2015: Algorithm 1 of Kuntz
+            et al. 2015; reference: the same as printed, with collisions of surface meshes, slow; each of the
+            two also -without-rejection; or one that a package adds.
+        needle_planner: Planner of the needle's paths, instead of the method's own (atlas: ao-rrt, kuntz2015:
+            rrt); those that begin with control are OMPL's.
+        processes: How many processes share the work; not on Windows. For success they simulate, the plan is
+            the same, and all cores are used if not given; a cost is made small in one if not given.
+        cpu_budget: Stop after so many seconds of processor time.
+        gap: Stop once the cost is proved to be at most this share above the least from any scope tip of the
+            atlas, such as 0.05; the plan states what is proved.
+    """
+
+    goal: Annotated[GoalText, Parameter(name=("--goal", "--objective"))] = SUCCESS.name
+    passes: int = 1
     phases: PhasesText = None
-    least_clearance: Annotated[
-        NotNegative,
-        Parameter(help="Every axis in tissue keeps at least so many mm from every obstacle, if not more."),
-    ] = 0.0
-    method: Annotated[
-        str,
-        Parameter(
-            help="Search for plans. atlas: over all that scope and tubes can do; kuntz2015: Algorithm 1 of "
-            "Kuntz et al. 2015; reference: the same as printed, with collisions of surface meshes, slow; "
-            "each of the two also -without-rejection; or one that a package adds."
-        ),
-    ] = ATLAS
-    needle_planner: Annotated[
-        PlannerName | None,
-        Parameter(
-            help="Planner of the needle's paths, instead of the method's own (atlas: ao-rrt, kuntz2015: "
-            "rrt); those that begin with control are OMPL's."
-        ),
-    ] = None
-    processes: Annotated[
-        Processes | None,
-        Parameter(
-            help="How many processes share the work; not on Windows. For success they simulate, the plan is "
-            "the same, and all cores are used if not given; a cost is made small in one if not given."
-        ),
-    ] = None
-    cpu_budget: Annotated[Seconds | None, Parameter(help="Stop after so many seconds of processor time.")] = (
-        None
-    )
-    gap: Annotated[
-        NotNegative | None,
-        Parameter(
-            help="Stop once the cost is proved to be at most this share above the least from any scope tip "
-            "of the atlas, such as 0.05; the plan states what is proved."
-        ),
-    ] = None
+    least_clearance: NotNegative = 0.0
+    method: str = ATLAS
+    needle_planner: PlannerName | None = None
+    processes: Processes | None = None
+    cpu_budget: Seconds | None = None
+    gap: NotNegative | None = None
 
     @property
     def cost(self) -> str:

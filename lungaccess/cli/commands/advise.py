@@ -1,9 +1,7 @@
 """The command `lungaccess advise`: the path of the bronchoscope alone, turn by turn."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -20,13 +18,10 @@ def advise(
     patient: PatientFolder,
     *,
     target: TargetOptions = TargetOptions(),
-    lesion_radius: Annotated[Positive, Parameter(help="Radius of the lesion, mm.")] = 5.0,
-    system: Annotated[str, Parameter(help="Preset or TOML file whose scope is used.")] = DEFAULT_SYSTEM,
-    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
-    out: Annotated[
-        Path,
-        Parameter(help="Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer."),
-    ] = Path("lungaccess-advice"),
+    lesion_radius: Positive = 5.0,
+    system: str = DEFAULT_SYSTEM,
+    seed: Seed = 0,
+    out: Path = Path("lungaccess-advice"),
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
@@ -34,6 +29,12 @@ def advise(
 
     The goal is the airway voxel nearest to the lesion's centre, if possible one in the lesion where the scope
     fits.  Exit code 0 if the scope reaches it, 1 if it stops before.
+
+    Args:
+        lesion_radius: Radius of the lesion, mm.
+        system: Preset or TOML file whose scope is used.
+        seed: Seed of the random numbers.
+        out: Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer.
     """
     from lungaccess.planning.one_stage import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
     from lungaccess.problem.system import load_system

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
@@ -51,22 +49,22 @@ def alternatives(
     *,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    count: Annotated[Count, Parameter(help="How many plans at most.")] = 15,
-    separation: Annotated[
-        NotNegative,
-        Parameter(help="The needles of every two plans lie somewhere at least so many mm from each other."),
-    ] = 5.0,
+    count: Count = 15,
+    separation: NotNegative = 5.0,
     search: SearchOptions = SearchOptions(),
     errors: ErrorOptions = ErrorOptions(),
-    out: Annotated[Path, Parameter(help="Folder for plan-01.json and so on, and trade_off.svg.")] = Path(
-        "lungaccess-alternatives"
-    ),
+    out: Path = Path("lungaccess-alternatives"),
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show plans to one target that differ, check each, and write them.
 
     Those that no other beats in success, length and clearance together are marked: the Pareto front.
+
+    Args:
+        count: How many plans at most.
+        separation: The needles of every two plans lie somewhere at least so many mm from each other.
+        out: Folder for plan-01.json and so on, and trade_off.svg.
     """
     from anatomy.base.files import write_text
     from lungaccess.judging import answer_with_several

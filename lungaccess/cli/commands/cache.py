@@ -2,9 +2,9 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import App, Parameter
+from cyclopts import App
 
 from anatomy.base.cache import cache_limit_bytes, default_cache, parse_size, size_in_words
 from lungaccess.cli import terminal
@@ -46,15 +46,16 @@ def show(*, output: CacheOptions = CacheOptions()) -> ExitCode:
 @cache.command(help_epilogue=epilogue("cache prune"))
 def prune(
     *,
-    older_than: Annotated[
-        NotNegative | None, Parameter(help="Days without use after which something goes.")
-    ] = None,
-    max_size: Annotated[
-        str | None, Parameter(help="What may stay, such as 2GB; LUNGACCESS_CACHE_LIMIT if not given.")
-    ] = None,
+    older_than: NotNegative | None = None,
+    max_size: str | None = None,
     output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
-    """Remove old formats, leftovers of killed commands, and what is too old or too much."""
+    """Remove old formats, leftovers of killed commands, and what is too old or too much.
+
+    Args:
+        older_than: Days without use after which something goes.
+        max_size: What may stay, such as 2GB; LUNGACCESS_CACHE_LIMIT if not given.
+    """
     from anatomy.base.cache_entries import overdue
 
     most = cache_limit_bytes() if max_size is None else parse_size(max_size, "--max-size")

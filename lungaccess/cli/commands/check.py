@@ -12,30 +12,26 @@ from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions
 
 
 def check(
-    plan: Annotated[Path, Parameter(help="The plan.json to check.")],
+    plan: Path,
     patient: PatientOfPlan,
     *,
-    system: Annotated[
-        str | None,
-        Parameter(help="Check against this preset or TOML file instead of the devices stated in the plan."),
-    ] = None,
-    curve: Annotated[
-        str | None,
-        Parameter(
-            help="Check the plan with a curve that was edited in 3D Slicer, scene.mrml#needle, and say what "
-            "broke."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None, Parameter(help="Where the plan with the edited needle goes if it is accepted.")
-    ] = None,
+    system: str | None = None,
+    curve: str | None = None,
+    out: Path | None = None,
     errors: ErrorOptions = ErrorOptions(),
-    everything: Annotated[
-        bool, Parameter(name="--all", negative="", help="List every finding, not only the nearest limits.")
-    ] = False,
+    everything: Annotated[bool, Parameter(name="--all", negative="")] = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused."""
+    """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
+
+    Args:
+        plan: The plan.json to check.
+        system: Check against this preset or TOML file instead of the devices stated in the plan.
+        curve: Check the plan with a curve that was edited in 3D Slicer, scene.mrml#needle, and say what
+            broke.
+        out: Where the plan with the edited needle goes if it is accepted.
+        everything: List every finding, not only the nearest limits.
+    """
     from lungaccess.judging.appraisal import appraise
 
     if curve is not None:

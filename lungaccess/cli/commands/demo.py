@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from cyclopts import Parameter
 from rich.panel import Panel
 
 from anatomy.base.errors import AnatomyError
@@ -23,17 +22,21 @@ if TYPE_CHECKING:
 
 def demo(
     *,
-    out: Annotated[Path, Parameter(help="Folder for plan.json, the pictures and report.html.")] = Path(
-        "demo-output"
-    ),
+    out: Path = Path("demo-output"),
     # The cost has settled by then, and a first visitor does not wait long.
-    budget: Annotated[Seconds, Parameter(help="Planning time in seconds.")] = 3.0,
+    budget: Seconds = 3.0,
     # The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps.
-    seed: Annotated[Seed, Parameter(help="Seed of the patient and of the search.")] = 1,
+    seed: Seed = 1,
     force: Force = False,
     output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
-    """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it."""
+    """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it.
+
+    Args:
+        out: Folder for plan.json, the pictures and report.html.
+        budget: Planning time in seconds.
+        seed: Seed of the patient and of the search.
+    """
     from lungaccess.cli.anatomy_tables import anatomy_tables
     from lungaccess.problem.target import stated_target
 

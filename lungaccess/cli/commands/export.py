@@ -1,9 +1,6 @@
 """The command `lungaccess export`: a plan and its patient for other programs."""
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from anatomy.base.errors import SettingsError
 from lungaccess.cli import terminal
@@ -18,44 +15,27 @@ def export(
     plan: PlanFile,
     patient: PatientOfPlan,
     *,
-    slicer: Annotated[
-        Path | None,
-        Parameter(
-            help="Folder for the scene, curves, models and segmentation; drag its scene.mrml into 3D Slicer."
-        ),
-    ] = None,
-    trajectory: Annotated[
-        Path | None,
-        Parameter(help="Folder for the motion in time: joint values as CSV, and messages of ROS 2 as YAML."),
-    ] = None,
-    models: Annotated[
-        Path | None,
-        Parameter(
-            help="Folder for surfaces of anatomy and devices, as STL and as one glTF, and for the camera "
-            "of a film."
-        ),
-    ] = None,
-    dicom: Annotated[
-        Path | None,
-        Parameter(
-            help="Folder for segments, structured report and overview as DICOM, beside the CT's series."
-        ),
-    ] = None,
-    ct: Annotated[
-        Path | None,
-        Parameter(
-            help="Folder of the CT's DICOM series for --dicom; the one that was segmented if not given."
-        ),
-    ] = None,
-    anonymise: Annotated[
-        bool, Parameter(help="Leave name, identity, dates and physicians out of what --dicom writes.")
-    ] = False,
+    slicer: Path | None = None,
+    trajectory: Path | None = None,
+    models: Path | None = None,
+    dicom: Path | None = None,
+    ct: Path | None = None,
+    anonymise: bool = False,
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Write a stored plan for other programs and systems; exit code 1 if the check refuses it.
 
     A refused plan is named so for 3D Slicer, and is not written otherwise.
+
+    Args:
+        slicer: Folder for the scene, curves, models and segmentation; drag its scene.mrml into 3D Slicer.
+        trajectory: Folder for the motion in time: joint values as CSV, and messages of ROS 2 as YAML.
+        models: Folder for surfaces of anatomy and devices, as STL and as one glTF, and for the camera of a
+            film.
+        dicom: Folder for segments, structured report and overview as DICOM, beside the CT's series.
+        ct: Folder of the CT's DICOM series for --dicom; the one that was segmented if not given.
+        anonymise: Leave name, identity, dates and physicians out of what --dicom writes.
     """
     if all(folder is None for folder in (slicer, trajectory, models, dicom)):
         raise SettingsError(

@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 def info(
     patient: PatientFolder,
     *,
-    out: Annotated[
-        Path | None,
-        Parameter(
-            help="Folder for tree.png, a picture of the airway tree, and motion.png; for a liver organ.png."
-        ),
-    ] = None,
-    details: Annotated[bool, Parameter(help="List every repair of the airway tree.", negative="")] = False,
+    out: Path | None = None,
+    details: Annotated[bool, Parameter(negative="")] = False,
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Show what was understood of a patient: volumes, airway tree, sources and warnings."""
+    """Show what was understood of a patient: volumes, airway tree, sources and warnings.
+
+    Args:
+        out: Folder for tree.png, a picture of the airway tree, and motion.png; for a liver organ.png.
+        details: List every repair of the airway tree.
+    """
     if out is not None:
         claim_folder(out, ("tree.png", "motion.png", "organ.png"), force=force)
     lung = output.load_organ(patient, thick_slices=True, refuse=False)
@@ -55,17 +55,13 @@ def info(
     return ExitCode.OK
 
 
-def presets(
-    *,
-    show: Annotated[
-        str | None,
-        Parameter(help="Print the TOML file of this system: edit it, and hand it over with --system FILE."),
-    ] = None,
-    output: OutputOptions = OutputOptions(),
-) -> ExitCode:
+def presets(*, show: str | None = None, output: OutputOptions = OutputOptions()) -> ExitCode:
     """List the systems that ship with lungaccess, the least invasive first, or print one to start from.
 
     Its JSON holds every setting.
+
+    Args:
+        show: Print the TOML file of this system: edit it, and hand it over with --system FILE.
     """
     from anatomy.base.settings import to_mapping
     from lungaccess.problem.needle_load import system_warnings

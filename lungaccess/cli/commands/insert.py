@@ -24,33 +24,39 @@ def insert(
     plan: PlanFile,
     patient: PatientOfPlan,
     *,
-    noise: Annotated[NotNegative, Parameter(help="Noise of the tracked tip along each axis, mm.")] = 0.5,
-    tilt: Annotated[
-        NotNegative, Parameter(help="Noise of its direction about each of two axes, degrees.")
-    ] = 0.6,
-    rate: Annotated[Hertz, Parameter(help="Measurements a second.")] = 20.0,
-    latency: Annotated[NotNegative, Parameter(help="Age of a measurement when it is used, s.")] = 0.1,
-    lost: Annotated[NotNegative, Parameter(help="Share of the measurements that are lost, 0 to 1.")] = 0.0,
-    speed: Annotated[Positive, Parameter(help="Speed of the insertion, mm/s.")] = 2.0,
-    replan_every: Annotated[NotNegative, Parameter(help="Least insertion between two replans, mm.")] = 2.0,
-    number: Annotated[
-        int, Parameter(name="--pass", help="Which pass of the plan, where it has several.")
-    ] = 1,
+    noise: NotNegative = 0.5,
+    tilt: NotNegative = 0.6,
+    rate: Hertz = 20.0,
+    latency: NotNegative = 0.1,
+    lost: NotNegative = 0.0,
+    speed: Positive = 2.0,
+    replan_every: NotNegative = 2.0,
+    number: Annotated[int, Parameter(name="--pass")] = 1,
     errors: ErrorsText = None,
-    tolerance: Annotated[
-        NotNegative, Parameter(help="A tip that ends no farther from the target has reached it, mm.")
-    ] = 2.0,
-    samples: Annotated[Samples, Parameter(help="How many needles are inserted, each in both ways.")] = 50,
-    seed: Annotated[Seed, Parameter(help="Seed of the first needle; the others count on.")] = 0,
-    film: Annotated[
-        Path | None, Parameter(help="WebP file for a film of the first needle, blindly and tracked.")
-    ] = None,
-    picture: Annotated[
-        Path | None, Parameter(help="PNG file for the true paths and tip errors of all.")
-    ] = None,
+    tolerance: NotNegative = 2.0,
+    samples: Samples = 50,
+    seed: Seed = 0,
+    film: Path | None = None,
+    picture: Path | None = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees."""
+    """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees.
+
+    Args:
+        noise: Noise of the tracked tip along each axis, mm.
+        tilt: Noise of its direction about each of two axes, degrees.
+        rate: Measurements a second.
+        latency: Age of a measurement when it is used, s.
+        lost: Share of the measurements that are lost, 0 to 1.
+        speed: Speed of the insertion, mm/s.
+        replan_every: Least insertion between two replans, mm.
+        number: Which pass of the plan, where it has several.
+        tolerance: A tip that ends no farther from the target has reached it, mm.
+        samples: How many needles are inserted, each in both ways.
+        seed: Seed of the first needle; the others count on.
+        film: WebP file for a film of the first needle, blindly and tracked.
+        picture: PNG file for the true paths and tip errors of all.
+    """
     from lungaccess.judging.checking import check
     from lungaccess.planning.procedure import insert_plan
     from lungaccess.plans.plan import Plan

@@ -1,10 +1,9 @@
 """The command `lungaccess needle`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.base.errors import SettingsError
@@ -33,37 +32,27 @@ if TYPE_CHECKING:
 def needle(
     patient: PatientFolder,
     *,
-    start: Annotated[
-        str,
-        Parameter(
-            help="Number or name of a start pose that came with the patient; a plan.json, whose needle "
-            "starts there; or a text file with a 4x4 pose whose +z column is the direction of insertion."
-        ),
-    ],
+    start: str,
     frame: FrameOfPose = None,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    planner: Annotated[
-        OurPlannerName,
-        Parameter(
-            help="decide: a path, or a proof that there is none; rrt; ao-rrt and optimal: better and better "
-            "paths; resolution: the best path of pieces at a resolution, or the statement that it has none."
-        ),
-    ] = "decide",
-    objective: Annotated[
-        ObjectiveText,
-        Parameter(
-            help="What to make small: length, inverse-clearance (nearness to obstacles), cost-map, "
-            "voxel-sum, or a weighted sum such as length=1,cost-map=0.5."
-        ),
-    ] = "length",
+    planner: OurPlannerName = "decide",
+    objective: ObjectiveText = "length",
     budget: BudgetOptions = BudgetOptions(),
-    out: Annotated[
-        Path | None, Parameter(help="PNG file for a picture of start, path or blocked place, and target.")
-    ] = None,
+    out: Path | None = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the needle alone from a given pose, or prove that no path exists and say what is blocked."""
+    """Plan the needle alone from a given pose, or prove that no path exists and say what is blocked.
+
+    Args:
+        start: Number or name of a start pose that came with the patient; a plan.json, whose needle starts
+            there; or a text file with a 4x4 pose whose +z column is the direction of insertion.
+        planner: decide: a path, or a proof that there is none; rrt; ao-rrt and optimal: better and better
+            paths; resolution: the best path of pieces at a resolution, or the statement that it has none.
+        objective: What to make small: length, inverse-clearance (nearness to obstacles), cost-map, voxel-sum,
+            or a weighted sum such as length=1,cost-map=0.5.
+        out: PNG file for a picture of start, path or blocked place, and target.
+    """
     from anatomy.lung import Lung
     from lungaccess.planning.one_stage import plan_needle
 

@@ -15,23 +15,23 @@ from lungaccess.cli.result_folder import Force, require_empty_folder
 
 def phantom(
     *,
-    out: Annotated[Path, Parameter(help="Folder for patient.toml, masks and CT.")] = Path("PATIENT"),
-    seed: Annotated[Seed, Parameter(help="Seed of the patient: another one, another patient.")] = 2,
-    size: Annotated[
-        Literal["adult", "small"], Parameter(help="small: 0.7 times an adult, a child of about ten years.")
-    ] = "adult",
-    spacing: Annotated[
-        Positive | None,
-        Parameter(help="Edge of the voxels, mm; 1 for the adult, 1.25 for the small patient."),
-    ] = None,
-    breathing: Annotated[
-        bool,
-        Parameter(negative="", help="Also motion.nrrd, how the lungs breathe; the masks show end-inhale."),
-    ] = False,
+    out: Path = Path("PATIENT"),
+    seed: Seed = 2,
+    size: Literal["adult", "small"] = "adult",
+    spacing: Positive | None = None,
+    breathing: Annotated[bool, Parameter(negative="")] = False,
     force: Force = False,
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
-    """Write a synthetic patient: masks, CT and the truth about it; no data are needed."""
+    """Write a synthetic patient: masks, CT and the truth about it; no data are needed.
+
+    Args:
+        out: Folder for patient.toml, masks and CT.
+        seed: Seed of the patient: another one, another patient.
+        size: small: 0.7 times an adult, a child of about ten years.
+        spacing: Edge of the voxels, mm; 1 for the adult, 1.25 for the small patient.
+        breathing: Also motion.nrrd, how the lungs breathe; the masks show end-inhale.
+    """
     from anatomy.phantom import make_phantom, write_phantom
 
     require_empty_folder(out, force=force)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from cyclopts import Parameter
 from rich.panel import Panel
 
 from lungaccess.cli import terminal
@@ -47,28 +46,23 @@ def plan(
     through: PlaceOptions = PlaceOptions(),
     errors: ErrorOptions = ErrorOptions(),
     tool: ToolText = None,
-    thick_slices: Annotated[
-        bool,
-        Parameter(help="Plan on masks from slices of more than 3 mm, which lack small airways and vessels."),
-    ] = False,
-    out: Annotated[Path, Parameter(help="Folder for plan.json, cost_over_time.csv and the pictures.")] = Path(
-        "lungaccess-plan"
-    ),
-    pictures: Annotated[
-        bool, Parameter(help="Whether overview.png, tree.png and cost_over_time.png are drawn.")
-    ] = True,
-    explain_time: Annotated[
-        NotNegative | None,
-        Parameter(
-            help="Seconds of processor time, compiling kernels not counted, for what is learned where there "
-            "is no plan: the nearest miss, what blocks, which preset or change of device would do, what is "
-            "proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is."
-        ),
-    ] = None,
+    thick_slices: bool = False,
+    out: Path = Path("lungaccess-plan"),
+    pictures: bool = True,
+    explain_time: NotNegative | None = None,
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the access to a target, check the plan, and write plan, pictures and cost over time."""
+    """Plan the access to a target, check the plan, and write plan, pictures and cost over time.
+
+    Args:
+        thick_slices: Plan on masks from slices of more than 3 mm, which lack small airways and vessels.
+        out: Folder for plan.json, cost_over_time.csv and the pictures.
+        pictures: Whether overview.png, tree.png and cost_over_time.png are drawn.
+        explain_time: Seconds of processor time, compiling kernels not counted, for what is learned where
+            there is no plan: the nearest miss, what blocks, which preset or change of device would do, what
+            is proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is.
+    """
     from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.system import systems_with_tool

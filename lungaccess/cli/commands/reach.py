@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder, write_json
@@ -27,30 +25,25 @@ def reach(
     patient: PatientFolder,
     *,
     system: SystemOptions = SystemOptions(),
-    spacing: Annotated[Spacing, Parameter(help="Side of the map's voxels, mm.")] = 3.0,
-    search: Annotated[
-        CountOrNone,
-        Parameter(help="Random trees for each point that no single arc reaches; 0 for single arcs only."),
-    ] = 0,
-    compare: Annotated[
-        str | None, Parameter(help="Further presets or TOML files to compare with, separated by commas.")
-    ] = None,
+    spacing: Spacing = 3.0,
+    search: CountOrNone = 0,
+    compare: str | None = None,
     phases: PhasesText = None,
-    out: Annotated[Path, Parameter(help="Folder for the volumes, the pictures and reach.json.")] = Path(
-        "lungaccess-reach"
-    ),
-    page: Annotated[
-        Path | None,
-        Parameter(
-            help="HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline."
-        ),
-    ] = None,
+    out: Path = Path("lungaccess-reach"),
+    page: Path | None = None,
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Map what a system reaches of the lung, and write the map as volumes for 3D Slicer and as a picture.
 
     A run that was stopped goes on where it was if it is started again with the same options.
+
+    Args:
+        spacing: Side of the map's voxels, mm.
+        search: Random trees for each point that no single arc reaches; 0 for single arcs only.
+        compare: Further presets or TOML files to compare with, separated by commas.
+        out: Folder for the volumes, the pictures and reach.json.
+        page: HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
     """
     from lungaccess.planning.reachability.reach_map import compare_reach
     from lungaccess.problem.system import load_system

@@ -2,9 +2,8 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.base.errors import SettingsError
@@ -36,49 +35,39 @@ if TYPE_CHECKING:
 def replan(
     patient: PatientFolder,
     *,
-    scope: Annotated[
-        str | None,
-        Parameter(
-            help="Where the tip of the bronchoscope really is: a text file with a 4x4 pose, +z forward and "
-            "+x up in the camera's picture; a point moved in 3D Slicer, scene.mrml#name; or a plan.json, "
-            "whose scope ends there."
-        ),
-    ] = None,
-    tube: Annotated[
-        str | None,
-        Parameter(
-            help="Where the tip of the tubes really is, instead: a text file with a 4x4 pose, +z forward; a "
-            "point moved in 3D Slicer, scene.mrml#name; or a plan.json."
-        ),
-    ] = None,
-    needle: Annotated[
-        str | None,
-        Parameter(help="Where the tip of the needle really is, with --procedure: stated as for --tube."),
-    ] = None,
+    scope: str | None = None,
+    tube: str | None = None,
+    needle: str | None = None,
     frame: FrameOfPose = None,
-    plan: Annotated[
-        Path | None,
-        Parameter(help="plan.json that is carried out, with --procedure: the policy says what to do next."),
-    ] = None,
+    plan: Path | None = None,
     errors: ErrorOptions = ErrorOptions(),
-    placement: Annotated[Count, Parameter(help="How often the scope has been placed, with --procedure.")] = 1,
-    radius: Annotated[Positive | None, Parameter(help="Radius of the goal in mm, with --procedure.")] = None,
-    record: Annotated[
-        Path | None,
-        Parameter(
-            help="File to which what was measured and decided is added, with --procedure; it is played "
-            "again first."
-        ),
-    ] = None,
+    placement: Count = 1,
+    radius: Positive | None = None,
+    record: Path | None = None,
     target: TargetOptions = TargetOptions(),
     system: SystemOptions = SystemOptions(),
-    objective: Annotated[ObjectiveText, Parameter(help="What to make small, as for `plan`.")] = DEFAULT,
-    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
+    objective: ObjectiveText = DEFAULT,
+    seed: Seed = 0,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the rest from a measured pose: tubes and needle from the scope's tip, or the needle alone.
 
     With --plan and --procedure the policy of the procedure says what to do next, with its chance of success.
+
+    Args:
+        scope: Where the tip of the bronchoscope really is: a text file with a 4x4 pose, +z forward and +x up
+            in the camera's picture; a point moved in 3D Slicer, scene.mrml#name; or a plan.json, whose scope
+            ends there.
+        tube: Where the tip of the tubes really is, instead: a text file with a 4x4 pose, +z forward; a point
+            moved in 3D Slicer, scene.mrml#name; or a plan.json.
+        needle: Where the tip of the needle really is, with --procedure: stated as for --tube.
+        plan: plan.json that is carried out, with --procedure: the policy says what to do next.
+        placement: How often the scope has been placed, with --procedure.
+        radius: Radius of the goal in mm, with --procedure.
+        record: File to which what was measured and decided is added, with --procedure; it is played again
+            first.
+        objective: What to make small, as for `plan`.
+        seed: Seed of the random numbers.
     """
     if plan is not None or errors.procedure is not None:
         poses = {"scope": scope, "tubes": tube, "needle": needle}

@@ -1,9 +1,7 @@
 """The command `lungaccess report`: everything about a plan on one page that opens offline."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
@@ -21,37 +19,32 @@ from lungaccess.cli.shown_ct import CtOption, shown_ct
 
 
 def report(
-    plan: Annotated[Path, Parameter(help="The plan.json; cost_over_time.csv beside it is shown, too.")],
+    plan: Path,
     patient: PatientOfPlan,
     *,
-    out: Annotated[
-        Path | None, Parameter(help="The HTML file; report.html beside the plan if not given.")
-    ] = None,
-    alternatives: Annotated[
-        CountOrNone,
-        Parameter(help="So many other plans to the same target are searched and shown on demand."),
-    ] = 0,
+    out: Path | None = None,
+    alternatives: CountOrNone = 0,
     ct: CtOption = None,
-    movie: Annotated[
-        Path | None, Parameter(help="WebP file for the flight through the airway to the scope's place.")
-    ] = None,
+    movie: Path | None = None,
     errors: ErrorOptions = ErrorOptions(),
-    samples: Annotated[
-        SamplesOrNone | None,
-        Parameter(
-            help="Deviated plans of the estimate of success; 0 leaves it out; 2000 if not given, or 120 "
-            "procedures that measure."
-        ),
-    ] = None,
-    seed: Annotated[Seed | None, Parameter(help="Seed of that estimate; 0 if not given.")] = None,
-    instructions: Annotated[
-        bool, Parameter(help="Whether instructions for the scope are listed step by step.")
-    ] = True,
+    samples: SamplesOrNone | None = None,
+    seed: Seed | None = None,
+    instructions: bool = True,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Write one HTML file about a stored plan: it plays in 3-D, with slices, charts, limits and risk.
 
     A plan that states its chance of success shows that, unless errors, procedure, samples or seed are given.
+
+    Args:
+        plan: The plan.json; cost_over_time.csv beside it is shown, too.
+        out: The HTML file; report.html beside the plan if not given.
+        alternatives: So many other plans to the same target are searched and shown on demand.
+        movie: WebP file for the flight through the airway to the scope's place.
+        samples: Deviated plans of the estimate of success; 0 leaves it out; 2000 if not given, or 120
+            procedures that measure.
+        seed: Seed of that estimate; 0 if not given.
+        instructions: Whether instructions for the scope are listed step by step.
     """
     from lungaccess.cli.plan_search import advised
     from lungaccess.judging.appraisal import appraise

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from anatomy.base.words import of_hundred, percent, range_of_hundred
 from lungaccess.cli import terminal
@@ -29,27 +27,23 @@ def risk(
     patient: PatientOfPlan,
     *,
     errors: ErrorOptions = ErrorOptions(),
-    samples: Annotated[
-        Samples | None,
-        Parameter(help="Number of deviated plans; 10000, or 1000 procedures that measure on their way."),
-    ] = None,
-    radius: Annotated[
-        Positive | None,
-        Parameter(
-            help="Radius of the goal in mm; by default that of the nodule, or 5 if the target lies in none."
-        ),
-    ] = None,
-    probability: Annotated[
-        Probability, Parameter(help="Probability of success that the tolerances keep.")
-    ] = 0.95,
+    samples: Samples | None = None,
+    radius: Positive | None = None,
+    probability: Probability = 0.95,
     tool: ToolText = None,
-    seed: Annotated[Seed, Parameter(help="Seed of the random numbers.")] = 0,
-    processes: Annotated[
-        Processes, Parameter(help="How many processes share procedures that measure; one on Windows.")
-    ] = 1,
+    seed: Seed = 0,
+    processes: Processes = 1,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Estimate how likely a stored plan succeeds if the devices deviate from it."""
+    """Estimate how likely a stored plan succeeds if the devices deviate from it.
+
+    Args:
+        samples: Number of deviated plans; 10000, or 1000 procedures that measure on their way.
+        radius: Radius of the goal in mm; by default that of the nodule, or 5 if the target lies in none.
+        probability: Probability of success that the tolerances keep.
+        seed: Seed of the random numbers.
+        processes: How many processes share procedures that measure; one on Windows.
+    """
     from lungaccess.judging.appraisal import Headline
     from lungaccess.planning.procedure import simulate_procedure
     from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES

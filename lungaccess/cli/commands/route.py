@@ -1,9 +1,7 @@
 """The command `lungaccess route`: a route along airways or vessels for a device of limited curvature."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Literal
 
 from anatomy.base.files import write_json
 from anatomy.io.frames import Frame, parse_point
@@ -19,46 +17,42 @@ if TYPE_CHECKING:
 
 
 def route(
-    source: Annotated[
-        Path,
-        Parameter(
-            help="Folder of a patient, a centreline with radii (.vtp, .vtu), a mask of vessels, or a drawing "
-            "(.png)."
-        ),
-    ],
+    source: Path,
     *,
-    goal: Annotated[
-        str,
-        Parameter(
-            help="Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the "
-            "right, y down; or the name of a target that came with the patient: the place nearest to it."
-        ),
-    ],
-    start: Annotated[str | None, Parameter(help="Start; the widest end of the tubes if not given.")] = None,
-    lumen: Annotated[
-        Literal["hepatic-vein", "portal-vein", "hepatic-artery"] | None,
-        Parameter(help="Vessel of a liver of Med-RAD in which the device moves."),
-    ] = None,
-    curvature: Annotated[Positive, Parameter(help="Largest curvature of the device, 1/mm.")],
-    radius: Annotated[NotNegative, Parameter(help="Outer radius of the device, mm.")] = 0.0,
-    margin: Annotated[NotNegative, Parameter(help="Gap that must remain between device and wall, mm.")] = 0.0,
-    tolerance: Annotated[
-        NotNegative, Parameter(help="How far the ends of the route may lie from start and goal, mm.")
-    ] = 0.0,
-    repair: Annotated[
-        Literal["exact", "ga"],
-        Parameter(help="exact: a nonlinear program; ga: the genetic search of Li et al. 2021."),
-    ] = "exact",
-    seed: Annotated[Seed, Parameter(help="Seed of the genetic search.")] = 0,
-    frame: Annotated[
-        Frame | None, Parameter(help="Frame of a centreline file or mask that states none.")
-    ] = None,
-    pixel: Annotated[Positive | None, Parameter(help="Size of a pixel of a drawing, mm.")] = None,
-    out: Annotated[Path, Parameter(help="Folder for route.json and route.png.")] = Path("lungaccess-route"),
+    goal: str,
+    start: str | None = None,
+    lumen: Literal["hepatic-vein", "portal-vein", "hepatic-artery"] | None = None,
+    curvature: Positive,
+    radius: NotNegative = 0.0,
+    margin: NotNegative = 0.0,
+    tolerance: NotNegative = 0.0,
+    repair: Literal["exact", "ga"] = "exact",
+    seed: Seed = 0,
+    frame: Frame | None = None,
+    pixel: Positive | None = None,
+    out: Path = Path("lungaccess-route"),
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it."""
+    """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it.
+
+    Args:
+        source: Folder of a patient, a centreline with radii (.vtp, .vtu), a mask of vessels, or a drawing
+            (.png).
+        goal: Goal in mm with its frame: ras:x,y,z or lps:x,y,z; for a drawing lps:x,y,0, x to the right, y
+            down; or the name of a target that came with the patient: the place nearest to it.
+        start: Start; the widest end of the tubes if not given.
+        lumen: Vessel of a liver of Med-RAD in which the device moves.
+        curvature: Largest curvature of the device, 1/mm.
+        radius: Outer radius of the device, mm.
+        margin: Gap that must remain between device and wall, mm.
+        tolerance: How far the ends of the route may lie from start and goal, mm.
+        repair: exact: a nonlinear program; ga: the genetic search of Li et al. 2021.
+        seed: Seed of the genetic search.
+        frame: Frame of a centreline file or mask that states none.
+        pixel: Size of a pixel of a drawing, mm.
+        out: Folder for route.json and route.png.
+    """
     from lungaccess.planning.one_stage import open_source, route_record, widest_end
     from lungaccess.showing.report.route import route_png
     from stages.scope.route import RouteLimits, plan_route

@@ -2,9 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -15,20 +13,16 @@ if TYPE_CHECKING:
 
 
 def shapes(
-    *,
-    system: Annotated[
-        str,
-        Parameter(
-            help="Name of a preset, or path of a TOML file: a system, or one to three tables [[tubes]], the "
-            "innermost first."
-        ),
-    ] = DEFAULT_SYSTEM,
-    out: Annotated[Path | None, Parameter(help="CSV file for a table of all shapes.")] = None,
-    output: CacheOptions = CacheOptions(),
+    *, system: str = DEFAULT_SYSTEM, out: Path | None = None, output: CacheOptions = CacheOptions()
 ) -> ExitCode:
     """Follow a design of one to three tubes through all insertions and relative rotations.
 
     Exit code 0 if the device allows any deployment; 1 if it allows none.
+
+    Args:
+        system: Name of a preset, or path of a TOML file: a system, or one to three tables [[tubes]], the
+            innermost first.
+        out: CSV file for a table of all shapes.
     """
     from lungaccess.planning.one_stage import design_shapes, load_tubes, save_shapes, shapes_record
 

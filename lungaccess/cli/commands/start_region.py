@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
@@ -23,26 +21,27 @@ def start_region(
     plan: PlanFile,
     patient: PatientOfPlan,
     *,
-    distance: Annotated[Positive, Parameter(help="Starts are tried up to so many mm away.")] = 5.0,
-    tilt: Annotated[Positive, Parameter(help="Starts are tried up to so many degrees tilted.")] = 15.0,
-    poses: Annotated[Samples, Parameter(help="About how many starts are tried.")] = 10_000,
-    iterations: Annotated[
-        SamplesOrNone, Parameter(help="Of the search where nothing simpler finds a path; 0 for none.")
-    ] = 100,
-    radius: Annotated[
-        NotNegative | None,
-        Parameter(
-            help="How far in mm from the target a path may end, 0 for not at all; by default the radius "
-            "of the goal, as of `risk`."
-        ),
-    ] = None,
-    scope: Annotated[
-        bool, Parameter(help="Whether poses of the scope's tip are tried as well, which takes some seconds.")
-    ] = False,
-    seed: Annotated[Seed, Parameter(help="Seed of the search.")] = 0,
+    distance: Positive = 5.0,
+    tilt: Positive = 15.0,
+    poses: Samples = 10_000,
+    iterations: SamplesOrNone = 100,
+    radius: NotNegative | None = None,
+    scope: bool = False,
+    seed: Seed = 0,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Tell from which poses near its start the needle of a stored plan still reaches the target, clear."""
+    """Tell from which poses near its start the needle of a stored plan still reaches the target, clear.
+
+    Args:
+        distance: Starts are tried up to so many mm away.
+        tilt: Starts are tried up to so many degrees tilted.
+        poses: About how many starts are tried.
+        iterations: Of the search where nothing simpler finds a path; 0 for none.
+        radius: How far in mm from the target a path may end, 0 for not at all; by default the radius of the
+            goal, as of `risk`.
+        scope: Whether poses of the scope's tip are tried as well, which takes some seconds.
+        seed: Seed of the search.
+    """
     from lungaccess.planning.one_stage import safe_scope_region
     from lungaccess.plans.plan import Plan
     from lungaccess.uncertainty.risk import safe_start_region

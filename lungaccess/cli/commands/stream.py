@@ -20,22 +20,12 @@ def stream(
     plan: PlanFile,
     patient: PatientOfPlan,
     *,
-    host: Annotated[
-        str, Parameter(help="Address to listen at, or of the server; this machine alone if not given.")
-    ] = "127.0.0.1",
-    port: Annotated[
-        Port, Parameter(help="Its port; 0 for a free one to listen at, which is printed.")
-    ] = 18944,
-    connect: Annotated[
-        bool, Parameter(negative="", help="Connect to a server there, such as PLUS, and do not listen.")
-    ] = False,
-    rate: Annotated[
-        Hertz, Parameter(help="Rounds a second, in each of which all poses are sent, Hz.")
-    ] = 20.0,
-    loop: Annotated[bool, Parameter(negative="", help="Begin the motion again when it has ended.")] = False,
-    seconds: Annotated[
-        Seconds | None, Parameter(help="End after so long; until Ctrl-C if not given.")
-    ] = None,
+    host: str = "127.0.0.1",
+    port: Port = 18944,
+    connect: Annotated[bool, Parameter(negative="")] = False,
+    rate: Hertz = 20.0,
+    loop: Annotated[bool, Parameter(negative="")] = False,
+    seconds: Seconds | None = None,
     errors: ErrorOptions = ErrorOptions(),
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
@@ -43,6 +33,14 @@ def stream(
 
     With --procedure the policy of the procedure decides about tracked poses, else the cheapest way is taken.
     A plan that the check refuses is not sent: exit code 1.
+
+    Args:
+        host: Address to listen at, or of the server; this machine alone if not given.
+        port: Its port; 0 for a free one to listen at, which is printed.
+        connect: Connect to a server there, such as PLUS, and do not listen.
+        rate: Rounds a second, in each of which all poses are sent, Hz.
+        loop: Begin the motion again when it has ended.
+        seconds: End after so long; until Ctrl-C if not given.
     """
     from lungaccess.cli.plan_tables import show_headline
     from lungaccess.judging.appraisal import Headline

@@ -63,15 +63,17 @@ def template(
     ],
     /,
     *,
-    out: Annotated[Path | None, Parameter(help="File to write; it is printed if not given.")] = None,
-    schema: Annotated[
-        bool, Parameter(help="The JSON Schema of such files, for editors and other programs, not an example.")
-    ] = False,
+    out: Path | None = None,
+    schema: bool = False,
     force: Force = False,
 ) -> ExitCode:
     """Print an example of a file that a command reads, every key explained; edit it and hand it over.
 
     Devices have templates of their own: `lungaccess presets --show NAME`.
+
+    Args:
+        out: File to write; it is printed if not given.
+        schema: The JSON Schema of such files, for editors and other programs, not an example.
     """
     text = schema_text(kind) if schema else template_text(kind)
     if out is None:

@@ -1,9 +1,7 @@
 """The command `lungaccess tour`: several lesions in one procedure."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Literal
 
 from anatomy.base.files import write_json
 from lungaccess.cli import terminal
@@ -21,53 +19,38 @@ if TYPE_CHECKING:
 def tour(
     patient: PatientFolder,
     *,
-    targets: Annotated[
-        Path | None,
-        Parameter(
-            help="Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm; the patient's own targets "
-            "if not given."
-        ),
-    ] = None,
-    system: Annotated[
-        str, Parameter(help="Preset or TOML file whose devices reach the lesions from the airway.")
-    ] = DEFAULT_SYSTEM,
-    require_plan: Annotated[
-        bool,
-        Parameter(
-            help="Count an exit only if a coupled plan of scope, tubes and needle from there was found."
-        ),
-    ] = True,
-    iterations: Annotated[
-        CountOrNone, Parameter(help="Of the planner, for a lesion that no direct arc of the needle reaches.")
-    ] = 100,
-    closed: Annotated[
-        bool, Parameter(help="Return to the root of the airway after the last lesion.")
-    ] = False,
-    reading: Annotated[
-        Literal["printed", "reduced"],
-        Parameter(
-            help="How the resistances of Pan et al. 2025 are merged: as printed, or by true reduction of the "
-            "tree."
-        ),
-    ] = "printed",
-    beta: Annotated[
-        NotNegative,
-        Parameter(help="Weight of the angle in the resistance; the paper's worked example needs 2.5."),
-    ] = 0.2,
-    tissue_weight: Annotated[
-        NotNegative,
-        Parameter(
-            help="How many mm of the scope's travel a mm between exit and lesion is worth, for the shortest "
-            "tour."
-        ),
-    ] = 0.0,
-    speed: Annotated[Positive, Parameter(help="Speed of the scope, mm/s, for the times.")] = 10.0,
-    per_lesion: Annotated[NotNegative, Parameter(help="Time that each lesion takes besides, s.")] = 300.0,
-    out: Annotated[Path, Parameter(help="Folder for tour.json and tour.png.")] = Path("lungaccess-tour"),
+    targets: Path | None = None,
+    system: str = DEFAULT_SYSTEM,
+    require_plan: bool = True,
+    iterations: CountOrNone = 100,
+    closed: bool = False,
+    reading: Literal["printed", "reduced"] = "printed",
+    beta: NotNegative = 0.2,
+    tissue_weight: NotNegative = 0.0,
+    speed: Positive = 10.0,
+    per_lesion: NotNegative = 300.0,
+    out: Path = Path("lungaccess-tour"),
     force: Force = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
-    """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out."""
+    """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out.
+
+    Args:
+        targets: Text file with one lesion a line: ras:x,y,z or lps:x,y,z, mm; the patient's own targets if
+            not given.
+        system: Preset or TOML file whose devices reach the lesions from the airway.
+        require_plan: Count an exit only if a coupled plan of scope, tubes and needle from there was found.
+        iterations: Of the planner, for a lesion that no direct arc of the needle reaches.
+        closed: Return to the root of the airway after the last lesion.
+        reading: How the resistances of Pan et al. 2025 are merged: as printed, or by true reduction of the
+            tree.
+        beta: Weight of the angle in the resistance; the paper's worked example needs 2.5.
+        tissue_weight: How many mm of the scope's travel a mm between exit and lesion is worth, for the
+            shortest tour.
+        speed: Speed of the scope, mm/s, for the times.
+        per_lesion: Time that each lesion takes besides, s.
+        out: Folder for tour.json and tour.png.
+    """
     from lungaccess.planning import lesions_of, plan_tour, read_lesions, tour_record
     from lungaccess.problem.system import load_system
     from lungaccess.showing.report.tour import tour_png

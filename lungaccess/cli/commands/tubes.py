@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -23,33 +21,28 @@ if TYPE_CHECKING:
 
 def tubes(
     *,
-    outer: Annotated[NotNegative, Parameter(help="How far the outer tube comes out of the scope, mm.")],
-    inner: Annotated[NotNegative, Parameter(help="How far the inner tube comes out of the scope, mm.")],
-    system: Annotated[
-        str,
-        Parameter(
-            help="Name of a preset, or path of a TOML file: a system, or just two tables [[tubes]], the "
-            "inner one first."
-        ),
-    ] = DEFAULT_SYSTEM,
-    rotate: Annotated[
-        Angle,
-        Parameter(
-            help="Direction of the inner tube's bend about the scope's axis, from +x of its tip, degrees."
-        ),
-    ] = 0.0,
-    relative: Annotated[
-        Angle, Parameter(help="How much farther the base of the outer tube is turned, degrees.")
-    ] = 0.0,
-    propose: Annotated[
-        bool, Parameter(help="Compare sequences to the same place, and look for designs that sweep less.")
-    ] = False,
-    out: Annotated[Path, Parameter(help="PNG file for the picture.")] = Path("tubes.png"),
+    outer: NotNegative,
+    inner: NotNegative,
+    system: str = DEFAULT_SYSTEM,
+    rotate: Angle = 0.0,
+    relative: Angle = 0.0,
+    propose: bool = False,
+    out: Path = Path("tubes.png"),
     output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Deploy the tubes alone: tip, stability, sideways motion, picture.
 
     Exit code 0 if the device allows it; 1 if the tubes would snap or exceed a limit of the system.
+
+    Args:
+        outer: How far the outer tube comes out of the scope, mm.
+        inner: How far the inner tube comes out of the scope, mm.
+        system: Name of a preset, or path of a TOML file: a system, or just two tables [[tubes]], the inner
+            one first.
+        rotate: Direction of the inner tube's bend about the scope's axis, from +x of its tip, degrees.
+        relative: How much farther the base of the outer tube is turned, degrees.
+        propose: Compare sequences to the same place, and look for designs that sweep less.
+        out: PNG file for the picture.
     """
     from lungaccess.planning.one_stage import deploy_tubes, load_tubes
 

@@ -1,9 +1,6 @@
 """The command `lungaccess view`: the explorer of a patient on a page of this machine."""
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from anatomy.base.errors import SettingsError
 from lungaccess.cli import terminal
@@ -15,36 +12,31 @@ from lungaccess.cli.shown_ct import CtOption, shown_ct
 
 
 def view(
-    patient: Annotated[
-        Path | None,
-        Parameter(
-            help="Folder of masks: Med-RAD, TotalSegmentator, or own masks with a patient.toml; or a CT, an "
-            "image file or a folder of DICOM, which is segmented first. Without one the page lets you choose."
-        ),
-    ] = None,
+    patient: Path | None = None,
     *,
-    system: Annotated[
-        str, Parameter(help="System that is shown first: name of a preset, or path of a TOML file.")
-    ] = DEFAULT_SYSTEM,
+    system: str = DEFAULT_SYSTEM,
     ct: CtOption = None,
-    series: Annotated[
-        str | None, Parameter(help="UID of the DICOM series of a CT, where the folder holds several.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        Parameter(help="Patient folder for a CT; NAME-patient here if not given. It is taken up again."),
-    ] = None,
-    port: Annotated[Port | None, Parameter(help="Port of this machine; a free one if not given.")] = None,
-    browser: Annotated[bool, Parameter(help="Whether the page is opened in the browser.")] = True,
-    thick_slices: Annotated[
-        bool, Parameter(help="Explore masks from slices of more than 3 mm, which lack small structures.")
-    ] = False,
+    series: str | None = None,
+    out: Path | None = None,
+    port: Port | None = None,
+    browser: bool = True,
+    thick_slices: bool = False,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Explore a patient or a CT: click a target, see the feasible exits and better and better plans.
 
     The page is served to this machine alone, at the address that is printed, until Ctrl-C; nothing is fetched
     from elsewhere.  Needs the extra `view`.
+
+    Args:
+        patient: Folder of masks: Med-RAD, TotalSegmentator, or own masks with a patient.toml; or a CT, an
+            image file or a folder of DICOM, which is segmented first. Without one the page lets you choose.
+        system: System that is shown first: name of a preset, or path of a TOML file.
+        series: UID of the DICOM series of a CT, where the folder holds several.
+        out: Patient folder for a CT; NAME-patient here if not given. It is taken up again.
+        port: Port of this machine; a free one if not given.
+        browser: Whether the page is opened in the browser.
+        thick_slices: Explore masks from slices of more than 3 mm, which lack small structures.
     """
     import asyncio
     import webbrowser

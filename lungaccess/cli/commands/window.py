@@ -1,9 +1,7 @@
 """The command `lungaccess window`: the phases of the breath in which a plan is proved."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 from anatomy.base.files import require_suffix
 from anatomy.base.words import of_hundred, percent
@@ -19,22 +17,25 @@ if TYPE_CHECKING:
 
 
 def window(
-    plan: Annotated[Path, Parameter(help="The plan.json.")],
+    plan: Path,
     patient: PatientOfPlan,
     *,
-    tolerance: Annotated[
-        NotNegative, Parameter(help="Largest distance in mm to the moving target, at most 2.")
-    ] = 2.0,
-    out: Annotated[Path | None, Parameter(help="A plan.json to write, the plan with its window.")] = None,
-    tissue_carries_needle: Annotated[
-        bool, Parameter(help="Show what the breath does to the needle once it is in place, as a figure.")
-    ] = False,
-    picture: Annotated[Path | None, Parameter(help="A PNG to write, the window on a clock.")] = None,
+    tolerance: NotNegative = 2.0,
+    out: Path | None = None,
+    tissue_carries_needle: bool = False,
+    picture: Path | None = None,
     output: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show in which phases of the breath a plan is proved clear and on target; exit code 1 if in none.
 
     The patient needs a motion: [motion] in its patient.toml.
+
+    Args:
+        plan: The plan.json.
+        tolerance: Largest distance in mm to the moving target, at most 2.
+        out: A plan.json to write, the plan with its window.
+        tissue_carries_needle: Show what the breath does to the needle once it is in place, as a figure.
+        picture: A PNG to write, the window on a clock.
     """
     from dataclasses import asdict, replace
 

@@ -8,7 +8,7 @@ from typing import Any
 import lungaccess as la
 from lungaccess.problem.target import point_target
 from lungaccess.showing.live import plan_trajectory
-from lungaccess.showing.live.trajectory_files import PATH_FILES, joint_trajectory, tip_path
+from lungaccess.showing.live.trajectory import PATH_FILES, joint_trajectory, tip_path
 
 MM_PER_M = 1000.0
 DEFAULT_SYSTEM = "lung-default"

@@ -11,6 +11,7 @@ import pytest
 
 from anatomy.base.errors import FileError, SettingsError
 from anatomy.base.settings import override, parse, to_mapping
+from docs.write_tables import device_keys
 from lungaccess.problem.needle_load import needle_load, system_warnings
 from lungaccess.problem.system import (
     System,
@@ -199,7 +200,7 @@ def test_example_of_the_documentation_works(tmp_path: Path) -> None:
 
 
 def test_documentation_names_every_key() -> None:
-    page = (DOCS / "reference" / "devices.md").read_text(encoding="utf-8")
+    page = device_keys()
 
     def keys(mapping: dict[str, object]) -> set[str]:
         nested = (keys(value) for value in mapping.values() if isinstance(value, dict))

@@ -19,6 +19,7 @@ from anatomy.base.errors import FileError, SettingsError
 from anatomy.base.settings import parse, to_mapping
 from anatomy.lung import Lung
 from anatomy.motion.source import share_of_motion
+from docs.write_tables import error_presets
 from lungaccess.problem.error_files import DEFAULT_ERRORS, error_preset_names, load_errors
 from lungaccess.problem.errors import (
     BREATHING,
@@ -33,24 +34,10 @@ from lungaccess.uncertainty.risk.breathing import phase
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
 from lungaccess.uncertainty.risk.draws import Draws
 
-PAGE = Path(__file__).parents[4] / "docs/reference/errors.md"
 PRESETS = [load_errors(name) for name in error_preset_names()]
 MODELS = st.sampled_from([each for each in PRESETS if not each.rests])
 """Those that need no plan."""
 COUNT = 4000
-
-
-def rows_of(model: ErrorModel) -> list[tuple[str, str, str, str, str]]:
-    """Return what the page says of a model: error, distribution, sizes by patient and attempt, source."""
-    found = []
-    for kind, unit in UNITS.items():
-        term = model.term(kind)
-        if isinstance(term, BreathingError):
-            sizes = (f"{term.median_mm:g} mm, ln {term.patient_ln:g}", "phase") if term.size else ("0", "0")
-        else:
-            sizes = tuple(f"{size:g} {unit}" if size else "0" for size in (term.patient, term.attempt))
-        found.append((f"`{kind}`", term.distribution, *sizes, term.source))
-    return found
 
 
 def equal(a: Deviations, b: Deviations) -> bool:
@@ -65,16 +52,23 @@ def equal(a: Deviations, b: Deviations) -> bool:
 def test_the_page_states_every_entry_of_every_preset() -> None:
     names = error_preset_names()
     stated: dict[str, list[tuple[str, ...]]] = {name: [] for name in names}
-    table = PAGE.read_text(encoding="utf-8").split("| error | presets |", 1)[1]
-    for line in table.splitlines():
+    for line in error_presets().splitlines():
         if line.startswith("| `"):
             error, presets, *entry = (cell.strip() for cell in line.strip("|").split("|"))
             listed = set(re.findall(r"`([^`]+)`", presets))
             assert listed <= set(names)
             for name in names:
-                if (name not in listed) if presets.startswith("all") else (name in listed):
+                if presets == "all" or name in listed:
                     stated[name].append((error, *entry))
-    assert stated == {name: rows_of(load_errors(name)) for name in names}
+    for name in names:
+        for error, distribution, patient, attempt, source in stated[name]:
+            term = load_errors(name).term(error.strip("`"))
+            assert (distribution, source) == (term.distribution, term.source)
+            assert (patient, attempt) != ("0", "0") or not term.size
+            if not isinstance(term, BreathingError):
+                sizes = [float(size.split(" ")[0]) for size in (patient, attempt)]
+                assert sizes == [term.patient, term.attempt]
+        assert [error.strip("`") for error, *_entry in stated[name]] == list(UNITS)
 
 
 def test_the_presets_have_the_published_sizes() -> None:

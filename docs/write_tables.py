@@ -96,11 +96,9 @@ def error_presets() -> str:
         "| error | presets | distribution | by patient | by attempt | source |",
         "|---|---|---|---|---|---|",
     ]
-    for found in sorted(presets, key=lambda each: kinds.index(each[0])):
-        held = presets[entry]
-        lines.append(
-            f"| {' | '.join((entry[0], 'all' if len(held) == len(names) else ', '.join(held), *entry[1:]))} |"
-        )
+    for shown in sorted(presets, key=lambda each: kinds.index(each[0])):
+        held = "all" if len(presets[shown]) == len(names) else ", ".join(presets[shown])
+        lines.append(f"| {' | '.join((shown[0], held, *shown[1:]))} |")
     return "\n".join(lines) + "\n"
 
 

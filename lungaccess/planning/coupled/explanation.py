@@ -5,6 +5,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from anatomy.base.words import plural
 from lungaccess.planning.coupled.atlas import Atlas, motions_of
 from lungaccess.planning.coupled.counterfactuals import Counterfactual, find_counterfactuals
@@ -106,6 +108,13 @@ def _main_reason(arcs: DirectArcs, blocked: Counter[str]) -> str:
     obstacles = blocked.copy()
     del obstacles["nothing"], obstacles["the needle's limits"]
     most = f", mostly by {obstacles.most_common(1)[0][0]}" if obstacles else ""
+    count = arcs.atlas.deployments.count
+    # A few deployments far off would else hide that the needle cannot bend to the target from all others.
+    if len(arcs.in_workspace) < 0.01 * count:
+        return (
+            f"the target lies outside the needle's workspace for {count - len(arcs.in_workspace)} of {count} "
+            f"deployments, and every path tried from the others is blocked{most}"
+        )
     return f"every path tried from a deployment that could reach the target is blocked{most}"
 
 
@@ -130,8 +139,16 @@ def _typically(task: Task, excess_mm: float) -> str:
 
 
 def _scope_reasons(task: Task, atlas: Atlas) -> dict[str, int]:
-    """Count scope tips, airways that are too narrow, and the deployments looked at."""
-    reasons = {"scope: tips with a proved motion": atlas.motions.count}
+    """Count scope tips, airways that are too narrow or end far off, and the deployments looked at."""
+    passable = atlas.motions.passages.passable
+    away_mm = np.linalg.norm(task.lung.tree.points_lps - task.target.lps_mm, axis=1)
+    nearest = f"the nearest {away_mm.min():.0f} mm from the target"
+    passed = f"the nearest {away_mm[passable].min():.0f} mm" if passable.any() else "none"
+    reasons = {
+        f"masks: points of the airways, {nearest}": len(away_mm),
+        f"scope: points of the airways that it passes, {passed} from the target": int(passable.sum()),
+        "scope: tips with a proved motion": atlas.motions.count,
+    }
     generation, excess = atlas.motions.passages.narrowest
     closed = int((~atlas.motions.passages.passable).sum())
     if closed:

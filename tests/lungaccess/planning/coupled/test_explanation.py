@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,12 @@ import lungaccess as la
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
+from lungaccess.planning.coupled import explanation
 from lungaccess.plans.insertion import scope_motion
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, point_target
+from lungaccess.problem.task import Task
 from stages.scope import prover_of
 from tests.lungaccess.points import FAR_TARGET
 from tests.stages.scenes import lung_of
@@ -80,6 +84,7 @@ class TestScope:
         generation = int(re.search(r"too narrow at generation (\d+)", str(error))[1])
         closed = next(count for reason, count in error.reasons.items() if "too narrow" in reason)
         assert generation == 0 and closed == small_lung.tree.n_points
+        assert error.reasons["scope: points of the airways that it passes, none from the target"] == 0
 
     def test_the_advised_diameter_has_a_place_and_a_larger_one_has_none(self, small_lung: Lung) -> None:
         advice = explained(small_lung, self.THICK_SCOPE, la.resolve_target(small_lung)).advice
@@ -114,6 +119,32 @@ def test_tubes_that_never_leave(small_lung: Lung) -> None:
     refused = {k: v for k, v in error.reasons.items() if k.startswith("tube: the tube")}
     assert sum(refused.values()) == error.reasons["tube: deployments looked at"]
     assert refused["tube: the tube meets the airway wall at too flat an angle"] > 0
+
+
+def test_the_nearest_airway_and_the_nearest_that_the_scope_passes_are_told(small_lung: Lung) -> None:
+    target = la.resolve_target(small_lung)
+    task = Task(lung=small_lung, system=SYSTEM, target=target)
+    away = np.linalg.norm(small_lung.tree.points_lps - target.lps_mm, axis=1)
+    passable = away > np.median(away)
+    motions = SimpleNamespace(count=3, passages=SimpleNamespace(passable=passable, narrowest=(2, 0.4)))
+    atlas = SimpleNamespace(motions=motions, deployments=SimpleNamespace(candidates=7))
+    reasons = explanation._scope_reasons(task, atlas)
+    nearest, passed = away.min(), away[passable].min()
+    assert reasons[f"masks: points of the airways, the nearest {nearest:.0f} mm from the target"] == len(away)
+    key = f"scope: points of the airways that it passes, the nearest {passed:.0f} mm from the target"
+    assert passed > nearest + 1.0 and reasons[key] == np.count_nonzero(passable)
+
+
+@pytest.mark.parametrize(("inside", "told"), [(9, "for 991 of 1000 deployments"), (10, "every path tried")])
+def test_a_few_deployments_far_off_do_not_hide_that_the_needle_bends_too_little(
+    inside: int, told: str
+) -> None:
+    arcs = SimpleNamespace(
+        in_workspace=np.arange(inside), atlas=SimpleNamespace(deployments=SimpleNamespace(count=1000))
+    )
+    said = explanation._main_reason(arcs, Counter({"the pleura": 3, "nothing": 5}))
+    assert told in said and said.endswith("blocked, mostly by the pleura")
+    assert ("outside the needle's workspace" in said) == (inside < 10)
 
 
 class TestNeedle:

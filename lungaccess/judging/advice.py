@@ -86,9 +86,9 @@ class Adviser:
 
     def trials(self) -> Iterator[Advice | None]:
         """Yield what each trial shows, the quickest trials first; None where there is nothing to show."""
+        yield from self._passes()
         yield from self._errors_known()
         yield from self._procedures()
-        yield from self._passes()
         yield from self._points()
         yield from self._presets()
 

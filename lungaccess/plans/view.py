@@ -59,15 +59,23 @@ def bronchus_sign(lung: Lung, target_lps: Float) -> str:
     return "no bronchus leads into the nodule"
 
 
-def view_words(plan: Plan, lung: Lung) -> str:
-    """Say what radial ultrasound is expected to show of the nodule from scope and tubes; "" if not known."""
+def view_rows(plan: Plan, lung: Lung) -> list[tuple[str, str]]:
+    """Return the expected views from scope and tubes and the bronchus sign, as names and values."""
     target = np.asarray(plan.target_lps)
     sign = bronchus_sign(lung, target)
     if not sign:
-        return ""
+        return []
     tips = (plan.scope.lps_from_scope_tip, plan.tube.lps_from_tip)
     scope, tubes = radial_views(lung, target, np.array([tip[:3, [3, 2, 0]].T.ravel() for tip in tips]))
-    return f"expected {scope} at the tip of the scope, {tubes} at that of the tubes; {sign}"
+    return [
+        ("ultrasound at scope / tubes", f"{scope} / {tubes}"),
+        ("bronchus into the nodule", "none" if sign.startswith("no ") else "yes"),
+    ]
+
+
+def view_words(plan: Plan, lung: Lung) -> str:
+    """Return `view_rows` in one sentence, "" if nothing is known."""
+    return "; ".join(f"{name}: {value}" for name, value in view_rows(plan, lung))
 
 
 def best_view_words(lung: Lung, target_lps: Float, tips: Float) -> str:

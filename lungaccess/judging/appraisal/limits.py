@@ -7,6 +7,7 @@ from dataclasses import asdict
 from anatomy.base.records import frozen_value
 from lungaccess.judging.checking import Finding
 from lungaccess.judging.checking.clearances import REACH_MM
+from lungaccess.judging.checking.findings import PASS
 from lungaccess.plans.plan import Plan
 
 SHOWN_LIMITS = 10
@@ -149,20 +150,20 @@ class Limit:
 def limits_of(findings: Iterable[Finding], plan: Plan | None = None) -> tuple[Limit, ...]:
     """Return the limits among the findings of a check: broken ones first, then by how near the limit is.
 
-    The numbers are those that the check measured.  A plan, if given, adds the clearances that it states.
+    The numbers are those that the check measured, of the pass that comes nearest.  A plan, if given, adds the
+    clearances that it states.
     """
-    by_name = {each.name: each for each in findings}
+    by_name: dict[str, list[Finding]] = {}
+    for each in findings:
+        name = each.name.split(".", 1)[1] if each.stage.startswith(PASS) else each.name
+        by_name.setdefault(name, []).append(each)
     rows = [_limit(kind, by_name, plan) for kind in KINDS]
     return tuple(sorted((row for row in rows if row is not None), key=lambda row: (row.ok, -row.used)))
 
 
-def _limit(kind: _Kind, findings: dict[str, Finding], plan: Plan | None) -> Limit | None:
+def _limit(kind: _Kind, findings: dict[str, list[Finding]], plan: Plan | None) -> Limit | None:
     """Return the row of a kind from its tightest finding; None if nothing limits it here."""
-    measured = [
-        found
-        for name in kind.findings
-        if (found := findings.get(name)) is not None and found.side is not None
-    ]
+    measured = [found for name in kind.findings for found in findings.get(name, ()) if found.side is not None]
     if not measured:
         return None
     tightest = max(measured, key=lambda found: (not found.ok, _used(found)))

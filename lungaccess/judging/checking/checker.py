@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from lungaccess.judging.checking.completion import Motions, completed_plan
 from lungaccess.judging.checking.deployment import check_deployment
 from lungaccess.judging.checking.environment import Environment
-from lungaccess.judging.checking.findings import CheckReport, Finding, Findings
+from lungaccess.judging.checking.findings import PASS, CheckReport, Finding, Findings
 from lungaccess.judging.checking.needle_load import check_needle_load
 from lungaccess.judging.checking.outcome import check_tubes_at_target
 from lungaccess.judging.checking.record import check_record
@@ -75,7 +75,7 @@ def _of_further(one: Finding, number: int) -> Finding:
     if one.name == TISSUE:
         detail = "what this pass takes as planned, beside the first, which takes enough"
         one = Finding(name=one.name, ok=True, value=one.value, unit=one.unit, detail=detail)
-    return replace(one, name=f"pass_{number}.{one.name}")
+    return replace(one, name=f"{PASS}{number}.{one.name}")
 
 
 def check(

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from anatomy.base.records import frozen_value
 from anatomy.display import title
 
+PASS = "pass_"
+"""Names of what was found of a further pass begin with this and its number."""
 Side = Literal["at least", "at most"]
 _HEADINGS = ("", "what", "found", "limit", "margin", "")
 Row = tuple[str, ...]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +11,8 @@ import numpy as np
 from anatomy.base.words import plural
 from lungaccess.judging.appraisal.limits import SHOWN_LIMITS
 from lungaccess.plans.costs import costs_in_words, known_costs
-from lungaccess.plans.view import view_words
+from lungaccess.plans.plan import redirection_mm
+from lungaccess.plans.view import view_rows
 from lungaccess.problem.nodules import target_words
 
 if TYPE_CHECKING:
@@ -30,7 +33,7 @@ def key_numbers(plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> l
 def figures_of_plan(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
     """Return headed rows of what the plan does and costs, without its limits."""
     costs = costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None))
-    passes = [(f"pass {number}", said) for number, said in enumerate(plan.redirections, 2)]
+    passes = list(_pass_rows(plan))
     more = [("Further passes", passes)] if passes else []
     return [("Plan", _general_rows(plan, lung)), *_stage_rows(plan, lung), *more, ("Cost", costs)]
 
@@ -43,7 +46,7 @@ def _general_rows(plan: Plan, lung: Lung) -> list[Row]:
         ("target, LPS mm", f"{x:.1f}, {y:.1f}, {z:.1f}"),
         ("target, RAS mm", f"{-x + 0.0:.1f}, {-y + 0.0:.1f}, {z:.1f}"),
         *((("place of the target", place),) if (place := target_words(lung, plan.target_lps)) else ()),
-        *((("radial ultrasound", view),) if (view := view_words(plan, lung)) else ()),
+        *view_rows(plan, lung),
         ("fissures", _fissures(plan)),
         ("breath hold", plan.breath_hold or "not stated"),
         ("method, seed", f"{plan.method}, {plan.seed}"),
@@ -85,6 +88,13 @@ def _needle_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
         ("accumulated turn", f"{np.degrees(needle.accumulated_turn_rad):.1f}°"),
     ]
     return [("Needle", rows)]
+
+
+def _pass_rows(plan: Plan) -> Iterator[Row]:
+    for number, (before, after) in enumerate(pairwise(plan.passes), 2):
+        back_mm, on_mm = redirection_mm(before, after)
+        tubes = "same tubes" if plan.same_tubes[number - 1] == plan.same_tubes[number - 2] else "tubes moved"
+        yield f"pass {number}", f"back {back_mm:.1f}, on {on_mm:.1f} mm, {tubes}"
 
 
 def _limit_rows(appraisal: Appraisal) -> tuple[str, list[Row]]:

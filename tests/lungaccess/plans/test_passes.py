@@ -15,13 +15,15 @@ from lungaccess.judging.appraisal import appraise
 from lungaccess.judging.checking import check
 from lungaccess.planning.one_system import run
 from lungaccess.planning.procedure import simulate_procedure
+from lungaccess.plans.kernels.tissue import taken_at
+from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan, redirection_mm
-from lungaccess.plans.tissue import own_nodule
+from lungaccess.plans.tissue import own_nodule, wanted_of
 from lungaccess.plans.view import best_view_words, bronchus_sign, radial_views, view_words
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.request import Request
-from lungaccess.problem.system import with_tool
+from lungaccess.problem.system import system_fingerprint, with_tool
 from lungaccess.problem.tools import load_tool
 from lungaccess.uncertainty.risk import assess
 from lungaccess.uncertainty.risk.assessor import RiskAssessor, drawn_anew
@@ -67,6 +69,12 @@ def test_every_pass_is_checked_and_kept_in_the_file(plans: tuple[Plan, Plan], sm
     assert again.digest == several.digest and len(again.passes) == PASSES
     last = several.further[-1]
     beside = replace(last, end_lps=np.asarray(last.end_lps) + [0.0, 0.0, 1.0])
+    assert {each.ok for each in report.findings if each.name.endswith("tool.tissue")} == {True}
+    few = with_tool(CORE, replace(load_tool("core"), least=12.0))
+    stated = replace(several, system=few, system_fingerprint=system_fingerprint(few))
+    assert "tool.tissue" in {each.name for each in check(stated, small_lung).refusals}, (
+        "the first takes enough"
+    )
     broken = check(replace(several, further=(*several.further[:-1], beside)), small_lung)
     assert not broken.accepted and {each.name.split(".")[0] for each in broken.refusals} == {"pass_3"}
 
@@ -158,9 +166,28 @@ def test_a_probe_in_a_nodule_sees_it_all_round(plans: tuple[Plan, Plan], small_l
     tips = np.array([[*target, *ahead], [*edge, *ahead], [*far, *ahead]])
     assert radial_views(small_lung, target, tips) == ["concentric", "eccentric", "absent"]
     assert best_view_words(small_lung, target, tips[1:]).startswith("expected eccentric at the best")
-    assert "at the tip of the scope" in view_words(plans[0], small_lung)
+    assert "scope / tubes: absent / absent" in view_words(plans[0], small_lung)
     beside = small_lung.tree.points_lps[0]
     assert bronchus_sign(small_lung, beside) == best_view_words(small_lung, beside, tips) == ""
     assert bronchus_sign(small_lung, target) in {
         "a bronchus leads into the nodule", "no bronchus leads into the nodule"
     }  # fmt: skip
+
+
+def test_the_rest_of_a_plan_goes_on_until_the_tool_is_at_the_target(
+    plans: tuple[Plan, Plan], small_lung: Lung
+) -> None:
+    plan, target = plans[0], la.resolve_target(small_lung)
+    wanted = wanted_of(small_lung, target.lps_mm, CORE.tool)
+    for found in (
+        la.replan_from_tube(small_lung, CORE, plan.tube.lps_from_tip, target),
+        la.replan_from_scope(small_lung, CORE, plan.scope.lps_from_scope_tip, target, tries=0),
+    ):
+        last = found.path.frames()[-1]
+        assert taken_at(wanted, last) >= wanted.least
+        middle = last[:3, 3] - CORE.tool.beyond_mm * last[:3, 2]
+        assert np.linalg.norm(middle - target.lps_mm) < 1.0
+        assert found.needle.end_lps.tolist() == last[:3, 3].tolist()
+    small = with_tool(CORE, replace(load_tool("core"), least=14.9))
+    with pytest.raises(NoPlan, match="as measured"):
+        la.replan_from_tube(small_lung, small, plan.tube.lps_from_tip, target)

@@ -86,7 +86,7 @@ def with_passes(
     policy = Policy(same, request.lung, rating.errors, rating.procedure, radius_mm=request.radius_mm)
     ended = _Ended.of(policy, draws, rating.seed_of(CHOOSING))
     reach_mm = goal_radius(request.lung, request.target.lps_mm, request.radius_mm)[0]
-    ways = list(_ways(best, direct, reach_mm))
+    ways = list(_candidates(best, direct, reach_mm))
     frames = np.array([with_tool_in_place(request.system, each.path).frames()[-1] for each in ways])
     clear = [ended.clear] * len(ways)
     if rating.procedure.is_open_loop:
@@ -108,7 +108,7 @@ def with_passes(
     return plans[int(np.argmax(gained))]
 
 
-def _ways(best: Candidate, direct: DirectCandidates, reach_mm: float) -> Iterator[Candidate]:
+def _candidates(best: Candidate, direct: DirectCandidates, reach_mm: float) -> Iterator[Candidate]:
     """Yield proved ways from the place of the scope to aims about the target, the best one first."""
     yield best
     evaluator, atlas = direct.evaluator.beside(), direct.atlas

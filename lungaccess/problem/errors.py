@@ -248,7 +248,6 @@ class Place:
     """Errors of other sizes where the scope's tip stands in some of the airways.
 
     Args:
-        lobe: Lobe of the scope's tip, such as "right upper"; any where it is empty.
         generation_from, generation_to: Generations of the tip's airway for which it holds, both included; the
             trachea is 0.
         scope_position, ... (of the classes of `ErrorModel`): What stands there in place of the model's own.
@@ -296,7 +295,6 @@ class ErrorModel:
     Without arguments there is no error at all; `load_errors` reads the presets, which state their sources.
 
     Args:
-        name: What the model is called where its results are shown, see `label`.
         scope_position: Position of the scope tip, along each axis.
         tube_rotation: Rotation of planar tubes together, or of each tube that is not planar.
         needle_roll: Angle of the needle about its axis at each arc.

@@ -29,7 +29,6 @@ class ScopePlacing:
     """What is done once the bronchoscope stands where the plan has it.
 
     Args:
-        measured: Whether its tip is measured, and tubes and needle are planned again from there.
         position_mm, direction_deg: Errors of measuring: of the position along each axis, of the direction
             about each of two axes.
         placements: How often the scope may be placed.  It is moved away and placed again, at the same tip,
@@ -79,7 +78,6 @@ class NeedleSteering:
         target_mm: Error of the target as tracked, along each axis; None where it is not seen during the
             insertion.
         latency_mm: Insertion between a measurement and its use: the speed times the tracker's delay.
-        lost_share: Share of the measurements that are lost.
     """
 
     closed_loop: Annotated[bool, switch("whether the needle is measured and planned again on its way")] = (

@@ -1,16 +1,11 @@
 """The breath as a clock: end-exhale at the top, end-inhale at the bottom, and the window on its rim."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from anatomy.base.records import frozen_value
-
-if TYPE_CHECKING:
-    from lungaccess.plans.window import BreathingWindow
+from lungaccess.plans.window import BreathingWindow
 
 PROVED, MODEL_ONLY, NOT_PROVED = "#009E73", "#B8860B", "#C9A5A0"
 """Proved for this patient, by a model of other people's lungs, and neither; their lightness differs, too."""

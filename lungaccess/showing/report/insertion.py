@@ -1,21 +1,17 @@
 """Needles inserted with errors, drawn: their true paths in the plane of the plan, as a picture or a film."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.files import atomic_write
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from lungaccess.planning.procedure.insertion import Insertion, InsertionStudy
 from lungaccess.showing.report import style
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.planning.procedure.insertion import Insertion, InsertionStudy
-    from stages.needle import Query
+from stages.needle import Query
 
 OPEN, CLOSED = style.TUBE, style.SCOPE
 FRAMES, FRAME_MS, LAST_MS = 40, 90, 2000

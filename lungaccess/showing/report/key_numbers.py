@@ -1,24 +1,18 @@
 """The key figures of a plan as labels and values."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy.base.words import plural
+from anatomy.lung import Lung
+from lungaccess.judging.appraisal import Appraisal
 from lungaccess.judging.appraisal.limits import SHOWN_LIMITS
 from lungaccess.plans.costs import costs_in_words, known_costs
-from lungaccess.plans.plan import redirection_mm
+from lungaccess.plans.plan import Plan, redirection_mm
 from lungaccess.plans.view import view_rows
 from lungaccess.problem.nodules import target_words
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.judging.appraisal import Appraisal
-    from lungaccess.plans.plan import Plan
 
 STRUCTURES = {"airway": "airway wall", "outside": "outside of the lung"}
 Row = tuple[str, str]

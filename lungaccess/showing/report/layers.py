@@ -1,23 +1,18 @@
 """Masks as picture layers: thickness along a view, and cuts along any plane."""
 
-from __future__ import annotations
-
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Bool, Float, Int
+from anatomy.grid import Grid
 from anatomy.kept_records import kept
+from anatomy.organ import Organ
 from anatomy.structures import BITS, OUTSIDE
 from lungaccess.showing.report.pack import Packed, pack, unpack
 from lungaccess.showing.report.views import STANDARD, View
-
-if TYPE_CHECKING:
-    from anatomy.grid import Grid
-    from anatomy.organ import Organ
-
 
 PROJECTIONS_VERSION = 2
 SEEN_THROUGH = ("lung", "fissure", "vessel", "airway", "lumen", "nodule")

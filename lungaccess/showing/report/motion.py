@@ -1,10 +1,7 @@
 """How the lungs of a patient breathe: displacements from end-exhale to end-inhale, from three sides."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
@@ -13,13 +10,11 @@ from matplotlib.colors import Normalize
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
 from anatomy.structures import OUTSIDE
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import STANDARD
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
 
 WIDTH_IN, HEIGHT_IN = 17.0, 6.6
 PANELS_IN = ((0.55, 0.6, 5.2, 5.3), (6.2, 0.6, 5.2, 5.3), (11.9, 0.6, 3.8, 5.3))

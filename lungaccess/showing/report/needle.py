@@ -1,10 +1,7 @@
 """The picture of a needle planned alone: its start, its path or what stands in the way, and the target."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,15 +9,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 
 from anatomy.base.typed import Float
+from anatomy.organ import Organ
+from lungaccess.planning.one_stage import NeedleAnswer
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import View, plane_view
 from lungaccess.showing.report.zoom import paint_cut
-
-if TYPE_CHECKING:
-    from anatomy.organ import Organ
-    from lungaccess.planning.one_stage import NeedleAnswer
-    from stages.needle import Query
+from stages.needle import Query
 
 WIDTH_IN, HEIGHT_IN = 12.4, 6.9
 WHOLE_IN, CLOSE_IN = (0.25, 1.05, 5.8, 5.0), (6.35, 1.05, 5.8, 5.0)

@@ -1,27 +1,21 @@
 """Why there is no plan, as a picture: where needles can start and why each fails, and the nearest misses."""
 
-from __future__ import annotations
-
 import os
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from anatomy.base.typed import Float
-from lungaccess.judging.explanation import FAILS
+from anatomy.lung import Lung
+from lungaccess.judging.explanation import FAILS, Explanation
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import AXIAL, CORONAL, View, plane_view
 from lungaccess.showing.report.zoom import paint_cut
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.judging.explanation import Explanation
 
 WIDTH_IN, HEIGHT_IN = 17.0, 7.4
 PANELS_IN = ((0.5, 1.0, 5.0, 5.3), (5.9, 1.0, 5.0, 5.3), (11.4, 1.0, 5.3, 5.3))

@@ -1,25 +1,19 @@
 """A proof of unreachability as a picture: from where deployments are ruled out, and from where not."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from anatomy.base.typed import Float
 from anatomy.base.words import percent
+from anatomy.lung import Lung
+from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import AXIAL, CORONAL, View
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from anatomy.lung import Lung
-    from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 
 WIDTH_IN, HEIGHT_IN = 12.4, 7.2
 PANELS_IN = ((0.6, 1.0, 5.3, 5.3), (6.6, 1.0, 5.3, 5.3))

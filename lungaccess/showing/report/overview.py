@@ -1,31 +1,24 @@
 """The one picture of a plan: three projections, two cuts, the clearances and the key numbers."""
 
-from __future__ import annotations
-
 import os
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from lungaccess.judging.appraisal import Appraisal
 from lungaccess.judging.appraisal.headline import Headline
+from lungaccess.plans.plan import Plan
 from lungaccess.showing.report import drawing, style, zoom
 from lungaccess.showing.report.key_numbers import key_numbers
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import STANDARD, View
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from anatomy.lung import Lung
-    from lungaccess.judging.appraisal import Appraisal
-    from lungaccess.plans.plan import Plan
-
 
 WIDTH_IN, HEIGHT_IN = 18.0, 11.9
 HEADLINE_TOP_IN = 0.47

@@ -1,31 +1,24 @@
 """The picture of a reachability map: three planes of what is reached and how clear, with the shares."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from anatomy.base.typed import Bool, Float, UInt8
 from anatomy.base.words import percent
+from anatomy.grid import Volume
+from anatomy.lung import Lung
+from lungaccess.planning.reachability import ReachMap
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import STANDARD, View
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from anatomy.grid import Volume
-    from anatomy.lung import Lung
-    from lungaccess.planning.reachability import ReachMap
-
 
 WIDTH_IN, HEIGHT_IN = 18.0, 11.0
 LEFTS_IN, WIDTHS_IN = (0.55, 5.55, 10.55), (4.5, 4.5, 3.4)

@@ -1,10 +1,7 @@
 """A route along tubes: from two sides, with its curvature and its distance to the wall."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,10 +12,7 @@ from matplotlib.patches import Patch
 from anatomy.base.typed import Float
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.views import CORONAL, SAGITTAL, View
-
-if TYPE_CHECKING:
-    from stages.scope.route import Centreline, Route
-
+from stages.scope.route import Centreline, Route
 
 WIDTH_IN, HEIGHT_IN = 15.0, 9.0
 VIEWS_IN = ((0.5, 3.6, 6.9, 4.7), (7.9, 3.6, 6.6, 4.7))

@@ -1,28 +1,22 @@
 """A tour over the airway: how often each stretch is passed, and the order of the lesions."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
 from anatomy.poses import pose
+from lungaccess.planning import TourAnswer
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import CORONAL, SAGITTAL, View
 from stages.needle import direct_path
-
-if TYPE_CHECKING:
-    from anatomy.airway_tree import AirwayTree
-    from anatomy.lung import Lung
-    from lungaccess.planning import TourAnswer
-    from stages.scope.tour import Itinerary
-
+from stages.scope.tour import Itinerary
 
 WIDTH_IN, HEIGHT_IN = 15.0, 7.6
 PANELS_IN = ((0.5, 0.9, 6.9, 5.8), (7.9, 0.9, 6.6, 5.8))

@@ -1,10 +1,7 @@
 """The airway tree over its mask, coloured by generation; and an organ without airways."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
@@ -13,16 +10,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from anatomy.organ import Organ
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import STANDARD, View
-
-if TYPE_CHECKING:
-    from anatomy.airway_tree import AirwayTree
-    from anatomy.lung import Lung
-    from anatomy.organ import Organ
-
 
 WIDTH_IN, HEIGHT_IN = 17.0, 6.6
 PANELS_IN = ((0.55, 0.6, 5.4, 5.3), (6.5, 0.6, 5.4, 5.3), (12.4, 0.6, 3.6, 5.3))

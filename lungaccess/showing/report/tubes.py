@@ -1,11 +1,8 @@
 """Shape, torsion and stability of deployed tubes in one picture, with the steps that led there."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,10 +12,7 @@ from matplotlib.patches import Circle, Patch, Rectangle
 
 from anatomy.base.typed import Float
 from lungaccess.showing.report import drawing, style
-
-if TYPE_CHECKING:
-    from stages.tube import DeployedSequence, Equilibrium, Tube
-
+from stages.tube import DeployedSequence, Equilibrium, Tube
 
 WIDTH_IN, HEIGHT_IN = 15.6, 8.3
 SIDE_IN, FRONT_IN, KEY_IN = (0.75, 4.3, 7.0, 3.2), (0.75, 0.65, 3.1, 2.8), (4.35, 0.65, 3.4, 2.8)

@@ -1,22 +1,15 @@
 """Cuts through the anatomy along the plane of a device, with the device true to its width."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from anatomy.base.typed import Float
 from lungaccess.plans.curves import SHORTEST_MM
+from lungaccess.plans.plan import Plan
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.layers import Layers
 from lungaccess.showing.report.views import View, plane_view
-
-if TYPE_CHECKING:
-    from lungaccess.plans.plan import Plan
-
 
 PIXELS = 520
 """Columns of a cut: as many as the panel has on paper."""

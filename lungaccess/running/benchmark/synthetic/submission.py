@@ -85,7 +85,6 @@ class SubmittedAnswer:
     """The answer to one query.
 
     Args:
-        query: Name of the query, "PHANTOM/DEVICE/NN".
         scope, tubes, needle: All three, or none where no plan was found.
         unreachable: Whether the planner claims that there is none; only without a plan.
         first_cpu_s, cpu_s: Processor time of the first plan, and of the whole query.

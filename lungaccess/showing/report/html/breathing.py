@@ -1,32 +1,26 @@
 """A plan in the breath, for its page: the displacement of the lung, and clearances at phases."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.typed import Bool, Float
+from anatomy.lung import Lung
 from anatomy.meshes import point_distances_mm
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.judging.appraisal.grade import Grade
 from lungaccess.judging.checking.environment import Environment
-from lungaccess.judging.checking.space import airway_except, has, labels_at
+from lungaccess.judging.checking.space import Select, airway_except, has, labels_at
+from lungaccess.plans.plan import Plan
+from lungaccess.plans.window import BreathingWindow
 from lungaccess.showing.report.clock import PROVED, limit_names, on_rim, sectors
 from lungaccess.showing.report.html import words
 from lungaccess.showing.report.html.deployment import CAP_MM, NOT_MEASURED, profile_points, required_mm
 from lungaccess.showing.report.pack import Packed, pack
 from lungaccess.uncertainty.breathing.moving import Moving
 from lungaccess.uncertainty.breathing.window import TOLERANCE_MM, miss_allowed
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.judging.checking.space import Select
-    from lungaccess.plans.plan import Plan
-    from lungaccess.plans.window import BreathingWindow
-
 
 NO_WINDOW = (
     "The patient breathes, but the plan has no window: in which phases it is clear was not computed. "

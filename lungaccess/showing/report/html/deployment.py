@@ -1,10 +1,8 @@
 """A plan as motion: what a page needs to play scope, tubes and needle, and their costs up to each point."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +10,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.kernels.sight import follow_rays
+from anatomy.lung import Lung
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
 from lungaccess.plans.bifurcations import route_bifurcations
@@ -19,15 +18,11 @@ from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
 from lungaccess.plans.insertion import SHOWN_STEP_MM, shown_motion
 from lungaccess.plans.picture import HALF_ANGLE_RAD, camera_aside_mm
+from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.pack import Packed, pack
 from stages.needle import Objective
 from stages.scope import ScopeMotion
 from stages.tube import Neighbourhood, points_on_arcs
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.plans.plan import Plan
-
 
 TUBE_STEP_MM = 1.0
 """Insertion between two stored shapes of the tubes; the page interpolates, and the bend opens slowly."""

@@ -1,21 +1,14 @@
 """Surfaces for looking at: marching cubes, vertices gathered in cells, smoothed, and stored small."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume
 from anatomy.kept_records import kept
+from anatomy.lung import Lung
 from lungaccess.showing.report.pack import Packed, pack
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from stages.needle import StartRegion
-
+from stages.needle import StartRegion
 
 SURFACES_VERSION = 4
 STEPS = 65535

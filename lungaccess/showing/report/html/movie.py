@@ -1,23 +1,17 @@
 """Virtual bronchoscopy as an animated picture: rays marched through the depth of the lumen."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from anatomy.base.files import atomic_write
 from anatomy.base.typed import Array, Float, UInt8
+from anatomy.lung import Lung
 from anatomy.structures import LUMEN
 from lungaccess.plans.insertion import shown_motion
+from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.html.deployment import moved_mm
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.plans.plan import Plan
-
 
 PIXELS, FRAMES, FRAME_MS, LAST_MS = 240, 72, 90, 1500
 HALF_ANGLE_RAD = np.deg2rad(48.0)

@@ -1,26 +1,22 @@
 """The page of a search that found no plan: where needles can start, what blocks, and what would reach it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
+from lungaccess.judging.explanation import Explanation
+from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.colours import MISS, NEAREST, OTHER, START_COLOURS
 from lungaccess.showing.report.html import words
 from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import structure_meshes
 from lungaccess.showing.report.html.volumes import page_image
 from lungaccess.showing.report.pack import Packed, pack
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.judging.explanation import Explanation
-    from lungaccess.plans.plan import Plan
 
 MODULES = ("devices.js", "no_plan.js")
 PLACES = '<label>Through <select id="place"></select></label>'

@@ -1,27 +1,29 @@
 """The page of a plan: it plays in the anatomy, with slices, charts, limits, risk and provenance."""
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.words import of_hundred, range_of_hundred
+from anatomy.grid import Volume
+from anatomy.lung import Lung
 from lungaccess.judging.advice import Advice
-from lungaccess.judging.appraisal import Appraiser
+from lungaccess.judging.appraisal import Appraisal, Appraiser, Headline, Limit
 from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
 from lungaccess.planning import with_front
 from lungaccess.plans.chance import Chance
+from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import error_preset_names, load_errors
+from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.goals import SUCCESS
 from lungaccess.problem.nodules import target_words
-from lungaccess.problem.procedures import load_procedure, procedure_names
+from lungaccess.problem.procedures import Procedure, load_procedure, procedure_names
 from lungaccess.showing.report.html import breathing, tables, words
 from lungaccess.showing.report.html.deployment import device_points, packed_plan
 from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
@@ -29,16 +31,7 @@ from lungaccess.showing.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.showing.report.html.tables import resting_section, risk_section
 from lungaccess.showing.report.html.trade_off import CAPTION, trade_off_svg
 from lungaccess.showing.report.html.volumes import image_words, page_image
-
-if TYPE_CHECKING:
-    from anatomy.grid import Volume
-    from anatomy.lung import Lung
-    from lungaccess.judging.appraisal import Appraisal, Headline, Limit
-    from lungaccess.plans.plan import Plan
-    from lungaccess.problem.errors import ErrorModel
-    from lungaccess.problem.procedures import Procedure
-    from stages.needle import StartRegion
-
+from stages.needle import StartRegion
 
 MODULES = (
     "motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "player.js", "devices.js",

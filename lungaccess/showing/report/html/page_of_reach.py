@@ -1,26 +1,22 @@
 """The page of a reachability map: over the slices, in 3-D, and as volumes by side and system."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.words import of_hundred
 from anatomy.grid import Volume
+from anatomy.lung import Lung
+from lungaccess.planning.reachability import ReachMap
 from lungaccess.showing.report.html import words
 from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import Look, packed_surface, structure_meshes
 from lungaccess.showing.report.html.volumes import page_image
 from lungaccess.showing.report.pack import Packed, pack
 from lungaccess.showing.report.reach import CLEARANCE_MM, COLOURS, fullest_point
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.planning.reachability import ReachMap
 
 MODULES = ("reach.js",)
 STEPS_PER_MM = 25.0

@@ -1,28 +1,22 @@
 """What is known about a plan, as tables of the page: limits, instructions, chance of success, provenance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from anatomy.base.words import percent, plural, range_of_hundred
+from anatomy.lung import Lung
+from lungaccess.judging.appraisal import Appraisal, Limit
 from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS
+from lungaccess.judging.checking import CheckReport
+from lungaccess.judging.checking.findings import Finding
+from lungaccess.planning import Alternative
 from lungaccess.planning.procedure import ProcedureReport
+from lungaccess.planning.success import Estimate
 from lungaccess.plans.chance import Chance
+from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.html import words
 from lungaccess.showing.report.key_numbers import figures_of_plan
-from lungaccess.uncertainty.risk import Share
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.judging.appraisal import Appraisal, Limit
-    from lungaccess.judging.checking import CheckReport
-    from lungaccess.judging.checking.findings import Finding
-    from lungaccess.planning import Alternative
-    from lungaccess.planning.success import Estimate
-    from lungaccess.plans.plan import Plan
-    from lungaccess.uncertainty.risk import RestingRow, RiskReport, Sensitivity
+from lungaccess.uncertainty.risk import RestingRow, RiskReport, Sensitivity, Share
 
 AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}

@@ -1,16 +1,11 @@
 """A drawing of what plans trade against each other: chance of success, length in tissue and clearance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from anatomy.base.words import of_hundred
+from lungaccess.planning import Alternative
 from lungaccess.showing.report.html import words
 from lungaccess.uncertainty.risk import Share
-
-if TYPE_CHECKING:
-    from lungaccess.planning import Alternative
 
 WIDTH, HEIGHT = 560.0, 366.0
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 26.0, 14.0, 72.0

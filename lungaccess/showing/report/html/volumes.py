@@ -1,9 +1,6 @@
 """Image volumes of a page: structures and CT as bytes, coarse everywhere and fine around the devices."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,13 +10,10 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Array, Float, Int, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.kept_records import kept
+from anatomy.lung import Lung
 from anatomy.morphology import window
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
 from lungaccess.showing.report.pack import Packed, pack
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-
 
 CODES = {"outside": 0, "lung": 1, "airway wall": 2, "lumen": 3, "vessel": 4, "fissure": 5, "nodule": 6}
 LABELS_VERSION = 2

@@ -1,16 +1,12 @@
 """HTML made of plain values: escaped text, tables, lists."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from lungaccess.judging.advice import Advice
-    from lungaccess.judging.appraisal import Grade, Headline
+from lungaccess.judging.advice import Advice
+from lungaccess.judging.appraisal import Grade, Headline
 
 Cell = str
 

@@ -13,6 +13,7 @@ from lungaccess.plans.schema import schema_of
 from lungaccess.problem.error_files import error_preset_names, load_errors
 from lungaccess.problem.errors import UNITS, BreathingError, ErrorModel
 from lungaccess.problem.system import System
+from stages.scope import WallContact
 
 FOLDER = Path(__file__).resolve().parent / "reference" / "tables"
 """Git ignores the folder, because its files follow from the code."""
@@ -36,15 +37,18 @@ def device_keys() -> str:
     """Return a table of every key of a device file for each of its parts, as Markdown."""
     schema = schema_of(System)
     parts = {"System": schema, **schema["$defs"]}
-    lines: list[str] = []
-    for name, caption in DEVICE_TABLES.items():
-        lines += ["", f"**{caption[0].upper()}{caption[1:]}**", ""]
-        lines += ["| key | meaning | allowed | default |", "|---|---|---|---|"]
-        required = parts[name].get("required", ())
-        for key, of in parts[name]["properties"].items():
-            if key not in NOT_STATED:
-                default = "" if key in required or of.get("default") is None else _default(of["default"])
-                lines.append(f"| `{key}` | {of.get('description', '')} | {_allowed(of)} | {default} |")
+    captions = {name: f"**{each[0].upper()}{each[1:]}**" for name, each in DEVICE_TABLES.items()}
+    return "\n".join(f"{caption}\n\n{key_table(parts[name])}" for name, caption in captions.items())
+
+
+def key_table(part: Mapping[str, Any]) -> str:
+    """Return a table of the keys of a part of a file, from its JSON Schema, as Markdown."""
+    lines = ["| key | meaning | allowed | default |", "|---|---|---|---|"]
+    required = part.get("required", ())
+    for key, of in part["properties"].items():
+        if key not in NOT_STATED:
+            default = "" if key in required or of.get("default") is None else _default(of["default"])
+            lines.append(f"| `{key}` | {of.get('description', '')} | {_allowed(of)} | {default} |")
     return "\n".join(lines) + "\n"
 
 
@@ -105,7 +109,12 @@ def error_presets() -> str:
 def write_tables() -> None:
     """Write the tables where the pages include them."""
     FOLDER.mkdir(exist_ok=True)
-    for name, text in (("device_keys", device_keys()), ("error_presets", error_presets())):
+    wall = key_table(schema_of(WallContact))
+    for name, text in (
+        ("device_keys", device_keys()),
+        ("error_presets", error_presets()),
+        ("wall_keys", wall),
+    ):
         (FOLDER / f"{name}.txt").write_text(text, encoding="utf-8")
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 from anatomy.base.facade import public_names
-from docs.write_tables import write_tables
 
 project = "lungaccess"
 author = "The lungaccess contributors"
@@ -79,7 +78,8 @@ PACKAGES.mkdir(exist_ok=True)
 for old in PACKAGES.iterdir():
     old.unlink()
 write_reference()
-write_tables()
+sys.path.insert(0, str(ROOT))  # `sphinx-build` starts beside its own script, not in the project.
+importlib.import_module("docs.write_tables").write_tables()
 
 # The pictures of the gallery are those that its scripts make.
 subprocess.run([sys.executable, str(ROOT / "examples" / "run_all.py"), str(HERE / "pictures")], check=True)

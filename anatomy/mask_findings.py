@@ -79,14 +79,13 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     if images.nodules is not None:
         nodules = images.nodules.array
         yield "nodules_ml", _count(nodules) * ml
-        yield "nodules_beyond_lungs", float(np.count_nonzero(nodules & ~lung)) / _count(nodules)
         yield "nodules_in_others", _count(nodules & (vessels | lumen)) / _count(nodules)
         if images.targets_lps:
             there = images.grid.values_at(nodules, np.array(images.targets_lps), False)
             yield "targets_in_nodules", float(there.mean())
         # Nodules of more voxels are not taken apart: they are refused for their volume.
         if _count(nodules) <= 5_000_000:
-            yield from _of_nodules(nodules, lung)
+            yield from _of_nodules(nodules, lung, images.grid)
     if images.lobes is not None:
         yield from _of_lobes(images.lobes.array, lung, images.grid, tree)
 
@@ -161,22 +160,28 @@ def _of_airway(lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, 
 
 def _at_lumen(wall: Mask, lumen: Mask, grid: Grid) -> float:
     """Return the share of a wall within `WALL_MM` of the lumen."""
-    import edt
-
     box = window(*bounds(wall | lumen))
-    sides = tuple(map(float, grid.spacing_mm))
-    near = edt.edt(np.asfortranarray(~lumen[box]), anisotropy=sides, order="F") <= WALL_MM
+    near = _beyond_mm(lumen[box], grid) <= WALL_MM
     return float(np.count_nonzero(near & wall[box])) / _count(wall)
 
 
-def _of_nodules(nodules: Mask, lung: Mask) -> Iterator[tuple[str, float]]:
-    """Yield how much of the nodules lies in or at the lungs, and how compact the largest one is."""
+def _beyond_mm(mask: Mask, grid: Grid) -> Float:
+    """Return how far from a mask every voxel lies; infinity if the mask is empty."""
+    import edt
+
+    sides = tuple(map(float, grid.spacing_mm))
+    return np.asarray(edt.edt(np.asfortranarray(~mask), anisotropy=sides, order="F"))
+
+
+def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, float]]:
+    """Yield how much of the nodules lies in, at and beyond the lungs, and how compact the largest one is."""
     voxels, part = components(nodules)
     box = window(*bounds(nodules, 1))
     near = grown_by_one(np.asfortranarray(lung[box]))
     at = near[tuple((voxels - [axis.start for axis in box]).T)]
     touches = np.bincount(part, weights=at) > 0
     yield "nodules_at_lungs", float(touches[part].mean())
+    yield "nodules_beyond_lungs_mm", float(_beyond_mm(lung[box], grid)[nodules[box]].max(initial=0.0))
     largest = voxels[part == np.argmax(np.bincount(part))]
     yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
     yield "nodule_end", max(_flattest(voxels[:, axis], part) for axis in range(3))

@@ -258,9 +258,9 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             possible=(0.5, 1), reason="a nodule that a mask of the lungs leaves out still touches it",
             remedy="Check the header of the mask of the nodules, and that it shows nothing else",
         ),
-        "nodules_beyond_lungs": Limit(
-            check="nodules", words="{} of the nodules lie beyond the lungs, and count as lung",
-            usual=(0, 0.05), possible=(0, 1),
+        "nodules_beyond_lungs_mm": Limit(
+            check="nodules", words="Nodules reach {} beyond the lungs, and count as lung there",
+            form="{:.1f} mm", usual=(0, 1), possible=(0, MOST),
             reason="a mask of the lungs may leave out a nodule at the pleura, and one of nodules may be wide",
             remedy="Look whether a nodule reaches into the chest wall or the mediastinum",
         ),

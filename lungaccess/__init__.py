@@ -15,15 +15,21 @@ print(la.check(plan, lung).accepted)
 
 import importlib.util
 import os.path
+import sys
 
 for _name in ("anatomy", "stages"):
     _found = importlib.util.find_spec(_name)
     _place = os.path.dirname(os.path.dirname(os.path.realpath(__file__)))
     if _found is None or not os.path.realpath(_found.origin or "").startswith(os.path.join(_place, _name)):
-        raise ImportError(
+        _said = (
             f"The package {_name} of lungaccess is hidden by {_found and _found.origin}, which Python finds "
             f"before {os.path.join(_place, _name)}. Rename what hides it, or run from another folder"
         )
+        if sys.argv[:1] == ["-m"]:
+            # Of `python -m lungaccess`, which would end with 1, the exit code of the answer "no".
+            sys.stderr.write(_said + "\n")
+            sys.exit(2)
+        raise ImportError(_said)
 
 from anatomy.base.facade import lazy_exports  # noqa: E402 -- it is known now whose package that is
 

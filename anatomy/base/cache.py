@@ -18,9 +18,7 @@ UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 def default_cache() -> Path:
     """Return the folder for cached lungs: `$LUNGACCESS_CACHE`, or `lungaccess` in the user's cache."""
     stated = os.environ.get("LUNGACCESS_CACHE")
-    if stated:
-        return Path(stated)
-    return user_cache() / "lungaccess"
+    return Path(os.path.expanduser(stated)) if stated else user_cache() / "lungaccess"
 
 
 def user_cache() -> Path:
@@ -29,7 +27,8 @@ def user_cache() -> Path:
     A folder for temporary files would not do: anybody may leave code there, under a name that is known.
     """
     base = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
-    if base:
+    # By its standard a relative path there is as good as none.
+    if base and os.path.isabs(base):
         return Path(base)
     try:
         return Path.home() / ".cache"

@@ -1,6 +1,7 @@
 """Masks from the values of an image, which are one label, named labels, or fractions; else refused."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -78,6 +79,12 @@ def parse_labels(text: str) -> tuple[int, ...] | None:
     """Return the labels that a text such as 1 or 1,2 names; None if it is no list of whole numbers."""
     parts = text.split(",")
     return tuple(int(part) for part in parts) if all(part.isdecimal() for part in parts) else None
+
+
+def file_and_label(path: Path) -> tuple[Path, str]:
+    """Return the file and the label that `file#label` names; the label is empty if the path names a file."""
+    name, _mark, label = path.name.rpartition("#")
+    return (path, "") if not name or path.exists() else (path.with_name(name), label)
 
 
 def is_whole(values: Array) -> bool:

@@ -15,7 +15,7 @@ from anatomy.io.assembly import assemble, require_cost
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume
 from anatomy.io.label_names import stored_names
-from anatomy.io.mask_values import parse_labels
+from anatomy.io.mask_values import file_and_label, parse_labels
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.motion_files import MotionFile, read_motion
 from anatomy.lobes import LOBES, lobe_named
@@ -238,11 +238,11 @@ def _entries(files: _Files) -> tuple[str, ...]:
 
 def _source(role: str, entry: str, folder: Path) -> MaskSource:
     """Return a mask source; a part of the lungs that is named after a lobe is that lobe."""
-    name, separator, label = entry.rpartition("#")
-    if not separator or (folder / entry).is_file():
-        path = _named_file(folder, entry)
-        return _or_lobe(MaskSource(role=role, path=path), image_stem(path))
+    file, label = file_and_label(folder / entry)
+    name = entry.removesuffix(f"#{label}")
     path = _named_file(folder, name)
+    if file == folder / entry:
+        return _or_lobe(MaskSource(role=role, path=path), image_stem(path))
     labels = parse_labels(label)
     if labels is not None:
         return MaskSource(role=role, path=path, labels=labels)

@@ -14,7 +14,14 @@ from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.images import images_in, read_volume
-from anatomy.io.mask_values import is_whole, mask_of, parse_labels, require_label_values, select
+from anatomy.io.mask_values import (
+    file_and_label,
+    is_whole,
+    mask_of,
+    parse_labels,
+    require_label_values,
+    select,
+)
 from anatomy.io.masks import SOLID, MaskSource, read_masks
 from anatomy.io.placement import place
 from anatomy.io.totalsegmentator import file_sources, mask_sources
@@ -101,16 +108,16 @@ def _read(image: str, path: Path) -> _Read:
     """Read one image from whatever a path names."""
     if path.is_dir():
         return _one_of_folder(image, path)
-    base, mark, stated = path.name.rpartition("#")
-    if mark and not path.exists():
+    file, stated = file_and_label(path)
+    if file != path:
         labels = parse_labels(stated)
         if labels is None:
             raise FileError(
                 f"{path.name} names no labels",
                 expected="values after #, with commas between them",
-                remedy=f"Write for instance {base}#1,2",
+                remedy=f"Write for instance {file.name}#1,2",
             )
-        return _of_file(image, path.with_name(base), labels, f"{base} (labels {stated})")
+        return _of_file(image, file, labels, f"{file.name} (labels {stated})")
     sources, _ = file_sources(path)
     if sources:
         return _of_sources(image, sources, path.name)
@@ -275,7 +282,7 @@ class Given:
         named = (self.totalsegmentator, self.onnx_airway, self.nodule_contours, self.nodule_mask)
         found: dict[str, str] = {}
         for path in (path for path in (*self.files().values(), *named) if path is not None):
-            file = path if path.exists() else path.with_name(path.name.rpartition("#")[0] or path.name)
+            file, _label = file_and_label(path)
             found |= {str(each): sha256(each) for each in (images_in(file) if file.is_dir() else [file])}
         return found
 

@@ -143,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: The words after the name of the program; those of this process if None.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    words = [_with_home(word) for word in (sys.argv[1:] if arguments is None else arguments)]
     terminal.prepare_surroundings()
     try:
         with warnings.catch_warnings(), _termination_as_interruption():
@@ -181,6 +181,9 @@ def _show_damage(others: Callable[..., None]) -> Callable[..., None]:
     def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
         if issubclass(category, DamagedCacheWarning | KernelsNotKeptWarning):
             error_console.print(str(message), soft_wrap=True)
+        elif "\nTraceback" in str(message):
+            # Numba tells so of a variable of the environment that it cannot read.
+            error_console.print(str(message).split("\n")[0], soft_wrap=True)
         else:
             others(message, category, *where, **more)
 
@@ -193,17 +196,15 @@ def _answer(words: list[str]) -> int:
         terminal.console.file.write(START_PAGE)
         return ExitCode.OK
     as_json = asks_json(words)
-    first_compilation.command = words[0]
+    first_compilation.command = next((word for word in words if not word.startswith("-")), "")
     try:
         result_folder.protect_files(words)
         code = app.meta(with_nodule_number(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:
         return _explain(usage_error(error), as_json)
     except LungaccessError as error:
-        # What the library raises does not know the command that a person typed.
-        typed = [word for word in words if not word.startswith("-")]
-        command = next((each for each in (" ".join(typed[:2]), *typed[:1]) if each in EXAMPLES), "")
-        error.remedy = error.remedy or help_words(command)
+        error.expected = error.expected or "input that this command can use"
+        error.remedy = error.remedy or _see_help(" ".join(_command_in(words)))
         return _explain(error, as_json)
     except BrokenPipeError:
         raise
@@ -307,17 +308,23 @@ def usage_error(error: CycloptsError) -> UsageError:
     found, expected = _found_and_expected(error)
     found = _AVAILABLE.sub("", found)
     guess = _GUESS.search(found)
-    explained = help_words(command)
+    explained = _see_help(command)
     remedy = f"{guess.group(1)} {explained}" if guess else explained
     return UsageError(
         _one_line(_GUESS.sub("", found)), expected=_one_line(expected), remedy=_one_line(remedy)
     )
 
 
-def help_words(command: str) -> str:
-    """Return where a command such as "study run" is explained; "" is the program itself."""
-    if example := EXAMPLES.get(command):
-        return f"`lungaccess {command} --help` explains every option; an example: {example}"
+def _command_in(words: Sequence[str]) -> tuple[str, ...]:
+    """Return the words that name the command, such as study and run; none if they name none."""
+    named = [word for word in words if not word.startswith("-")][:2]
+    return next((tuple(named[:n]) for n in (2, 1) if " ".join(named[:n]) in EXAMPLES), ())
+
+
+def _see_help(command: str) -> str:
+    """Return the sentence that leads to the help of a command, or of all of them."""
+    if command in EXAMPLES:
+        return f"`lungaccess {command} --help` explains every option; an example: {EXAMPLES[command]}"
     return f"`{' '.join(('lungaccess', *command.split()))} --help` lists the commands"
 
 
@@ -368,6 +375,12 @@ def _name(argument: Argument) -> str:
 
 def _one_line(text: str) -> str:
     return " ".join(text.split())
+
+
+def _with_home(word: str) -> str:
+    """Return a word such as --out=~/plan with the user's folder, which not every shell puts in there."""
+    name, mark, value = word.partition("=")
+    return f"{name}={os.path.expanduser(value)}" if mark and name.startswith("--") else word
 
 
 def asks_json(words: Sequence[str]) -> bool:

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
 from anatomy.base.records import frozen_value
+from anatomy.plausibility import require_known_checks
 from lungaccess.cli.numbers import Count, NotNegative, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from lungaccess.problem.goals import SUCCESS, WINDOW
@@ -116,6 +117,9 @@ class PatientOptions(CacheOptions):
     """
 
     accept: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
+
+    def __post_init__(self) -> None:
+        require_known_checks(self.accept)
 
     def load(self, patient: Path, *, thick_slices: bool = False) -> Lung:
         """Return a patient's lung; see `load_lung`."""

@@ -72,9 +72,11 @@ def prepare_surroundings() -> None:
     """Let closed streams lead nowhere, and others write what their encoding lacks in other words.
 
     A file that is opened next would else get the number of a closed stream, and what others print.  Pictures
-    are files, so that the user's choice of windows for matplotlib concerns none, and may stop its import.
+    are files, so that the user's choice of windows for matplotlib concerns none, and may stop its import; so
+    may a number of threads for numba, of which no kernel takes more than one.
     """
-    os.environ.pop("MPLBACKEND", None)
+    for concerns_nothing in ("MPLBACKEND", "NUMBA_NUM_THREADS"):
+        os.environ.pop(concerns_nothing, None)
     for number in range(3):
         try:
             os.fstat(number)

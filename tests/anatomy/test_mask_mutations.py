@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError, LungaccessError
 from anatomy.base.typed import Array
 from anatomy.build import build_lung
@@ -31,17 +30,30 @@ MANY = int(os.environ.get("LUNGACCESS_MUTATIONS", "250"))
 """So many mutations of each patient are drawn in the slow test."""
 SAME_PLACE_MM = 1.0
 """Nodules whose middles are as near are the same targets, and lungs that differ by less are the same."""
+NOWHERE = (np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 class Checked:
-    """The masks of a patient as they were read, and what a user is told of them."""
+    """The masks of a patient as they were read, and what a user is told of them.
 
-    def __init__(self, images: PatientImages, tree: AirwayTree, folder: Path) -> None:
-        sides = coarse_sides(images.lung.array & ~images.lumen.array, images.grid)
-        nowhere = np.zeros((0, 3))
-        points = (nowhere, nowhere) if sides is None else points_of_sides(*sides, images.grid)
-        self.images, self.tree, self.folder = images, tree, folder
-        self.findings = mask_findings(images, tree, points)
+    What depends on masks alone that are as those of `whole` is taken from there.
+    """
+
+    def __init__(self, images: PatientImages, folder: Path, whole: Checked | None = None) -> None:
+        self.images, self.folder = images, folder
+        self.changed = [
+            role
+            for role in ROLES
+            if whole and not _are_same(getattr(images, role), getattr(whole.images, role))
+        ]
+        changed = set(self.changed if whole else ROLES)
+        self.tree = whole.tree if whole and "lumen" not in changed else tree_from_mask(images.lumen)
+        if whole and not changed & {"lumen", "lung"}:
+            self.points = whole.points
+        else:
+            sides = coarse_sides(images.lung.array & ~images.lumen.array, images.grid)
+            self.points = NOWHERE if sides is None else points_of_sides(*sides, images.grid)
+        self.findings = mask_findings(images, self.tree, self.points)
         told = [*images.warnings, *(each.found for each in self.findings if each.verdict != FITS)]
         # The same warning with other numbers is no new one.
         self.words = {re.sub(r"-?\d+(?:\.\d+)?", "#", each) for each in told}
@@ -55,7 +67,7 @@ def masks_of(images: PatientImages) -> Masks:
 def checked(images: PatientImages, folder: Path) -> Checked:
     """Write the masks of a patient into the folder `whole`, and read them again."""
     images = load_patient(write(folder / "whole", masks_of(images), targets_lps=images.targets_lps))
-    return Checked(images, tree_from_mask(images.lumen), folder)
+    return Checked(images, folder)
 
 
 @pytest.fixture(scope="module")
@@ -103,18 +115,16 @@ def outcome(whole: Checked, mutation: Mutation) -> str:
     folder = whole.folder / "changed"
     try:
         images = load_patient(write(folder, mutation.masks, whole.masks, whole.images.targets_lps))
-        has_tree = _are_same(images.lumen, whole.images.lumen)
-        found = Checked(images, whole.tree if has_tree else tree_from_mask(images.lumen), folder)
+        found = Checked(images, folder, whole)
     except LungaccessError:
         return "refused"
     if any(each.verdict == REFUSED for each in found.findings):
         return "refused"
-    changed = [role for role in ROLES if not _are_same(getattr(images, role), getattr(whole.images, role))]
-    if not changed:
+    if not found.changed:
         return "same"
     if found.words - whole.words:
         return "warned"
-    is_in_place = changed == ["nodules"] and _are_in_place(images, whole.images)
+    is_in_place = found.changed == ["nodules"] and _are_in_place(images, whole.images)
     return "in place" if is_in_place else "silent"
 
 
@@ -128,7 +138,7 @@ def test_nodules_beyond_the_lungs_are_told(whole: Checked) -> None:
     lung, nodules = whole.images.lung, whole.images.nodules
     assert nodules is not None
     images = replace(whole.images, lung=replace(lung, array=lung.array & ~nodules.array))
-    findings = mask_findings(images, whole.tree, (np.zeros((0, 3)),) * 2)
+    findings = mask_findings(images, whole.tree, NOWHERE)
     assert [each.verdict for each in findings if "beyond the lungs" in each.found] == [DOUBTFUL]
 
 

@@ -46,6 +46,31 @@ def test_closed_streams_are_no_crash(closed):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"NUMBA_NUM_THREADS": "0"}, {"NUMBA_OPT": "abc"}, {"XDG_CACHE_HOME": "folder"}, {"COLUMNS": "-5"},
+        {"LUNGACCESS_CACHE": "~/cache"}, {"MATPLOTLIBRC": "nowhere"}, {"TMPDIR": "/nowhere"},
+        {"HOME": "/nowhere"}, {"PYTHONWARNINGS": "error"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_odd_variables_of_the_environment_change_no_answer(environment, tmp_path):
+    home = {"HOME": str(tmp_path / "home"), "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR", "")}
+    done = run(f"{sys.executable} -m lungaccess cache", tmp_path, **(home | environment))
+    assert done.returncode == ExitCode.OK, done.stderr
+    assert "Traceback" not in done.stderr
+    assert not [each for each in os.listdir(tmp_path) if each != "home"]
+
+
+def test_a_folder_of_the_user_is_put_in_where_the_shell_does_not(tmp_path):
+    done = run(
+        f"{sys.executable} -m lungaccess template patient '--out=~/x.toml'", tmp_path, HOME=str(tmp_path)
+    )
+    assert done.returncode == ExitCode.OK, done.stderr
+    assert [*map(str, tmp_path.iterdir())] == [str(tmp_path / "x.toml")]
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252", "utf-16"])
 def test_any_encoding_of_the_output_will_do(encoding, tmp_path):
     done = run(
@@ -71,6 +96,9 @@ def test_a_folder_that_hides_a_package_is_named(tmp_path, name):
     (tmp_path / name / "__init__.py").touch()
     done = run(f'{sys.executable} -c "import lungaccess"', tmp_path)
     assert str(tmp_path / name) in done.stderr.splitlines()[-1]
+    done = run(f"{sys.executable} -m lungaccess presets", tmp_path)
+    assert done.returncode == ExitCode.BAD_INPUT and str(tmp_path / name) in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("words", [["--rotate", "1e9"], ["--relative", "-1e300"], ["--rotate", "1e-320"]])

@@ -138,6 +138,9 @@ def _of_lungs(
     outside, _ = ndimage.label(~coarse)
     yield "lung_holes", float(np.count_nonzero((outside != outside[0, 0, 0]) & ~coarse)) / total
     points = sampled(lung, grid, SAMPLE_MM)
+    if len(points):
+        wide, _, tall = np.ptp(points, axis=0) + SAMPLE_MM
+        yield "tall_lungs", float(tall / wide)
     left = points[:, 0] > tree.carina_lps[0]
     yield "smaller_lung", float(min(left.mean(), 1.0 - left.mean())) if len(points) else 0.0
     for name, other in others.items():
@@ -154,6 +157,11 @@ def _of_airway(lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, 
     yield "trachea_mm", float(np.median(tree.radius_mm[tree.branch_points(0)]))
     yield "thinnest_mm", float(np.median(tree.radius_mm[last]))
     yield "ends_in_lungs", float(np.mean(grid.values_at(lung, tips, False)))
+    widest, usual = (
+        np.array([how(tree.radius_mm[tree.branch_points(n)]) for n in range(tree.n_branches)])
+        for how in (np.max, np.median)
+    )
+    yield "widening", float(np.max(widest[1:] / usual[tree.branch_parent[1:]], initial=0.0))
     left = int(np.count_nonzero(tips[:, 0] > tree.carina_lps[0]))
     yield "least_ends", float(min(left, len(tips) - left))
 

@@ -112,6 +112,12 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             reason="from a child of one year after breathing out to a very tall man after breathing in",
             remedy="Check the voxel size in the header, and look at the masks",
         ),
+        "tall_lungs": Limit(
+            check="volume", words="The lungs are {} times as tall as both are wide", form="{:.2f}",
+            usual=(0.6, 1.5), possible=(0.25, 4),
+            reason="phantoms have 0.9 to 1; lungs are 20 to 30 cm tall and 22 to 30 cm wide",
+            remedy="Check the distance of the slices in the header, and look whether a lung is missing",
+        ),
         "smaller_lung": Limit(
             check="one-lung", words="{} of the lungs lie on the side of the carina that has less of them",
             usual=(0.25, 0.5), possible=(0.05, 0.5),
@@ -147,6 +153,13 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             usual=(0, 2.2), possible=(0, 6),
             reason="CT shows bronchi down to 1 mm; wider ends are those of a "
             "tree that is cut, or of a mask that was widened", remedy=_FILE,
+        ),
+        "widening": Limit(
+            check="airway", words="A branch of the airway is up to {} times as wide as the one it leaves",
+            form="{:.1f}", usual=(0, 2.2), possible=(0, MOST),
+            reason="a branch is thinner; where it begins phantoms have up to 1.6 times, a ball that leaked "
+            "into the lung 3 times and more",
+            remedy="Look for a leak of the airway into the lung, which would be taken as free for the scope",
         ),
         "ends_in_lungs": Limit(
             check="bronchi", words="{} of the ends of the airway lie in the lungs",

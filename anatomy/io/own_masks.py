@@ -1,7 +1,9 @@
 """A folder of masks from any source, described by a `patient.toml`."""
 
+import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -268,10 +270,25 @@ def _named_file(folder: Path, name: str) -> Path:
     if path.is_file():
         return path
     there = (
-        [other.name for other in path.parent.iterdir() if image_suffix(other)] if path.parent.is_dir() else []
+        [other.name for other in path.parent.iterdir() if image_suffix(other) and other.is_file()]
+        if path.parent.is_dir()
+        else []
     )
+    if (folder / (slashed := name.replace("\\", "/"))).is_file():
+        remedy = f"Write {slashed}: every system takes / between folders"
+    elif any(map(partial(_are_alike, path.name), there)):
+        remedy = "A file there has the same name with its letters composed otherwise (Unicode NFC or NFD): "
+        remedy += "rename the file in plain letters"
+    else:
+        remedy = did_you_mean(path.name, there) or f"Images there: {', '.join(sorted(there)) or 'none'}"
+    if path.is_symlink() or path.exists():
+        remedy = f"It is a folder, or a link that leads nowhere. {remedy}"
     raise FileError(
         f"{DESCRIPTION} in {folder} names {name}, which is not there",
         expected="an existing file; names are relative to the folder of the patient.toml, or absolute",
-        remedy=did_you_mean(path.name, there) or f"Images there: {', '.join(sorted(there)) or 'none'}",
+        remedy=remedy,
     )
+
+
+def _are_alike(one: str, other: str) -> bool:
+    return unicodedata.normalize("NFC", one) == unicodedata.normalize("NFC", other)

@@ -6,7 +6,7 @@ from pathlib import Path
 from anatomy.base.files import sha256
 from anatomy.io.assembly import assemble
 from anatomy.io.images import image_stem, images_in
-from anatomy.io.label_names import label_values, published_names, stored_names
+from anatomy.io.label_names import LUNG_VESSELS, label_values, published_names, stored_names
 from anatomy.io.lungs import fill_lung
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.near_names import plain, require_single
@@ -97,7 +97,8 @@ def file_sources(path: Path, *, is_label_map: bool = False) -> tuple[list[MaskSo
     stem = image_stem(path)
     if is_label_map or stem == "lung_vessels" or stem not in ROLES:
         names, statement = _label_names(path, must_have=is_label_map)
-        return _named_sources(path, names), statement
+        if names or stem not in ROLES:
+            return _named_sources(path, names), statement
     return [MaskSource(role=ROLES[stem], path=path, lobe=_lobe(stem))], []
 
 
@@ -110,8 +111,9 @@ def _label_names(path: Path, *, must_have: bool) -> tuple[dict[int, str], list[s
     if stem != "lung_vessels" and not must_have and not stem.startswith("total"):
         return {}, []
     values = label_values(path)
-    if stem == "lung_vessels" and values <= {0, 1}:
-        return {1: "lung_vessels"}, []
+    is_mask = values <= {0, 1} or any(value % 1 for value in values)
+    if stem == "lung_vessels" and (is_mask or (len(values) == 2 and not values <= {0, *LUNG_VESSELS})):
+        return {}, []
     table, statement = published_names(stem, values, path)
     return table, [statement]
 

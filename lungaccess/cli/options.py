@@ -116,7 +116,7 @@ class PatientOptions(CacheOptions):
             them, such as gap or vessels.
     """
 
-    accept: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
+    accept: Annotated[tuple[str, ...], Parameter(consume_multiple=1)] = ()
 
     def __post_init__(self) -> None:
         require_known_checks(self.accept)
@@ -127,9 +127,6 @@ class PatientOptions(CacheOptions):
 
     def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> Organ:
         """Return a patient's lung, or a liver of Med-RAD; see `load_organ`."""
-        from anatomy.plausibility import require_known_checks
-
-        require_known_checks(self.accept)
         return load_organ(patient, self.cache, thick_slices, self.accept if refuse else None)
 
 
@@ -277,7 +274,7 @@ class ErrorOptions:
     """
 
     errors: ErrorsText = None
-    known: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = ()
+    known: Annotated[tuple[str, ...], Parameter(consume_multiple=1)] = ()
     procedure: str | None = None
 
     def load(self) -> ErrorModel:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError, LungaccessError
-from anatomy.base.typed import Array
+from anatomy.base.typed import Array, Float
 from anatomy.build import build_lung
 from anatomy.grid import Volume
 from anatomy.io.patients import load_patient
@@ -40,6 +41,8 @@ class Checked:
     """
 
     def __init__(self, images: PatientImages, folder: Path, whole: Checked | None = None) -> None:
+        self.tree: AirwayTree
+        self.points: tuple[Float, Float]
         self.images, self.folder = images, folder
         self.changed = [
             role
@@ -95,7 +98,7 @@ def _middles(nodules: Volume) -> Array:
 def _beyond(nodules: Volume, lung: Volume) -> Array:
     """Return where nodules lie farther from the lungs than `SAME_PLACE_MM`."""
     far = ndimage.distance_transform_edt(~lung.array, lung.grid.spacing_mm)
-    return nodules.array & (far > SAME_PLACE_MM)
+    return np.asarray(nodules.array & (far > SAME_PLACE_MM))
 
 
 def _are_in_place(one: PatientImages, other: PatientImages) -> bool:
@@ -140,6 +143,29 @@ def test_nodules_beyond_the_lungs_are_told(whole: Checked) -> None:
     images = replace(whole.images, lung=replace(lung, array=lung.array & ~nodules.array))
     findings = mask_findings(images, whole.tree, NOWHERE)
     assert [each.verdict for each in findings if "beyond the lungs" in each.found] == [DOUBTFUL]
+
+
+def test_a_leak_of_the_airway_into_the_lung_is_told(whole: Checked) -> None:
+    lumen, grid = whole.images.lumen.array, whole.images.grid
+    far = np.argmax(np.linalg.norm(whole.tree.points_lps - whole.tree.carina_lps, axis=1))
+    ball = np.linalg.norm(
+        grid.lps(np.indices(grid.shape).reshape(3, -1).T) - whole.tree.points_lps[far], axis=1
+    )
+    leak = lumen | (ball.reshape(grid.shape) < 9.0) & whole.images.lung.array
+    images = replace(whole.images, lumen=Volume(grid=grid, array=np.asfortranarray(leak)))
+    findings = mask_findings(images, tree_from_mask(images.lumen), whole.points)
+    assert [each.verdict for each in findings if "as wide as the one it leaves" in each.found] == [DOUBTFUL]
+
+
+def test_slices_at_twice_their_distance_are_told(whole: Checked, tmp_path: Path) -> None:
+    stretched = {
+        role: replace(
+            mask, grid=replace(mask.grid, lps_from_ijk=mask.grid.lps_from_ijk @ np.diag([1.0, 1.0, 2.0, 1.0]))
+        )
+        for role, mask in whole.masks.items()
+    }
+    found = Checked(load_patient(write(tmp_path, stretched)), tmp_path)
+    assert [each.verdict for each in found.findings if "times as tall" in each.found] == [DOUBTFUL]
 
 
 def _require_none_silent(whole: Checked, mutations: Iterable[Mutation]) -> None:

@@ -59,6 +59,7 @@ def risk(
     stored = Plan.load(plan)
     stored = replace(stored, system=with_tool(stored.system, None if tool is None else load_tool(tool)))
     lung = output.load(patient)
+    stored.require_lung(lung)
     with progress("bringing the scope to rest on the wall"):
         wall = model.wall or WallContact()
         rested = resting_rows(resting_tip(stored, lung, wall), wall)

@@ -140,6 +140,15 @@ def test_broken_toml_bare_targets_and_missing_files_are_refused(own_folder):
     describe(own_folder, wall="missing.nrrd")
     with pytest.raises(FileError, match=r"missing\.nrrd"):
         load_patient(own_folder)
+    (own_folder / "bronchi\u00e9.nrrd").symlink_to(own_folder / "lumen.nrrd")
+    (own_folder / "gone.nrrd").symlink_to("nowhere")
+    for name, remedy in (
+        ("bronchie\u0301.nrrd", "NFC or NFD"), (".\\lumen.nrrd", r"Write \./lumen\.nrrd"),
+        ("gone.nrrd", "leads nowhere"),
+    ):  # fmt: skip
+        describe(own_folder, wall=name)
+        with pytest.raises(FileError, match=remedy):
+            load_patient(own_folder)
     (own_folder / "patient.toml").write_text("lumen = ")
     with pytest.raises(SettingsError, match="not valid TOML"):
         load_patient(own_folder)

@@ -138,6 +138,15 @@ def test_a_folder_of_older_versions_is_understood(tmp_path, masks):
     assert patient.wall is None
 
 
+def test_vessels_of_older_versions_are_read_by_their_values(tmp_path, masks):
+    test_a_folder_of_older_versions_is_understood(tmp_path, masks)
+    for top in (0.9, 255.0):
+        values = np.where(masks["arteries"].array, top, 0).astype(np.float32)
+        values[0, 0, 0] = 0.1 if top < 1 else 0.0
+        write_volume(tmp_path / "lung_vessels.nii.gz", Volume(grid=masks["lumen"].grid, array=values))
+        require_same(load_patient(tmp_path).vessels, masks["arteries"])
+
+
 def test_label_names_in_the_header_decide(tmp_path, masks):
     path = tmp_path / "segmentation.nii.gz"
     volume = label_map(masks)

@@ -157,6 +157,9 @@ def test_labels_without_names_must_be_chosen(tmp_path: Path, ct: Volume, truth: 
     with pytest.raises(FileError, match="names no labels"):
         read_given({"airway": Path(f"{path}#bronchi")}, None, ct.grid)
     assert len(Given(airway=Path(f"{path}#1"), vessels=path).hashes()) == 1
+    for nameless in (tmp_path / "nowhere.nii.gz", tmp_path / "#1"):
+        with pytest.raises(FileError, match=nameless.name):
+            Given(lungs=nameless).hashes()
 
 
 def test_other_voxels_are_carried_over_and_another_frame_is_refused(

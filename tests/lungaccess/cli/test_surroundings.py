@@ -74,7 +74,9 @@ def test_a_folder_of_the_user_is_put_in_where_the_shell_does_not(tmp_path):
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252", "utf-16"])
 def test_any_encoding_of_the_output_will_do(encoding, tmp_path):
     done = run(
-        f"{sys.executable} -m lungaccess tubes --outer 1 --inner 2", PYTHONIOENCODING=f"{encoding}:strict"
+        f"{sys.executable} -m lungaccess tubes --outer 1 --inner 2",
+        tmp_path,
+        PYTHONIOENCODING=f"{encoding}:strict",
     )
     assert "Error" not in done.stderr and done.returncode in (ExitCode.OK, ExitCode.NEGATIVE), done.stderr
 

@@ -31,6 +31,9 @@ BROKEN_TOML = {
     "unknown_key.toml": 'name = "x"\nsurprise = 1\n',
     "wrong_types.toml": 'name = 3\nscope = "wide"\ntubes = 1\nlumen = 7\n',
     "not_finite.toml": "[scope_position]\nattempt_mm = nan\n[needle]\ndiameter_mm = -inf\n",
+    "huge.toml": "[needle]\ndiameter_mm = 1e308\nlength_mm = 1e300\n",
+    "tiny.toml": "[needle]\ndiameter_mm = 5e-324\n[[tubes]]\ncurvature_per_m = -0.0\n",
+    "truth.toml": "[needle]\ndiameter_mm = true\n[scope_position]\nattempt_mm = false\n",
     "empty.toml": "",
 }
 

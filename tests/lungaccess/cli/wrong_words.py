@@ -31,6 +31,7 @@ FAR_POINTS = ("lps:1e9,0,0", "ras:0,0,-5000", "lps:-9e307,1e308,0")
 """Points in no patient."""
 NO_NUMBERS = (
     "x", "", "nan", "1,5", "--", "1e", "0x", "\N{INFINITY}", "one", "1 2", "5mm", "30 deg", "10%",
+    "1e999", "--5", "1__0", "\N{VULGAR FRACTION ONE HALF}", "1,000.0", "-nan", "null", "true",
 )  # fmt: skip
 ODD_WORDS = (
     "",

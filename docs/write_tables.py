@@ -47,13 +47,13 @@ def key_table(part: Mapping[str, Any]) -> str:
     required = part.get("required", ())
     for key, of in part["properties"].items():
         if key not in NOT_STATED:
-            default = "" if key in required or of.get("default") is None else _default(of["default"])
+            default = "required" if key in required else _default(of.get("default"))
             lines.append(f"| `{key}` | {of.get('description', '')} | {_allowed(of)} | {default} |")
     return "\n".join(lines) + "\n"
 
 
 def _default(value: object) -> str:
-    if isinstance(value, Mapping) or value in ([], ""):
+    if value is None or isinstance(value, Mapping) or value in ([], ""):
         return ""
     return str(value).lower() if isinstance(value, bool) else f"{value}"
 

@@ -86,6 +86,8 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         # Nodules of more voxels are not taken apart: they are refused for their volume.
         if _count(nodules) <= 5_000_000:
             yield from _of_nodules(nodules, lung, images.grid)
+            if images.nodule_labels is not None:
+                yield "nodule_pieces", _pieces_of_a_label(nodules, images.nodule_labels.array)
     if images.lobes is not None:
         yield from _of_lobes(images.lobes.array, lung, images.grid, tree)
 
@@ -193,6 +195,13 @@ def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, fl
     largest = voxels[part == np.argmax(np.bincount(part))]
     yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
     yield "nodule_end", max(_flattest(voxels[:, axis], part) for axis in range(3))
+
+
+def _pieces_of_a_label(nodules: Mask, labels: Array) -> float:
+    """Return how many nodules that do not touch have the same label, where most have."""
+    voxels, part = components(nodules)
+    pairs = np.unique(np.stack([labels[tuple(voxels.T)], part], axis=1), axis=0)
+    return float(np.bincount(pairs[:, 0]).max())
 
 
 def _flattest(places: Int, part: Int) -> float:

@@ -265,6 +265,12 @@ LIMITS: Mapping[str, Limit] = MappingProxyType(
             reason="nodules are round; a flat end is seen where a mask or image was cut",
             remedy="Look whether the nodule is whole",
         ),
+        "nodule_pieces": Limit(
+            check="nodules", words="Up to {} nodules that do not touch have the same label", form="{:.0f}",
+            usual=(0, 1), possible=(0, MOST),
+            reason="a label is one nodule, and its middle the target, which lies between its pieces",
+            remedy="Give each nodule a label of its own",
+        ),
         "nodules_at_lungs": Limit(
             check="nodules", words="{} of the nodules lie in or at the lungs",
             usual=(0.999, 1),

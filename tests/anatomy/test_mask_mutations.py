@@ -27,8 +27,8 @@ from anatomy.sides import coarse_sides, points_of_sides
 from anatomy.tree import tree_from_mask
 from tests.anatomy.mask_mutations import KINDS, ROLES, Masks, Mutation, drawn, write
 
-MANY = int(os.environ.get("LUNGACCESS_MUTATIONS", "250"))
-"""So many mutations of each patient are drawn in the slow test."""
+MANY = int(os.environ.get("LUNGACCESS_MUTATIONS", "200"))
+"""So many mutations of each of four phantoms and a patient are drawn in the slow tests, 1,000 in all."""
 SAME_PLACE_MM = 1.0
 """Nodules whose middles are as near are the same targets, and lungs that differ by less are the same."""
 NOWHERE = (np.zeros((0, 3)), np.zeros((0, 3)))
@@ -168,6 +168,14 @@ def test_slices_at_twice_their_distance_are_told(whole: Checked, tmp_path: Path)
     assert [each.verdict for each in found.findings if "times as tall" in each.found] == [DOUBTFUL]
 
 
+def test_two_nodules_of_one_label_are_told(whole: Checked) -> None:
+    nodules = whole.images.nodules
+    assert nodules is not None
+    labels = replace(nodules, array=np.asfortranarray(nodules.array * np.uint16(7)))
+    findings = mask_findings(replace(whole.images, nodule_labels=labels), whole.tree, whole.points)
+    assert [each.verdict for each in findings if "have the same label" in each.found] == [DOUBTFUL]
+
+
 def _require_none_silent(whole: Checked, mutations: Iterable[Mutation]) -> None:
     ended: dict[str, list[str]] = {}
     for mutation in mutations:
@@ -192,7 +200,7 @@ def test_no_mutation_is_silent(kind: str, role: str, whole: Checked) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, 8, 11])
+@pytest.mark.parametrize("seed", [3, 8, 11, 21])
 def test_no_drawn_mutation_of_a_phantom_is_silent(seed: int, tmp_path: Path) -> None:
     whole, rng = checked(make_phantom(seed=seed, size="small").images, tmp_path), np.random.default_rng(seed)
     _require_none_silent(whole, (drawn(whole.masks, rng) for _ in range(MANY)))

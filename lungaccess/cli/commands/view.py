@@ -61,6 +61,12 @@ def view(
         segment(patient, out=made, series=series, thick_slices=thick_slices, accept=output.accept)
         held.close()  # The explorer writes into the folder, too, when a nodule is added.
         patient = made
+    elif out is not None or series is not None:
+        raise SettingsError(
+            f"{patient or 'What the page opens'} is no CT, and --{'series' if out is None else 'out'} is for a CT",
+            expected="a CT, which is segmented first",
+            remedy="Leave the option out to explore masks, or to choose on the page",
+        )
     shown = None if patient is None else shown_ct(ct, patient)
     if shown is not None:
         shown.read()  # Here, where a file that is none is refused before anything is shown.

@@ -68,11 +68,21 @@ class Link:
         connects: Whether it is a client.
 
     Raises:
-        SettingsError: If pyigtl is missing, or the address cannot be listened at.
+        SettingsError: If pyigtl is missing, the host is no name, or the address cannot be listened at.
     """
 
     def __init__(self, host: str = HOST, port: int = PORT, *, connects: bool = False) -> None:
         Decoder()  # Says at once if pyigtl is missing.
+        try:
+            is_name = bool(host.encode("idna"))  # An empty one would stand for all networks.
+        except UnicodeError:
+            is_name = False
+        if not is_name:
+            raise SettingsError(
+                f"{host!r:.80} is no name of a machine",
+                expected="a name or a number of the network, such as localhost or 127.0.0.1",
+                remedy="Choose another --host",
+            )
         self._host, self._stated_port, self._connects = host, port, connects
         self._peers: dict[socket.socket, _Peer] = {}
         self._counts: Counter[str] = Counter()

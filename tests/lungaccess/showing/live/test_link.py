@@ -169,6 +169,10 @@ def test_a_client_waits_for_its_server_and_comes_back(monkeypatch: pytest.Monkey
 
 
 def test_a_port_in_use_is_an_error_in_words(link: Link) -> None:
+    for host in ("", "..", "\udcff", "a" * 300):
+        for connects in (True, False):
+            with pytest.raises(SettingsError, match="no name of a machine"):
+                Link(host, 0, connects=connects)
     with pytest.raises(SettingsError, match="cannot be listened at"):
         Link(port=link.port)
     with pytest.raises(SettingsError, match="cannot be listened at"):

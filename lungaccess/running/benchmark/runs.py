@@ -42,13 +42,11 @@ class BenchmarkRow:
 
     Args:
         start, target: Numbers of the published start and target, from 1; None for a patient without queries.
-        radius_mm: Least radius of curvature of the needle.
         planner: "" if the query is ruled out, by proof, before any planner begins.
         first_cpu_ms: Processor time to the first path, without compilation.
         first_length_mm, length_mm: Of the first and the last path, with the distance left to the target.
         clearance_mm, needed_clearance_mm: Least distance from the path's axis to obstacles, where the exit is
             not exempt, and what it must be.
-        proved: Whether it is proved that no path exists.
         reason: Why there is no path; "" if there is one.
         arcs: The last path from the published start: "length_mm", "roll_rad" and "curvature_per_mm" of each
             arc, as `stages.needle.ArcPath` has them; no arcs if there is none.
@@ -87,7 +85,6 @@ def run_query(
 
     Args:
         seeds: One run each; the resolution search draws nothing at random, so it runs once.
-        time_s: Processor time of a run.
     """
     rows = list(_runs(environment, query, published, radius_mm, tuple(planners), tuple(seeds), time_s))
     known = any(row.solved for row in rows)

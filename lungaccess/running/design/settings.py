@@ -71,7 +71,6 @@ class Design:
         designs: How many devices a round begins with.
         rounds: The first covers the ranges evenly; each further one lies closer around the best so far.
         reduction: One of so many devices goes on to so many times the targets, until all are counted.
-        seed: Seed of the devices and of the order of the targets.
     """
 
     study: Study

@@ -21,12 +21,7 @@ UNKNOWN, INVALID_GOAL, TIMEOUT, EXACT, CRASH = 0, 2, 4, 6, 7
 
 @frozen_value
 class Improvement:
-    """A plan that is better than those before.
-
-    Args:
-        time_s: Planning time.
-        cost: Under the run's objective.
-    """
+    """A plan that is better than those before."""
 
     time_s: float
     iteration: int
@@ -38,7 +33,6 @@ class Answer:
     """What a run ended with.
 
     Args:
-        key: That of the run.
         outcome: `PLAN`, `PATH`, `NO_PLAN`, or the class of the error that ended the run.
         status: Number of OMPL's word for it in `STATUS`.
         kernels: Digest of the kernels of the process that made the run.
@@ -47,7 +41,6 @@ class Answer:
         message, advice: Why there is no plan, and what would help.
         time_s, cpu_s: Of the whole run, without opening the patient.
         memory_mb: Resident memory of the process after the run, MiB.
-        iterations: At the best plan.
         accepted: Whether the independent check accepts the plan; for a needle path, whether nothing objects
             to it.
         costs: By the keys of `stages.needle.TERMS`.

@@ -63,7 +63,6 @@ def run_study(
         scheduler: Address of a running dask scheduler; processes on this machine if None.
         workers: How many processes on this machine; as many as there are cores if None.
         cache: Folder of prepared anatomies and atlases, on every machine; the usual one if None.
-        progress: Receives what is being done, and the share of the missing runs that is done.
 
     Raises:
         SettingsError: If both a scheduler and a number of workers are given.

@@ -35,12 +35,9 @@ class Problem:
     """What is asked of the planners: everything but planner and seed.
 
     Args:
-        target: Number of the target in its case, from 1.
         target_lps (tuple of 3 float): LPS mm.
-        origin: Where the target came from.
         start: Number of the needle's start pose, 0 for none.
         stop_spacing_mm, site_spacing_mm: Of the deployment atlas.
-        time_s: The budget.
         first_plan: Whether a run ends with its first plan.
         errors: Under which the chance of success of a plan is counted; None for not at all.
         procedure: By which it is counted.

@@ -91,7 +91,6 @@ class PlannerChoice:
         method: One of `lungaccess.planning.searches.planners`; for the needle, one of
             `stages.needle.NEEDLE_PLANNERS`.
         goal: For "plan", what plans are made good at instead of the case's objective, such as "success".
-        iterations: Instead of those of the budget.
         without_counterfactuals: Whether a run of "plan" that finds nothing goes without the search for a
             device that would.
     """

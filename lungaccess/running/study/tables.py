@@ -143,10 +143,6 @@ def _short(row: tuple[Any, ...]) -> str:
 def export_csv(path: Path, folder: Path) -> list[Path]:
     """Write the tables of a results file as CSV with a heading; numbers are written without loss.
 
-    Args:
-        path: Results file.
-        folder: Made if it is not there.
-
     Returns:
         The files written.
 

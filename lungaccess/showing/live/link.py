@@ -36,7 +36,6 @@ class LinkCounts:
     """What a link has done so far.
 
     Args:
-        sent, received: Messages.
         joined, left: Connections.
         dropped: Messages and connections that were dropped, by reason.
     """

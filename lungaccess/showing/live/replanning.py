@@ -74,7 +74,6 @@ class TrackedReplanner:
     """Plans the rest of a plan from tracked poses; nothing that a pose can be makes it fail.
 
     Args:
-        plan, lung: The plan that is followed, and its patient.
         policy: What then decides about the tracked poses of scope, tubes and needle, as long as the target is
             where the plan has it; else the cheapest way is taken.
 

@@ -57,8 +57,6 @@ class LiveSession:
     """Sends a plan in motion and plans again from what is tracked, round by round.
 
     Args:
-        plan, lung: The plan, and the patient that it was made for.
-        link: Where messages go and come from.
         rate_hz: Rounds a second.
         speeds: How fast the sent poses move along the plan.
         loop: Whether the motion begins again when it has ended; otherwise its end is sent on and on.

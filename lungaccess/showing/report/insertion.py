@@ -106,9 +106,6 @@ def insertion_webp(
     Shown are the true paths so far, the plan, the path that was planned last from where the tracker has the
     tip, and where the target is in the end.
 
-    Args:
-        path: path of a WebP file in an existing folder.
-
     Raises:
         FileError: If the file cannot be written.
     """

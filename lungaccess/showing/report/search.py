@@ -113,7 +113,6 @@ def front_png(
         criteria: Titles of one or two criteria; one alone is drawn over the order in which devices were
             counted.
         values: The criteria of each device by its name, the device first with which the search began.
-        front: Names of the devices that no other one surpasses, in the order of their numbers.
     """
     two = len(criteria) == 2
     places = {name: (each[1] if two else n, each[0]) for n, (name, each) in enumerate(values.items(), 1)}

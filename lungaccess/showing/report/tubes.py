@@ -47,7 +47,6 @@ def tubes_png(
 
     Args:
         equilibrium: What to draw; at least one tube must be out of the scope.
-        path: PNG file to write.
         deployed: Its earlier steps are drawn as thin grey lines.
         scope_diameter_mm: Drawn around the tubes; a little more than the outermost tube's if None.
         notes: Lines to print beside the picture.

@@ -67,7 +67,6 @@ def check_curve(plan: Plan, lung: Lung, curve: Markup) -> EditedCurve:
     on the planned ones.
 
     Args:
-        plan: The plan that the curve was exported from.
         curve: Its name says of which device it is; any other is that of the needle.
 
     Raises:

@@ -57,7 +57,6 @@ class Exported:
     """What was written.
 
     Args:
-        files: Names in the folder.
         report: What the independent check says of the plan; the scene and the README repeat it.
     """
 
@@ -80,7 +79,6 @@ def export_slicer(
     independent check refuses is written too, and named so in the scene.
 
     Args:
-        lung: The patient it was made for.
         folder: Made if it is missing.
         progress: Told each step and the share that is done.
 

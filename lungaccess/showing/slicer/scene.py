@@ -29,8 +29,6 @@ class Item:
 
     Args:
         kind: Its node class, without `vtkMRML` and `Node`.
-        name: As people see it.
-        file: Its file, beside the scene.
         colour: Red, green, blue in [0, 1].
     """
 

@@ -118,7 +118,6 @@ class DrawnReport:
             needles does not exceed, by the share.
         tissue: What has to be in the tool in words; empty without a tool: then the tip ends within the
             radius.
-        with_needle: Whether the plan has a needle; its tubes end at the target where it has none.
     """
 
     model: ErrorModel
@@ -178,7 +177,6 @@ def assess(
     Args:
         model: The preset `breath-hold` if None.  Where the patient's own breathing is known, it is that which
             is drawn: `lungaccess.uncertainty.risk.breathing.model_for` says how.
-        samples: Number of deviated plans.
         seed: The same seed gives the same report.
         radius_mm: Radius of the goal; see `RiskAssessor`.
         each_kind: Whether success under errors of one kind only, sensitivities and rare touches are

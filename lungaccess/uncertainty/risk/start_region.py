@@ -41,7 +41,6 @@ def safe_start_region(
     the same region.
 
     Args:
-        lung: The patient that the plan was made for.
         radius_mm: How far from the target a path may end; by default the radius of the goal of `assess`, 0
             for exactly at the target.
         offset_mm, tilt_deg: Largest distance and angle from the planned start of the poses that are tried.

@@ -93,7 +93,6 @@ def write_benchmark(
     Args:
         names: Of the phantoms; all of them if empty.
         with_ct: Whether to write CTs, 25 MB each, which no rule needs.
-        with_tips: Whether to write the tips of the scopes.
 
     Raises:
         SettingsError: If there is no such phantom.

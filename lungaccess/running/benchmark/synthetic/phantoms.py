@@ -28,7 +28,6 @@ class BenchmarkPhantom:
 
     Args:
         name: Family and number, such as "adult-01".
-        family: One of `FAMILIES`.
         number: 1 to `OF_A_FAMILY`.
         breathes: Whether the patient comes with the motion of its breath.
     """

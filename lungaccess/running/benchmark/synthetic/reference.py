@@ -58,7 +58,6 @@ def benchmark_study(
     Args:
         methods: METHOD or METHOD+NEEDLE_PLANNER; see `lungaccess.planning.searches.planners` and
             `stages.needle.NEEDLE_PLANNERS`.
-        phantoms: Those of the folder if empty.
         systems: Among `SYSTEMS`.
         targets: The first so many of each lung of a phantom; all if None.
         iterations, time_s (optional): Budget of a query; iterations can be repeated exactly.

@@ -49,7 +49,6 @@ class Score:
         status: "solved", "refused", "no plan", "claimed unreachable", "proved unreachable" or "no answer".
         reason: Why it is refused: what the check found.
         cost: Integral of 1 / clearance over the needle; this and all below only where it is solved.
-        needle_mm: Length of the needle.
         success: Estimated chance of success under the errors `breath-hold` without correction; None if not
             asked for.
         breath_share: Share of the breath in which the plan is proved clear and on target, of phantoms that
@@ -88,7 +87,6 @@ def score_submission(
     """Yield the score of every query of the phantoms in a folder, phantom by phantom.
 
     Args:
-        folder: The cases, as `write_benchmark` makes them.
         cache: Folder of prepared anatomies; the usual one if None.
         samples: Deviated plans for the chance of success; 0 for no estimate.
         certify_boxes: Budget of a proof that a target claimed unreachable is so; 0 for no proof.

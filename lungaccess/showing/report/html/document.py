@@ -63,7 +63,6 @@ def write_page(
     """Write a page, all or nothing.
 
     Args:
-        path: path of the HTML file.
         template: Name of the page's own HTML, which goes into the body.
         modules: Scripts of this page, after `SHARED_MODULES`.
         data: Plain JSON values; the scripts find them in the element "report-data".

@@ -36,7 +36,6 @@ def bronchoscopy_webp(
     lumen is half full, so that voxels do not show; no device is drawn.
 
     Args:
-        path: path of a WebP file in an existing folder.
         frames, pixels: Number of pictures, and their width and height.
 
     Raises:

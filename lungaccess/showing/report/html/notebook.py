@@ -31,9 +31,7 @@ def view(plan: Plan, lung: Lung, options: PageOptions | None = None, *, height_p
     """Return the page of a plan for the last line of a cell: it plays in 3-D, with slices, charts and risk.
 
     Args:
-        lung: The patient that the plan was made for.
         options: As of `plan_page`.
-        height_px: Height of the frame in the notebook.
 
     Raises:
         PlanFileError, AnatomyError: As `plan_page`.

@@ -26,10 +26,6 @@ PLACES = '<label>Through <select id="place"></select></label>'
 def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Write the page of a search that found no plan to one HTML file that opens offline.
 
-    Args:
-        lung: The patient of the explanation.
-        path: path of an HTML file in an existing folder.
-
     Raises:
         FileError: If the file cannot be written.
     """

@@ -81,10 +81,6 @@ def plan_page(
     The surfaces are smoothed and simplified and only for looking at; every number comes from the plan, the
     check and the exact distances.
 
-    Args:
-        lung: The patient that the plan was made for.
-        path: path of an HTML file in an existing folder.
-
     Raises:
         FileError: If the file cannot be written.
         PlanFileError: If the plan was made for another lung.

@@ -33,7 +33,6 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
 
     Args:
         maps: All of one lung; each has its own system.
-        path: path of an HTML file in an existing folder.
 
     Raises:
         FileError: If the file cannot be written.

@@ -32,6 +32,8 @@ class Tool:
             a cylinder does not reach ahead of the tip, and no tool has its middle ahead of it.
         least: Tissue of the nodule in the tool that counts as success, in `unit`.
         unit: "mm" of the tool's length, "mm3" of its volume, or "share" of the nodule.
+        margin_mm: Tissue about the nodule counts as nodule up to this distance: what an ablation has to
+            cover.
         rim_mm: Only tissue so near to the nodule's surface counts, 0 for all of it: the inside may be
             necrotic.
 

@@ -92,6 +92,7 @@ class Limit:
         finding: The finding of the check with the number; of several, the tightest.
         value: What the check measured, in `unit`; None for the radius of a straight needle.
         bound: What it is limited by, in `unit`; of a distance, the device's radius and the margins.
+        side: "at least" or "at most".
         used: How much of the limit is used: 1 at the limit, 0 far from it.
         stated: The lower bound that the plan itself states, see docs/explanation/check.md; None for what is
             no clearance.

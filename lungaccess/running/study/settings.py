@@ -50,7 +50,10 @@ class Case:
     """A patient, a system and targets.
 
     Args:
+        anatomy: "phantom", or a patient's folder; a relative one is relative to the study's file.
         phantom: Which one, for the anatomy "phantom".
+        system: Preset, or TOML file relative to the study's file.
+        fissures_allowed: Whether fissures may be crossed; None for what the system says.
         objective: What plans are made good at, unless a planner states a goal; see
             `lungaccess.problem.request.goal_of`.
         errors, procedure: Error model and procedure under which the chance of success of each plan is
@@ -91,6 +94,7 @@ class PlannerChoice:
         method: One of `lungaccess.planning.searches.planners`; for the needle, one of
             `stages.needle.NEEDLE_PLANNERS`.
         goal: For "plan", what plans are made good at instead of the case's objective, such as "success".
+        own_process: Whether each run has a fresh process; OMPL's planners have one in any case.
         without_counterfactuals: Whether a run of "plan" that finds nothing goes without the search for a
             device that would.
     """
@@ -168,7 +172,11 @@ class AtlasGrid:
 
 @settings
 class Study:
-    """Every case with every planner and every seed."""
+    """Every case with every planner and every seed.
+
+    Args:
+        folder: What relative paths are relative to; that of the file if it was read from one.
+    """
 
     name: Annotated[str, text("name of the study")]
     case: Annotated[tuple[Case, ...], Field(min_length=1, description="at least one [[case]]")]

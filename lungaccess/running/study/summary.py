@@ -23,6 +23,7 @@ class Group:
     Args:
         failed: Of the runs, those that could not be made and will be made again; they count nowhere else.
         solved_share: Share of the runs with a plan.
+        accepted_share: Share of the plans that the check accepts; 0 if there is none.
         first_plan_s: Median and largest planning time of the first plan.
         cost: Median cost of the best plans.
         success: Median chance of success of the best plans; None where the study counts none.

@@ -31,6 +31,7 @@ class ScopeAnswer:
     """How the bronchoscope gets to where it stands: by a published tip, or by a motion of the planner's own.
 
     Args:
+        query: Name of the query, "PHANTOM/DEVICE/NN".
         tip: Number of a tip in `tips-DEVICE.json` of the phantom, from 0.
         lps_from_entry (4x4 or None): Base of the bending section at the beginning, in the trachea.
         states (list of [mm, rad, rad] or None): Advance, twist and bend; the scope never draws back, and

@@ -357,7 +357,7 @@ class SearchOptions(BudgetOptions):
     """
 
     goal: Annotated[GoalText, Parameter(name=("--goal", "--objective"))] = SUCCESS.name
-    passes: int = 1
+    passes: Count = 1
     phases: PhasesText = None
     least_clearance: NotNegative = 0.0
     method: str = ATLAS

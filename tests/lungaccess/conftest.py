@@ -18,6 +18,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.fields import corner_geometry, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.lung import Lung
+from anatomy.morphology import components
 from anatomy.motion.prepare import prepare_motion
 from anatomy.phantom import Phantom
 from anatomy.phantom.files import PhantomBreathing
@@ -140,6 +141,8 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         fields=fields,
         lumen_depth=distance_field("lumen_depth", ~lumen, grid),
         nodules=Volume(grid=grid, array=ball) if nodule else None,
+        nodule_parts=components(ball & nodule),
+        vessel_border_mm=(),
         mask=lambda name: Volume(grid=grid, array=masks[name]),
         tree=_tree(trunk),
         breath_hold=None,

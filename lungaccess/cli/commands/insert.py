@@ -12,7 +12,7 @@ from anatomy.base.files import require_writable_folder
 from anatomy.base.words import of_hundred, percent, range_of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Hertz, NotNegative, Positive, Samples, Seed
+from lungaccess.cli.numbers import Count, Hertz, NotNegative, Positive, Samples, Seed
 from lungaccess.cli.options import ErrorsText, PatientOfPlan, PatientOptions, PlanFile, require_picture
 from lungaccess.cli.progress import progress
 
@@ -31,7 +31,7 @@ def insert(
     lost: NotNegative = 0.0,
     speed: Positive = 2.0,
     replan_every: NotNegative = 2.0,
-    number: Annotated[int, Parameter(name="--pass")] = 1,
+    number: Annotated[Count, Parameter(name="--pass")] = 1,
     errors: ErrorsText = None,
     tolerance: NotNegative = 2.0,
     samples: Samples = 50,

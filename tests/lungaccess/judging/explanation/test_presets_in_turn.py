@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from numba.core.compiler_lock import global_compiler_lock
 
@@ -36,6 +37,7 @@ class FakeAtlas:
     """What is passed on unseen."""
 
     system: System
+    motions: Any = field(default_factory=lambda: SimpleNamespace(tips=np.zeros((0, 9))))
 
 
 class FakeTime:

@@ -70,7 +70,7 @@ def test_the_phases_of_a_window_are_drawn_uniformly() -> None:
 
 def test_the_motion_of_the_patient_takes_the_place_of_the_populations() -> None:
     free, held = load_errors("expiratory-free"), load_errors("breath-hold")
-    lung: Any = SimpleNamespace(motion=motion())
+    lung: Any = SimpleNamespace(motion=motion(), vessel_border_mm=())
     known = model_for(free, plan(), lung).breathing
     assert (known.median_mm, known.patient_ln, known.distribution) == (12.0, BREATHS_LN, "lognormal")
     assert "made" in known.source
@@ -79,13 +79,13 @@ def test_the_motion_of_the_patient_takes_the_place_of_the_populations() -> None:
     assert model_for(held, plan(phases=None), lung) is held
     assert model_for(held, plan(phases=np.zeros((0, 2))), lung) is held
     for still in (None, replace(motion(), warning_only=True)):
-        unknown: Any = SimpleNamespace(motion=still)
+        unknown: Any = SimpleNamespace(motion=still, vessel_border_mm=())
         assert model_for(free, plan(), unknown) is free
     assert replace(gated, breathing=held.breathing) == held
 
 
 def test_draws_of_a_patient_replace_those_of_the_population() -> None:
-    lung: Any = SimpleNamespace(motion=motion())
+    lung: Any = SimpleNamespace(motion=motion(), vessel_border_mm=())
     model = ErrorModel(breathing=model_for(load_errors("expiratory-free"), plan(), lung).breathing)
     of_plan = PatientMotion(plan(), motion())
     drawn = Draws(500, 1, 3, stretch=0.4, motion=of_plan).deviations(model).target_mm

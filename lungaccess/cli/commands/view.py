@@ -63,7 +63,7 @@ def view(
         patient = made
     elif out is not None or series is not None:
         raise SettingsError(
-            f"{patient or 'No patient'} is no CT, and --{'series' if out is None else 'out'} is for a CT alone",
+            f"{patient or 'No patient'} is no CT, and --{'series' if out is None else 'out'} is for a CT",
             expected="a CT, which is segmented first",
             remedy="Leave the option out to explore masks, or to choose on the page",
         )

@@ -18,7 +18,7 @@ import numpy as np
 
 import lungaccess as la
 from anatomy.base.errors import LungaccessError
-from anatomy.base.typed import Float
+from anatomy.base.typed import Bool, Float
 from anatomy.build import build_lung
 from anatomy.grid import Volume
 from anatomy.lung import Lung
@@ -64,7 +64,7 @@ def with_nodule(lung: Lung, centre: Float, diameter_mm: float, rng: np.random.Ge
     return replace(lung, nodules=Volume(grid=grid, array=inside))
 
 
-def brute(plan: Plan, lung: Lung, draws: int, seed: int) -> Float:
+def brute(plan: Plan, lung: Lung, draws: int, seed: int) -> Bool:
     """Return which draws succeed `(N,)`, by the voxels in which points of the tool's axis lie."""
     tool, model = plan.system.tool, load_errors()
     whole = RiskAssessor(plan, lung)

@@ -16,7 +16,7 @@ from stages.needle.path import Query, violation
 from tests.scenarios.cases import NEEDLE_DEVICE, NEEDLE_ITERATIONS, NEEDLE_OBJECTIVE, PLANNERS, Anatomy, Case
 from tests.scenarios.scenes import Scenes
 
-STAGES = ("scope: ", "tube: ", "needle: ")
+STAGES = ("masks: ", "scope: ", "tube: ", "needle: ")
 Cost = float | None
 
 

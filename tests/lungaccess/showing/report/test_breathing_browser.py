@@ -19,7 +19,7 @@ pytestmark = [
     pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there"),
 ]
 
-LUMEN = (14, 58, 87)
+LUMEN = (25, 80, 126)
 
 
 @pytest.fixture

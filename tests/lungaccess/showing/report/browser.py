@@ -139,6 +139,15 @@ class Browser:
         """Wait until the page has been drawn again."""
         self.run_async("requestAnimationFrame(() => requestAnimationFrame(() => done(null)))")
 
+    def rest(self) -> None:
+        """Wait until nothing moves: a slow machine then draws what is hidden, and slices, anew and well."""
+        self.run_async(
+            "const look = () => { const tools = window.lungaccessReport.state().view_tools;"
+            " if (tools && tools.slow && tools.quality === 'moving') setTimeout(look, 30);"
+            " else requestAnimationFrame(() => requestAnimationFrame(() => done(null))); };"
+            " requestAnimationFrame(look)"
+        )
+
     def messages(self) -> list[str]:
         """Return warnings and errors of the console since the last call."""
         entries = self._send("POST", "/se/log", {"type": "browser"})

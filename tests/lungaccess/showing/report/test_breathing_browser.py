@@ -61,9 +61,12 @@ def test_everything_breathes_together(
 ) -> None:
     """Devices and target go where Python has them, inside and outside the window; all pictures change."""
     plan, canvases = breathing_plans[0], ("scene", "slice-axial", "slice-across", "inside")
+    page.run("window.lungaccessReport.set(1); window.lungaccessReport.breathe(1)")
+    page.rest()
     moving, before = Moving.of(plan, breathing_lung), [page.run(PICTURE, 1, name) for name in canvases]
     for phase, said in ((0.0, "✗ not proved"), (0.35, "✗ not proved"), (0.8, "✓ proved")):
         page.run("window.lungaccessReport.set(1); window.lungaccessReport.breathe(arguments[0])", phase)
+        page.rest()
         state = page.state()
         end = moving.carried(np.array(plan.needle.end_lps)[None], phase)[0]
         np.testing.assert_allclose(state["tip_lps"], end, atol=5e-3)
@@ -76,6 +79,7 @@ def test_everything_breathes_together(
             assert all(page.run(PICTURE, 1, name) != old for name, old in zip(canvases, before, strict=True))
             assert state["gl_error"] == 0
     page.run("window.lungaccessReport.breathe(1)")
+    page.rest()
     assert [page.run(PICTURE, 1, name) for name in canvases] == before
 
 
@@ -86,6 +90,7 @@ def test_the_lumen_breathes_in_the_slices(
     moving, step_mm = Moving.of(breathing_plans[0], breathing_lung), 140 / 360
     page.run(CHOOSE, "field", "140")
     page.run("window.lungaccessReport.set(0.2); window.lungaccessReport.breathe(0)")
+    page.rest()
     across, down = pixels(page, "slice-axial", LUMEN).T
     aside = np.stack([across - 179.5, down - 179.5, np.zeros(len(across))], axis=1)
     places = np.array(page.state()["tip_lps"]) + step_mm * aside

@@ -83,7 +83,7 @@ def fresh(window: browser.Browser) -> browser.Browser:
     ):
         window.run(CHOOSE, name, value)
     window.run("window.lungaccessReport.set(1)")
-    window.frame()
+    window.rest()
     return window
 
 
@@ -160,7 +160,7 @@ def test_the_window_maps_hounsfield_units_to_greys(fresh: browser.Browser) -> No
     part = (slice(190, 330), slice(200, 330))
     for name, (low, high) in {"lung": (-1350, 150), "tissue": (-160, 240), "bone": (-500, 1300)}.items():
         fresh.run(CHOOSE, "window", name)
-        fresh.frame()
+        fresh.rest()
         greys = np.array(fresh.run(GREYS, "slice-axial")).reshape(SIDE, SIDE)
         wanted = np.clip(255 * (hu - low) / (high - low), 0, 255)
         assert np.abs(greys - wanted)[part].max() <= 1.0
@@ -257,7 +257,7 @@ def test_opacity_of_a_structure(fresh: browser.Browser) -> None:
     s.value = arguments[0]; s.dispatchEvent(new Event('input'))"""
     for value in (0, 45):
         fresh.run(change, value)
-        fresh.frame()
+        fresh.rest()
         same = fresh.run("return document.getElementById('slice-axial').toDataURL()") == before
         assert same is (value == 45)
 
@@ -332,7 +332,8 @@ def test_hours_of_the_prompts_are_those_of_the_picture(
             wanted = int(np.floor(angle / 30 + 0.5)) % 12 or 12
             # What holds the middle of the picture is straight ahead, up to 12 degrees from it.
             straight = from_middle < (12.0 if opening["hour"] == 0 else 4.0)
-            assert opening["hour"] == (0 if straight else wanted)
+            wanted = 0 if straight else wanted
+            assert opening["hour"] == wanted
             assert (f"at {wanted} o'clock" if wanted else "straight ahead") in each["text"]
     shown = fresh.run("return document.getElementById('h-route').parentNode.textContent")
     assert all(each["text"] in shown for each in stored)
@@ -352,6 +353,7 @@ def test_playing_pauses_before_every_bifurcation(fresh: browser.Browser, data: d
             fresh.frame()
             if fresh.run("return document.getElementById('play').textContent") == "Play":
                 break
+        fresh.rest()
         state = fresh.state()
         assert round(1000 * state["position"]) == tick
         eye = pack.unpack(scope["points"])[each["state"]]

@@ -217,7 +217,8 @@ def with_nodule(point_lps: Float, source: PatientSource, turn: Turn) -> Part:
     """Segment a patient again with one more nodule, and return the part after which it is explored.
 
     Raises:
-        SettingsError: If the folder was not segmented here, or from masks of others.
+        SettingsError: If the folder was not segmented here, or from masks of others, or if a corrected mask
+            takes the place of the new nodule.
         LungaccessError: As `anatomy.segmentation.pipeline.segment`.
     """
     from anatomy.segmentation.pipeline import read_ct
@@ -241,11 +242,26 @@ def with_nodule(point_lps: Float, source: PatientSource, turn: Turn) -> Part:
     )  # fmt: skip
     _made(request, turn)
     part = _exploring(folder, source, turn)
-    lung = load_patient(folder, cache=source.cache, accept=source.accept)
-    here = lung.grid.voxels(point_lps)
-    near = [(float(np.abs(each.voxels - here).sum(axis=1).min()), each.number) for each in nodules_of(lung)]
-    part.message["target"] = f"nodule {min(near)[1]}" if near else point
+    number = nodule_near(load_patient(folder, cache=source.cache, accept=source.accept), point_lps)
+    if number is None:
+        raise SettingsError(
+            f"The nodules of {folder} have none at {point} after the segmentation",
+            expected="no corrected mask of nodules, which takes the place of what is found",
+            remedy="Add the nodule to that mask, or take the mask away",
+        )
+    part.message["target"] = f"nodule {number}"
     return part
+
+
+def nodule_near(lung: Lung, point_lps: Float) -> int | None:
+    """Return the number of the nodule nearest to a point; None if all are farther than 3 mm away."""
+    # The outline of a nodule may leave out the voxel that was pointed at, at its border.
+    near = [
+        (float(np.linalg.norm(lung.grid.lps(each.voxels) - point_lps, axis=1).min()), each.number)
+        for each in nodules_of(lung)
+    ]
+    away_mm, number = min(near, default=(np.inf, 0))
+    return number if away_mm <= 3.0 else None
 
 
 def segmentation_record(folder: Path) -> dict[str, Any] | None:

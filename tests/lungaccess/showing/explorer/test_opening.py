@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from anatomy.grid import Grid, Volume
+from anatomy.lung import Lung
 from anatomy.phantom import Phantom
+from lungaccess.problem.nodules import nodules_of
 from lungaccess.showing.explorer import Explorer, PatientSource
+from lungaccess.showing.explorer.opening import nodule_near
 from tests.anatomy.io.series import write_series
 from tests.lungaccess.showing.explorer.client import Client, opened, with_client
 from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served
@@ -25,6 +28,15 @@ def thinned(volume: Volume, step: int) -> Volume:
     matrix = volume.grid.lps_from_ijk @ np.diag([1.0, 1.0, float(step), 1.0])
     array = np.ascontiguousarray(volume.array[:, :, ::step])
     return Volume(grid=Grid(shape=array.shape, lps_from_ijk=matrix), array=array)
+
+
+def test_a_nodule_that_was_pointed_at_is_told_from_others(small_lung: Lung) -> None:
+    first, *others = nodules_of(small_lung)
+    assert others
+    assert nodule_near(small_lung, first.centre_lps) == first.number
+    edge = small_lung.grid.lps(first.voxels)[np.argmax(first.voxels[:, 0])]
+    assert nodule_near(small_lung, edge + np.array([2.0, 0.0, 0.0])) == first.number
+    assert nodule_near(small_lung, edge + np.array([4.0, 0.0, 0.0])) is None
 
 
 @pytest.fixture

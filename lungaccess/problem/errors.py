@@ -113,10 +113,12 @@ class _Term:
     def sized(self, size: float) -> Self:
         """Return the term scaled to a size of both parts together; a term of none gets one an attempt.
 
-        An error of a known size is about the plan, wherever the shaft rests.
+        An error of a known size is about the plan: it has no bias, wherever the shaft rests.
         """
         if self.distribution == RESTING:
             return replace(self, distribution=NORMAL).sized(size)  # type: ignore[type-var]
+        if self.bias:
+            return replace(self, **{f"bias_{self.unit}": ()}).sized(size)  # type: ignore[type-var]
         if not self.size:
             return replace(self, **{f"attempt_{self.unit}": size})  # type: ignore[type-var]
         return self.scaled(size / self.size)

@@ -213,6 +213,14 @@ def test_biases_and_places_are_restored_without_loss(tmp_path: Path) -> None:
 # Sizes -------------------------------------------------------------------------------------------
 
 
+def test_an_error_of_a_known_size_has_no_bias() -> None:
+    # A shaft at rest is off by 5 mm in nearly all draws alike: scaling the bias with the little spread would
+    # ask for errors of several decimetres.
+    biased = PositionError(patient_mm=0.05, bias_mm=(3.0, -4.6, 0.0))
+    model = ErrorModel(scope_position=biased).only("scope_position", 10.0)
+    assert model.scope_position.bias == () and model.scope_position.size == pytest.approx(10.0)
+
+
 @given(model=MODELS, kind=st.sampled_from(list(UNITS)), size=st.floats(0.01, 1.0))
 def test_one_kind_alone_has_the_size_that_was_asked_for(model: ErrorModel, kind: str, size: float) -> None:
     alone = model.only(kind, size)

@@ -237,16 +237,21 @@ def _allowed(cls: type, loc: Sequence[int | str]) -> str:
     field = _fields(_class_at(cls, keys[:-1])).get(keys[-1]) if keys else None
     if field is None:
         return ""
+    said: Sequence[object] = field.metadata
+    kind, meaning = _without_none(field.annotation), field.description
+    items = typing.get_args(kind)
+    if isinstance(loc[-1], int) and items and kind not in _NOUNS:
+        # Of an item of a list its own bounds are what was not kept.
+        item = FieldInfo.from_annotation(items[0])
+        said, kind, meaning = item.metadata, item.annotation, item.description or meaning
     bounds = [
         f"{word} {getattr(item, attribute):g}"
-        for kind, attribute, word in _BOUND_WORDS
-        for item in field.metadata
-        if isinstance(item, kind)
+        for bound, attribute, word in _BOUND_WORDS
+        for item in said
+        if isinstance(item, bound)
     ]
-    meaning = f" ({field.description})" if field.description else ""
-    kind = _without_none(field.annotation)
     noun = _NOUNS.get(kind) or ("a list" if typing.get_origin(kind) is tuple else "a table")
-    return f"{noun} {' and '.join(bounds)}".strip() + meaning
+    return f"{noun} {' and '.join(bounds)}".strip() + (f" ({meaning})" if meaning else "")
 
 
 _BOUND_WORDS: tuple[tuple[type, str, str], ...] = (

@@ -33,6 +33,7 @@ class Cart:
     wheel: Wheel
     sources: tuple[str, ...] = ()
     braked: Annotated[bool, switch("whether it has a brake")] = False
+    offsets_mm: tuple[Annotated[float, quantity("offset of a wheel", at_least=-5.0, at_most=5.0)], ...] = ()
 
 
 CART = {"name": "a", "wheel": {"diameter_mm": 10}, "sources": ["x", "y"]}
@@ -56,6 +57,8 @@ def test_plain_values_become_typed_ones() -> None:
         ("wheel.diameter_mm", "10", "wheel.diameter_mm = '10'", "a finite number"),
         ("wheel.diameter_mm", True, "wheel.diameter_mm = True", "a finite number"),
         ("wheel.hub_mm", 50.0, "wheel.hub_mm = 50.0", "at least 0 and below 50"),
+        ("offsets_mm", [0, 9], "offsets_mm.1 = 9", "a finite number at least -5 and at most 5 (offset"),
+        ("offsets_mm", 9, "offsets_mm = 9", "a list"),
         ("wheel.hub_mm", 10.0, "wheel.hub_mm = 10.0", "less than diameter_mm = 10"),
         ("wheel.diametr_mm", 1.0, "wheel.diametr_mm is not a setting", "did you mean diameter_mm?"),
         ("colour", "red", "colour is not a setting", "one of name, wheel, sources, braked"),

@@ -13,7 +13,7 @@ COLD_RUN = """
 from benchmarks.scenes import configurations, mechanics
 made = mechanics(3)
 made.batch(*configurations(made, 10))
-made.given_base_angles(*(values[0] for values in configurations(made, 1))).jacobian
+made.given_base_angles(*(values[0] for values in configurations(made, 1)))
 """
 
 
@@ -37,10 +37,6 @@ class Solves:
     def time_one_solve(self, tubes: int) -> None:
         """One configuration, with all that an `Equilibrium` holds."""
         self.made.given_base_angles(self.angles[0], self.beta[0])
-
-    def time_jacobian(self, tubes: int) -> None:
-        """The tip's motion by all joints."""
-        _ = self.made.given_tip_angles(self.one.tip_angles_rad, self.beta[0]).jacobian
 
     def track_error_um(self, tubes: int) -> float:
         """Largest error of a tip in micrometres, against steps a tenth as long."""

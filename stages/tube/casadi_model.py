@@ -30,7 +30,6 @@ from stages.tube.casadi_rates import (
     bending_n_mm2,
     determinant_function,
     landmarks_mm,
-    pose_derivative,
     rest_curvature_per_mm,
     rotation_of,
     state_rates,
@@ -78,8 +77,7 @@ class OrderedTubes:
     """The functions of tubes whose landmarks keep one order.
 
     All are `casadi.Function`, made when first asked for, and can be called with numbers or with symbols.
-    Vectors are columns.  The order holds where `margins` is not negative; elsewhere the results mean
-    nothing.
+    Vectors are columns.  Where the landmarks have another order the results mean nothing.
 
     Args:
         tubes: n >= 1 tubes, innermost first.
@@ -92,20 +90,6 @@ class OrderedTubes:
         self._steps = steps_per_piece
         self._marks = [landmarks_mm(tube) for tube in tubes]
         self._ahead = [sum(tube == i for tube, _ in order.landmarks) for i in range(len(tubes))]
-
-    @cached_property
-    def margins(self) -> Any:
-        """Function: beta (n,) mm -> (N,) mm, how far each landmark is from changing places.
-
-        Of a program's variables only the beta are bounded by it; `beta <= 0` is not included.
-        """
-        beta = casadi.MX.sym("beta_mm", len(self._tubes))
-        places = self._places(beta)
-        gaps = [far - near for far, near in itertools.pairwise(places)]
-        for i, marks in enumerate(self._marks):
-            if self._ahead[i] < len(marks):
-                gaps.append(-(beta[i] + marks[-1 - self._ahead[i]]))
-        return casadi.Function("margins", [beta], [casadi.vertcat(*gaps)], ["beta_mm"], ["margins_mm"])
 
     @cached_property
     def forward(self) -> Any:
@@ -147,27 +131,6 @@ class OrderedTubes:
             [found, position, rotation, determinant],
             ["base_angles_rad", "beta_mm", "guess_rad"],
             ["tip_angles_rad", "position_mm", "rotation", "determinant"],
-        )
-
-    @cached_property
-    def tip_jacobian(self) -> Any:
-        """Function: tip angles (n,) rad, beta (n,) mm -> (6, 2n) derivative of the tip's pose.
-
-        Columns are the base angles in rad, then beta in mm.  Rows are the position in mm, then the
-        rotation vector in rad, both in the base frame.  The tip angles follow the joints as the implicit
-        function theorem has it.  Singular where the determinant is 0.
-        """
-        tip, beta = self._symbols("tip_angles_rad")
-        base, position, rotation = self._integrate(tip, beta)
-        by_tip, by_beta = (pose_derivative(position, rotation, by) for by in (tip, beta))
-        tip_by_base = casadi.inv(casadi.jacobian(base, tip))
-        fixed_base = by_beta - by_tip @ tip_by_base @ casadi.jacobian(base, beta)
-        return casadi.Function(
-            "tip_jacobian",
-            [tip, beta],
-            [casadi.horzcat(by_tip @ tip_by_base, fixed_base)],
-            ["tip_angles_rad", "beta_mm"],
-            ["jacobian"],
         )
 
     def _symbols(self, angles: str) -> tuple[Any, Any]:
@@ -344,17 +307,6 @@ class CasadiTubes:
                 remedy="Begin nearer to an equilibrium",
             )
         return self.given_tip_angles(tip.full()[:, 0], beta)
-
-    def tip_jacobian(
-        self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, guess_rad: ArrayLike | None = None
-    ) -> Float:
-        """Return the `(6, 2n)` derivative of the tip's pose by base angles and beta, at an equilibrium.
-
-        Rows and columns as in `OrderedTubes.tip_jacobian`; parameters and errors as in `solve`.
-        """
-        beta = self._vector(beta_mm, "beta")
-        tip = self.solve(base_angles_rad, beta, guess_rad).tip_angles_rad
-        return read_only(np.array(self.ordered(self.order_at(beta)).tip_jacobian(tip, beta).full()))
 
     def _vector(self, values: ArrayLike, name: str) -> Float:
         found = np.array(values, dtype=np.float64)

@@ -102,13 +102,6 @@ def rotation_of(quaternion: Any) -> Any:
     return casadi.MX.eye(3) + 2 * unit[0] * cross + 2 * cross @ cross
 
 
-def pose_derivative(position: Any, rotation: Any, by: Any) -> Any:
-    """Return the (6, m) derivative of a pose: its position, then its rotation vector."""
-    columns = casadi.horzsplit(rotation)
-    turn = sum(casadi.skew(column) @ casadi.jacobian(column, by) for column in columns)
-    return casadi.vertcat(casadi.jacobian(position, by), 0.5 * turn)
-
-
 def determinant_function(n: int) -> Any:
     """Return the function: matrix (n, n) -> determinant, in plain arithmetic."""
     matrix = casadi.SX.sym("matrix", n, n)

@@ -1,8 +1,7 @@
-"""One equilibrium of nested tubes: its shape, torsion, stability, and the motion of its tip."""
+"""One equilibrium of nested tubes: its shape, torsion and stability."""
 
 import math
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,15 +9,12 @@ from numpy.typing import ArrayLike
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Bool, Float
 from anatomy.grid import read_only
-from stages.tube.errors import ConvergenceError
-from stages.tube.kernels import equilibrium, jacobian, pose, torsion
+from stages.tube.kernels import equilibrium, pose, torsion
 from stages.tube.nesting import NestedTubes
 
 
 class Equilibrium:
-    """One equilibrium: shape, torsion, stability and the tip's motion.
-
-    Made by `TubeMechanics`.
+    """One equilibrium: shape, torsion and stability, made by `TubeMechanics`.
 
     Args:
         mechanics: The tubes.
@@ -40,9 +36,8 @@ class Equilibrium:
         self._cutting, n_steps = mechanics.cut(
             mechanics.rear_ends(beta_mm[None], np.array([needle_mm]))[0].copy()
         )
-        self._nodes, self._steps = torsion_scratch(n_steps, n, 2 * n)
-        owners = np.concatenate([-1 - np.arange(n), np.arange(n)])
-        torsion.twist(mechanics.design, self._cutting, tip_angles_rad, owners, self._nodes, self._steps)
+        self._nodes, self._steps = equilibrium.scratch_for(n_steps, n, n - 1)
+        torsion.twist(mechanics.design, self._cutting, tip_angles_rad, self._nodes, self._steps)
         self._poses = np.zeros((n_steps + 1, 12))
         pose.lay(self._cutting, self._nodes, self._steps, self._poses)
 
@@ -67,7 +62,7 @@ class Equilibrium:
     @cached_property
     def least_determinant(self) -> float:
         """Least of the determinants along the tubes; -inf where two directions lose stability at once."""
-        return float(equilibrium.least_determinant(self._relative_nodes(), self._beta_mm))
+        return float(equilibrium.least_determinant(self._nodes, self._beta_mm))
 
     @property
     def stable(self) -> bool:
@@ -121,7 +116,7 @@ class Equilibrium:
         """Return the derivatives of angles and torsion by all tip angles but the last, `(n - 1, n)`."""
         from scipy.interpolate import CubicHermiteSpline
 
-        arc_lengths, _psi, _rate, dpsi, drate = self._relative_nodes()
+        arc_lengths, _psi, _rate, dpsi, drate = self._nodes
         if s <= 0.0 or len(arc_lengths) == 1:
             return dpsi[0], drate[0]
         at = min(int(np.searchsorted(arc_lengths, s, "right")) - 1, len(arc_lengths) - 2)
@@ -129,58 +124,6 @@ class Equilibrium:
         share = (s - float(arc_lengths[at])) / h
         angles = CubicHermiteSpline([0.0, h], dpsi[at : at + 2], drate[at : at + 2])
         return angles(share * h), angles(share * h, 1)
-
-    @cached_property
-    def jacobian_of_tip_angles(self) -> Float:
-        """The tip's motion `(6, 2 n)` by tip angles and by shifts of the rear ends, the others held.
-
-        Rows: velocity of the tip in mm, then rotation in rad, in the base frame.
-        """
-        n = self.mechanics.count
-        moved = np.zeros((2 * n, 6))
-        jacobian.motions(self._cutting, self._nodes, self._steps, self._poses, moved)
-        tip = self._poses[-1, 9:]
-        rotation, translation = moved[:, :3], moved[:, 3:]
-        velocity = translation + np.cross(rotation, tip)
-        # The innermost tube's material turns with its own tip angle too.
-        turned = rotation.copy()
-        turned[0] += self._poses[-1, [2, 5, 8]]
-        return read_only(np.concatenate([velocity, turned], axis=1).T.copy())
-
-    @cached_property
-    def base_angle_derivatives(self) -> tuple[Float, Float]:
-        """Derivatives `(n, n)` of the base angles by tip angles and by shifts, rad/rad and rad/mm."""
-        n = self.mechanics.count
-        _s, _psi, rate, dpsi, drate = self._nodes
-        found = dpsi[0].T + self.beta_mm[:, None] * drate[0].T
-        found[:, n:] += np.diag(rate[0])
-        return read_only(found[:, :n].copy()), read_only(found[:, n:].copy())
-
-    @cached_property
-    def jacobian(self) -> Float:
-        """The tip's motion `(6, 2 n)` by base angles (rad) and by shifts of the rear ends (mm).
-
-        Rows: velocity of the tip in mm, then rotation in rad, in the base frame [Rucker2011].
-
-        Raises:
-            ConvergenceError: If the equilibrium is just losing stability, so that it does not follow the base
-                smoothly.
-        """
-        n = self.mechanics.count
-        by_tip, by_shift = self.base_angle_derivatives
-        free = self.jacobian_of_tip_angles
-        try:
-            through = np.linalg.solve(by_tip.T, free[:, :n].T).T
-        except np.linalg.LinAlgError:
-            raise ConvergenceError(
-                "The tip's motion has no limit: the tubes are about to snap", expected="a stable equilibrium"
-            ) from None
-        return read_only(np.concatenate([through, free[:, n:] - through @ by_shift], axis=1))
-
-    def _relative_nodes(self) -> tuple[Float, ...]:
-        s, psi, rate, dpsi, drate = self._nodes
-        n = self.mechanics.count
-        return s, psi, rate, np.ascontiguousarray(dpsi[:, : n - 1]), np.ascontiguousarray(drate[:, : n - 1])
 
     def _arc_lengths(self, arc_lengths_mm: ArrayLike) -> Float:
         s = np.atleast_1d(np.array(arc_lengths_mm, dtype=np.float64))
@@ -213,12 +156,3 @@ def matrices(poses: Float) -> Float:
     found[:, :3, 3] = poses[:, 9:]
     found[:, 3, 3] = 1.0
     return found
-
-
-def torsion_scratch(n_steps: int, n: int, columns: int) -> tuple[Any, Any]:
-    """Return the arrays `nodes` and `steps` that `torsion.twist` fills."""
-    nodes = (
-        np.zeros(n_steps + 1), np.zeros((n_steps + 1, n)), np.zeros((n_steps + 1, n)),
-        np.zeros((n_steps + 1, columns, n)), np.zeros((n_steps + 1, columns, n)),
-    )  # fmt: skip
-    return nodes, (np.zeros(n_steps), np.zeros((n_steps, columns)), np.zeros(n_steps, np.int64))

@@ -20,18 +20,17 @@ from anatomy.kernels.compiling import kernel, merged_kernel
 SHORTEST_PIECE_MM = 1e-9
 """Shorter pieces are rounding and are left out."""
 
-# Columns of `pieces`: arc lengths of both ends; the bodies whose shift moves them (-1: none); 1 / the sum of
-# bending stiffnesses; how many tubes are bent here; the only one if it is one; number of steps.  After them
-# follows the bending stiffness of each body here, 0 where it is not.
-NEAR, FAR, NEAR_OWNER, FAR_OWNER, SOFTNESS, BENT, BENT_TUBE, STEPS, PIECE_COLUMNS = range(9)
+# Columns of `pieces`: arc lengths of both ends; 1 / the sum of bending stiffnesses; how many tubes are bent
+# here; the only one if it is one; number of steps.  After them follows the bending stiffness of each body
+# here, 0 where it is not.
+NEAR, FAR, SOFTNESS, BENT, BENT_TUBE, STEPS, PIECE_COLUMNS = range(7)
 
 
 @merged_kernel
 def _breakpoints(lengths, bends, beta, found):
-    """Fill `found` (B, 2) with arc lengths, rising, and the tubes that move them; return how many."""
+    """Fill `found` (B,) with the arc lengths, rising from 0, where a body or bend ends; return how many."""
     count = 1
-    found[0, 0] = 0.0
-    found[0, 1] = -1.0
+    found[0] = 0.0
     for m in range(lengths.shape[0] + 2 * bends.shape[0]):
         tube = m
         along = 0.0
@@ -45,12 +44,10 @@ def _breakpoints(lengths, bends, beta, found):
         if s <= SHORTEST_PIECE_MM:
             continue
         at = count
-        while found[at - 1, 0] > s:
-            found[at, 0] = found[at - 1, 0]
-            found[at, 1] = found[at - 1, 1]
+        while found[at - 1] > s:
+            found[at] = found[at - 1]
             at -= 1
-        found[at, 0] = s
-        found[at, 1] = tube
+        found[at] = s
         count += 1
     return count
 
@@ -71,16 +68,15 @@ def cut(design, beta, step, pieces, moments, directions):
             precurvature in rad.
     """
     stiffness, lengths, bends = design
-    found = np.zeros((1 + lengths.shape[0] + 2 * bends.shape[0], 2))
+    found = np.zeros(1 + lengths.shape[0] + 2 * bends.shape[0])
     n_found = _breakpoints(lengths, bends, beta, found)
     count = 0
     last = 0
     for m in range(1, n_found):
-        if found[m, 0] - found[last, 0] < SHORTEST_PIECE_MM:
+        if found[m] - found[last] < SHORTEST_PIECE_MM:
             continue
         piece = pieces[count]
-        piece[NEAR], piece[NEAR_OWNER] = found[last, 0], found[last, 1]
-        piece[FAR], piece[FAR_OWNER] = found[m, 0], found[m, 1]
+        piece[NEAR], piece[FAR] = found[last], found[m]
         last = m
         middle = 0.5 * (piece[NEAR] + piece[FAR])
         if not _fill(design, beta, middle, piece[PIECE_COLUMNS:], moments[count], directions[count]):

@@ -175,14 +175,14 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
 
 
 @inner_kernel
-def newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, enough):
+def newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, enough):
     """Let Newton's method find tip angles for base angles from a guess; return the last error, rad.
 
     It stops where the error is below `enough`.
     """
     worst = math.inf
     for _ in range(NEWTON_STEPS):
-        twist(design, cutting, tip_angles, owners, nodes, steps)
+        twist(design, cutting, tip_angles, nodes, steps)
         worst = _newton_step(nodes, beta, base_angles, tip_angles, matrix, right)
         if worst < enough:
             break
@@ -190,7 +190,7 @@ def newton(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles,
 
 
 @merged_kernel
-def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
+def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right):
     """Find tip angles by raising the precurvature from nothing; return the last error, rad."""
     pieces, moments, directions, count = cutting
     for i in range(tip_angles.shape[0]):
@@ -202,9 +202,7 @@ def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_ang
         share = min(done + stride, 1.0)
         eased = (pieces, math.sqrt(share) * moments, directions, count)
         enough = TOLERANCE if share == 1.0 else NEAR_ENOUGH
-        worst = newton(
-            design, eased, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, enough
-        )
+        worst = newton(design, eased, base_angles, beta, nodes, steps, tip_angles, matrix, right, enough)
         if worst < enough:
             done = share
             kept[:] = tip_angles
@@ -215,7 +213,7 @@ def _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_ang
 
 
 @merged_kernel
-def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right):
+def _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right):
     """Start from angles all round until a stable equilibrium is found; return the last error, rad.
 
     If all that are found are unstable, the first of them is taken.
@@ -230,9 +228,7 @@ def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, t
             if i < n - 1:
                 tip_angles[i] += 2.0 * math.pi * (code % ROUND) / ROUND
                 code //= ROUND
-        worst = newton(
-            design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, TOLERANCE
-        )
+        worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
         if worst < TOLERANCE:
             if least_determinant(nodes, beta) > 0.0:
                 return worst
@@ -241,12 +237,12 @@ def _tried_all_round(design, cutting, base_angles, beta, owners, nodes, steps, t
                 kept[:] = tip_angles
     tip_angles[:] = kept
     if any_found < math.inf:
-        twist(design, cutting, tip_angles, owners, nodes, steps)
+        twist(design, cutting, tip_angles, nodes, steps)
     return any_found
 
 
 @kernel()
-def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stable, tip_angles):
+def settle(design, cutting, base_angles, beta, nodes, steps, prefer_stable, tip_angles):
     """Find the equilibrium next to the guess in `tip_angles`, which gets its angles, `nodes` the rest.
 
     If Newton's method fails from there, or ends at an unstable one and stable ones are preferred, the
@@ -255,25 +251,21 @@ def settle(design, cutting, base_angles, beta, owners, nodes, steps, prefer_stab
     """
     last = tip_angles.shape[0] - 1
     matrix, right = np.zeros((last, last)), np.zeros(last)
-    worst = newton(
-        design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right, TOLERANCE
-    )
+    worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
     least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
     if least > 0.0 or (worst < TOLERANCE and not prefer_stable):
         return worst, least
     first, first_worst = tip_angles.copy(), worst
-    worst = _continued(design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right)
+    worst = _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right)
     least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
     if least > 0.0:
         return worst, least
-    worst = _tried_all_round(
-        design, cutting, base_angles, beta, owners, nodes, steps, tip_angles, matrix, right
-    )
+    worst = _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right)
     least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
     if least > 0.0 or not first_worst < TOLERANCE:
         return worst, least
     tip_angles[:] = first
-    twist(design, cutting, tip_angles, owners, nodes, steps)
+    twist(design, cutting, tip_angles, nodes, steps)
     return first_worst, least_determinant(nodes, beta)
 
 
@@ -285,13 +277,13 @@ def cutting_scratch(design, n):
     return np.zeros((most, PIECE_COLUMNS + bodies)), np.zeros((most, n)), np.zeros((most, n))
 
 
-@inner_kernel
+@kernel()
 def scratch_for(n_steps, n, columns):
     """Return `nodes` and `steps` as `torsion.twist` fills them."""
     angles = np.zeros((2, n_steps + 1, n))
     derivatives = np.zeros((2, n_steps + 1, columns, n))
     nodes = (np.zeros(n_steps + 1), angles[0], angles[1], derivatives[0], derivatives[1])
-    return nodes, (np.zeros(n_steps), np.zeros((n_steps, columns)), np.zeros(n_steps, np.int64))
+    return nodes, (np.zeros(n_steps), np.zeros(n_steps, np.int64))
 
 
 @kernel(nogil=True)
@@ -309,7 +301,6 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
     """
     n = base_angles.shape[1]
     pieces, moments, directions = cutting_scratch(design, n)
-    owners = -1 - np.arange(n - 1)
     allocated = 0
     nodes, steps = scratch_for(allocated, n, n - 1)
     poses = np.zeros((allocated + 1, 12))
@@ -321,7 +312,7 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
             poses = np.zeros((allocated + 1, 12))
         cutting = (pieces, moments, directions, count)
         worst, least = settle(
-            design, cutting, base_angles[m], beta[m], owners, nodes, steps, prefer_stable, tip_angles[m]
+            design, cutting, base_angles[m], beta[m], nodes, steps, prefer_stable, tip_angles[m]
         )
         lay(cutting, nodes, steps, poses)
         turned(poses[allocated], tip_angles[m, 0], results[m, TIP:])

@@ -105,7 +105,7 @@ def step_of(cutting, nodes, steps, at, begin, end, twist, out):
     """
     pieces, moments, directions, _count = cutting
     psi, rate = nodes[1], nodes[2]
-    lengths, piece_of = steps[0], steps[2]
+    lengths, piece_of = steps
     k = piece_of[at]
     h = (end - begin) * lengths[at]
     if pieces[k, BENT] == 1.0:

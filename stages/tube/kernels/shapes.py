@@ -46,10 +46,7 @@ def _settled(design, base_angles, beta, step, tip_angles):
     cutting = (pieces, moments, directions, count)
     nodes, steps = scratch_for(n_steps, n, last)
     matrix, right = np.zeros((last, last)), np.zeros(last)
-    worst = newton(
-        design, cutting, base_angles, beta, -1 - np.arange(last), nodes, steps, tip_angles, matrix, right,
-        TOLERANCE,
-    )  # fmt: skip
+    worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
     return worst, cutting, nodes, steps
 
 
@@ -114,7 +111,7 @@ def largest_strain(design, strained, beta, cutting, nodes, steps, first=0):
     psi, rate = nodes[1], nodes[2]
     worst = 0.0
     for at in range(steps[0].shape[0]):
-        k = steps[2][at]
+        k = steps[1][at]
         middle = 0.5 * (pieces[k, NEAR] + pieces[k, FAR])
         for end in range(2):
             x, y = curvature(cutting, k, float(end), steps[0][at], psi, rate, at)
@@ -151,7 +148,7 @@ def _changes(cutting, nodes, steps, k):
     psi, rate = nodes[1], nodes[2]
     changed, size = 0.0, 0.0
     for at in range(steps[0].shape[0]):
-        if steps[2][at] == k:
+        if steps[1][at] == k:
             x0, y0 = curvature(cutting, k, 0.0, steps[0][at], psi, rate, at)
             x1, y1 = curvature(cutting, k, 1.0, steps[0][at], psi, rate, at)
             changed += math.hypot(x1 - x0, y1 - y0)

@@ -5,7 +5,7 @@ With the Bishop frame of the centreline, tube i is turned by the angle psi_i and
     u_i' = -(1 / kt_i) sum_j [kb_i kappa_i kb_j kappa_j / sum kb] sin(psi_j - psi_i)
 
 where psi includes the direction of the precurvature, and u_i = 0 at the end of each tube.  Angles at the tip
-are given, so this is an initial value problem; its derivatives are carried along.
+are given, so this is an initial value problem; its derivatives by them are carried along.
 """
 
 import math
@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
-from stages.tube.kernels.assembly import FAR, FAR_OWNER, NEAR, NEAR_OWNER, SOFTNESS, STEPS
+from stages.tube.kernels.assembly import FAR, NEAR, SOFTNESS, STEPS
 
 # Nystroem's method of order 5 for y'' = f(y) [Hairer1993, sec. II.14].
 C2, C3 = 1.0 / 5.0, 2.0 / 3.0
@@ -82,43 +82,27 @@ def _look_ahead(nodes, at, h, share, a1, a2, a3, work):
             work[ANGLES, c + 1, i] = dpsi[at, c, i] - along * drate[at, c, i] + h2 * bent
 
 
-@inner_kernel
-def _add_stretch(nodes, at, h, dh, share, a1, a2, a3, work):
-    """Add to the derivatives in `work[ANGLES]` what they owe to derivatives `dh` (N, columns) of the step."""
-    rate = nodes[2]
-    for i in range(work.shape[2]):
-        bent = a1 * work[0, 0, i] + a2 * work[1, 0, i] + a3 * work[2, 0, i]
-        for c in range(work.shape[1] - 1):
-            work[ANGLES, c + 1, i] += dh[at - 1, c] * (2.0 * h * bent - share * rate[at, i])
-
-
 @merged_kernel
-def _look_from(nodes, at, h, dh, stretches, pairs, count, work):
+def _look_from(nodes, at, h, pairs, count, work):
     """Fill the four stages of `work` of the step of `h` down from node `at`."""
     _look_ahead(nodes, at, h, 0.0, 0.0, 0.0, 0.0, work)
     _pull(pairs, count, work[ANGLES], work[0])
     _look_ahead(nodes, at, h, C2, A21, 0.0, 0.0, work)
-    if stretches:
-        _add_stretch(nodes, at, h, dh, C2, A21, 0.0, 0.0, work)
     _pull(pairs, count, work[ANGLES], work[1])
     _look_ahead(nodes, at, h, C3, A31, A32, 0.0, work)
-    if stretches:
-        _add_stretch(nodes, at, h, dh, C3, A31, A32, 0.0, work)
     _pull(pairs, count, work[ANGLES], work[2])
     _look_ahead(nodes, at, h, 1.0, A41, A42, A43, work)
-    if stretches:
-        _add_stretch(nodes, at, h, dh, 1.0, A41, A42, A43, work)
     _pull(pairs, count, work[ANGLES], work[3])
 
 
 @inner_kernel
-def _step(nodes, at, h, dh, stretches, pairs, count, work):
+def _step(nodes, at, h, pairs, count, work):
     """Take a step of -h from node `at` to the one before it.
 
     `rate` is along s, but the step goes down: its sign is turned where it enters and leaves.
     """
     _s, psi, rate, dpsi, drate = nodes
-    _look_from(nodes, at, h, dh, stretches, pairs, count, work)
+    _look_from(nodes, at, h, pairs, count, work)
     h2 = h * h
     for i in range(work.shape[2]):
         bent = P1 * work[0, 0, i] + P2 * work[1, 0, i] + P3 * work[2, 0, i]
@@ -131,52 +115,37 @@ def _step(nodes, at, h, dh, stretches, pairs, count, work):
             dturned += R3 * work[2, c + 1, i] + R4 * work[3, c + 1, i]
             dpsi[at - 1, c, i] = dpsi[at, c, i] - h * drate[at, c, i] + h2 * dbent
             drate[at - 1, c, i] = drate[at, c, i] - h * dturned
-            if stretches:
-                dpsi[at - 1, c, i] += dh[at - 1, c] * (2.0 * h * bent - rate[at, i])
-                drate[at - 1, c, i] -= dh[at - 1, c] * turned
 
 
 @merged_kernel
-def _coast(nodes, at, h, dh):
+def _coast(nodes, at, h):
     """Take a step of -h from node `at` where no two tubes are bent: torsion stays."""
     _s, psi, rate, dpsi, drate = nodes
     for i in range(psi.shape[1]):
         psi[at - 1, i] = psi[at, i] - h * rate[at, i]
         rate[at - 1, i] = rate[at, i]
         for c in range(dpsi.shape[1]):
-            dpsi[at - 1, c, i] = dpsi[at, c, i] - h * drate[at, c, i] - dh[at - 1, c] * rate[at, i]
+            dpsi[at - 1, c, i] = dpsi[at, c, i] - h * drate[at, c, i]
             drate[at - 1, c, i] = drate[at, c, i]
 
 
-@inner_kernel
-def _any_stretch(owners):
-    """Tell whether a column is of a length: a flag that began as False would compile a step once more."""
-    for owner in owners:
-        if owner >= 0:
-            return True
-    return False
-
-
 @kernel()
-def twist(design, cutting, tip_angles, owners, nodes, steps):
+def twist(design, cutting, tip_angles, nodes, steps):
     """Integrate torsion from the tip to the front plate.
 
     Args:
         design (tuple): See `assembly`.
         cutting (tuple): pieces, moments, directions, and the number of pieces, as `assembly.cut` fills them.
         tip_angles ((n,) float64): psi_i at the end of each tube, rad.
-        owners ((m,) int64): Derivatives wanted: that by the tip angle of tube c is -1 - c, that by its shift
-            is c.
-        nodes (tuple): s (N + 1,), psi and u in rad and rad/mm (N + 1, n), their derivatives (N + 1, m, n);
-            node 0 is at the front plate, node N at the tip.  Is filled.
-        steps (tuple): Length in mm (N,), its derivatives (N, m), and the piece (N,) int64 of each step.  Is
-            filled.
+        nodes (tuple): s (N + 1,), psi and u in rad and rad/mm (N + 1, n), their derivatives by the tip angles
+            of the first m tubes (N + 1, m, n); node 0 is at the front plate, node N at the tip.  Is filled.
+        steps (tuple): Length in mm (N,) and the piece (N,) int64 of each step.  Is filled.
     """
     pieces, moments, directions, count = cutting
     s, psi, rate, dpsi, drate = nodes
-    lengths, dlengths, piece_of = steps
+    lengths, piece_of = steps
     n = tip_angles.shape[0]
-    columns = owners.shape[0]
+    columns = dpsi.shape[1]
     at = lengths.shape[0]
     work = np.zeros((SCRATCH_ROWS, columns + 1, n))
     pairs = np.zeros((n * (n - 1) // 2, PAIR_COLUMNS))
@@ -185,9 +154,8 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
         psi[at, i] = tip_angles[i]
         rate[at, i] = 0.0
         for c in range(columns):
-            dpsi[at, c, i] = 1.0 if owners[c] == -1 - i else 0.0
+            dpsi[at, c, i] = 1.0 if c == i else 0.0
             drate[at, c, i] = 0.0
-    stretches = _any_stretch(owners)
     for k in range(count - 1, -1, -1):
         number = int(pieces[k, STEPS])
         bent = _pair_up(design[0], pieces, moments, directions, k, pairs)
@@ -197,13 +165,7 @@ def twist(design, cutting, tip_angles, owners, nodes, steps):
             s[at] = pieces[k, NEAR] + (number - 1 - m) * h
             lengths[at] = h
             piece_of[at] = k
-            for c in range(columns):
-                moved = 0.0
-                if owners[c] >= 0:
-                    moved += 1.0 if pieces[k, FAR_OWNER] == owners[c] else 0.0
-                    moved -= 1.0 if pieces[k, NEAR_OWNER] == owners[c] else 0.0
-                dlengths[at, c] = moved / number
             if bent > 0:
-                _step(nodes, at + 1, h, dlengths, stretches, pairs, bent, work)
+                _step(nodes, at + 1, h, pairs, bent, work)
             else:
-                _coast(nodes, at + 1, h, dlengths)
+                _coast(nodes, at + 1, h)

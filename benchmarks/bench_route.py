@@ -13,7 +13,7 @@ from stages.scope.route.proof import prove
 from stages.scope.route.settings import RouteLimits
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
-from stages.scope.tour.shortest import shortest_tour
+from stages.scope.tour.itinerary import shortest_tour
 from stages.scope.tour.subtree import subtree_to
 
 COLD_RUN = """

@@ -122,7 +122,7 @@ def _tubes(tubes: int) -> Work:
 
 
 def _tour(lesions: int) -> Work:
-    from stages.scope.tour.shortest import shortest_tour
+    from stages.scope.tour.itinerary import shortest_tour
 
     models = scenes.tours(lesions)
     return lambda: [shortest_tour(subtree) for subtree in models]

@@ -24,8 +24,7 @@ from experiments.support.tour_models import random_airway, random_lesions
 from lungaccess.showing.report import style
 from stages.scope.tour.circuit import SAME_RESISTANCE, circuits
 from stages.scope.tour.exits import Exit, find_exits
-from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary
-from stages.scope.tour.shortest import shortest_tour
+from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary, shortest_tour
 from stages.scope.tour.subtree import Subtree, subtree_to
 
 LESIONS = (3, 4, 5, 6, 7, 8, 9)

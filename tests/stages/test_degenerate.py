@@ -29,7 +29,7 @@ from stages.scope.route.centreline import from_graph, from_tree
 from stages.scope.route.planner import plan_route
 from stages.scope.route.settings import RouteLimits
 from stages.scope.tour.exits import find_exits
-from stages.scope.tour.shortest import shortest_tour
+from stages.scope.tour.itinerary import shortest_tour
 from stages.scope.tour.subtree import subtree_to
 from stages.tube.device import BentPiece, Tube
 from stages.tube.mechanics import TubeMechanics

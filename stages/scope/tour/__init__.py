@@ -14,8 +14,7 @@ if TYPE_CHECKING:
         combinations,
     )
     from stages.scope.tour.exits import Exit, ExitRule, ExitTest, exits_of, find_exits
-    from stages.scope.tour.itinerary import Itinerary, one_by_one_mm, plan_itinerary
-    from stages.scope.tour.shortest import shortest_tour
+    from stages.scope.tour.itinerary import Itinerary, one_by_one_mm, plan_itinerary, shortest_tour
     from stages.scope.tour.subtree import MOST_LESIONS, Resistances, Subtree, branch_resistances, subtree_to
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

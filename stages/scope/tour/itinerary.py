@@ -1,4 +1,4 @@
-"""The order of visits for chosen exits, and how often each stretch is passed."""
+"""The shortest tour: which exits it takes, the order of visits, and how often each stretch is passed."""
 
 from collections.abc import Sequence
 
@@ -147,3 +147,65 @@ def _to_root(parent: Int, v: int) -> list[int]:
     while parent[path[-1]] >= 0:
         path.append(int(parent[path[-1]]))
     return path
+
+
+def shortest_tour(subtree: Subtree, *, closed: bool = False) -> Itinerary:
+    """Return the tour of least cost over all choices of one exit a lesion: a group Steiner problem on a tree.
+
+    A closed tour costs twice the length of the stretches that it uses; an open one may end at any exit and
+    saves the return from there.  The costs of the chosen exits are added.
+
+    Args:
+        closed: Whether the tour returns to the root.
+    """
+    taken, passed = _exits_taken(subtree, closed)
+    depth, cost = subtree.depth_mm[subtree.exit_vertex], subtree.exit_cost_mm
+    chosen = []
+    for m in range(subtree.n_lesions):
+        own = subtree.exit_lesion == m
+        # Of exits of a lesion that lie on the tour at the same cost it is the deepest, which may be its end.
+        same = passed & own & (cost == cost[taken & own].min())
+        chosen.append(max(np.flatnonzero(same).tolist(), key=lambda x: float(depth[x])))
+    return plan_itinerary(subtree, chosen, closed=closed)
+
+
+def _exits_taken(subtree: Subtree, closed: bool) -> tuple[Bool, Bool]:
+    """Return which exits `(X,)` are taken, and which lie on the tour, by an integer program, which is exact.
+
+    x says which stretches are used, z which of them lead to the end of an open tour, y which exits are
+    taken.  A stretch needs its parent, an exit its stretch, a lesion one exit.
+    """
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import coo_array
+
+    n, count = subtree.n_vertices, len(subtree.exits)
+    rows: list[tuple[int, int, float]] = []
+    low: list[float] = []
+
+    def require(entries: list[tuple[int, float]], least: float) -> None:
+        rows.extend((len(low), column, factor) for column, factor in entries)
+        low.append(least)
+
+    for v in range(1, n):
+        if subtree.parent[v] > 0:
+            require([(int(subtree.parent[v]), 1.0), (v, -1.0)], 0.0)
+        require([(v, 1.0), (n + v, -1.0)], 0.0)
+    for v in range(n):
+        onward = [(n + int(c), -1.0) for c in np.flatnonzero(subtree.parent == v)]
+        if onward:
+            require([(n + v, 1.0), *onward], 0.0)
+    for x, v in enumerate(subtree.exit_vertex.tolist()):
+        require([(v, 1.0), (2 * n + x, -1.0)], 0.0)
+    for m in range(subtree.n_lesions):
+        require([(2 * n + int(x), 1.0) for x in np.flatnonzero(subtree.exit_lesion == m)], 1.0)
+    row, column, factor = zip(*rows, strict=True)
+    matrix = coo_array((factor, (row, column)), shape=(len(low), 2 * n + count))
+    saved = np.zeros(n) if closed else -subtree.length_mm
+    found = milp(
+        np.concatenate((2.0 * subtree.length_mm, saved, subtree.exit_cost_mm)),
+        constraints=LinearConstraint(matrix.tocsr(), lb=np.array(low)),
+        bounds=Bounds(0, 1),
+        integrality=np.ones(2 * n + count),
+        options={"mip_rel_gap": 0.0},
+    )
+    return found.x[2 * n :] > 0.5, found.x[subtree.exit_vertex] > 0.5

@@ -10,11 +10,9 @@ import pytest
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import SettingsError
 from experiments.support.tour_models import random_airway, random_lesions
-from stages.scope.tour import shortest
 from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
-from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary
-from stages.scope.tour.shortest import shortest_tour
+from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary, shortest_tour
 from stages.scope.tour.subtree import Subtree, subtree_to
 from tests.stages.scope.tour.trees import (
     by_trying_everything,
@@ -92,7 +90,7 @@ def test_open_tour_is_twice_the_union_less_the_deepest_way() -> None:
 
 
 @pytest.mark.parametrize("block", range(5))
-def test_program_equals_trying_everything(block: int) -> None:
+def test_integer_program_equals_trying_everything(block: int) -> None:
     """500 small random cases, open and closed, with exits that cost something and exits that do not."""
     rng = np.random.default_rng((4, block))
     for _ in range(100):
@@ -100,18 +98,6 @@ def test_program_equals_trying_everything(block: int) -> None:
         for closed in (False, True):
             best = by_trying_everything(subtree, closed=closed)
             assert shortest_tour(subtree, closed=closed).cost_mm == pytest.approx(best, abs=1e-9)
-
-
-def test_integer_program_equals_the_dynamic_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(5)
-    for _ in range(20):
-        subtree = random_subtree(rng, 9, orders=7)
-        for closed in (False, True):
-            by_program = shortest_tour(subtree, closed=closed).cost_mm
-            with monkeypatch.context() as patch:
-                patch.setattr(shortest, "MOST_WORK", 0.0)
-                by_integers = shortest_tour(subtree, closed=closed).cost_mm
-            assert by_integers == pytest.approx(by_program, abs=1e-6)
 
 
 def test_exact_tour_is_never_longer_than_that_of_least_resistance() -> None:
@@ -158,16 +144,14 @@ def test_wrong_exits_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_thirty_lesions_with_scattered_exits_are_solved_by_integers() -> None:
-    """Their sets of open lesions are too many for the dynamic program; both relaxations bound the answer."""
+def test_thirty_lesions_with_scattered_exits() -> None:
+    """Fewer lesions, drawn choices and changes of one exit bound the answer."""
     rng = np.random.default_rng(6)
     tree = airway(3, 8)
     exits = [[exit_at(m, p) for p in rng.integers(0, tree.n_points, 3)] for m in range(30)]
     subtree = subtree_to(tree, exits)
-    assert shortest._binary(subtree).work > shortest.MOST_WORK
     best = shortest_tour(subtree, closed=True)
     fewer = shortest_tour(subtree_to(tree, exits[:15]), closed=True)
-    assert shortest._binary(subtree_to(tree, exits[:15])).work < shortest.MOST_WORK
     assert fewer.length_mm <= best.length_mm + 1e-6
     for _ in range(300):
         guess = [int(rng.choice(np.flatnonzero(subtree.exit_lesion == m))) for m in range(30)]

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
@@ -16,7 +17,7 @@ from anatomy.lung import Lung
 from anatomy.morphology import voxels_of
 from anatomy.structures import OUTSIDE
 from stages.scope.advisor.kernels.collision import FINE_DEPTH_MM
-from stages.scope.advisor.kernels.voxel_graph import WALL, clearance_l1, number_component, widest_paths
+from stages.scope.advisor.kernels.voxel_graph import clearance_l1, widest_paths
 
 DEPTH_UNITS_PER_MM = 256.0
 """Depths are compared as integers of 1/256 mm, the unit of the distance fields."""
@@ -149,10 +150,13 @@ def _lumen(mask: Volume, root_lps: ArrayLike, depth: DistanceField | None) -> Lu
     inside = np.zeros(grid.shape, dtype=bool)
     inside[tuple((voxels - low).T)] = True
     away = np.linalg.norm(mask.grid.lps(voxels) - np.asarray(root_lps, dtype=np.float64), axis=1)
-    index = np.full(grid.shape, WALL, dtype=np.int32)
-    stack = np.zeros((len(voxels), 3), dtype=np.int16)
-    seed = (voxels[int(np.argmin(away))] - low).astype(np.int64)
-    numbered, neighbours = number_component(inside, seed, stack, index)
+    pieces, _count = ndimage.label(inside)
+    seed = voxels[int(np.argmin(away))] - low
+    numbered = np.ascontiguousarray(np.argwhere(pieces == pieces[tuple(seed)]), dtype=np.int32)
+    index = np.full(grid.shape, -1, dtype=np.int32)
+    index[tuple(numbered.T)] = np.arange(len(numbered))
+    steps = np.repeat(np.eye(3, dtype=np.int32), 2, axis=0) * np.array([[-1], [1]] * 3, dtype=np.int32)
+    neighbours = np.stack([index[tuple((numbered + step).T)] for step in steps], axis=1)
     if depth is None:
         depth = distance_field("lumen_depth", index < 0, grid)
     return Lumen(

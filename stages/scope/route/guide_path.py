@@ -8,7 +8,6 @@ from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
-from stages.scope.route.kernels.repair import breadth_first
 
 DEFAULT_NEIGHBOURS = 8
 """Nearest nodes that are linked: two along a tube, and those of a fork, with some to spare."""
@@ -138,11 +137,19 @@ def fewest_hops(links: Links, source: int, goal: int) -> Int:
     Raises:
         NoRouteError: If no chain of links joins them.
     """
-    path: Int = breadth_first(links.start, links.nodes, source, goal)
-    if not len(path):
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    count = len(links.start) - 1
+    graph = csr_array((np.ones(len(links.nodes)), links.nodes, links.start), shape=(count, count))
+    _order, before = breadth_first_order(graph, source)
+    if before[goal] < 0 and goal != source:
         raise NoRouteError(
             "The centreline does not join start and goal",
             expected="one connected tree of tubes",
             remedy="Look at the gaps in the segmentation, or choose points in the same tree",
         )
-    return path
+    path = [goal]
+    while path[-1] != source:
+        path.append(int(before[path[-1]]))
+    return np.array(path[::-1], dtype=np.int64)

@@ -8,59 +8,6 @@ import numpy as np
 
 from anatomy.kernels.compiling import kernel
 
-WALL = -1
-UNSEEN = -2
-
-
-@kernel()
-def number_component(inside, seed, stack, index):
-    """Number the voxels of `inside` (bool) that hang together with voxel `seed` by their faces.
-
-    `index`, an int32 volume of the same shape and all `WALL`, becomes the number of each such voxel.
-    `stack` is (K, 3) int16 for as many voxels as there are inside.  Returns the voxels `(N, 3)` int32 and
-    their neighbours `(N, 6)` int32.
-    """
-    ni, nj, nk = inside.shape
-    index[seed[0], seed[1], seed[2]] = UNSEEN
-    stack[0, 0], stack[0, 1], stack[0, 2] = seed[0], seed[1], seed[2]
-    top = 1
-    count = 1
-    while top > 0:
-        top -= 1
-        i, j, k = int(stack[top, 0]), int(stack[top, 1]), int(stack[top, 2])
-        for side in range(6):
-            step = 2 * (side % 2) - 1
-            a = i + (step if side < 2 else 0)
-            b = j + (step if 2 <= side < 4 else 0)
-            c = k + (step if side >= 4 else 0)
-            if not (0 <= a < ni and 0 <= b < nj and 0 <= c < nk):
-                continue
-            if inside[a, b, c] and index[a, b, c] == WALL:
-                index[a, b, c] = UNSEEN
-                stack[top, 0], stack[top, 1], stack[top, 2] = a, b, c
-                top += 1
-                count += 1
-    voxels = np.zeros((count, 3), np.int32)
-    n = 0
-    for i in range(ni):
-        for j in range(nj):
-            for k in range(nk):
-                if index[i, j, k] == UNSEEN:
-                    index[i, j, k] = n
-                    voxels[n, 0], voxels[n, 1], voxels[n, 2] = i, j, k
-                    n += 1
-    neighbours = np.zeros((count, 6), np.int32)
-    for n in range(count):
-        for side in range(6):
-            neighbours[n, side] = WALL
-            step = 2 * (side % 2) - 1
-            a = voxels[n, 0] + (step if side < 2 else 0)
-            b = voxels[n, 1] + (step if 2 <= side < 4 else 0)
-            c = voxels[n, 2] + (step if side >= 4 else 0)
-            if 0 <= a < ni and 0 <= b < nj and 0 <= c < nk:
-                neighbours[n, side] = index[a, b, c]
-    return voxels, neighbours
-
 
 @kernel()
 def clearance_l1(neighbours, steps, out):

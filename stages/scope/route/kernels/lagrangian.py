@@ -54,12 +54,6 @@ def _sample_at(control, f, rows, v):
 
 
 @inner_kernel
-def _objective_weights(sample, weights):
-    """Return the weights of the distance from the reference, and of bending, at a sample."""
-    return weights[CENTRING] * sample[0] / (sample[4] * sample[4]), weights[BENDING] * sample[0]
-
-
-@inner_kernel
 def _curvature_violation(v, weights):
     """Return the violation of the curvature limit, then c' x c'' (norm, vector), and |c'|^2 and |c'|^3."""
     nx = v[1, 1] * v[2, 2] - v[1, 2] * v[2, 1]
@@ -108,44 +102,6 @@ def _end_violation(program, control, end):
 
 
 @inner_kernel
-def lagrangian(program, control, multipliers, penalty, hints, violation):
-    """Return the value of the augmented Lagrangian.
-
-    `violation` (S + 2, 2) receives the constraint values, curvature and depth at the samples, then the
-    distances of the ends.  `hints` (S,) keeps the cone in which each sample was found.
-    """
-    count = program.first.shape[0]
-    v = np.zeros((3, 3))
-    total = 0.0
-    for s in range(count):
-        sample = program.samples[s]
-        _sample_at(control, program.first[s], program.rows[s], v)
-        centring, bending = _objective_weights(sample, program.weights)
-        for axis in range(3):
-            off = v[0, axis] - sample[1 + axis]
-            total += 0.5 * (centring * off * off + bending * v[2, axis] * v[2, axis])
-        violation[s, 0] = _curvature_violation(v, program.weights)[0]
-        violation[s, 1] = _depth_violation(program, s, v, multipliers[s, 1], hints)[0]
-        for kind in range(2):
-            active = violation[s, kind] + multipliers[s, kind] / penalty
-            if active > 0.0:
-                total += 0.5 * penalty * active * active
-    ends = 0.0
-    for end in range(2):
-        value, _dx, _dy, _dz, distance, a = _end_violation(program, control, end)
-        violation[count + end, 0] = value
-        if a < 0:
-            continue
-        # The wanted point also draws, gently.
-        pull = program.weights[CENTRING] / program.weights[TOLERANCE]
-        ends += 0.5 * pull * distance * distance
-        active = value + multipliers[count + end, 0] / penalty
-        if active > 0.0:
-            ends += 0.5 * penalty * active * active
-    return total + ends
-
-
-@inner_kernel
 def _add_row(band, slope, first, lo, hi, value, row, weight):
     """Add one residual with its 12 derivatives to the normal equations of the free control points."""
     for i in range(12):
@@ -160,25 +116,6 @@ def _add_row(band, slope, first, lo, hi, value, row, weight):
                 continue
             other = 3 * (b - lo) + j % 3
             band[at, at - other] += weight * row[i] * row[j]
-
-
-@merged_kernel
-def _add_objective(band, slope, f, lo, hi, rows, v, sample, weights):
-    """Add the objective of a sample to the normal equations."""
-    centring, bending = _objective_weights(sample, weights)
-    for axis in range(3):
-        off = v[0, axis] - sample[1 + axis]
-        for c in range(4):
-            a = f + c
-            if a < lo or a >= hi:
-                continue
-            at = 3 * (a - lo) + axis
-            slope[at] += centring * rows[0, c] * off + bending * rows[2, c] * v[2, axis]
-            for e in range(c + 1):
-                if f + e >= lo:
-                    band[at, 3 * (c - e)] += (
-                        centring * rows[0, c] * rows[0, e] + bending * rows[2, c] * rows[2, e]
-                    )
 
 
 @merged_kernel
@@ -216,37 +153,67 @@ def _add_end(band, slope, at, dx, dy, dz, distance, active, penalty, weights):
                 band[at + i, i - j] += penalty * d[i] * d[j] / (distance * tolerance) ** 2
 
 
-@merged_kernel
-def normal_equations(program, control, multipliers, penalty, hints, band, slope):
-    """Fill `slope` with the gradient of the augmented Lagrangian and `band` with its Gauss-Newton matrix."""
+@inner_kernel
+def lagrangian(program, control, multipliers, penalty, hints, violation, band, slope):
+    """Return the augmented Lagrangian; fill its gradient `slope` and the Gauss-Newton matrix `band`.
+
+    `violation` (S + 2, 2) receives the constraint values, curvature and depth at the samples, then the
+    distances of the ends.  `hints` (S,) keeps the cone in which each sample was found.
+    """
     lo, hi, weights = program.lo, program.hi, program.weights
     band[:] = 0.0
     slope[:] = 0.0
-    row = np.zeros(12)
-    v = np.zeros((3, 3))
-    count = program.first.shape[0]
+    row, v = np.zeros(12), np.zeros((3, 3))
+    count, total = program.first.shape[0], 0.0
     for s in range(count):
         f, rows, sample = program.first[s], program.rows[s], program.samples[s]
         _sample_at(control, f, rows, v)
-        _add_objective(band, slope, f, lo, hi, rows, v, sample, weights)
+        centring, bending = (
+            weights[CENTRING] * sample[0] / (sample[4] * sample[4]),
+            weights[BENDING] * sample[0],
+        )
+        for axis in range(3):
+            off = v[0, axis] - sample[1 + axis]
+            total += 0.5 * (centring * off * off + bending * v[2, axis] * v[2, axis])
+            for c in range(max(lo - f, 0), min(hi - f, 4)):
+                at = 3 * (f + c - lo) + axis
+                slope[at] += centring * rows[0, c] * off + bending * rows[2, c] * v[2, axis]
+                for e in range(max(lo - f, 0), c + 1):
+                    band[at, 3 * (c - e)] += (
+                        centring * rows[0, c] * rows[0, e] + bending * rows[2, c] * rows[2, e]
+                    )
         value, norm, nx, ny, nz, speed2, speed3 = _curvature_violation(v, weights)
+        violation[s, 0] = value
         active = value + multipliers[s, 0] / penalty
-        if active > 0.0 and norm > 0.0:
-            _curvature_row(rows, v, weights[LIMIT], norm, nx, ny, nz, speed2, speed3, row)
-            _add_row(band, slope, f, lo, hi, active, row, penalty)
+        if active > 0.0:
+            total += 0.5 * penalty * active * active
+            if norm > 0.0:
+                _curvature_row(rows, v, weights[LIMIT], norm, nx, ny, nz, speed2, speed3, row)
+                _add_row(band, slope, f, lo, hi, active, row, penalty)
         value, cx, cy, cz = _depth_violation(program, s, v, multipliers[s, 1], hints)
+        violation[s, 1] = value
         active = value + multipliers[s, 1] / penalty
         dx, dy, dz = v[0, 0] - cx, v[0, 1] - cy, v[0, 2] - cz
-        size = math.sqrt(dx * dx + dy * dy + dz * dz)
-        if active > 0.0 and size > 0.0:
-            size *= sample[4]
-            for c in range(4):
-                row[3 * c] = rows[0, c] * dx / size
-                row[3 * c + 1] = rows[0, c] * dy / size
-                row[3 * c + 2] = rows[0, c] * dz / size
-            _add_row(band, slope, f, lo, hi, active, row, penalty)
+        size = math.sqrt(dx * dx + dy * dy + dz * dz) * sample[4]
+        if active > 0.0:
+            total += 0.5 * penalty * active * active
+            if size > 0.0:
+                for c in range(4):
+                    row[3 * c] = rows[0, c] * dx / size
+                    row[3 * c + 1] = rows[0, c] * dy / size
+                    row[3 * c + 2] = rows[0, c] * dz / size
+                _add_row(band, slope, f, lo, hi, active, row, penalty)
+    ends = 0.0
     for end in range(2):
         value, dx, dy, dz, distance, a = _end_violation(program, control, end)
-        if a >= 0:
-            active = value + multipliers[count + end, 0] / penalty
-            _add_end(band, slope, 3 * (a - lo), dx, dy, dz, distance, active, penalty, weights)
+        violation[count + end, 0] = value
+        if a < 0:
+            continue
+        # The wanted point also draws, gently.
+        pull = weights[CENTRING] / weights[TOLERANCE]
+        ends += 0.5 * pull * distance * distance
+        active = value + multipliers[count + end, 0] / penalty
+        if active > 0.0:
+            ends += 0.5 * penalty * active * active
+        _add_end(band, slope, 3 * (a - lo), dx, dy, dz, distance, active, penalty, weights)
+    return total + ends

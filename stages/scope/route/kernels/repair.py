@@ -17,7 +17,7 @@ import math
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
-from stages.scope.route.kernels.lagrangian import lagrangian, normal_equations
+from stages.scope.route.kernels.lagrangian import lagrangian
 
 BAND = 12
 """Half the bandwidth of the normal equations: four control points of three coordinates."""
@@ -65,15 +65,14 @@ def _solve(band, slope, damping, factor, step):
 def _descend(program, control, multipliers, penalty, hints, violation, steps, work):
     """Minimise the augmented Lagrangian by at most `steps` least-squares steps; return how many were taken.
 
-    `work`: band, factor, slope and step of the normal equations, and the control points and violations of a
-    trial.  `control` is changed in place.
+    `work`: band and slope of the normal equations, their factor and step, and the control points, violations,
+    band and slope of a trial.  `control` and its `violation` are changed in place.
     """
-    band, factor, slope, step, trial, trial_violation = work
+    band, slope, factor, step, trial, trial_violation, trial_band, trial_slope = work
     lo, hi = program.lo, program.hi
     damping = FIRST_DAMPING
-    value = lagrangian(program, control, multipliers, penalty, hints, violation)
+    value = lagrangian(program, control, multipliers, penalty, hints, violation, band, slope)
     for taken in range(steps):
-        normal_equations(program, control, multipliers, penalty, hints, band, slope)
         improved = False
         before = value
         # No step gains anything where the damping is larger: steps are then rounding.
@@ -82,7 +81,9 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
                 for a in range(lo, hi):
                     for axis in range(3):
                         trial[a, axis] = control[a, axis] + step[3 * (a - lo) + axis]
-                new = lagrangian(program, trial, multipliers, penalty, hints, trial_violation)
+                new = lagrangian(
+                    program, trial, multipliers, penalty, hints, trial_violation, trial_band, trial_slope
+                )
                 if new < value:
                     value = new
                     improved = True
@@ -91,6 +92,7 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
         if not improved:
             return taken + 1
         control[lo:hi] = trial[lo:hi]
+        violation[:], band[:], slope[:] = trial_violation, trial_band, trial_slope
         damping = max(damping * LOWER, LEAST_DAMPING)
         if before - value <= STALL * abs(before):
             return taken + 1
@@ -115,15 +117,10 @@ def repair(control, program, rounds, steps, tolerance):
     n = 3 * (program.hi - program.lo)
     multipliers = np.zeros((count + 2, 2))
     violation = np.full((count + 2, 2), -1.0)
-    trial_violation = np.full((count + 2, 2), -1.0)
     work = (
-        np.zeros((n, BAND)),
-        np.zeros((n, BAND)),
-        np.zeros(n),
-        np.zeros(n),
-        control.copy(),
-        trial_violation,
-    )
+        np.zeros((n, BAND)), np.zeros(n), np.zeros((n, BAND)), np.zeros(n), control.copy(),
+        violation.copy(), np.zeros((n, BAND)), np.zeros(n),
+    )  # fmt: skip
     hints = np.full(count, -1, dtype=np.int64)
     penalty = FIRST_PENALTY
     worst = math.inf
@@ -131,7 +128,6 @@ def repair(control, program, rounds, steps, tolerance):
     earlier = np.full(rounds, math.inf)
     for turn in range(rounds):
         taken += _descend(program, control, multipliers, penalty, hints, violation, steps, work)
-        lagrangian(program, control, multipliers, penalty, hints, violation)
         previous = worst
         worst = 0.0
         for s in range(count + 2):
@@ -144,39 +140,3 @@ def repair(control, program, rounds, steps, tolerance):
         if worst > 0.25 * previous:
             penalty = min(penalty * 10.0, MAX_PENALTY)
     return worst, taken
-
-
-@kernel()
-def breadth_first(start, links, source, goal):
-    """Return the nodes from `source` to `goal` with the fewest hops, empty if there is none.
-
-    `links[start[n]:start[n + 1]]` are the neighbours of node n, nearest first.
-    """
-    came_from = np.full(start.shape[0] - 1, -1, dtype=np.int64)
-    queue = np.zeros(start.shape[0] - 1, dtype=np.int64)
-    queue[0] = source
-    came_from[source] = source
-    head = 0
-    tail = 1
-    while head < tail and came_from[goal] < 0:
-        node = queue[head]
-        head += 1
-        for at in range(start[node], start[node + 1]):
-            other = links[at]
-            if came_from[other] < 0:
-                came_from[other] = node
-                queue[tail] = other
-                tail += 1
-    if came_from[goal] < 0:
-        return np.zeros(0, dtype=np.int64)
-    count = 1
-    node = goal
-    while node != source:
-        node = came_from[node]
-        count += 1
-    path = np.zeros(count, dtype=np.int64)
-    node = goal
-    for at in range(count - 1, -1, -1):
-        path[at] = node
-        node = came_from[node]
-    return path

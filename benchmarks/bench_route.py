@@ -9,12 +9,10 @@ from experiments.support.tour_models import random_airway, random_lesions
 from stages.scope.route.centreline import Centreline, from_tree
 from stages.scope.route.guide_path import nearest_links
 from stages.scope.route.planner import Replanner, plan_route
-from stages.scope.route.proof import prove
-from stages.scope.route.settings import RouteLimits
-from stages.scope.tour.circuit import circuits
+from stages.scope.route.proof import RouteLimits, prove
 from stages.scope.tour.exits import find_exits
 from stages.scope.tour.itinerary import shortest_tour
-from stages.scope.tour.subtree import subtree_to
+from stages.scope.tour.subtree import circuits, subtree_to
 
 COLD_RUN = """
 from benchmarks.bench_route import Routes, Tours

@@ -7,12 +7,11 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.grid import Grid, Volume
 from benchmarks.fresh import FreshProcess
-from stages.scope.advisor.advisor import Advisor, start_state
+from stages.scope.advisor.advisor import Advisor, PathSettings, start_state
 from stages.scope.advisor.best_motion import Weights, evaluate_motions
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen, lumen_of_mask
 from stages.scope.advisor.nf1 import goal_at, navigation_field
-from stages.scope.advisor.path_search import PathSettings
 
 SPACING_MM = (0.7, 0.7, 0.6)
 LINES = (

@@ -39,7 +39,7 @@ from lungaccess.problem.target import point_target
 from stages.needle.environment import needle_environment
 from stages.needle.objective import Objective
 from stages.needle.path import ArcPath, Query, arc_transform
-from stages.needle.replanning.belief import tilt
+from stages.needle.replanning.insertion import tilt
 from stages.needle.replanning.replanner import Replanner
 
 REPLAN_LIMIT_MS = 20.0

@@ -28,8 +28,7 @@ from lungaccess.showing.report import style
 from stages.scope.route.curve import Curve
 from stages.scope.route.guide_path import NoRouteError
 from stages.scope.route.planner import Repair, plan_route
-from stages.scope.route.proof import measure
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import RouteLimits, measure
 
 METHODS = ("exact", "ga", "rrt", "rrt*", "rrt first", "rrt* first")
 COMPARED = METHODS[:4]

@@ -21,13 +21,12 @@ from experiments.support.scope.ends import NEAR_MM, success, touching
 from experiments.support.scope.goals import PAPER_SPACING_MM, ends, goal_with_clearance
 from experiments.support.scope.speed import ARRIVED_MM, SPARE_VOXELS, measure_speed
 from lungaccess.showing.report import style
-from stages.scope.advisor.advisor import Advisor, start_state
+from stages.scope.advisor.advisor import Advisor, PathSettings, start_state
 from stages.scope.advisor.best_motion import Weights
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import lumen_of_lung
 from stages.scope.advisor.path import ScopePath
-from stages.scope.advisor.path_search import PathSettings
 
 WEIGHTS = {
     "(1, 0, 0)": Weights(nf1=1.0, clearance=0.0, twist=0.0),

@@ -24,8 +24,8 @@ from experiments.support.results import Result, setting_of, study_parser, write_
 from lungaccess.showing.report import style
 from stages.tube.casadi_model import CasadiTubes
 from stages.tube.device import Tube
+from stages.tube.equilibrium import STEP_RAD
 from stages.tube.mechanics import TubeMechanics
-from stages.tube.nesting import STEP_RAD
 
 COUNTS = (1, 2, 3)
 COLOURS = (style.AIRWAY, style.TUBE, style.SCOPE)

@@ -32,7 +32,6 @@ SECOND_OPINION = {
     "stages.tube.casadi_model",
     "stages.tube.casadi_rates",
     "stages.tube.casadi_shape",
-    "stages.tube.casadi_statics",
     "stages.tube.errors",
     "stages.tube.sequences",
 }

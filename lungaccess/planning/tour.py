@@ -131,7 +131,7 @@ def plan_tour(
     Args:
         lesions_lps: (M, 3) float64, LPS mm.
         rule: By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
-        reading: How resistances are merged: "printed" or "reduced", see `stages.scope.tour.circuit`.
+        reading: How resistances are merged: "printed" or "reduced", see `stages.scope.tour.subtree`.
         tissue_weight: How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the
             shortest tour.
         atlas: If given, an exit counts only if a coupled plan from there was found: scope, tubes and needle,

@@ -61,9 +61,7 @@ if TYPE_CHECKING:
         ReachScan,
         StartIndex,
     )
-    from stages.needle.replanning.belief import Belief, Unknown, tilt
-    from stages.needle.replanning.escaping import structure_name, with_limits
-    from stages.needle.replanning.insertion import Commands, TrueNeedle, steer
+    from stages.needle.replanning.insertion import Belief, Commands, TrueNeedle, Unknown, steer, tilt
     from stages.needle.replanning.reaiming import pose_at
     from stages.needle.replanning.replanner import (
         DEFAULT_SETTINGS,
@@ -72,6 +70,8 @@ if TYPE_CHECKING:
         Replan,
         Replanner,
         ReplanSettings,
+        structure_name,
+        with_limits,
         with_reserve,
     )
     from stages.needle.search.base import RestartingRRT, Search, first_path

@@ -7,17 +7,18 @@ from anatomy.base.facade import lazy_exports
 if TYPE_CHECKING:
     from stages.tube.arcs import TubeShape, pieces_of_arcs, points_on_arcs
     from stages.tube.casadi_model import CasadiTubes
-    from stages.tube.casadi_shape import DerivedShape, derive_shape
-    from stages.tube.casadi_statics import LoadedShape, derive_loaded
+    from stages.tube.casadi_shape import DerivedShape, LoadedShape, derive_loaded, derive_shape
     from stages.tube.deployments import (
         DEFAULT_STOP_MM,
         Deployments,
         Enumerator,
         SiteEnumerator,
         enumerate_deployments,
+        exit_points,
         join_deployments,
     )
     from stages.tube.design_shapes import (
+        ShapeTree,
         coarser_shapes,
         longest_mm,
         open_shapes,
@@ -25,18 +26,18 @@ if TYPE_CHECKING:
         shapes_digest,
         shapes_format,
         shapes_of,
+        tree_of_shapes,
     )
     from stages.tube.device import BentPiece, ConcentricTubes, Tube, straightening
     from stages.tube.environment import DEFAULT_ROTATIONS, tube_constants, tube_environment
-    from stages.tube.equilibrium import Equilibrium
+    from stages.tube.equilibrium import Equilibrium, check_nesting
     from stages.tube.errors import ConvergenceError
-    from stages.tube.exits import exit_points
     from stages.tube.following import DeployedSequence, SnapError, deploy
     from stages.tube.kernels import DesignArrays, ManyShapes, ShapeArrays, TubeEnvironment
     from stages.tube.mechanics import Batch, TubeMechanics
-    from stages.tube.nearby import NearbyShape, Neighbourhood
-    from stages.tube.nesting import check_nesting
     from stages.tube.one_shape import (
+        NearbyShape,
+        Neighbourhood,
         copies,
         deployed,
         design_arrays,
@@ -56,7 +57,6 @@ if TYPE_CHECKING:
         propose_designs,
     )
     from stages.tube.sequences import BEND_RAD, Sequence, alternating, inner_first, kuntz2015, together
-    from stages.tube.shape_tree import ShapeTree, tree_of_shapes
     from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
     from stages.tube.validation import REASONS, Deployment, DeploymentValidator
 

@@ -1,23 +1,250 @@
-"""The shape of one deployment of any design, derived by the CasADi model alone: a second opinion for checks.
+"""Deployments of any design, and tubes with a needle in them, by CasADi alone: a second opinion for checks.
 
-Nothing of the kernels takes part: neither their integration nor their judgement of stability.
+Nothing of the kernels takes part: neither their integration nor their judgement of stability.  Tubes with a
+needle, in tissue or free, are a boundary value problem: force and moment of the whole, and the torsional
+moments of the tubes, are carried by Runge-Kutta steps from the tip, where they are 0, to the front plate,
+where frame and rear ends are given; Newton's method finds the tip [Rucker2011].
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
+import casadi
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from stages.tube.casadi_model import CasadiTubes
-from stages.tube.casadi_statics import derive_loaded
+from stages.tube.casadi_rates import SAME_MM, bending_n_mm2, landmarks_mm, rest_curvature_per_mm
 from stages.tube.device import Tube
 from stages.tube.errors import ConvergenceError
 from stages.tube.sequences import BEND_RAD, joint_steps, together
+
+STEPS = 24
+"""Runge-Kutta steps in each piece."""
+STAGES = tuple((k / 12.0) ** 3 for k in range(13))
+"""Shares of the needle's stiffness with which its shape is looked for, one after the other."""
+LARGEST_RESIDUAL = 1e-9
+"""In mm, rad and units of a quaternion: a larger one after Newton's method means that it did not converge."""
+# Places in the state of the loaded tubes: position, quaternion of the Bishop frame, force and moment in the
+# frame of the front plate; then angles and torsional moments.  The same without force and moment follow for
+# the tubes before the needle comes.
+POSITION, ROTATION, FORCE, MOMENT, FIRST_ANGLE = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13), 13
+
+
+@frozen_record
+class LoadedShape:
+    """Tubes with a needle in them, in the frame of the front plate.
+
+    Args:
+        arc_lengths_mm ((N,) float64): From the front plate to the tubes' tip.
+        points_mm: (N, 3) float64.
+        base_from_tip ((4, 4) float64): Frame of the tubes' tip, carried along without turning.
+        tip_angles_rad ((n,) float64): Angle of each tube at its own end.
+    """
+
+    arc_lengths_mm: Float
+    points_mm: Float
+    base_from_tip: Float
+    tip_angles_rad: Float
+
+
+def derive_loaded(
+    tubes: Sequence[Tube],
+    needle: Tube,
+    base_angles_rad: ArrayLike,
+    beta_mm: ArrayLike,
+    needle_mm: float,
+    *,
+    tissue_n_mm2: float = 0.0,
+    tissue_from_mm: float = 0.0,
+) -> LoadedShape:
+    """Return the shape of tubes that stood in tissue without a needle, when its tip is at `needle_mm`.
+
+    Args:
+        tubes: The innermost first.
+        needle: Straight.
+        base_angles_rad, beta_mm ((n,) float64): See `stages.tube.mechanics.TubeMechanics`.
+        needle_mm: Arc length of the needle's tip from the front plate.
+        tissue_n_mm2, tissue_from_mm: Force for each mm of tube and mm aside, beyond an arc length.  Far
+            stiffer tissue than lungs makes the problem too steep.
+
+    Raises:
+        ConvergenceError: If no shape is found.
+        SettingsError: As `CasadiTubes.solve`, or if nothing is ahead of the front plate.
+    """
+    beta, base = np.asarray(beta_mm, dtype=np.float64), np.asarray(base_angles_rad, dtype=np.float64)
+    before = CasadiTubes(tubes).solve(base, beta)
+    pieces = _pieces(tubes, needle, beta, needle_mm, tissue_from_mm)
+    if not pieces:
+        raise SettingsError("No tube is ahead of the front plate", expected="deployed tubes")
+    tip = before.base_from_tip
+    carried = Rotation.from_matrix(tip[:3, :3]) * Rotation.from_euler("z", -before.tip_angles_rad[0])
+    unloaded = [*tip[:3, 3], *np.roll(carried.as_quat(canonical=True), 1)]
+    problem = _Shooting(tubes, needle, beta, needle_mm, pieces, tissue_n_mm2, tissue_from_mm)
+    reference = np.concatenate([unloaded, before.tip_angles_rad])
+    unknown = reference.copy()
+    for share in STAGES:
+        unknown = problem.solved(unknown, reference, base, share)
+    states = np.array(problem.body(unknown, reference, 1.0).full())
+    places = np.concatenate([np.linspace(far, near, STEPS + 1)[1:] for far, near in pieces])
+    found = np.eye(4)
+    found[:3, 3] = unknown[:3]
+    found[:3, :3] = Rotation.from_quat(np.roll(unknown[3:7], -1)).as_matrix()
+    return LoadedShape(
+        arc_lengths_mm=read_only(np.append(pieces[0][0], places)[::-1].copy()),
+        points_mm=read_only(np.vstack([unknown[:3], states[POSITION].T])[::-1].copy()),
+        base_from_tip=read_only(found),
+        tip_angles_rad=read_only(unknown[7:]),
+    )
+
+
+def _pieces(
+    tubes: Sequence[Tube], needle: Tube, beta: Float, needle_mm: float, tissue_from_mm: float
+) -> list[tuple[float, float]]:
+    """Return far and near ends of the pieces in which nothing changes, from the tip to the front plate."""
+    tip = float(beta[0]) + tubes[0].length_mm
+    marks = {0.0, tip, tissue_from_mm}
+    for body, rear in zip((*tubes, needle), (*beta, needle_mm - needle.length_mm), strict=True):
+        marks |= {float(rear) + mark for mark in landmarks_mm(body)}
+    ends = [0.0]
+    for mark in sorted(marks):
+        if ends[-1] + SAME_MM < mark <= tip:
+            ends.append(mark)
+    return [(far, near) for near, far in itertools.pairwise(ends)][::-1]
+
+
+class _Shooting:
+    """Carries a guess of the tip to the front plate."""
+
+    def __init__(
+        self,
+        tubes: Sequence[Tube],
+        needle: Tube,
+        beta: Float,
+        needle_mm: float,
+        pieces: list[tuple[float, float]],
+        tissue_n_mm2: float,
+        tissue_from_mm: float,
+    ) -> None:
+        self._tubes, self._beta, self._pieces = tubes, beta, pieces
+        self._needle, self._needle_rear = needle, needle_mm - needle.length_mm
+        self._twisting = [tube.torsional_stiffness_n_mm2 for tube in tubes]
+        self._tissue = [tissue_n_mm2 if near >= tissue_from_mm - SAME_MM else 0.0 for _far, near in pieces]
+        n = len(tubes)
+        unknown, reference = casadi.MX.sym("unknown", 7 + n), casadi.MX.sym("reference", 7 + n)
+        base, share = casadi.MX.sym("base", n), casadi.MX.sym("share")
+        states = self._carried(unknown, reference, share)
+        last = states[:, -1]
+        twisted = last[FIRST_ANGLE + n : FIRST_ANGLE + 2 * n] / casadi.DM(self._twisting)
+        angles = last[FIRST_ANGLE : FIRST_ANGLE + n] + casadi.DM(beta) * twisted
+        residual = casadi.vertcat(last[POSITION], last[ROTATION] - casadi.DM([1, 0, 0, 0]), angles - base)
+        self.body = casadi.Function("body", [unknown, reference, share], [states])
+        given = casadi.vertcat(reference, base, share)
+        self._residual = casadi.Function("residual", [unknown, given], [residual])
+        options = {"abstol": 1e-12, "max_iter": 40, "error_on_fail": False}
+        self._root = casadi.rootfinder("root", "newton", {"x": unknown, "p": given, "g": residual}, options)
+
+    def solved(self, guess: Float, reference: Float, base: Float, share: float) -> Float:
+        """Return tip position, quaternion and angles for which the front plate is where it is."""
+        given = np.concatenate([reference, base, [share]])
+        found = self._root(x0=guess, p=given)["x"]
+        left = float(np.abs(self._residual(found, given).full()).max())
+        if not left <= LARGEST_RESIDUAL:
+            raise ConvergenceError(
+                f"With {share:.3g} of the needle's stiffness Newton's method leaves a residual of {left:.3g}",
+                expected=f"at most {LARGEST_RESIDUAL:g}",
+                remedy="Take softer tissue, or tubes farther from a snap",
+            )
+        return np.asarray(found.full()[:, 0])
+
+    def _carried(self, unknown: Any, reference: Any, share: Any) -> Any:
+        """Return the states after each step, from the tip on."""
+        n = len(self._tubes)
+        rest = casadi.MX.zeros(n)
+        tip = casadi.vertcat(unknown[:7], casadi.MX.zeros(6), unknown[7:], rest, reference, rest)
+        states, state = [], tip
+        for (far, near), tissue in zip(self._pieces, self._tissue, strict=True):
+            step = self._step(0.5 * (far + near), tissue)
+            shares, length = casadi.repmat(share, 1, STEPS), casadi.DM([(near - far) / STEPS])
+            states.append(step.mapaccum(STEPS)(state, casadi.repmat(length, 1, STEPS), shares))
+            state = states[-1][:, -1]
+        return casadi.horzcat(*states)
+
+    def _step(self, middle: float, tissue: float) -> Any:
+        """Return the Runge-Kutta step in a piece: state, step in mm, share of the needle -> state."""
+        n = len(self._tubes)
+        state, length = casadi.SX.sym("state", FIRST_ANGLE + 4 * n + 7), casadi.SX.sym("step_mm")
+        share = casadi.SX.sym("share")
+        rate = casadi.Function("rate", [state, share], [self._rates(state, share, middle, tissue)])
+        first = rate(state, share)
+        second = rate(state + 0.5 * length * first, share)
+        third = rate(state + 0.5 * length * second, share)
+        fourth = rate(state + length * third, share)
+        after = state + length / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+        return casadi.Function("step", [state, length, share], [after])
+
+    def _rates(self, state: Any, share: Any, middle: float, tissue: float) -> Any:
+        """Return the derivative of the state by arc length [Rucker2011]."""
+        n = len(self._tubes)
+        bending, rest = [], []
+        for tube, rear in zip(self._tubes, self._beta, strict=True):
+            marks = landmarks_mm(tube)
+            part = int(np.searchsorted(marks, middle - rear))
+            bending.append(bending_n_mm2(tube, marks, part))
+            rest.append(rest_curvature_per_mm(tube, marks, part))
+        marks = landmarks_mm(self._needle)
+        stiff = bending_n_mm2(self._needle, marks, int(np.searchsorted(marks, middle - self._needle_rear)))
+        loaded, before = state[: FIRST_ANGLE + 2 * n], state[FIRST_ANGLE + 2 * n :]
+        ahead, ahead_before = _forward(loaded[ROTATION]), _forward(before[ROTATION])
+        off = loaded[POSITION] - before[POSITION]
+        across = off - ahead_before * casadi.dot(ahead_before, off)
+        # A vector in the frame of a quaternion.
+        quaternion = loaded[ROTATION]
+        vector = loaded[MOMENT]
+        axis, w = -quaternion[1:], quaternion[0]
+        aside = 2 * casadi.cross(axis, vector)
+        local = vector + w * aside + casadi.cross(axis, aside)
+        rates = []
+        for part, moment, total in (
+            (loaded[FIRST_ANGLE:], local, sum(bending) + share * stiff),
+            (before[7:], casadi.SX.zeros(3), sum(bending)),
+        ):
+            turns = [_rotated(part[i], rest[i]) for i in range(n)]
+            u = (moment[:2] + sum(bending[i] * turns[i] for i in range(n))) / total
+            twists = [part[n + i] / self._twisting[i] if bending[i] else casadi.SX(0) for i in range(n)]
+            pulls = [bending[i] * (u[0] * turns[i][1] - u[1] * turns[i][0]) for i in range(n)]
+            rates.append((u, [*twists, *pulls]))
+        (u, twisted), (u_before, twisted_before) = rates
+        return casadi.vertcat(
+            ahead, _spin(loaded[ROTATION], u), tissue * across, casadi.cross(loaded[FORCE], ahead), *twisted,
+            ahead_before, _spin(before[ROTATION], u_before), *twisted_before,
+        )  # fmt: skip
+
+
+def _forward(quaternion: Any) -> Any:
+    """Return the forward direction of a quaternion (w, x, y, z)."""
+    w, x, y, z = casadi.vertsplit(quaternion)
+    return casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
+
+
+def _rotated(angle: Any, vector: Float) -> Any:
+    c, s = casadi.cos(angle), casadi.sin(angle)
+    return casadi.vertcat(c * vector[0] - s * vector[1], s * vector[0] + c * vector[1])
+
+
+def _spin(quaternion: Any, u: Any) -> Any:
+    """Return the derivative of a quaternion by a curvature (2,) in its own frame."""
+    w, x, y, z = casadi.vertsplit(quaternion)
+    a, b = u[0], u[1]
+    return 0.5 * casadi.vertcat(-x * a - y * b, w * a - z * b, w * b + z * a, x * b - y * a)
+
 
 STEP_MM = 1.0
 """Largest motion between two steps."""

@@ -15,12 +15,13 @@ from anatomy.base.typed import Bool, Float, Int
 from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.poses import pose
 from stages.tube import kernels
-from stages.tube.design_shapes import coarser_shapes, shapes_of
+from stages.tube.arcs import points_on_arcs
+from stages.tube.design_shapes import ShapeTree, coarser_shapes, shapes_of
 from stages.tube.device import ConcentricTubes
 from stages.tube.environment import DEFAULT_ROTATIONS, THREADS, tube_constants, tube_environment
 from stages.tube.kernels import placing
-from stages.tube.shape_tree import ShapeTree
 from stages.tube.shapes import TubeShapes
 from stages.tube.validation import REASONS
 
@@ -272,3 +273,20 @@ def _joined(parts: list[Deployments], first_site: Int) -> Deployments:
     for why in dict.fromkeys(why for part in parts for why in part.refused):
         refused[why] = sum(part.refused.get(why, 0) for part in parts)
     return Deployments(**arrays, candidates=sum(part.candidates for part in parts), refused=refused)
+
+
+def exit_points(tubes: ConcentricTubes, scope_tips: Float, deployments: Deployments, chosen: Int) -> Float:
+    """Return the points `(N, 3)` LPS mm at which the axes of chosen deployments leave the lumen for good.
+
+    Args:
+        scope_tips ((S, 9) float64): Point, direction and +x of the frame of each scope tip, LPS mm;
+            `deployments.site` counts them.
+        chosen ((N,) int64): Which of the deployments.
+    """
+    tips, at_mm = scope_tips[deployments.site[chosen]], deployments.exit_mm[chosen]
+    rotations = deployments.rotation_rad[chosen]
+    shapes, points = shapes_of(tubes), np.zeros((len(chosen), 3))
+    for row, (tip, shape) in enumerate(zip(tips, deployments.shape[chosen].tolist(), strict=True)):
+        frame = pose(tip[:3], tip[3:6], tip[6:])
+        points[row] = points_on_arcs(shapes.arcs_of(shape), frame, float(rotations[row]), at_mm[row])[0]
+    return points

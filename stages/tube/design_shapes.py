@@ -9,13 +9,146 @@ from typing import Any
 
 import numpy as np
 
+from anatomy.base.records import frozen_record
 from anatomy.base.settings import to_mapping
-from anatomy.base.typed import Int
+from anatomy.base.typed import Float, Int
+from anatomy.grid import read_only
 from anatomy.kept_records import kept_record, record_path
 from anatomy.machine_code.sources import kernel_digest
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.shape_tree import STILL_MM, ShapeTree, tree_of_shapes
+from stages.tube.kernels import placing
 from stages.tube.shapes import ShapeGrid, ShapeLimits, TubeShapes, tube_shapes
+
+TOLERANCE_MM = 0.1
+"""Shapes nearer to each other share a beginning: less than what tubes are off by anyway."""
+EXACT_MM = 1e-9
+"""The tolerance where nothing twists: shapes are few then, and those with one beginning have it exactly."""
+SWEEP_CLASSES = np.array([0.0, 0.125, 0.25, 0.5, 1.0])
+"""Shares of the largest sweep, up to which sweeps are rounded where they enter the clearance."""
+STILL_MM = 1e-6
+"""Less sweep is rounding."""
+
+
+@frozen_record
+class ShapeTree:
+    """The stretches of the shapes of a design, M nodes, each followed right after those before it.
+
+    Args:
+        depth, skip ((M,) int64): Level from 1 on; the node to go on with where this one is refused.
+        first ((M + 1,) int64): Where the `stretches` of each node begin.
+        stretches ((R, 12) float64): See `stages.tube.kernels.placing`.
+        radius, clearance ((M,) float64): Outermost radius; what has to be free beside it and the margins, for
+            sweep and tolerance; mm.
+        first_shape ((M + 1,) int64): Where the `shapes` (S,) begin that end with each node.
+    """
+
+    depth: Int
+    skip: Int
+    first: Int
+    stretches: Float
+    radius: Float
+    clearance: Float
+    first_shape: Int
+    shapes: Int
+
+    def with_margin(self, margin_mm: float) -> tuple[np.ndarray, ...]:
+        """Return the tree as `placing.place_tree` takes it, every clearance larger by a margin."""
+        return (
+            self.depth, self.skip, self.first, self.stretches, self.radius,
+            self.clearance + margin_mm, self.first_shape, self.shapes,
+        )  # fmt: skip
+
+
+def tree_of_shapes(shapes: TubeShapes, *, tolerance_mm: float | None = None) -> ShapeTree:
+    """Return the tree of shapes that share their beginnings within a tolerance.
+
+    Args:
+        tolerance_mm: Largest distance between shapes that share a stretch; how far they really are enters
+            clearances.  TOLERANCE_MM, or EXACT_MM where nothing twists, if None.
+    """
+    if tolerance_mm is None:
+        tolerance_mm = TOLERANCE_MM if shapes.rotations_rad.any() else EXACT_MM
+    stop = shapes.stop_mm
+    places = np.rint(shapes.insertions_mm[:, 0] / stop).astype(np.int64)
+    most = int(places.max(initial=0))
+    ends, middles = np.zeros((shapes.count, most + 1, 3)), np.zeros((shapes.count, most + 1, 3))
+    radii = np.zeros((shapes.count, most + 1))
+    cut = [np.zeros((0, placing.STRETCH_COLUMNS))] * shapes.count
+    room = np.zeros((most + int(np.diff(shapes.first_arc).max(initial=0)) + 1, placing.STRETCH_COLUMNS))
+    for shape in range(shapes.count):
+        rows = placing.cut_at_stops(
+            shapes.arcs_of(shape), stop, room, ends[shape], middles[shape], radii[shape]
+        )
+        cut[shape] = room[:rows].copy()
+    groups, sweeps = _sweep_classes(shapes)
+    nodes, errors, leaf = _grown(places, groups, ends, middles, radii, tolerance_mm)
+    return _in_order(shapes, cut, stop, nodes, errors, leaf, radii, sweeps[groups])
+
+
+def _sweep_classes(shapes: TubeShapes) -> tuple[Int, Float]:
+    """Return the class of each shape's sweep `(S,)`, and up to where each class reaches, mm."""
+    reach = SWEEP_CLASSES * max(float(shapes.lateral_sweep_mm.max(initial=0.0)), STILL_MM)
+    reach[0] = STILL_MM
+    groups = np.searchsorted(reach, shapes.lateral_sweep_mm).astype(np.int64)
+    reach[0] = 0.0
+    return groups, reach
+
+
+def _grown(
+    places: Int, groups: Int, ends: Float, middles: Float, radii: Float, tolerance: float
+) -> tuple[Int, Float, Int]:
+    room = 4 * len(places) + 16
+    while True:
+        nodes, errors = np.zeros((room, 4), dtype=np.int64), np.zeros(room)
+        leaf = np.zeros(len(places), dtype=np.int64)
+        count = placing.grow(places, groups, ends, middles, radii, tolerance, nodes, errors, leaf)
+        if count >= 0:
+            return nodes[:count], errors[:count], leaf
+        room *= 2
+
+
+def _in_order(
+    shapes: TubeShapes,
+    cut: list[Float],
+    stop: float,
+    nodes: Int,
+    errors: Float,
+    leaf: Int,
+    radii: Float,
+    sweeps: Float,
+) -> ShapeTree:
+    """Return the tree with its nodes in the order in which they are followed."""
+    count = len(nodes)
+    parents, places, firsts = nodes[:, 0], nodes[:, 1], nodes[:, 2]
+    ending = np.bincount(leaf, minlength=count)
+    size = np.ones(count, dtype=np.int64)
+    for node in range(count - 1, -1, -1):  # children come after their parents
+        if parents[node] >= 0:
+            size[parents[node]] += size[node]
+    rank, room = np.zeros(count, dtype=np.int64), np.zeros(count + 1, dtype=np.int64)
+    for node in range(count):
+        rank[node] = room[parents[node] + 1]
+        room[parents[node] + 1] += size[node]
+        room[node + 1] = rank[node] + 1
+    order = np.argsort(rank)
+    stop_of = [np.floor((rows[:, placing.BEGINS] + STILL_MM) / stop).astype(np.int64) + 1 for rows in cut]
+    own = [cut[firsts[node]][stop_of[firsts[node]] == places[node]] for node in order]
+    arc_errors = np.zeros(count)
+    np.maximum.at(arc_errors, leaf, shapes.arc_error_mm)
+    for node in range(count - 1, -1, -1):
+        if parents[node] >= 0:
+            arc_errors[parents[node]] = max(arc_errors[parents[node]], arc_errors[node])
+    return ShapeTree(
+        depth=read_only(places[order]),
+        skip=read_only((rank + size)[order]),
+        first=read_only(np.concatenate([[0], np.cumsum([len(rows) for rows in own])]).astype(np.int64)),
+        stretches=read_only(np.concatenate([np.zeros((0, placing.STRETCH_COLUMNS)), *own])),
+        radius=read_only(radii[firsts, places][order]),
+        clearance=read_only((sweeps[firsts] + errors + arc_errors)[order]),
+        first_shape=read_only(np.concatenate([[0], np.cumsum(ending[order])]).astype(np.int64)),
+        shapes=read_only(np.argsort(rank[leaf], kind="stable").astype(np.int64)),
+    )
+
 
 KEPT = 4
 """Designs in memory: a system, and variants of it that are compared with it."""

@@ -12,10 +12,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float
 from anatomy.grid import read_only
-from stages.tube.equilibrium import Equilibrium, matrices
+from stages.tube.equilibrium import SAME_MM, Equilibrium, NestedTubes, matrices
 from stages.tube.errors import ConvergenceError
 from stages.tube.kernels import equilibrium
-from stages.tube.nesting import SAME_MM, NestedTubes
 
 
 @frozen_record

@@ -20,10 +20,9 @@ from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
 from stages.tube.arcs import TubeShape
 from stages.tube.device import Tube
-from stages.tube.equilibrium import matrices
+from stages.tube.equilibrium import SAME_MM, matrices
 from stages.tube.kernels import shapes as kernel
 from stages.tube.mechanics import TubeMechanics
-from stages.tube.nesting import SAME_MM
 from stages.tube.sequences import BEND_RAD
 
 SNAPS = "the tubes would snap on the way"

@@ -27,7 +27,7 @@ from stages.scope.motion_proof import prove_motion
 from stages.scope.motions import ScopeMotions, find_motions
 from stages.scope.route.centreline import from_graph, from_tree
 from stages.scope.route.planner import plan_route
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import RouteLimits
 from stages.scope.tour.exits import find_exits
 from stages.scope.tour.itinerary import shortest_tour
 from stages.scope.tour.subtree import subtree_to

@@ -13,7 +13,7 @@ from experiments.support.mutants.twisted import MOVED_MM
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from stages.tube import Neighbourhood, pieces_of_arcs
-from stages.tube.nearby import NearbyShape
+from stages.tube.one_shape import NearbyShape
 
 
 @of_needle

@@ -12,8 +12,7 @@ from experiments.support.route.sampling import grow
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve, interpolate
 from stages.scope.route.guide_path import NoRouteError
-from stages.scope.route.proof import prove
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import RouteLimits, prove
 
 
 @settings

@@ -15,7 +15,7 @@ from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.genetic import GeneticSettings, cut_segments, repair_genetic, search_segment
 from stages.scope.route.planner import Replanner, plan_route
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import RouteLimits
 
 REPEATS = 7
 """Of so many runs with one process and with two, the quickest counts: others may use the machine too."""

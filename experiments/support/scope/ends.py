@@ -11,13 +11,12 @@ from scipy.spatial import cKDTree
 
 from anatomy.lung import Lung
 from experiments.support.scope.goals import end_goals, ends, goal_with_clearance
-from stages.scope.advisor.advisor import Advisor, start_state
+from stages.scope.advisor.advisor import Advisor, PathSettings, start_state
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, joints
 from stages.scope.advisor.lumen import Lumen, lumen_of_lung
 from stages.scope.advisor.nf1 import navigation_field
 from stages.scope.advisor.path import ScopePath
-from stages.scope.advisor.path_search import PathSettings
 
 NEAR_MM = 10.0
 

@@ -11,12 +11,11 @@ from anatomy.lung import Lung
 from experiments.support.machine import median_cpu_s
 from experiments.support.results import Result
 from experiments.support.scope.goals import PAPER_VOXELS, end_goals, ends, goal_with_clearance, paper_sized
-from stages.scope.advisor.advisor import Advisor, start_state
+from stages.scope.advisor.advisor import Advisor, PathSettings, start_state
 from stages.scope.advisor.best_motion import evaluate_motions
 from stages.scope.advisor.kinematics import ScopeModel
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import Goal, goal_at, navigation_field
-from stages.scope.advisor.path_search import PathSettings
 
 FIELD_S, MOTION_S, PATH_S = 10.0, 0.3, 31.0
 """[Rosell2012, section VI]: 10 s, 0.3 s, and 31 s with a standard deviation of 2 s in 10 runs."""

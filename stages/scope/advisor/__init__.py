@@ -5,7 +5,15 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from stages.scope.advisor.advisor import Advice, Advisor, ThinnerScope, start_state, why_stopped
+    from stages.scope.advisor.advisor import (
+        Advice,
+        Advisor,
+        PathSearch,
+        PathSettings,
+        ThinnerScope,
+        start_state,
+        why_stopped,
+    )
     from stages.scope.advisor.best_motion import (
         Candidates,
         Motion,
@@ -14,7 +22,6 @@ if TYPE_CHECKING:
         evaluate_motions,
     )
     from stages.scope.advisor.environment import ScopeEnvironment
-    from stages.scope.advisor.instructions import Instruction, instructions_along
     from stages.scope.advisor.kinematics import (
         ScopeModel,
         ScopeState,
@@ -27,7 +34,13 @@ if TYPE_CHECKING:
     )
     from stages.scope.advisor.lumen import Lumen, lumen_of_lung, lumen_of_mask
     from stages.scope.advisor.nf1 import Goal, NavigationField, goal_at, navigation_field
-    from stages.scope.advisor.path import MARKUPS_SCHEMA, FlyThrough, ScopePath, camera_flight
-    from stages.scope.advisor.path_search import PathSearch, PathSettings
+    from stages.scope.advisor.path import (
+        MARKUPS_SCHEMA,
+        FlyThrough,
+        Instruction,
+        ScopePath,
+        camera_flight,
+        instructions_along,
+    )
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from stages.scope.route.genetic import GeneticSettings
     from stages.scope.route.guide_path import GuidePath, Links, NoRouteError, fewest_hops, nearest_links
     from stages.scope.route.planner import Replanner, Route, plan_route, require_proved
-    from stages.scope.route.proof import Proof, RouteMetrics, measure, prove
-    from stages.scope.route.settings import RouteLimits
+    from stages.scope.route.proof import Proof, RouteLimits, RouteMetrics, measure, prove
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

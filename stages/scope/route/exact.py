@@ -11,11 +11,9 @@ from anatomy.base.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
 from stages.scope.route.guide_path import GuidePath
-from stages.scope.route.kernels.lagrangian import Program
-from stages.scope.route.kernels.repair import repair
+from stages.scope.route.kernels.repair import Program, repair
 from stages.scope.route.kernels.spline import take_samples
-from stages.scope.route.proof import Proof, prove
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import Proof, RouteLimits, prove
 
 BENDING = 0.02
 """Weight of the squared curvature, in limits."""

@@ -19,7 +19,7 @@ from anatomy.base.settings import quantity, settings
 from anatomy.base.typed import Bool, Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import RouteLimits
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

@@ -23,8 +23,7 @@ from stages.scope.route.guide_path import (
     guide_path_along,
     nearest_links,
 )
-from stages.scope.route.proof import Proof
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import Proof, RouteLimits
 
 Repair = Literal["exact", "ga", "none"]
 

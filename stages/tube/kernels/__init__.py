@@ -6,13 +6,6 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.tube.kernels.aiming import CLOSE_MM, aim_shape
-    from stages.tube.kernels.deployment import tip_of_arcs, validate_arcs
-    from stages.tube.kernels.insertions import (
-        INSERTION_STEP_MM,
-        greatest_insertions,
-        insertions_exist,
-        sweep_slope,
-    )
     from stages.tube.kernels.one_shape import (
         DesignArrays,
         ManyShapes,
@@ -23,10 +16,12 @@ if TYPE_CHECKING:
         take_over,
         whole_way,
     )
+    from stages.tube.kernels.placing import tip_of_arcs, validate_arcs
     from stages.tube.kernels.planar import (
         CURVED_LENGTH,
         INNER_CURVATURE,
         INNER_RADIUS,
+        INSERTION_STEP_MM,
         MARGIN,
         MAX_EXTENSION,
         MAX_PROTRUSION,
@@ -37,9 +32,12 @@ if TYPE_CHECKING:
         OUTER_RADIUS,
         OVERLAP_CURVATURE,
         SWEEP_SAMPLES,
+        greatest_insertions,
+        insertions_exist,
         lateral_sweep,
         off_track,
         planar_point,
+        sweep_slope,
     )
     from stages.tube.kernels.shapes import (
         ARC_COLUMNS,

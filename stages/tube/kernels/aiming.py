@@ -9,8 +9,8 @@ import math
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
-from stages.tube.kernels.deployment import tip_of_arcs
 from stages.tube.kernels.one_shape import MAX_EXTENSION, in_order, near_shape, take_over, whole_way
+from stages.tube.kernels.placing import tip_of_arcs
 from stages.tube.kernels.shapes import TIP
 
 ITERATIONS = 30

@@ -14,7 +14,7 @@ from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning.one_stage.scope import advise_scope
 from lungaccess.problem.system import System, load_system
-from stages.scope.advisor.instructions import instructions_along
+from stages.scope.advisor.path import instructions_along
 
 
 @pytest.fixture(scope="module")

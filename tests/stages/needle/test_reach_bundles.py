@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from anatomy.poses import pose
-from stages.needle.kernels import reach_bundles as kernel
+from stages.needle.kernels import reach_arcs as kernel
 from stages.needle.path import CURVATURE, ROLL, direct_path
 
 

@@ -375,7 +375,7 @@ def choose_tubes(
         scene: Scene.
         sizes (pair of Sizes): What is left of the errors for a needle that is planned again behind the tubes,
             and for another.
-        environment, constants: Of the tubes, see `stages.tube.kernels.deployment`.
+        environment, constants: Of the tubes, see `stages.tube.kernels.placing`.
         choices: Choices.
         planned, vias ((A, 3), (A - 1, 3) float64): The planned path of the needle and where its arcs meet, in
             the frame of its start.

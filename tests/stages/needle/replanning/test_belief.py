@@ -9,8 +9,7 @@ import pytest
 
 from anatomy.base.typed import Float
 from stages.needle.path import ArcPath, Query, arc_transform, direct_path
-from stages.needle.replanning.belief import FACTORS, Belief, Unknown, tilt
-from stages.needle.replanning.insertion import TrueNeedle, steer
+from stages.needle.replanning.insertion import FACTORS, Belief, TrueNeedle, Unknown, steer, tilt
 from stages.needle.replanning.replanner import Replanner, ReplanSettings
 from tests.stages.needle.replanning.around_a_ball import BESIDE, KAPPA, query, with_ball
 

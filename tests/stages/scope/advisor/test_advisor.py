@@ -9,15 +9,13 @@ import pytest
 
 from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
-from stages.scope.advisor.advisor import Advisor, start_state, why_stopped
+from stages.scope.advisor.advisor import Advisor, PathSettings, start_state, why_stopped
 from stages.scope.advisor.best_motion import Motion
 from stages.scope.advisor.environment import ScopeEnvironment
-from stages.scope.advisor.instructions import instructions_along
 from stages.scope.advisor.kinematics import ScopeModel, advanced, straight_state
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import goal_at
-from stages.scope.advisor.path import ScopePath, camera_flight
-from stages.scope.advisor.path_search import PathSettings
+from stages.scope.advisor.path import ScopePath, camera_flight, instructions_along
 from tests.stages.scope.airways import CARINA, LEFT, LINES, RIGHT, tube, wall_mm
 
 MODEL = ScopeModel(radius_mm=1.5, twist_low_deg=-90.0, bend_low_deg=-120.0)

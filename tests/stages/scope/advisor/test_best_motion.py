@@ -10,13 +10,12 @@ import pytest
 
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
-from stages.scope.advisor.advisor import Advisor, start_state
+from stages.scope.advisor.advisor import Advisor, PathSettings, start_state
 from stages.scope.advisor.best_motion import CANDIDATES, VERDICTS, Motion, Weights, evaluate_motions, offsets
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, advanced, tool_frames
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import goal_at, navigation_field
-from stages.scope.advisor.path_search import PathSettings
 from tests.stages.scope.airways import LINES
 
 WEIGHTS = Weights(nf1=0.5, clearance=0.3, twist=0.2)

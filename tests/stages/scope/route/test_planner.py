@@ -14,8 +14,7 @@ from stages.scope.route.exact import segments
 from stages.scope.route.genetic import repair_genetic
 from stages.scope.route.guide_path import NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.planner import Replanner, plan_route
-from stages.scope.route.proof import Proof, measure
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import Proof, RouteLimits, measure
 from tests.stages.scope.route.tubes import chain, corner, fork, least_clearance_of_corner, straight
 
 LIMITS = RouteLimits(max_curvature_per_mm=0.1)

@@ -12,7 +12,7 @@ from anatomy.io.centerlines import read_centerlines
 from stages.scope.route.centreline import Centreline, from_mask, from_tree
 from stages.scope.route.guide_path import Links, NoRouteError, fewest_hops, nearest_links
 from stages.scope.route.planner import Replanner, plan_route
-from stages.scope.route.settings import RouteLimits
+from stages.scope.route.proof import RouteLimits
 
 pytestmark = pytest.mark.data
 LIMITS = RouteLimits(max_curvature_per_mm=0.1, end_tolerance_mm=1.0)

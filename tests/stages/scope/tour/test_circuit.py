@@ -9,9 +9,16 @@ import pytest
 
 from anatomy.base.errors import SettingsError
 from experiments.support.tour_models import random_airway, random_lesions
-from stages.scope.tour.circuit import circuits
 from stages.scope.tour.exits import find_exits
-from stages.scope.tour.subtree import EXAMPLE_BETA, LEFT, Resistances, Subtree, branch_resistances, subtree_to
+from stages.scope.tour.subtree import (
+    EXAMPLE_BETA,
+    LEFT,
+    Resistances,
+    Subtree,
+    branch_resistances,
+    circuits,
+    subtree_to,
+)
 from tests.stages.scope.tour.trees import ends_of, exit_at, figure_1
 
 ETA = 1.0

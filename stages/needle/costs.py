@@ -17,12 +17,7 @@ from stages.needle.path import ArcPath, kernel_arcs
 
 
 def obstacle_clearance_mm(obstacles: Obstacles, points: Float) -> Float:
-    """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle.
-
-    Args:
-        obstacles: See `NeedleEnvironment`: obstacles are taken as solid boxes or voxel centres as stated
-            there.
-    """
+    """Return the distances `(N,)` in mm from points `(N, 3)`, LPS mm, to the nearest obstacle."""
     field, labels, geometry, bits = obstacles
     places = np.array(points, dtype=np.float64, order="C")
     clearance = np.zeros(len(places))
@@ -42,9 +37,6 @@ def inverse_clearance(obstacles: Obstacles, path: ArcPath) -> float:
 
     By the trapezoid rule with steps of at most 0.1 mm; clearance is that of the needle's axis, no less than
     0.1 mm.
-
-    Args:
-        obstacles: See `NeedleEnvironment`.
     """
     # Greatest step of the trapezoid rule, as long as the least clearance that counts.
     points, lengths = path.sample(0.1)
@@ -116,11 +108,8 @@ def path_costs(
 ) -> dict[str, float]:
     """Return costs of a path by their keys, exactly; see `stages.needle.objective.TERMS`.
 
-    Args:
-        obstacles: See `NeedleEnvironment`.
-        cost_map: Without a map its costs are 0.
-        parts: All that lies in tissue: the tubes beyond the wall, and the path of the needle.
-        terms: Which costs.
+    `parts` are all that lies in tissue: the tubes beyond the wall, and the path of the needle.  Without a map
+    its costs are 0.
     """
     return {term.key: _EVALUATED[term.key](obstacles, cost_map, path, parts) for term in terms}
 

@@ -52,13 +52,10 @@ class NeedleEnvironment:
 def needle_environment(
     lung: Organ, needle: Needle, margins: Margins, *, with_fissures: bool, goal_tolerance_mm: float = 0.0
 ) -> NeedleEnvironment:
-    """Gather what the kernels need to steer `needle` through `lung`.
+    """Gather what the kernels need to steer `needle` through `lung`, whose fissures may be obstacles.
 
-    The needle's axis keeps its radius and the margins from obstacles, whose voxels are solid boxes.
-
-    Args:
-        with_fissures: Whether fissures are obstacles.
-        goal_tolerance_mm: How far from the target a path may end.
+    The needle's axis keeps its radius and the margins from obstacles, whose voxels are solid boxes.  A path
+    may end `goal_tolerance_mm` from the target.
     """
     clearance = lung.obstacle_field(with_fissures=with_fissures)
     bits = obstacle_bits(with_fissures)
@@ -185,18 +182,11 @@ def _environment(
 def workspace_lengths(
     environment: NeedleEnvironment, positions: ArrayLike, tangents: ArrayLike, target: ArrayLike
 ) -> Float:
-    """Return the shortest path length from each start pose to a target, infinite where there is none.
+    """Return the shortest path length from start poses `(E, 3)` to a target, LPS mm, infinite where none is.
 
-    A path may end anywhere within the goal tolerance.  Nothing that a needle reaches is left out.  In free
-    space what is left in can be reached if the angle from the start is limited to 90 degrees, or the turn to
-    180, see `stages.needle.kernels.goal_ball`.
-
-    Args:
-        positions, tangents: (E, 3) float64, LPS mm.
-        target: (3,) float64, LPS mm.
-
-    References:
-        .. [Kuntz2015] fig. 4; [Dubins1957]
+    A path may end anywhere within the goal tolerance.  Nothing that a needle reaches is left out [Kuntz2015,
+    fig. 4; Dubins1957].  In free space what is left in can be reached if the angle from the start is limited
+    to 90 degrees, or the turn to 180, see `stages.needle.kernels.goal_ball`.
     """
     places = _plain(positions)
     lengths = np.zeros(len(places))

@@ -61,7 +61,6 @@ def find_obstruction(environment: NeedleEnvironment, query: Query) -> Obstructio
     """Return what rules out all paths at once by reach, at the start or at the target; None if nothing does.
 
     Only a target out of reach may be so without proof: with a goal tolerance, or wide limits of turning.
-
     """
     found = _reach(environment, query) or blocked_end(environment, query)
     return found and _with_obstacle(environment, found)

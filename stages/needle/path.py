@@ -145,11 +145,7 @@ class ArcPath:
         return np.concatenate(points), np.concatenate(lengths)
 
     def max_angle_from_start_rad(self, reference: Float | None = None) -> float:
-        """Return the largest angle between the tip and a direction, on all of the path.
-
-        Args:
-            reference ((3,) float64): Unit vector; by default the direction at the start.
-        """
+        """Return the largest angle between the tip and a direction `(3,)`, by default that at the start."""
         direction = self.lps_from_start[:3, 2] if reference is None else reference
         least = 1.0
         for frame, (length, roll, curvature) in zip(self.frames(), self.arcs, strict=False):
@@ -192,12 +188,7 @@ def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
 
 
 def path_from_tree(lps_from_start: Float, nodes: Float, parents: Int, last: int) -> ArcPath:
-    """Return the path from the root of a search tree to its node `last`.
-
-    Args:
-        nodes ((M, NODE_COLUMNS) float64): See `stages.needle.kernels.tree`.
-        parents: (M,) int64.
-    """
+    """Return the path from the root of a search tree to its node `last`; see `stages.needle.kernels.tree`."""
     chain = []
     node = last
     while node != 0:
@@ -219,9 +210,7 @@ def blocker_on_path(
 ) -> int:
     """Prove every arc of a path clear; return 0, or the label of the voxel that is too near.
 
-    Args:
-        branch: Pierced branch, whose wall is exempt at the exit; -1 for none.
-        inserted_mm: Length of the needle behind the start of the path.
+    `branch` is the pierced one, -1 for none, and `inserted_mm` the length of the needle behind the start.
     """
     for pose, bend, length in kernel_arcs(path):
         label = blocker_on_arc(
@@ -245,11 +234,8 @@ def violation(
 ) -> str:
     """Tell why a path is no answer to a query; "" if it is one.
 
-    All limits of the needle are tested, and every arc is proved clear.
-
-    Args:
-        goal_tolerance_mm: How far from the target the path may end, where the environment's own tolerance is
-            smaller.
+    All limits of the needle are tested, and every arc is proved clear.  The path may end as far from the
+    target as the larger of `goal_tolerance_mm` and the environment's own tolerance.
     """
     needle = environment.needle
     reference = query.lps_from_start[:3, 2] if query.reference is None else query.reference

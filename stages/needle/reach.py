@@ -100,8 +100,7 @@ class ReachScan:
         """Try all points, cube by cube of `BLOCK_MM`: what neighbours have in common is found once.
 
         Args:
-            points: (N, 3) float64, LPS mm.
-            seeds ((N,) uint64): Seed of the search to each point.
+            points, seeds ((N, 3) float64, (N,) uint64): LPS mm; seed of the search to each point.
             near ((N, K) int64): Indices of points near each, -1 for none; by default the one before.
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
@@ -141,12 +140,9 @@ def _cubes(points: Float) -> tuple[Int, Int]:
 
 
 class StartIndex:
-    """Start poses, sorted into bundles that are alike in place and direction.
+    """Start poses, points `(E, 3)` LPS mm and unit tangents, in bundles alike in place and direction.
 
     It does not depend on the needle, so one index serves all of them.
-
-    Args:
-        positions, tangents ((E, 3) float64): Points, LPS mm, and unit tangents.
     """
 
     def __init__(self, positions: ArrayLike, tangents: ArrayLike) -> None:
@@ -171,14 +167,10 @@ class StartIndex:
         return len(self._order)
 
     def holding(self, environment: NeedleEnvironment, target: ArrayLike) -> tuple[Int, Float]:
-        """Return the poses with a target in their workspace, the nearest first, and path lengths in mm.
+        """Return the poses with a target `(3,)`, LPS mm, in their workspace, nearest first, and path lengths.
 
-        The same as finite entries of `stages.needle.environment.workspace_lengths`; poses at the same length
-        come in their own order.
-
-        Args:
-            environment: The needle.
-            target: (3,) float64, LPS mm.
+        The same as finite entries of `stages.needle.environment.workspace_lengths`, mm; poses at the same
+        length come in their own order.
         """
         found = np.zeros(self.count, dtype=np.int64)
         lengths = np.zeros(self.count)

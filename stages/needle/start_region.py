@@ -226,11 +226,8 @@ def _down(value: float) -> str:
 def prove_starts(environment: NeedleEnvironment, query: Query, path: ArcPath) -> ProvedStarts:
     """Prove for a ball of places times a cone of directions that every start in it has a clear path.
 
-    The paths end within the environment's goal tolerance.  docs/explanation/start_region.md has the
-    theorem.
-
-    Args:
-        path: The planned path from the query's start: its corners are what the proved paths may go through.
+    The paths end within the environment's goal tolerance, and may go through the corners of the planned one.
+    docs/explanation/start_region.md has the theorem.
     """
     limits, branch = environment.limits, query.branch
     families = [_Family(environment, query, vias) for vias in _vias_of(path)]
@@ -256,11 +253,8 @@ def proved_factor(
 ) -> float:
     """Return the largest share of a deviation, at most 1, up to which all start poses are proved.
 
-    For many paths this is a fast measure of how much of a deviation of the start they bear: it takes a
-    fraction of `prove_starts`.
-
-    Args:
-        offset_mm, tilt_rad: The whole deviation, such as three times the errors that are expected; above 0.
+    The whole deviation, above 0, is such as three times the errors that are expected.  For many paths this is
+    a fast measure of how much they bear: it takes a fraction of `prove_starts`.
     """
     limits, branch = environment.limits, query.branch
     families = (_Family(environment, query, vias) for vias in _vias_of(path))

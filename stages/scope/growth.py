@@ -39,11 +39,7 @@ class StateTree:
     turned_from: Int
 
     def only(self, needed: Int) -> "tuple[StateTree, Int]":
-        """Return the states on the ways to some of them, and the new numbers of those.
-
-        Args:
-            needed ((S,) int64): Numbers of states.
-        """
+        """Return the states on the ways to some `(S,)` of them, and the new numbers of those."""
         keep = np.zeros(len(self.parent), dtype=np.bool_)
         keep[needed] = True
         keep[:1] = True

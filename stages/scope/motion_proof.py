@@ -128,14 +128,10 @@ class MotionProver:
         return motion if isinstance(self.prove(found), str) else found
 
     def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> "TipRow":
-        """Return tips along the motion to one of them, and which of them may be tips of a plan.
+        """Return tips along a proved motion to one of them, and which of them may be tips of a plan.
 
-        Those have a proved motion and lie in the region of scope tips, as all tips of `find_motions` do.
-
-        Args:
-            motion: A proved one.
-            shifts_mm ((K,) float64): How much farther the base stops, see
-                `stages.scope.motion_proof.shifted`.
+        Those have a proved motion and lie in the region of scope tips, as all tips of `find_motions` do.  The
+        base stops farther by shifts `(K,)` mm, see `shifted`.
         """
         shifts = np.ascontiguousarray(np.atleast_1d(np.asarray(shifts_mm, dtype=np.float64)))
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
@@ -193,12 +189,10 @@ MAX_TURN_AT_TIP_RAD = math.radians(45.0)
 
 
 def in_tip_region(tree: AirwayTree, tips: Float) -> tuple[Int, Bool]:
-    """Return the nearest tree point of each tip `(S,)`, and whether the tip lies in the region `(S,)`.
+    """Return the nearest tree point of tips `(S, >= 6)`, and whether each lies in the region of tips, `(S,)`.
 
-    Proofs that a target is unreachable rule out all of this region, so every tip of a motion lies in it.
-
-    Args:
-        tips ((S, >= 6) float64): Point and unit direction of each tip, LPS mm.
+    A tip is a point and a unit direction, LPS mm.  Proofs that a target is unreachable rule out all of this
+    region, so every tip of a motion lies in it.
     """
     distance_mm, nearest = tree.nearest_point_index.query(tips[:, :3])
     cosine = np.einsum("sk,sk->s", tips[:, 3:6], tree.tangents[nearest])

@@ -107,11 +107,7 @@ class RestingShape:
 
 
 class RestingShaft:
-    """Brings the shaft of a bronchoscope to rest in a lumen.
-
-    Args:
-        lumen: See `lumen_of`.
-    """
+    """Brings the shaft of a bronchoscope to rest in a lumen, see `lumen_of`."""
 
     def __init__(self, lumen: Lumen, scope: Bronchoscope, contact: "WallContact") -> None:
         self._lumen, self._scope, self._contact = lumen, scope, contact

@@ -16,10 +16,7 @@ class TubeShape:
     """One deployment of a design, in the frame of the scope tip before all tubes are turned together.
 
     Args:
-        insertions_mm, rotations_rad ((n,) float64): How far each tube comes out and how its rear end is
-            turned, the innermost first; see `TubeShapes`.
-        arcs ((a, 4) float64): Length in mm, direction of the bend in rad, curvature in 1/mm and outermost
-            radius in mm, as in `TubeShapes`.
+        insertions_mm, rotations_rad, arcs ((n,), (n,), (a, 4) float64): As in `TubeShapes`.
         lateral_sweep_mm, follow_the_leader_error_mm: Largest on the whole way.
         arc_error_mm: Largest distance between the arcs and the tubes.
         least_determinant: Least on the whole way, 1 where nothing twists; the tubes snap at 0.
@@ -40,11 +37,9 @@ class TubeShape:
 
 
 def pieces_of_arcs(arcs: Float, rotation_rad: float) -> Float:
-    """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of arcs `(a, 4)`.
+    """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of arcs as a `TubeShape` has.
 
-    Args:
-        arcs ((a, 4) float64): As those of `TubeShape`; what is shorter than SHORTEST_ARC_MM is left out.
-        rotation_rad: Rotation of all tubes together.
+    Arcs shorter than SHORTEST_ARC_MM are left out; `rotation_rad` turns all tubes together.
     """
     kept = arcs[arcs[:, 0] > SHORTEST_ARC_MM]
     rolls = np.diff(kept[:, 1], prepend=-rotation_rad)

@@ -223,10 +223,7 @@ class CasadiTubes:
         self._ordered: dict[Order, OrderedTubes] = {}
 
     def order_at(self, beta_mm: ArrayLike) -> Order:
-        """Return the order of the landmarks.
-
-        Args:
-            beta_mm ((n,) float64): Arc lengths of the bases, at most 0.
+        """Return the order of the landmarks of tubes whose bases are at arc lengths `(n,)`, at most 0.
 
         Raises:
             SettingsError: If a base is ahead of the plate, an end is behind it, a tube ends ahead of one
@@ -254,14 +251,7 @@ class CasadiTubes:
         return self._ordered[order]
 
     def given_tip_angles(self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike) -> CasadiEquilibrium:
-        """Return the equilibrium with these tip angles.
-
-        Args:
-            tip_angles_rad, beta_mm: (n,) float64.
-
-        Raises:
-            SettingsError: As `order_at`.
-        """
+        """Return the equilibrium with tip angles and bases `(n,)`; errors are those of `order_at`."""
         tip, beta = self._vector(tip_angles_rad, "tip angles"), self._vector(beta_mm, "beta")
         base, position, rotation, determinant = self.ordered(self.order_at(beta)).forward(tip, beta)
         base_from_tip = np.eye(4)
@@ -285,11 +275,9 @@ class CasadiTubes:
     def solve(
         self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, guess_rad: ArrayLike | None = None
     ) -> CasadiEquilibrium:
-        """Return the equilibrium with these base angles that Newton's method finds from a guess.
+        """Return the equilibrium with base angles `(n,)` that Newton's method finds from guessed tip angles.
 
-        Args:
-            base_angles_rad, beta_mm: (n,) float64.
-            guess_rad ((n,) float64): Guess of the tip angles; the base angles if none is given.
+        The guess is the base angles if none is given.
 
         Raises:
             SettingsError: As `order_at`.

@@ -65,11 +65,7 @@ def bending_n_mm2(tube: Tube, marks: Sequence[float], index: int) -> float:
 def state_rates(
     state: Any, bending: Sequence[float], twisting: Sequence[float], rest: Sequence[Float]
 ) -> Any:
-    """Return the derivative of the state by the arc length [Rucker2010].
-
-    The state is position, quaternion of the innermost tube's frame, its angle, the angles of the others
-    relative to it, and the torsional moments in N mm.
-    """
+    """Return the derivative of the state by the arc length [Rucker2010]."""
     n = len(bending)
     w, x, y, z = casadi.vertsplit(state[ROTATION])
     relative = [casadi.SX(0), *casadi.vertsplit(state[FIRST_ANGLE + 1 : FIRST_ANGLE + n])][:n]

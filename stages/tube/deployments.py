@@ -98,11 +98,9 @@ def enumerate_deployments(
     Args:
         scope_tips ((S, 9) float64): Point, direction and +x of the frame of each scope tip, LPS mm; rotations
             count from that +x.
-        with_fissures: Whether fissures are obstacles.
         rotations: Evenly spaced rotations of the tubes.  Where no tube is turned against another, a further
             one is looked at between two of them where not the same shapes are accepted at both: there the
             tube or its exit is near a limit.
-        stop_spacing_mm: Spacing of the insertions of all tubes.
         worthwhile: Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are
             of use; no others are looked at, but those between two rotations always are.
         progress: Told the share of sites done.
@@ -276,12 +274,9 @@ def _joined(parts: list[Deployments], first_site: Int) -> Deployments:
 
 
 def exit_points(tubes: ConcentricTubes, scope_tips: Float, deployments: Deployments, chosen: Int) -> Float:
-    """Return the points `(N, 3)` LPS mm at which the axes of chosen deployments leave the lumen for good.
+    """Return the points `(N, 3)` LPS mm at which the axes of deployments `(N,)` leave the lumen for good.
 
-    Args:
-        scope_tips ((S, 9) float64): Point, direction and +x of the frame of each scope tip, LPS mm;
-            `deployments.site` counts them.
-        chosen ((N,) int64): Which of the deployments.
+    `scope_tips` `(S, 9)` are point, direction and +x of each tip, LPS mm; `deployments.site` counts them.
     """
     tips, at_mm = scope_tips[deployments.site[chosen]], deployments.exit_mm[chosen]
     rotations = deployments.rotation_rad[chosen]

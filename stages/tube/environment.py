@@ -19,11 +19,7 @@ THREADS = 2
 
 
 def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
-    """Return what the tubes collide with in a lung.
-
-    Args:
-        with_fissures: Whether fissures are obstacles.
-    """
+    """Return what the tubes collide with in a lung, its fissures too if they are obstacles."""
     field = lung.obstacle_field(with_fissures=with_fissures)
     bits = obstacle_bits(with_fissures)
     depth = lung.lumen_depth

@@ -120,15 +120,7 @@ def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0)
 
 
 class Equilibrium:
-    """One equilibrium: shape, torsion and stability, made by `TubeMechanics`.
-
-    Args:
-        mechanics: The tubes.
-        tip_angles_rad ((n,) float64): Rotation of each tube's material at its end against the Bishop frame,
-            not wrapped.
-        beta_mm ((n,) float64): Where the rear ends are: 0 at the front plate, negative behind it.
-        needle_mm: How far the needle's tip is from the front plate, if there is a needle.
-    """
+    """One equilibrium: shape, torsion and stability, made by `TubeMechanics`, which says what is given."""
 
     def __init__(
         self, mechanics: NestedTubes, tip_angles_rad: Float, beta_mm: Float, needle_mm: float

@@ -68,8 +68,7 @@ class TubeMechanics(NestedTubes):
                 that of the innermost tube is.
 
         Raises:
-            SettingsError: If numbers are missing or not finite, a rear end is ahead of the front plate or of
-                that of the next tube, or a tube ends behind the front plate or ahead of one that it encloses.
+            SettingsError: If numbers are missing or not finite, or `check_shifts` refuses them.
         """
         tips, beta = self._joints(tip_angles_rad, "tip angles"), self._shifts(beta_mm)
         return Equilibrium(self, tips, beta, self._needle(needle_mm, beta[None])[0])

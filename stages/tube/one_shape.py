@@ -109,11 +109,7 @@ def copies(shape: ShapeArrays, count: int) -> ManyShapes:
 
 
 def deployed(design: DesignArrays, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> ShapeArrays | None:
-    """Return the shape of joint values, None if the tubes snap or a limit of the design is not kept.
-
-    Args:
-        insertions_mm, rotations_rad ((n,) float64): See `TubeShape`.
-    """
+    """Return the shape of joint values `(n,)`, None if the tubes snap or a limit of the design is broken."""
     shape = shape_arrays(design)
     shape.joints[:] = np.concatenate([np.asarray(insertions_mm), np.asarray(rotations_rad)])
     return shape if kernel.whole_way(design, shape) else None
@@ -195,9 +191,7 @@ class Neighbourhood:
         *,
         needle: Tube | None = None,
     ) -> "Neighbourhood":
-        """Return that of a deployment which is reached by the sequence `together`.
-
-        A needle's tip stays where that of the innermost tube is.
+        """Return that of a deployment reached by the sequence `together`, a needle's tip at that of tubes.
 
         Raises:
             SnapError: If the tubes snap on the way.
@@ -214,10 +208,7 @@ class Neighbourhood:
         return Neighbourhood(self._mechanics, shape.insertions_mm, shape.rotations_rad, shape.tip_angles_rad)
 
     def at(self, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
-        """Return the shape of joint values, reached straight from that deployment; None if tubes snap.
-
-        Args:
-            insertions_mm, rotations_rad: (n,) float64.
+        """Return the shape of joint values `(n,)`, reached straight from that deployment; None if tubes snap.
 
         Raises:
             SettingsError: If numbers are missing or not finite, or the tubes get out of order.

@@ -70,16 +70,8 @@ def least_sweep_sequence(
     """Compare the sequences that lead to one deployment, by their sweep.
 
     Looked at are: all tubes together, the innermost first, by increments in turns, and all tubes together
-    without relative rotation, which then turn in place.
-
-    Args:
-        tubes: Innermost first.
-        base_angles_rad: float or (n,) float64.
-        insertions_mm: (n,) float64.
-        needle: A straight needle whose tip stays where that of the innermost tube is.
-
-    Raises:
-        SettingsError: If the insertions are out of order or beyond the tubes' lengths.
+    without relative rotation, which then turn in place.  Arguments and errors are those of `together`, and a
+    straight needle whose tip stays where that of the innermost tube is.
     """
     together(tubes, base_angles_rad, insertions_mm)
     angles = np.broadcast_to(np.asarray(base_angles_rad, dtype=np.float64), (len(tubes),))
@@ -221,9 +213,6 @@ def propose_designs(
 
 def evaluate_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:
     """Return sweep and reach of a design, whose tubes are not turned against each other.
-
-    Args:
-        outer_mm, inner_mm: Insertions of the deployment.
 
     Raises:
         SettingsError: If the tubes cannot be inserted so, or snap.

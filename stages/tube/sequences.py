@@ -92,10 +92,7 @@ def kuntz2015(
 ) -> Sequence:
     """Turn, insert both tubes together, insert the inner one alone [Kuntz2015, sec. IV-B].
 
-    Args:
-        tubes: Inner and outer tube, in this order.
-        rotation_rad (float or (2,) float64): Rotation of the bases in the scope; one number turns both.
-        outer_mm, inner_mm: How far the tubes come out of the scope.
+    Tubes are the inner and the outer one; one rotation in the scope turns both.
 
     Raises:
         SettingsError: If there are not two tubes, the outer one would be ahead, or one is too short.

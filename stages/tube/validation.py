@@ -67,11 +67,7 @@ class Deployment:
 
 
 class DeploymentValidator:
-    """Accepts or refuses single deployments of tubes in one lung.
-
-    Args:
-        with_fissures: Whether fissures are obstacles.
-    """
+    """Accepts or refuses single deployments of tubes in one lung, with or without fissures as obstacles."""
 
     def __init__(self, lung: Lung, tubes: ConcentricTubes, margins: Margins, *, with_fissures: bool) -> None:
         self._environment = tube_environment(lung, with_fissures=with_fissures)

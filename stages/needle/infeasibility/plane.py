@@ -37,11 +37,9 @@ class Plane:
         return last
 
     def refined(self, *, directions: bool, require: Callable[[int], None]) -> "Plane":
-        """Return the same states in cells of half the side.
+        """Return the same states in cells of half the side, those of directions too if asked.
 
-        Args:
-            directions: Whether to halve the cells of directions too.
-            require: Called with the number of bytes that this takes, before it does.
+        `require` is called with the number of bytes that this takes, before it does.
         """
         halved = np.array([directions, directions, True, True])
         shape = np.where(halved, 2 * np.array(self.bits.shape) + 1, self.bits.shape)

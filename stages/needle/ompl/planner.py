@@ -38,12 +38,7 @@ class Question:
 
 
 class NeedleGoal(base.GoalSampleableRegion):
-    """The tip is at the target; its orientation is free.
-
-    Args:
-        target: (3,) float64, LPS mm.
-        tolerance_mm: How far from the target a path may end.
-    """
+    """The tip is within a tolerance of the target `(3,)`, LPS mm; its orientation is free."""
 
     def __init__(self, si: Any, target: Float, tolerance_mm: float = 0.0) -> None:
         super().__init__(si)
@@ -73,13 +68,9 @@ class NeedleGoal(base.GoalSampleableRegion):
 class NeedlePlanner(base.Planner):
     """A needle search as an OMPL planner.
 
-    `solve` runs the search in slices until it is finished, the termination condition holds, or the
-    iterations are spent; without `anytime` it stops at the first path.  Each better path replaces the one
-    before in the problem definition, which would rank by the number of arcs, not by cost.
-
-    Args:
-        make_search: Makes a search of a query and a seed.
-        question: Where the query stands when `solve` is called.
+    `solve` runs the search in slices until it is finished, the termination condition holds, or the iterations
+    are spent; without `anytime` it stops at the first path.  Each better path replaces the one before in the
+    problem definition, which would rank by the number of arcs, not by cost.
     """
 
     def __init__(

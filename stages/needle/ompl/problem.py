@@ -110,11 +110,7 @@ class NeedleProblem:
         return found | {name: getattr(control, name.removeprefix("control.")) for name in OMPL_PLANNERS}
 
     def own(self, method: str | None = None) -> Any:
-        """Return the planner that `plan` uses, made once for each name of `planners`.
-
-        Raises:
-            SettingsError: If there is no such planner.
-        """
+        """Return the planner that `plan` uses, made once for each name; SettingsError if there is none."""
         name = self.default if method is None else method
         if name not in self._own:
             known = self.planners()
@@ -134,7 +130,7 @@ class NeedleProblem:
         anytime: bool = False,
         cost_limit: float = math.inf,
     ) -> ArcPath | None:
-        """Search a path of arcs.
+        """Return a path of arcs that is proved clear and within all limits; None if none was found.
 
         A planner of OMPL ends with its first path, within BESIDE_TARGET_MM of the target; one arc in place of
         its last ones then brings the path to the target itself, with as few arcs in all as are proved.
@@ -142,13 +138,9 @@ class NeedleProblem:
         Args:
             seed, iterations: The same pair gives the same path, if the time does not run out first.  The
                 planners of OMPL take their random numbers from `seed_ompl` instead.
-            time_s: Stop after this time.
             method: Name of the planner, one of `planners`.
             anytime: Go on to better paths until time, iterations or search are at their end.
             cost_limit: What a path of our searches must cost less than, under the objective.
-
-        Returns:
-            A path proved clear and within all limits; None if none was found.
         """
         planner = self.own(method)
         ours = isinstance(planner, NeedlePlanner)

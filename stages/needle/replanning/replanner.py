@@ -58,10 +58,7 @@ def blocker_at(
 ) -> int:
     """Return the label of what a point of the needle is too near to, 0 if it is clear.
 
-    Args:
-        pose ((6,) floats): See `anatomy.kernels.arcs`.
-        inserted_mm: Length of needle up to the point, for the exemption at the exit.
-        branch: Pierced branch; -1 for none.
+    `inserted_mm` is the length of needle up to the point, `branch` the pierced one, -1 for none.
     """
     straight = (0.0, 1.0, 0.0, 0.0)
     return int(

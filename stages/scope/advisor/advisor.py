@@ -197,11 +197,7 @@ class Advice:
 
 @frozen_value
 class ThinnerScope:
-    """What a thinner scope of the same bends would reach.
-
-    Args:
-        distance_mm: Left to the centre of the goal voxel.
-    """
+    """What a thinner scope of the same bends would reach, and how far that is from the goal voxel."""
 
     radius_mm: float
     reached: bool
@@ -346,12 +342,7 @@ def start_state(lumen: Lumen, tree: AirwayTree, model: ScopeModel) -> ScopeState
 
 
 def why_stopped(path: ScopePath, field: NavigationField, tree: AirwayTree) -> str:
-    """Say in one sentence where and why a path ended; "" if it reached the goal.
-
-    Args:
-        field: Of the path's goal.
-        tree: Tells generations and distances from the carina.
-    """
+    """Say in one sentence where and why a path ended, by the field of its goal; "" if it reached the goal."""
     if path.reached:
         return ""
     lumen, tip = field.lumen, path.lps_from_tip[:3, 3]

@@ -113,12 +113,7 @@ class NavigationField:
 def navigation_field(
     lumen: Lumen, goal: int, *, kind: Kind = "clearance", metric: Metric = "mm"
 ) -> NavigationField:
-    """Compute NF1, or the clearance-based NF1 [Rosell2012, eq. 2], from a goal voxel.
-
-    Args:
-        goal: Number of an interior voxel.
-        kind, metric: See `NavigationField`.
-    """
+    """Compute NF1, or the clearance-based NF1 [Rosell2012, eq. 2], from the number of the goal's voxel."""
     if not 0 <= goal < lumen.count:
         raise TargetError(
             f"The lumen has no interior voxel {goal}", expected=f"a number from 0 to {lumen.count - 1}"

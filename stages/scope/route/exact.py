@@ -78,11 +78,7 @@ LEVELS = (
 
 @frozen_record
 class Problem:
-    """What a route has to keep to.
-
-    Args:
-        guide: What it follows; its ends are the wanted ones.
-    """
+    """What a route has to keep to; the ends of the guide path are the wanted ones."""
 
     guide: GuidePath
     centreline: Centreline

@@ -18,12 +18,7 @@ WAYPOINT_SPACING_MM = 3.0
 
 @frozen_record
 class GuidePath:
-    """P points from start to goal, of which no two neighbours coincide, with the radius of the lumen.
-
-    Args:
-        points_mm: (P, 3) float64, LPS mm.
-        radius_mm: (P,) float64.
-    """
+    """P points `(P, 3)` LPS mm from start to goal, no two neighbours in one place, and the lumen's radius."""
 
     points_mm: Float
     radius_mm: Float

@@ -85,9 +85,8 @@ def plan_route(
 
     Args:
         start_mm, goal_mm ((3,) float64): In the frame of the centreline (LPS mm), inside the lumen.
-        repair: "exact": a nonlinear program; "ga": the genetic search of the paper; "none".
+        repair: "exact": a nonlinear program; "ga": the genetic search of the paper, which has a seed; "none".
         links: Made with `nearest_links` beforehand, where many routes are planned on one centreline.
-        seed: Of the genetic search.
         executor: Repairs segments side by side.
         require_proof: Whether a curve that cannot be proved is refused; else `Route.proved` tells.
 

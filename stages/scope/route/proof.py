@@ -81,14 +81,11 @@ class Proof:
 
 
 def prove(curve: Curve, centreline: Centreline, *, max_curvature_per_mm: float, needed_mm: float) -> Proof:
-    """Prove, or disprove, that a curve keeps its curvature limit and stays inside the lumen.
+    """Prove, or disprove, that a curve keeps its curvature limit and is `needed_mm` deep in the lumen.
 
-    Each span is a Bezier cubic, halved until bounds decide: the convex hull of the derivative's points
-    bounds its norm from below, that of the cross product from above, and the depth in the lumen cannot
-    change by more than the distance.  A span that is not decided after ten halvings counts as failed.
-
-    Args:
-        needed_mm: Depth in the lumen that every point of the curve must have.
+    Each span is a Bezier cubic, halved until bounds decide: the convex hull of the derivative's points bounds
+    its norm from below, that of the cross product from above, and the depth in the lumen cannot change by
+    more than the distance.  A span that is not decided after ten halvings counts as failed.
     """
     verdicts = np.zeros(curve.n_spans, dtype=np.int64)
     points = np.zeros((curve.n_spans, 3))

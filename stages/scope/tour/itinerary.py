@@ -99,11 +99,7 @@ def plan_itinerary(subtree: Subtree, chosen: Sequence[int], *, closed: bool = Fa
 
 
 def one_by_one_mm(subtree: Subtree, chosen: Sequence[int], *, closed: bool = False) -> float:
-    """Return the length of a tour in which the scope returns to the root between any two lesions.
-
-    Args:
-        closed: Whether it also returns after the last, the farthest one.
-    """
+    """Return the length of a tour that returns to the root between lesions, if closed after the last too."""
     depth = subtree.depth_mm[subtree.exit_vertex[list(chosen)]]
     return float(2.0 * depth.sum() - (0.0 if closed else depth.max()))
 
@@ -154,9 +150,6 @@ def shortest_tour(subtree: Subtree, *, closed: bool = False) -> Itinerary:
 
     A closed tour costs twice the length of the stretches that it uses; an open one may end at any exit and
     saves the return from there.  The costs of the chosen exits are added.
-
-    Args:
-        closed: Whether the tour returns to the root.
     """
     taken, passed = _exits_taken(subtree, closed)
     depth, cost = subtree.depth_mm[subtree.exit_vertex], subtree.exit_cost_mm

@@ -205,10 +205,7 @@ def place_tree(environment, tubes, frames, tree, wanted, reasons, traces, placed
         environment: TubeEnvironment.
         tubes ((N_TUBES,) float64): Only the limits at the wall are looked at.
         frames ((T, 4, 4) float64): The scope tip, with +x where the tubes are turned to.
-        tree (tuple): Nodes in the order in which they are followed, M of them: `depth` (M,) int64 from 1 on,
-            `skip` (M,) int64 the node to go on with if this one is refused, `first` (M + 1,) int64 where its
-            `stretches` (R, STRETCH_COLUMNS) begin, `radius` and `clearance` (M,) float64, `first_shape` (M +
-            1,) int64 where the `shapes` (S,) int64 begin that end there.
+        tree (tuple): See `stages.tube.design_shapes.ShapeTree.with_margin`.
         wanted ((T, S) bool): Which shapes are looked at.
         reasons ((N_REASONS,) int64): Counts refused shapes by reason.
         traces ((depths + 1, N_TRACE) float64): Scratch.

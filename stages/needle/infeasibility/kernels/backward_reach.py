@@ -104,13 +104,7 @@ def _all_blocked(obstacles, required, around, x, y, z):
 
 @kernel(nogil=True)
 def fill_backward_reach(obstacles, required, reach):
-    """Fill the angles of a `BackwardReach`.
-
-    Args:
-        obstacles (tuple): Clearance field, labels, geometry and bits; see `stages.needle.kernels.proof`.
-        required (float): Clearance that a path to the target itself keeps, mm.
-        reach: BackwardReach.
-    """
+    """Fill the angles of a `BackwardReach` of paths that keep `required` mm from `Obstacles`."""
     frame, cell, kappa, angles = reach
     shells, count, _ = angles.shape
     half = 0.5 * (count - 1)

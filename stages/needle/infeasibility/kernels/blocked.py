@@ -42,8 +42,6 @@ def mark_probed(states, window, scale, depths, probed, corners):
     """Set the bits of the cells that the tangents of a plane's states meet at some depths.
 
     Args:
-        states: (V, U, Y, W) uint64, window : (4,) int64.
-        scale: (SCALE_SIZE,) float64.
         depths ((D,) float64): As seen from the plane, mm.
         probed: (D, Y', W') uint64.
         corners ((D, 2) int64): Cell numbers (y, x) of the first cell of each.
@@ -122,11 +120,8 @@ def grade_clearance(obstacles, limits, exempt_branch, inserted, origin, across, 
 def keep_clear(states, window, scale, depths, corners, grades, slacks):
     """Remove the states from which half a slab behind or ahead is blocked for every path.
 
-    Args:
-        states: (V, U, Y, W) uint64, window : (4,) int64.
-        scale: (SCALE_SIZE,) float64.
-        depths, corners: See `mark_probed`.
-        grades ((D, Y', X') uint8, slacks : (Q,) float64): See `grade_clearance`.
+    `depths` and `corners` are those of `mark_probed`, `grades` (D, Y', X') uint8 and `slacks` (Q,) those of
+    `grade_clearance`.
     """
     nv, nu, _rows, _words = states.shape
     free = np.zeros((depths.shape[0], slacks.shape[0], grades.shape[1], grades.shape[2] // 64), np.uint64)

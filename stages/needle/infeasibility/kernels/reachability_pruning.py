@@ -71,8 +71,6 @@ def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
     """Remove the states of a plane from which the goal cannot be reached, or which the start cannot reach.
 
     Args:
-        states: (V, U, Y, W) uint64, window : (4,) int64.
-        scale, ends: (SCALE_SIZE,), (ENDS_SIZE,) float64.
         depth (float): Of the plane, mm.
         reference ((3,) float64): Direction from which the limit of the angle counts: its component along the
             planes' normal, and its row and column.

@@ -3,7 +3,6 @@
 import numpy as np
 
 from anatomy.airway_tree import AirwayTree
-from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.plausibility import DOUBTFUL, Finding
 
@@ -15,20 +14,12 @@ HEART_MM = (70.0, 120.0)
 """The heart is looked for so far in front of the carina, and so far below it."""
 
 
-@frozen_value
-class Landmarks:
-    """Signs of each direction: 1 as in a patient whose header is right, -1 against it, 0 undecided."""
+def directions(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) -> list[Finding]:
+    """Return the directions that fail, as airway and lungs all speak against them, and those in doubt.
 
-    up: tuple[int, ...]
-    front: tuple[int, ...]
-    left: tuple[int, ...]
-
-
-def landmarks(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) -> Landmarks:
-    """Return what airway and lungs say about the directions.
-
-    Each direction is told by signs that do not depend on each other.  Only a header that is wrong, or organs
-    that are mirrored, turn all signs of a direction around.
+    Each direction is told by signs that do not depend on each other: 1 as in a patient whose header is right,
+    -1 against it, 0 undecided.  Only a header that is wrong, or organs that are mirrored, turn all signs of a
+    direction around; it is in doubt if one is.
 
     Args:
         left, right ((N, 3) float64, LPS mm): About one point in every cube of `SAMPLE_MM` of each lung.
@@ -46,17 +37,21 @@ def landmarks(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) -> 
         # The trachea runs backwards on its way down, by 8 to 40 degrees; less than 3 degrees say nothing.
         front.append(_sign(-along[1] / length, 0.05))
     whole = (points for points in lungs if len(points) and points[:, 2].min() > lowest_mm + 0.5 * SAMPLE_MM)
-    bases = [_base(points) for points in whole]
+    bases = []
+    for points in whole:
+        # This share of each lung is its base, which lies behind, where the diaphragm slopes down.
+        low = points[:, 2] <= np.quantile(points[:, 2], 0.15)
+        bases.append(float(points[low, 1].mean() - points[~low, 1].mean()))
     if bases:
         # The base lies 9 to 30 mm behind the rest; less says nothing.
         front.append(_sign(float(np.mean(bases)), 3.0))
-    return Landmarks(up=tuple(up), front=tuple(front), left=_left(tree, lungs, carina))
+    return _findings(up, front, _left(tree, lungs, carina))
 
 
-def _left(tree: AirwayTree, lungs: list[Float], carina: Float) -> tuple[int, ...]:
+def _left(tree: AirwayTree, lungs: list[Float], carina: Float) -> list[int]:
+    signs: list[int] = []
     if not all(len(points) for points in lungs):
-        return ()
-    signs = []
+        return signs
     lengths = _main_bronchi(tree, lungs)
     if lengths is not None:
         # The left main bronchus is about twice as long as the right one, 5 against 2.5 cm.
@@ -65,18 +60,11 @@ def _left(tree: AirwayTree, lungs: list[Float], carina: Float) -> tuple[int, ...
     if heart is not None:
         # Two thirds of the heart lie on the left: 10 to 30 mm on the average; less says nothing.
         signs.append(_sign(heart, 4.0))
-    return tuple(signs)
+    return signs
 
 
 def _sign(value: float, least: float) -> int:
     return 0 if abs(value) < least else int(np.sign(value))
-
-
-def _base(points: Float) -> float:
-    """Return how far the base of a lung lies behind the rest, mm."""
-    # This share of each lung is its base, which lies behind, where the diaphragm slopes down.
-    low = points[:, 2] <= np.quantile(points[:, 2], 0.15)
-    return float(points[low, 1].mean() - points[~low, 1].mean())
 
 
 def _main_bronchi(tree: AirwayTree, lungs: list[Float]) -> tuple[float, float] | None:
@@ -132,17 +120,16 @@ def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
     return float(middle - carina[0])
 
 
-def directions(signs: Landmarks) -> list[Finding]:
-    """Return the directions that fail, as all signs are against them, and those in doubt, as one is."""
+def _findings(up: list[int], front: list[int], left: list[int]) -> list[Finding]:
     found = []
     for name, what, votes in (
-        ("axes", "upside down or lying across: the trachea does not run upwards", signs.up),
+        ("axes", "upside down or lying across: the trachea does not run upwards", up),
         (
             "axes",
             "front to back: trachea and bases of the lungs lie as if front and back were exchanged",
-            signs.front,
+            front,
         ),
-        ("sides", "mirrored: main bronchi and heart lie as if left and right were exchanged", signs.left),
+        ("sides", "mirrored: main bronchi and heart lie as if left and right were exchanged", left),
     ):
         decided = [vote for vote in votes if vote]
         if not decided or max(decided) > 0 > min(decided):

@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 
 from anatomy.base.typed import Mask, UInt8
-from anatomy.morphology import bounds, window
+from anatomy.morphology import at_label_borders, bounds, window
 
 RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
 LOBES: Mapping[int, str] = MappingProxyType(
@@ -90,20 +90,10 @@ def fissures_between(lobes: UInt8) -> Mask:
 
     No chain of face neighbours passes from lobe to lobe without entering the fissure.
 
-    Args:
-        lobes ((ni, nj, nk) uint8): Numbers of `LOBES`, 0 elsewhere.
-
-    Returns:
-        (ni, nj, nk) bool.
+    `lobes` `(ni, nj, nk)` are numbers of `LOBES`, 0 elsewhere.
     """
     fissures = np.zeros(lobes.shape, dtype=np.bool_, order="F")
-    box = window(*bounds(lobes))
-    inner, out = lobes[box], fissures[box]
-    for axis in range(3):
-        behind = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
-        ahead = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
-        a, b = inner[behind], inner[ahead]
-        meet = (a != b) & (a > 0) & (b > 0) & ((a <= RIGHT_LOWER) == (b <= RIGHT_LOWER))
-        out[behind] |= meet
-        out[ahead] |= meet
+    for lung in (lobes <= RIGHT_LOWER, lobes > RIGHT_LOWER):
+        box = window(*bounds(lung & (lobes > 0)))
+        fissures[box] |= at_label_borders(lobes[box] * lung[box])
     return fissures

@@ -9,7 +9,7 @@ from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.base.words import percent
 from anatomy.display import point
 from anatomy.grid import Grid
-from anatomy.landmarks import SAMPLE_MM, directions, landmarks
+from anatomy.landmarks import SAMPLE_MM, directions
 from anatomy.lobes import LOBES, RIGHT_LOWER
 from anatomy.morphology import bounds, components, grown_by_one, lattice_of, sampled, window
 from anatomy.patient import PatientImages
@@ -40,10 +40,7 @@ def mask_findings(
     """
     found = findings_of(dict(_figures(images, tree)))
     found += _cut_off(images, tree)
-    corners = images.grid.lps(np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * (
-        np.array(images.grid.shape) - 1
-    ))  # fmt: skip
-    found += directions(landmarks(tree, *lungs_lps, lowest_mm=float(corners[:, 2].min())))
+    found += directions(tree, *lungs_lps, lowest_mm=float(images.grid.corners_lps[:, 2].min()))
     found += [Finding(name="airway", found=said, verdict=DOUBTFUL) for said in tree.report.warnings]
     return tuple(found)
 

@@ -24,6 +24,19 @@ def grown_by_one(mask: Mask) -> Mask:
     return mask
 
 
+def at_label_borders(labels: Array) -> Mask:
+    """Mark both of any two face neighbours that have different labels; 0 is no label."""
+    found = np.zeros(labels.shape, dtype=np.bool_, order="F")
+    for axis in range(3):
+        behind = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
+        ahead = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
+        a, b = labels[behind], labels[ahead]
+        meet = (a != b) & (a > 0) & (b > 0)
+        found[behind] |= meet
+        found[ahead] |= meet
+    return found
+
+
 def bounds(mask: Array, pad: int | Int = 0) -> tuple[Int, Int]:
     """Return `low` and `high` such that every voxel of a mask has `low <= ijk < high`; zeros if it is empty.
 

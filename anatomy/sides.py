@@ -8,6 +8,7 @@ import numpy as np
 
 from anatomy.base.typed import Array, Float, Int32, Mask
 from anatomy.grid import Grid
+from anatomy.morphology import at_label_borders
 
 
 def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | None:
@@ -91,7 +92,7 @@ def border_of(sides: Int32, step: tuple[int, ...], tissue: Mask) -> Mask:
     `sides` and `step` are those of `coarse_sides`.
     """
     border = np.zeros(tissue.shape, dtype=bool, order="F")
-    meeting = np.argwhere(_differs_from_neighbour(sides))
+    meeting = np.argwhere(at_label_borders(sides))
     if not len(meeting):
         return border
     low = np.maximum(meeting.min(axis=0) - 1, 0)
@@ -103,20 +104,5 @@ def border_of(sides: Int32, step: tuple[int, ...], tissue: Mask) -> Mask:
     stop = np.minimum(start + near.shape, tissue.shape)
     window = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
     near = near[tuple(slice(0, b - a) for a, b in zip(start, stop, strict=True))]
-    border[window] = _differs_from_neighbour(near * tissue[window])
+    border[window] = at_label_borders(near * tissue[window])
     return border
-
-
-def _differs_from_neighbour(sides: Int32) -> Mask:
-    """Mark both of any two face neighbours that lie on different sides; 0 is no side."""
-    differs = np.zeros(sides.shape, dtype=bool)
-    for axis in range(3):
-        ahead = [slice(None)] * 3
-        behind = [slice(None)] * 3
-        ahead[axis] = slice(1, None)
-        behind[axis] = slice(None, -1)
-        a, b = sides[tuple(ahead)], sides[tuple(behind)]
-        pair = (a != b) & (a > 0) & (b > 0)
-        differs[tuple(ahead)] |= pair
-        differs[tuple(behind)] |= pair
-    return differs

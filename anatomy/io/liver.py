@@ -16,8 +16,6 @@ LUMENS: Mapping[str, str] = {
     "hepatic-artery": "hepaticArtery",
 }
 """What users call the vessels of a liver, and the names of their files."""
-THICK_MM = 3.0
-"""Slices farther apart than this miss vessels as wide as a needle."""
 
 
 def is_liver(folder: Path) -> bool:
@@ -49,7 +47,14 @@ def load_liver(folder: Path) -> LiverImages:
     doubles = require_single(folder, [source.path for source in sources])
     masks = read_masks(sources, extent=("liver",))
     volumes, empty = volumes_of(masks)
-    texts = text_poses(folder, masks.grid)
+    poses, hashes = text_poses(folder, masks.grid)
+    spacing_mm, thick = float(masks.grid.spacing_mm.max()), []
+    # Slices farther apart miss vessels as wide as a needle.
+    if spacing_mm > 3.0:
+        thick = [
+            f"The slices are {spacing_mm:.1f} mm apart: thin vessels are missing, so that a path that looks "
+            "free may not be."
+        ]
     return LiverImages(
         name=folder.resolve().name,
         kind="med-rad-liver",
@@ -57,19 +62,7 @@ def load_liver(folder: Path) -> LiverImages:
         liver=volumes["liver"],
         lumens={role: volumes[role] for role in LUMENS},
         nodules=volumes.get("nodules"),
-        starts=texts.starts,
-        start_names=texts.start_names,
-        targets_lps=texts.targets_lps,
-        target_names=texts.target_names,
-        sources={**masks.sources, **texts.sources},
-        warnings=(*_thick(float(masks.grid.spacing_mm.max())), *doubles, *masks.statements, *empty),
-    )
-
-
-def _thick(spacing_mm: float) -> tuple[str, ...]:
-    if spacing_mm <= THICK_MM:
-        return ()
-    return (
-        f"The slices are {spacing_mm:.1f} mm apart: thin vessels are missing, so that a path that looks free "
-        "may not be.",
+        sources={**masks.sources, **hashes},
+        warnings=(*thick, *doubles, *masks.statements, *empty),
+        **poses,
     )

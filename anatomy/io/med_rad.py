@@ -4,12 +4,12 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.errors import AnatomyError, FileError, FrameError
 from anatomy.base.files import sha256
-from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import Grid
 from anatomy.io.assembly import LUNG_ROLES, assemble, describe_yourself
@@ -28,17 +28,6 @@ LUNG_FILES: Mapping[str, tuple[str, ...]] = {
 """Names of the files of a lung by role, that of the collection first; the case of letters is the same."""
 _BRAIN = ("brain", "ventricles", "globipallidi", "globipaladii")
 _FRAME_ON_DISK: Frame = "ras"
-
-
-@frozen_record
-class TextPoses:
-    """Starts `(4, 4)` and targets `(3,)`, LPS mm, with the names of their files, and the SHA-256 of these."""
-
-    starts: tuple[Float, ...]
-    start_names: tuple[str, ...]
-    targets_lps: tuple[Float, ...]
-    target_names: tuple[str, ...]
-    sources: Mapping[str, str]
 
 
 def is_med_rad(folder: Path) -> bool:
@@ -76,18 +65,15 @@ def load_med_rad(folder: Path) -> PatientImages:
     require_roles(folder, sources)
     doubles = require_single(folder, [source.path for source in sources], _doubled_lobes(sources))
     masks = read_masks(sources)
-    texts = text_poses(folder, masks.grid)
+    poses, hashes = text_poses(folder, masks.grid)
     return assemble(
         masks,
         name=folder.resolve().name,
         kind="med-rad",
         where=folder,
-        starts=texts.starts,
-        start_names=texts.start_names,
-        targets_lps=texts.targets_lps,
-        target_names=texts.target_names,
-        sources=texts.sources,
+        sources=hashes,
         warnings=(*doubles, *_not_read(folder, sources)),
+        **poses,
     )
 
 
@@ -142,10 +128,14 @@ def numbered_nodules(images: Mapping[str, Path]) -> list[MaskSource]:
     ]
 
 
-def text_poses(folder: Path, grid: Grid) -> TextPoses:
+def text_poses(folder: Path, grid: Grid) -> tuple[dict[str, Any], dict[str, str]]:
     """Read the files whose names end in `start1` and the like as poses, and `target` and the like as points.
 
     A name that holds both, such as `target1_start2.txt`, is a start.
+
+    Returns:
+        - dict - Fields of `PatientImages`: starts `(4, 4)` and targets `(3,)`, LPS mm, and their names.
+        - dict - The SHA-256 of the files.
 
     Raises:
         FileError: If a file holds no pose or point.
@@ -164,13 +154,13 @@ def text_poses(folder: Path, grid: Grid) -> TextPoses:
     for what, places in (("start", [pose[:3, 3] for pose in starts]), ("target", [p for _, p in targets])):
         for place in places:
             _require_inside(grid, place, what, folder)
-    return TextPoses(
-        starts=starts,
-        start_names=tuple(path.stem for path in start_files),
-        targets_lps=tuple(point for _, point in targets),
-        target_names=tuple(name for name, _ in targets),
-        sources={path.name: sha256(path) for path in (*start_files, *target_files)},
-    )
+    poses = {
+        "starts": starts,
+        "start_names": tuple(path.stem for path in start_files),
+        "targets_lps": tuple(point for _, point in targets),
+        "target_names": tuple(name for name, _ in targets),
+    }
+    return poses, {path.name: sha256(path) for path in (*start_files, *target_files)}
 
 
 def _natural(path: Path) -> tuple[list[int], str]:

@@ -1,5 +1,6 @@
 """A folder of masks from any source, described by a `patient.toml`."""
 
+import json
 import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -79,6 +80,23 @@ class PatientFile:
         Mapping[str, str], _key("What other programs made of the masks, and the files they were in")
     ] = Field(default_factory=dict)
     motion: Annotated[MotionFile | None, _key("How the lungs breathe")] = None
+
+
+def description_text(keys: Mapping[str, Any]) -> str:
+    """Return a `patient.toml` with those keys of `PatientFile` that are not empty.
+
+    Numbers have three decimals, and two in a list.
+    """
+    return "".join(f"{key} = {_toml(value)}\n" for key, value in keys.items() if value)
+
+
+def _toml(value: Any, decimals: int = 3) -> str:
+    if isinstance(value, Mapping):
+        named = ((key if key.isidentifier() else _toml(key), _toml(each)) for key, each in value.items())
+        return f"{{ {', '.join(f'{key} = {each}' for key, each in named)} }}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(_toml(each, 2) for each in value)}]"
+    return f"{value:.{decimals}f}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
 
 
 def load_own_masks(description: Path) -> PatientImages:

@@ -18,7 +18,7 @@ from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.images import write_volume
 from anatomy.io.motion_files import write_vectors
-from anatomy.io.own_masks import DESCRIPTION
+from anatomy.io.own_masks import DESCRIPTION, description_text
 from anatomy.motion.source import MotionSource
 from anatomy.phantom.branching import Centerlines
 from anatomy.phantom.chest import LOBES
@@ -66,7 +66,16 @@ def write_phantom(
     for name, volume in volumes.items():
         if volume is not None:
             write_volume(folder / f"{name}.nii.gz", volume)
-    truth, lines = _truth(phantom), _description(phantom)
+    truth = _truth(phantom)
+    lines = description_text(
+        {
+            "name": images.name,
+            "breath_hold": images.breath_hold,
+            **{key: f"{key}.nii.gz" for key in ("lumen", "wall", "vessels", "lung", "fissures")},
+            "nodule": "nodules.nii.gz",
+            "targets": [f"lps:{','.join(map(repr, n.centre_lps.tolist()))}" for n in phantom.nodules],
+        }
+    )
     if breathing:
         motion = PhantomBreathing.of(phantom)
         write_vectors(folder / MOTION_FILE, *motion.field(phantom))
@@ -75,19 +84,6 @@ def write_phantom(
     write_text(folder / "truth.json", json.dumps(truth))
     write_text(folder / DESCRIPTION, lines)
     return folder
-
-
-def _description(phantom: Phantom) -> str:
-    points = [",".join(repr(float(x)) for x in nodule.centre_lps) for nodule in phantom.nodules]
-    targets = ", ".join(f'"lps:{point}"' for point in points)
-    lines = [
-        f'name = "{phantom.images.name}"',
-        f'breath_hold = "{phantom.images.breath_hold}"',
-        *(f'{key} = "{key}.nii.gz"' for key in ("lumen", "wall", "vessels", "lung", "fissures")),
-        'nodule = "nodules.nii.gz"',
-        f"targets = [{targets}]",
-    ]
-    return "\n".join(lines) + "\n"
 
 
 def _truth(phantom: Phantom) -> dict[str, Any]:

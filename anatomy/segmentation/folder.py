@@ -5,7 +5,6 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from anatomy.base.checksums import values_checksum
 from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.base.files import atomic_write, read_json, require_writable_folder, sha256, write_text
-from anatomy.base.typed import Array, Float
+from anatomy.base.typed import Array
 from anatomy.grid import Grid, Volume
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
 from anatomy.io.own_masks import DESCRIPTION
@@ -308,61 +307,3 @@ class Description:
         write_text(self._path, text)
         self._aside.unlink(missing_ok=True)
         return False
-
-
-def description_text(
-    name: str,
-    *,
-    has_nodule: bool,
-    lobes: Sequence[int],
-    has_fissures: bool,
-    warnings: tuple[str, ...],
-    target_lps: Float | None,
-    thick_slices_mm: float,
-    accepted: tuple[str, ...] = (),
-    large_radius_mm: float = 0.0,
-    vessel_border_mm: tuple[float, ...] = (),
-    sources: Mapping[str, str] = MappingProxyType({}),
-) -> str:
-    """Return the `patient.toml` of a segmentation.
-
-    An empty name is left out; `lobes` are the numbers of those that are known, and `warnings` what to say of
-    them; the target `(3,)` is LPS mm; `thick_slices_mm` is the distance of slices that were accepted
-    although they are thick, else 0; `accepted` are checks that failed and were overruled; `sources` tells
-    what images were taken from elsewhere, by their names; `large_radius_mm`, from which vessels are
-    obstacles, is 0 if a given mask says what they are, and of their border nothing is known then.
-    """
-    lines = [f"name = {_quoted(name)}"] if name else []
-    lines += [
-        'lumen = "airway.nii.gz"',
-        'wall = "airway_wall.nii.gz"',
-        'vessels = "vessels.nii.gz"',
-        'lung = "lungs.nii.gz"',
-        'cost = "cost.nii.gz"',
-    ]
-    if has_fissures:
-        lines.append('fissures = "fissures.nii.gz"')
-    if lobes:
-        files = (f'"{LOBES[number]}" = "lobes.nii.gz#{number}"' for number in lobes)
-        lines.append(f"lobes = {{ {', '.join(files)} }}")
-    if warnings:
-        lines.append(f"warnings = {_quoted(list(warnings))}")
-    if has_nodule:
-        lines.append('nodule = "nodule.nii.gz"')
-    if target_lps is not None:
-        lines.append('targets = ["lps:{:.3f},{:.3f},{:.3f}"]'.format(*target_lps))
-    if thick_slices_mm:
-        lines.append(f"thick_slices_mm = {thick_slices_mm:.3f}")
-    if large_radius_mm:
-        lines.append(f"large_radius_mm = {large_radius_mm:.3f}")
-    if vessel_border_mm:
-        lines.append("vessel_border_mm = [{:.2f}, {:.2f}]".format(*vessel_border_mm))
-    if accepted:
-        lines.append(f"accepted = {_quoted(list(accepted))}")
-    if sources:
-        lines.append(f"sources = {{ {', '.join(f'{key} = {_quoted(v)}' for key, v in sources.items())} }}")
-    return "\n".join(lines) + "\n"
-
-
-def _quoted(value: str | list[str]) -> str:
-    return json.dumps(value, ensure_ascii=False)

@@ -8,7 +8,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Mask
 from anatomy.grid import Volume
-from anatomy.landmarks import SAMPLE_MM, directions, landmarks
+from anatomy.landmarks import SAMPLE_MM, directions
 from anatomy.morphology import sampled
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
 from anatomy.segmentation.input import FINE_SLICE_MM
@@ -57,7 +57,7 @@ def plausibility(
                     )
                 )
         left, right = (sampled(mask, ct.grid, SAMPLE_MM) for mask in (lungs.left, lungs.right))
-        found += directions(landmarks(tree, left, right, float(ct.grid.lps(np.zeros(3))[2])))
+        found += directions(tree, left, right, float(ct.grid.lps(np.zeros(3))[2]))
         if lungs.left.any() and lungs.right.any():
             warnings += missing_lung(lungs.left, lungs.right, ct.grid, tree.carina_lps)
     failed = tuple(each for each in found if each.verdict == REFUSED)

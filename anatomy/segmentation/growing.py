@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Int, Int16, Mask, UInt8
 from anatomy.poses import spread_directions
 from anatomy.segmentation.kernels import growing as growth
@@ -126,11 +126,11 @@ def grow(ground: Ground, start: Mask) -> Grown:
     edged, count = _to_its_edge(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, lumen[:count])
     # Thin airways are as wide as a voxel: the edge of something so narrow is not to be seen.
     flat[banned[flat[banned] == 0]] = BANNED
-    tubes = follow_thin_airways(
+    count, _n_tubes = follow_thin_airways(
         hu, smooth, state, _padded(ground.lung), ground.spacing_mm, edged, known, count
     )
     flat[flat != LUMEN] = 0
-    _join_and_wall(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, edged, tubes.count)
+    _join_and_wall(ground, hu.reshape(-1), smooth.reshape(-1), flat, shape, edged, count)
     return Grown(lumen=_inner(state == LUMEN), wall=_inner(state == lumen_edge.WALL), undone=int(undone))
 
 
@@ -182,18 +182,10 @@ def _inner(values: Mask) -> Mask:
     return values[inner, inner, inner]
 
 
-@frozen_value
-class Tubes:
-    """What was followed: the number of voxels of the lumen now, and of tubes."""
-
-    count: int
-    n_tubes: int
-
-
 def follow_thin_airways(
     hu: Int16, smooth: Int16, state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known: int, count: int
-) -> Tubes:
-    """Add to the lumen the thin airways that go on from its ends.
+) -> tuple[int, int]:
+    """Add to the lumen the thin airways that go on from its ends; return its voxels, and the tubes followed.
 
     Args:
         hu, smooth, state, lung ((nk, nj, ni) int16, int16, uint8, bool): The CT, the CT with less noise, what
@@ -212,7 +204,7 @@ def follow_thin_airways(
     starts = np.zeros((3, 4096, 3))
     n_starts = _find_starts(state, lung, spacing_mm, lumen[:count], known, starts)
     if n_starts == 0:
-        return Tubes(count=count, n_tubes=0)
+        return count, 0
     tissue_hu = float(np.median(smooth[lung]))
     # It is learnt anywhere, and beside voxels this much above the lung, as airways lie; the greater counts.
     noise = [
@@ -221,12 +213,12 @@ def follow_thin_airways(
     ]
     least = max(noise)
     if least <= 0.0:
-        return Tubes(count=count, n_tubes=0)
+        return count, 0
     count, n_tubes = kernel.follow_tubes(
         hu, state, lung, per_mm, spacing_mm, directions, radii_mm, least, tissue_hu + WALL_HU,
         starts[0], starts[1], starts[2], n_starts, lumen, count,
     )  # fmt: skip
-    return Tubes(count=count, n_tubes=n_tubes)
+    return count, n_tubes
 
 
 def _false_contrast(

@@ -14,11 +14,12 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
-from anatomy.io.own_masks import DESCRIPTION
+from anatomy.io.own_masks import DESCRIPTION, description_text
+from anatomy.lobes import LOBES
 from anatomy.plausibility import require_known_checks
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.folder import Description, SegmentationFolder, description_text, digest_of_ct
+from anatomy.segmentation.folder import Description, SegmentationFolder, digest_of_ct
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
 from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.parts import Parts
@@ -28,6 +29,11 @@ from anatomy.segmentation.vessels import border_mm, require_large_radius
 
 Progress = Callable[[str], None]
 
+MADE_MASKS = {
+    "lumen": "airway.nii.gz", "wall": "airway_wall.nii.gz", "vessels": "vessels.nii.gz",
+    "lung": "lungs.nii.gz", "cost": "cost.nii.gz",
+}  # fmt: skip
+"""Every segmentation makes these masks of a `patient.toml`."""
 BYTES_PER_CT_VOXEL, BYTES_PER_VOXEL = 12, 30
 """Peak memory over the voxels of the CT, and over those of the box."""
 
@@ -101,28 +107,31 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
     sides = [side for side in (parts.left, parts.right) if side.any()]
     known = all(np.count_nonzero(parts.lobes[side]) > 0.5 * np.count_nonzero(side) for side in sides)
+    # A given mask says itself which vessels are obstacles, and of its border nothing is known.
     large_mm = 0.0 if "vessels" in steps.given_names else request.large_radius_mm
-    said = tuple(folder.facts("lobes").get("warnings", ())) if known else ()
-    text = description_text(
-        request.name,
-        has_nodule=bool(parts.nodule.any()),
-        lobes=np.unique(parts.lobes[parts.lobes > 0]).tolist() if known else [],
-        has_fissures=bool(parts.fissures.any()) and (known or "fissures" in steps.from_elsewhere),
-        warnings=said,
-        target_lps=target,
-        thick_slices_mm=thick_mm,
-        accepted=steps.accepted,
-        large_radius_mm=large_mm,
-        vessel_border_mm=border_mm(large_mm, slice_mm(request.ct)) if large_mm else (),
-        sources=steps.from_elsewhere,
-    )
+    lobes = np.unique(parts.lobes[parts.lobes > 0]).tolist() if known else []
+    has_fissures = bool(parts.fissures.any()) and (known or "fissures" in steps.from_elsewhere)
+    keys = {
+        "name": request.name,
+        **MADE_MASKS,
+        "fissures": "fissures.nii.gz" if has_fissures else "",
+        "lobes": {LOBES[number]: f"lobes.nii.gz#{number}" for number in lobes},
+        "warnings": folder.facts("lobes").get("warnings", ()) if known else (),
+        "nodule": "nodule.nii.gz" if parts.nodule.any() else "",
+        "targets": () if target is None else ["lps:{:.3f},{:.3f},{:.3f}".format(*target)],
+        "thick_slices_mm": thick_mm,
+        "large_radius_mm": large_mm,
+        "vessel_border_mm": border_mm(large_mm, slice_mm(request.ct)) if large_mm else (),
+        "accepted": steps.accepted,
+        "sources": steps.from_elsewhere,
+    }
     return Segmentation(
         folder=folder.path,
         parts=parts,
         recomputed=tuple(steps.recomputed),
         corrected=tuple(steps.corrected),
         from_elsewhere=steps.from_elsewhere,
-        kept_description=description.finish(text),
+        kept_description=description.finish(description_text(keys)),
         warnings=tuple(warnings),
     )
 

@@ -12,12 +12,12 @@ from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.base.typed import Array, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io import write_volume
-from anatomy.io.own_masks import load_own_masks
+from anatomy.io.own_masks import description_text, load_own_masks
 from anatomy.phantom import Phantom
 from anatomy.plausibility import CHECKS
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.folder import description_text
 from anatomy.segmentation.labels import NUMBERINGS, lobe_numbers, sides_of
+from anatomy.segmentation.pipeline import MADE_MASKS
 from anatomy.segmentation.request import Given, GivenImages, read_given
 from anatomy.segmentation.scan_warnings import FITS, misplaced, moved_by
 
@@ -242,16 +242,8 @@ def test_the_description_tells_what_came_from_elsewhere(
 ) -> None:
     for name in ("airway", "airway_wall", "vessels", "lungs"):
         _write(tmp_path / f"{name}.nii.gz", ct, truth[name])
-    text = description_text(
-        "P",
-        has_nodule=False,
-        lobes=[],
-        has_fissures=False,
-        warnings=(),
-        target_lps=None,
-        thick_slices_mm=0.0,
-        sources={"airway_wall": 'w "1".nii.gz', "vessels": "v.nii.gz (TotalSegmentator)"},
-    )
-    (tmp_path / "patient.toml").write_text(text.replace('cost = "cost.nii.gz"\n', ""))
+    sources = {"airway_wall": 'w "1".nii.gz', "vessels": "v.nii.gz (TotalSegmentator)"}
+    text = description_text({"name": "P", **MADE_MASKS, "cost": "", "sources": sources})
+    (tmp_path / "patient.toml").write_text(text)
     (said,) = [w for w in load_own_masks(tmp_path / "patient.toml").warnings if "took the place" in w]
     assert 'airway wall from w "1".nii.gz; vessels from v.nii.gz (TotalSegmentator)' in said

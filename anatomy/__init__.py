@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from anatomy.airway_tree import AirwayTree
+    from anatomy.airway_tree import AirwayTree, TreeReport
     from anatomy.base.errors import (
         AnatomyError,
         FileError,
@@ -36,6 +36,5 @@ if TYPE_CHECKING:
     from anatomy.store import open_lung
     from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
     from anatomy.tree import tree_from_graph, tree_from_mask
-    from anatomy.tree_report import TreeReport
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree
+from anatomy.airway_tree import AirwayTree, PieceLeftOut
 from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.base.words import percent
 from anatomy.display import point
@@ -14,7 +14,6 @@ from anatomy.lobes import LOBES, RIGHT_LOWER
 from anatomy.morphology import bounds, components, grown_by_one, lattice_of, sampled, window
 from anatomy.patient import PatientImages
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
-from anatomy.tree_report import PieceLeftOut
 
 WALL_MM = 4.0
 """Walls are up to 3 mm thick, and their inner voxels share a face with the lumen."""

@@ -28,8 +28,16 @@ from anatomy.patient import PatientImages
 from anatomy.phantom import make_phantom
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.lungs import segment_lungs
-from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace
-from anatomy.segmentation.vessels import ALPHA, BETA, C_HU, Vessels, segment_vessels, vesselness
+from anatomy.segmentation.vessels import (
+    ALPHA,
+    BETA,
+    C_HU,
+    SIGMAS_MM,
+    ScaleSpace,
+    Vessels,
+    segment_vessels,
+    vesselness,
+)
 from anatomy.tree import tree_from_mask
 from experiments.support.anatomies import PHANTOM, default_anatomies, require_data
 from experiments.support.results import Result, setting_of, study_parser, write_result

@@ -20,7 +20,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Volume
 from anatomy.io import load_patient
-from anatomy.io.placement import place
+from anatomy.io.masks import place
 from anatomy.lobes import LOBES
 from anatomy.phantom import make_phantom
 from anatomy.phantom.patient import Size

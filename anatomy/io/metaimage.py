@@ -12,7 +12,7 @@ import numpy as np
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
 from anatomy.io import image_header
-from anatomy.io.compressed import pieces
+from anatomy.io.voxels import pieces
 
 _DTYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4",

@@ -18,8 +18,8 @@ from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
 from anatomy.grid import transform_points
 from anatomy.io import image_header
-from anatomy.io.compressed import pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
+from anatomy.io.voxels import pieces
 
 _VERSION_1: dict[str, tuple[int, str]] = {
     "dim": (40, "8h"), "datatype": (70, "2h"), "pixdim": (76, "8f"), "vox_offset": (108, "f"),

@@ -13,8 +13,8 @@ import numpy as np
 from anatomy.base.errors import FileError, FrameError
 from anatomy.base.typed import Float
 from anatomy.io import image_header
-from anatomy.io.compressed import pieces
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, Frame
+from anatomy.io.voxels import pieces
 
 _LPS_FROM_LAS = np.diag([1.0, -1.0, 1.0, 1.0])
 _LPS_WORDS = ("left-posterior-superior", "lps")

@@ -17,10 +17,10 @@ from anatomy.base.words import did_you_mean
 from anatomy.io.assembly import assemble, require_cost
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume
-from anatomy.io.label_names import stored_names
 from anatomy.io.mask_values import file_and_label, parse_labels
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.motion_files import MotionFile, read_motion
+from anatomy.io.totalsegmentator import stored_names
 from anatomy.lobes import LOBES, lobe_named
 from anatomy.patient import PatientImages
 

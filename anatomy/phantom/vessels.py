@@ -7,8 +7,7 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.phantom.branching import Sprouts, smooth_line
-from anatomy.phantom.growth import STEP_MM, Clearance, GrowthRule, grow, overlap_mm
+from anatomy.phantom.branching import STEP_MM, Clearance, GrowthRule, Sprouts, grow, overlap_mm, smooth_line
 from anatomy.phantom.territory import Territory
 from anatomy.poses import unit
 

@@ -13,8 +13,7 @@ from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Int16, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
-from anatomy.morphology import bounds, window
-from anatomy.segmentation.closing import distance_mm, near
+from anatomy.morphology import bounds, distance_mm, near, window
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.kernels.local_minima import depth_slice, smooth_slice
 

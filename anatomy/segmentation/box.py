@@ -15,8 +15,7 @@ from anatomy.base.errors import GridMismatchError, SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import bounds, window
-from anatomy.segmentation.closing import distance_mm
+from anatomy.morphology import bounds, distance_mm, window
 from anatomy.segmentation.folder import onto_grid
 from anatomy.segmentation.lungs import Lungs
 

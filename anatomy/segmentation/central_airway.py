@@ -9,8 +9,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import bounds, window
-from anatomy.segmentation.closing import distance_mm
+from anatomy.morphology import bounds, distance_mm, window
 from anatomy.segmentation.coarse import CoarseCt
 
 COLUMN_MEDIAN_HU = -920.0

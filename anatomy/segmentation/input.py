@@ -8,7 +8,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Array, Float32, Mask
 from anatomy.grid import Volume
-from anatomy.segmentation.closing import distance_mm
+from anatomy.morphology import distance_mm
 from anatomy.segmentation.coarse import CoarseCt
 
 AIR_HU = -1000.0

@@ -16,7 +16,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.settings import impossible, parse, quantity, settings
 from anatomy.base.typed import Array, Float, Float32, Mask
 from anatomy.grid import Volume
-from anatomy.segmentation.closing import largest_piece
+from anatomy.morphology import largest_piece
 
 SUFFIX = ".onnx"
 MOST_TILE = 512

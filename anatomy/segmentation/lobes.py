@@ -15,9 +15,8 @@ from anatomy.base.typed import Bool, Float32, Int, Int32, Mask, UInt8
 from anatomy.base.words import percent
 from anatomy.grid import Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER, fissures_between
-from anatomy.morphology import bounds, window
+from anatomy.morphology import bounds, closed, largest_piece, window
 from anatomy.segmentation.airway import Airways
-from anatomy.segmentation.closing import closed, largest_piece
 from anatomy.segmentation.fissures import BLOCK, EDGE_MM, Cubic, Fissureness, blocks_of, fissureness
 from anatomy.segmentation.lobar_bronchi import TRUNK_SHARE, Regions, lobes_of_branches
 from anatomy.segmentation.lungs import Lungs

@@ -8,9 +8,8 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Float32, Int, Int32, Mask
-from anatomy.morphology import bounds, window
+from anatomy.morphology import bounds, closed, distance_mm, largest_piece, near, window, without_holes
 from anatomy.segmentation.central_airway import CentralAirway, grow_from
-from anatomy.segmentation.closing import closed, distance_mm, largest_piece, near, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.input import AIR_HU
 from anatomy.segmentation.labels import RIGHT, sides_from_right

@@ -11,9 +11,8 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Float32, Int, Int32, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
-from anatomy.morphology import bounds, grown_by_one, window
+from anatomy.morphology import bounds, closed, grown_by_one, largest_piece, window, without_holes
 from anatomy.segmentation.central_airway import CentralAirway, central_airways
-from anatomy.segmentation.closing import closed, largest_piece, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.input import GREATEST_OFFSET_HU, Scale, air_in_hu, air_offset_hu, offset_around_hu
 from anatomy.segmentation.labels import LEFT, RIGHT, sides_from_right

@@ -11,8 +11,7 @@ from anatomy.base.errors import FileError, GridMismatchError
 from anatomy.base.files import DAMAGE, read_json, reading
 from anatomy.base.typed import Float, Int16, Mask
 from anatomy.grid import Grid
-from anatomy.morphology import bounds, components, window
-from anatomy.segmentation.closing import distance_mm, largest_piece
+from anatomy.morphology import bounds, components, distance_mm, largest_piece, window
 
 _CONTOURS = '{"annotations": [{"contours": [{"z_mm": ..., "ij": [[column, row], ...]}]}]}'
 _REMEDY = "`lungaccess template contours` prints an example; a mask can be given with --nodule-mask"

@@ -16,8 +16,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Float32, Int, Mask
 from anatomy.base.words import point_in_words
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import grown_by_one, window
-from anatomy.segmentation.closing import distance_mm
+from anatomy.morphology import distance_mm, grown_by_one, window
 
 CUBES = ((0.75, 24.0, 8.0), (1.25, 40.0, 18.0))
 """The cubes around the point that are tried in turn, all mm: edge of a voxel, half the side of the cube, and

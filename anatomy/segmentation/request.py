@@ -22,8 +22,7 @@ from anatomy.io.mask_values import (
     require_label_values,
     select,
 )
-from anatomy.io.masks import SOLID, MaskSource, read_masks
-from anatomy.io.placement import place
+from anatomy.io.masks import SOLID, MaskSource, place, read_masks
 from anatomy.io.totalsegmentator import file_sources, mask_sources
 from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.canonical import canonical

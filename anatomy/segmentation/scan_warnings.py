@@ -15,10 +15,9 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import bounds, components, window
+from anatomy.morphology import bounds, components, distance_mm, window
 from anatomy.nodule_size import NoduleSize, nodule_size
 from anatomy.plausibility import LIMITS, Finding
-from anatomy.segmentation.closing import distance_mm
 from anatomy.segmentation.input import FINE_SLICE_MM, slice_mm
 from anatomy.segmentation.parts import Parts
 

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree
+from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
-from anatomy.tree_report import TreeReport
 
 TANGENT_REACH_MM = 1.5
 """A tangent is the direction between the points this far before and behind on the branch."""

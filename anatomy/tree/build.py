@@ -5,19 +5,22 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.airway_tree import AirwayTree
+from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, TreeReport
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume
 from anatomy.tree.branches import NodeBranch, Strand, assemble, divide
-from anatomy.tree.coverage import complete
 from anatomy.tree.depth import exact_depth_mm, inside, segments_inside
-from anatomy.tree.lumen import PreparedLumen, prepare_lumen, require_few_tunnels
-from anatomy.tree.parallel import unite_parallel
-from anatomy.tree.skeleton import SkeletonTree, prune, span, spanning_tree, thin
-from anatomy.tree.trachea import find_trachea
-from anatomy.tree.voxel_tree import ROUNDS, VoxelTree, centred, rooted_voxel_tree, voxel_tree_of
-from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned, TreeReport
+from anatomy.tree.lumen import PreparedLumen, complete, prepare_lumen, require_few_tunnels
+from anatomy.tree.skeleton import SkeletonTree, find_trachea, prune, span, spanning_tree, thin
+from anatomy.tree.voxel_tree import (
+    ROUNDS,
+    VoxelTree,
+    centred,
+    rooted_voxel_tree,
+    unite_parallel,
+    voxel_tree_of,
+)
 
 
 def tree_from_mask(lumen: Volume) -> AirwayTree:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree
+from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Float
 from anatomy.tree.branches import Strand, assemble
-from anatomy.tree_report import TreeReport
 from stages.scope.tour.exits import ExitRule
 
 ORDERS = 8

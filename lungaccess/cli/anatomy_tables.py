@@ -38,9 +38,9 @@ MOTION_WORDS = {
 """The figures of a motion in words, see `anatomy.motion`."""
 
 if TYPE_CHECKING:
+    from anatomy.airway_tree import Repair
     from anatomy.lung import Lung
     from anatomy.organ import Organ
-    from anatomy.tree_report import Repair
 
 
 def organ_record(lung: Organ) -> dict[str, Any]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anatomy.phantom.branching import Sprouts, centerlines
-from anatomy.phantom.growth import limit_turn, split_cloud
+from anatomy.phantom.branching import Sprouts, centerlines, limit_turn, split_cloud
 
 
 def _tiny_tree() -> Sprouts:

@@ -13,9 +13,8 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Array, Float
 from anatomy.phantom import LABELS, Phantom, make_phantom
 from anatomy.phantom.branching import Sprouts
-from anatomy.phantom.bronchi import CENTRAL, TEMPLATE
 from anatomy.phantom.chest import Chest, Side, make_chest
-from anatomy.phantom.plan import ends_below_pleura
+from anatomy.phantom.plan import CENTRAL, TEMPLATE, ends_below_pleura
 from anatomy.phantom.rasterize import draw_body, phantom_grid
 from anatomy.phantom.territory import Territory
 from anatomy.phantom.traits import PLAIN, Traits

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from anatomy import store
+from anatomy.airway_tree import GapBridged, LoopOpened, SpurPruned
 from anatomy.base.cache import default_cache
 from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.store import META, open_lung
-from anatomy.tree_report import GapBridged, LoopOpened, SpurPruned
 from tests.anatomy import toys
 from tests.anatomy.stored_toy import FOLDER, KEY, SOURCES, no_reading, require_same
 from tests.anatomy.toys import toy

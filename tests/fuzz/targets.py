@@ -139,10 +139,10 @@ def _template(name: str) -> Callable[[Path], None]:
 
 def _text_targets() -> dict[str, Target]:
     from anatomy.io.frames import read_points, read_pose
-    from anatomy.io.label_names import stored_names
     from anatomy.io.markups import read_markups
     from anatomy.io.motion_files import read_landmarks, read_transform
     from anatomy.io.own_masks import _read_description, thick_slices_mm
+    from anatomy.io.totalsegmentator import stored_names
     from anatomy.segmentation.nodules import nodule_from_contours
     from lungaccess.planning.one_stage.tubes import load_tubes
     from lungaccess.planning.tour import read_lesions

@@ -8,8 +8,8 @@ from scipy import ndimage
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Float32, Mask
 from anatomy.grid import Grid, Volume
+from anatomy.morphology import distance_mm
 from anatomy.phantom import Phantom
-from anatomy.segmentation.closing import distance_mm
 
 KINDS = ("solid", "part-solid", "non-solid", "pleural", "diaphragm", "vascular")
 """The kinds of nodules that are drawn."""

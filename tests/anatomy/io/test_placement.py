@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from anatomy.base.errors import AnatomyError, FrameError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, write_volume
-from anatomy.io.placement import SHIFT_TOLERANCE, covers_same_voxels, place, union_grid
+from anatomy.io.masks import SHIFT_TOLERANCE, covers_same_voxels, place, union_grid
 
 GRID = Grid.from_spacing((8, 7, 6), [2.0, 1.5, 1.0], [-5.0, 3.0, 40.0])
 

@@ -14,9 +14,9 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io import read_volume
+from anatomy.morphology import closed, distance_mm, without_holes
 from anatomy.phantom import LABELS, Phantom, make_phantom
 from anatomy.segmentation.central_airway import central_airways
-from anatomy.segmentation.closing import closed, distance_mm, without_holes
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.lung_pieces import gas_pockets
 from anatomy.segmentation.lungs import CLOSING_MM, Lungs, lungs_given, segment_lungs

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from anatomy.base.typed import Mask
 from anatomy.grid import Grid, Volume
 from anatomy.phantom import Phantom
-from anatomy.segmentation.missing_lung import midline, missing_lung, solid_tissue
+from anatomy.segmentation.gate import midline, missing_lung, solid_tissue
 from anatomy.segmentation.scan_warnings import noise_hu, scan_warnings
 
 CARINA = np.zeros(3)

@@ -13,8 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.segmentation.kernels.eigenvalues import eigenvalues
-from anatomy.segmentation.scale_space import SIGMAS_MM, ScaleSpace, discrete_gaussian
-from anatomy.segmentation.vessels import vesselness
+from anatomy.segmentation.vessels import SIGMAS_MM, ScaleSpace, discrete_gaussian, vesselness
 from tests.anatomy.segmentation.shapes import distance_to_surface
 
 LUNG_HU, BLOOD_HU = -860.0, 40.0

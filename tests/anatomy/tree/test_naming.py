@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.lung import Lung
-from anatomy.phantom import Phantom, bronchi
+from anatomy.phantom import Phantom
+from anatomy.phantom import plan as planned
 from anatomy.phantom.branching import Centerlines, centerlines
 from anatomy.phantom.chest import make_chest
 from anatomy.phantom.plan import _plan_airways
@@ -38,7 +39,7 @@ FURTHER_JITTER = (0.0, 0.1, 0.16)
 def varied(seed: int, monkeypatch: pytest.MonkeyPatch) -> tuple[AirwayTree, Centerlines]:
     """Return the tree of a phantom of another build, and what was drawn."""
     rng, moved = np.random.default_rng(seed), VARIANTS[seed % len(VARIANTS)]
-    kept = (each for each in bronchi.TEMPLATE if each.name not in moved[1])
+    kept = (each for each in planned.TEMPLATE if each.name not in moved[1])
     spread = FURTHER_JITTER[seed % len(FURTHER_JITTER)]
     template = tuple(
         replace(
@@ -48,10 +49,10 @@ def varied(seed: int, monkeypatch: pytest.MonkeyPatch) -> tuple[AirwayTree, Cent
         )
         for each in kept
     )
-    monkeypatch.setattr(bronchi, "TEMPLATE", template)
+    monkeypatch.setattr(planned, "TEMPLATE", template)
     traits = Traits(flow_exponent=(2.0, 2.8)[seed % 2], bronchus_length=rng.uniform(0.85, 1.3))
     scale = rng.uniform(0.65, 1.15)
-    sprouts, _rule = bronchi.grow_airways(make_territory(make_chest(rng, scale), rng), scale, rng, traits)
+    sprouts, _rule = planned.grow_airways(make_territory(make_chest(rng, scale), rng), scale, rng, traits)
     plan = _plan_airways(sprouts, 1.0)
     named = np.array([bool(name) for name in plan.sprouts.name])
     thick = np.array(plan.sprouts.diameter_mm) >= rng.choice([0.0, 2.2, 3.0])

@@ -6,9 +6,8 @@ import itertools
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree
+from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.tree.branches import Strand, assemble
-from anatomy.tree_report import TreeReport
 from stages.scope.tour.exits import Exit
 from stages.scope.tour.itinerary import plan_itinerary
 from stages.scope.tour.subtree import Subtree

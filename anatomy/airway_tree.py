@@ -254,16 +254,14 @@ class AirwayTree:
         rank = np.zeros(self.n_branches, dtype=np.int64)
         for branch in range(1, self.n_branches):
             parent = int(self.branch_parent[branch])
-            rank[branch] = rank[parent] + (not self._continues(branch, parent))
+            radius = self.branch_mean_radius_mm / self.branch_mean_radius_mm[parent]
+            others = radius[np.setdiff1d(self.children(parent), branch)]
+            # Main bronchi have 0.6 to 0.85 of the trachea's radius where it forks, lobar bronchi less of
+            # theirs: this branch goes on as its parent, which only gave off narrow ones.
+            continues = radius[branch] >= 0.85 and (others < 0.6).all()
+            rank[branch] = rank[parent] + (not continues)
         mediastinal: Bool = (rank <= 1) & (self.n_branches > 1)
         return read_only(mediastinal)
-
-    def _continues(self, branch: int, parent: int) -> bool:
-        """Tell whether a branch is the same bronchus as its parent, which only gave off narrow branches."""
-        radius = self.branch_mean_radius_mm / self.branch_mean_radius_mm[parent]
-        others = radius[np.setdiff1d(self.children(parent), branch)]
-        # Main bronchi have 0.6 to 0.85 of the trachea's radius where it forks, lobar bronchi less of theirs.
-        return bool(radius[branch] >= 0.85 and (others < 0.6).all())
 
     @cached_property
     def bronchi(self) -> "BronchialNames":

@@ -17,8 +17,6 @@ from anatomy.lobes import FISSURES_UNKNOWN
 from anatomy.lung import Lung
 from anatomy.mask_findings import mask_findings
 from anatomy.morphology import bounds, window
-from anatomy.motion.motion import Motion
-from anatomy.motion.source import MotionSource
 from anatomy.patient import PatientImages
 from anatomy.plausibility import warnings_of_findings, with_accepted
 from anatomy.sides import border_of, coarse_sides, points_of_sides
@@ -79,7 +77,7 @@ def build_lung(
     """
     from anatomy.tree import tree_from_mask
 
-    keep, tell = keep or _unchanged, progress or _silent
+    keep, tell = keep or (lambda _name, array: array), progress or (lambda _step: None)
     warnings = list(images.warnings)
     if images.fissures is None:
         warnings.append(f"Fissures are not checked: {FISSURES_UNKNOWN}.")
@@ -94,8 +92,12 @@ def build_lung(
     findings = with_accepted(mask_findings(images, tree, lungs_lps), images.accepted)
     motion = None
     if images.motion is not None:
+        from anatomy.motion.prepare import prepare_motion
+
         tell("motion of breathing")
-        motion = _motion(images.motion, labels, box.grid, tree, keep, warnings)
+        motion = prepare_motion(images.motion, labels, box.grid, float(tree.carina_lps[0]))
+        warnings += motion.warnings
+        motion = replace(motion, nodes=keep("motion.nodes", motion.nodes))
     return Lung(
         name=images.name,
         kind=images.kind,
@@ -120,17 +122,6 @@ def build_lung(
         warnings=(*warnings, *warnings_of_findings(findings)),
         findings=findings,
     )
-
-
-def _motion(
-    source: MotionSource, labels: UInt16, grid: Grid, tree: AirwayTree, keep: Keep, warnings: list[str]
-) -> Motion:
-    """Bring the breathing to the masks; its warnings are among those of the patient."""
-    from anatomy.motion.prepare import prepare_motion
-
-    motion = prepare_motion(source, labels, grid, float(tree.carina_lps[0]))
-    warnings += motion.warnings
-    return replace(motion, nodes=keep("motion.nodes", motion.nodes))
 
 
 def _require_tissue(images: PatientImages) -> None:
@@ -210,16 +201,13 @@ def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, g
     labels[lumen] |= structures.LUMEN
 
 
-def _unchanged(_name: str, array: Array) -> Array:
-    return array
-
-
-def _silent(_step: str) -> None:
-    pass
-
-
 def clearance_fields(
-    labels: UInt16, grid: Grid, *, fissures: bool = False, keep: Keep = _unchanged, tell: Progress = _silent
+    labels: UInt16,
+    grid: Grid,
+    *,
+    fissures: bool = False,
+    keep: Keep = lambda _name, array: array,
+    tell: Progress = lambda _step: None,
 ) -> dict[str, DistanceField]:
     """Return the fields of the clearance to each structure and to all of them, by name.
 

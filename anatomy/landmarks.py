@@ -45,7 +45,32 @@ def directions(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) ->
     if bases:
         # The base lies 9 to 30 mm behind the rest; less says nothing.
         front.append(_sign(float(np.mean(bases)), 3.0))
-    return _findings(up, front, _left(tree, lungs, carina))
+    found = []
+    for name, what, votes in (
+        ("axes", "upside down or lying across: the trachea does not run upwards", up),
+        (
+            "axes",
+            "front to back: trachea and bases of the lungs lie as if front and back were exchanged",
+            front,
+        ),
+        (
+            "sides",
+            "mirrored: main bronchi and heart lie as if left and right were exchanged",
+            _left(tree, lungs, carina),
+        ),
+    ):
+        decided = [vote for vote in votes if vote]
+        if not decided or max(decided) > 0 > min(decided):
+            if name == "sides" or decided:
+                found.append(_doubt(name))
+        elif max(decided) < 0 and (name == "sides" or len(decided) > 1 or what.startswith("upside")):
+            remedy = "Check the header of the image: its directions may be wrong"
+            if name == "sides":
+                remedy += "; or the organs of this patient are mirrored"
+            found.append(Finding(name=name, found=f"The image is {what}", remedy=remedy))
+        elif max(decided) < 0:
+            found.append(_doubt(name))
+    return found
 
 
 def _left(tree: AirwayTree, lungs: list[Float], carina: Float) -> list[int]:
@@ -118,31 +143,6 @@ def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
         return None
     middle = np.mean([0.5 * (inner[0][line] + inner[1][line]) for line in sorted(shared)])
     return float(middle - carina[0])
-
-
-def _findings(up: list[int], front: list[int], left: list[int]) -> list[Finding]:
-    found = []
-    for name, what, votes in (
-        ("axes", "upside down or lying across: the trachea does not run upwards", up),
-        (
-            "axes",
-            "front to back: trachea and bases of the lungs lie as if front and back were exchanged",
-            front,
-        ),
-        ("sides", "mirrored: main bronchi and heart lie as if left and right were exchanged", left),
-    ):
-        decided = [vote for vote in votes if vote]
-        if not decided or max(decided) > 0 > min(decided):
-            if name == "sides" or decided:
-                found.append(_doubt(name))
-        elif max(decided) < 0 and (name == "sides" or len(decided) > 1 or what.startswith("upside")):
-            remedy = "Check the header of the image: its directions may be wrong"
-            if name == "sides":
-                remedy += "; or the organs of this patient are mirrored"
-            found.append(Finding(name=name, found=f"The image is {what}", remedy=remedy))
-        elif max(decided) < 0:
-            found.append(_doubt(name))
-    return found
 
 
 def _doubt(name: str) -> Finding:

@@ -62,7 +62,12 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         yield "wall_in_lumen", _shared(images.wall.array, lumen)
         yield "wall_in_vessels", _shared(images.wall.array, vessels)
         yield "wall_at_lumen", _at_lumen(images.wall.array, lumen, images.grid)
-        yield "least_wall", _least_wall(images.wall.array, images.grid, tree)
+        # How much of the airway has a wall, in the part that has the least.
+        around = (
+            _around(images.wall.array, images.grid, tree.points_lps, tree.radius_mm + by).any(1)
+            for by in (0, 0.5, 1, 2)
+        )
+        yield "least_wall", min(_shares_of_parts(np.any(list(around), 0), tree.points_lps, tree))
     if fissures is not None:
         within = _count(fissures & lung)
         yield "fissures_of_lungs", within / _count(lung)
@@ -83,7 +88,10 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         if _count(nodules) <= 5_000_000:
             yield from _of_nodules(nodules, lung, images.grid)
             if images.nodule_labels is not None:
-                yield "nodule_pieces", _pieces_of_a_label(nodules, images.nodule_labels.array)
+                # How many nodules that do not touch have the same label, where most have.
+                voxels, part = components(nodules)
+                named = np.stack([images.nodule_labels.array[tuple(voxels.T)], part], axis=1)
+                yield "nodule_pieces", float(np.bincount(np.unique(named, axis=0)[:, 0]).max())
     if images.lobes is not None:
         yield from _of_lobes(images.lobes.array, lung, images.grid, tree)
 
@@ -110,14 +118,6 @@ def _shares_of_parts(marks: Mask, points: Float, tree: AirwayTree) -> list[float
     # Each lung is looked at in so many parts from apex to base, of the same volume.
     parts = [part for order in ordered for part in np.array_split(order, 3)]
     return [float(marks[part].mean()) for part in parts if len(part)]
-
-
-def _least_wall(wall: Mask, grid: Grid, tree: AirwayTree) -> float:
-    """Return how much of the airway has a wall, in the part that has the least."""
-    walled = np.any(
-        [_around(wall, grid, tree.points_lps, tree.radius_mm + by).any(1) for by in (0, 0.5, 1, 2)], 0
-    )
-    return min(_shares_of_parts(walled, tree.points_lps, tree))
 
 
 def _of_lungs(
@@ -191,13 +191,6 @@ def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, fl
     largest = voxels[part == np.argmax(np.bincount(part))]
     yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
     yield "nodule_end", max(_flattest(voxels[:, axis], part) for axis in range(3))
-
-
-def _pieces_of_a_label(nodules: Mask, labels: Array) -> float:
-    """Return how many nodules that do not touch have the same label, where most have."""
-    voxels, part = components(nodules)
-    pairs = np.unique(np.stack([labels[tuple(voxels.T)], part], axis=1), axis=0)
-    return float(np.bincount(pairs[:, 0]).max())
 
 
 def _flattest(places: Int, part: Int) -> float:

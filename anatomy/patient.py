@@ -72,7 +72,12 @@ class PatientImages:
 
     def __post_init__(self) -> None:
         for role in MASKS:
-            _require_mask(getattr(self, role), role, self.grid)
+            mask: Volume | None = getattr(self, role)
+            if mask is not None:
+                self.grid.require_same(mask.grid, f"the mask {role}")
+                if mask.array.dtype != np.bool_:
+                    found = f"The mask {role} has the type {mask.array.dtype}"
+                    raise AnatomyError(found, expected="bool voxels")
         for name in ("lobes", "nodule_labels"):
             numbers = getattr(self, name)
             if numbers is not None:
@@ -87,14 +92,6 @@ class PatientImages:
             names = getattr(self, f"{what}_names") or tuple(f"{what}{n + 1}" for n in range(len(given)))
             object.__setattr__(self, f"{what}_names", names)
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
-
-
-def _require_mask(volume: Volume | None, role: str, grid: Grid) -> None:
-    if volume is None:
-        return
-    grid.require_same(volume.grid, f"the mask {role}")
-    if volume.array.dtype != np.bool_:
-        raise AnatomyError(f"The mask {role} has the type {volume.array.dtype}", expected="bool voxels")
 
 
 def _require_border(border_mm: tuple[float, ...]) -> None:

@@ -85,22 +85,18 @@ def _entry(path: Path, formats: Mapping[str, str]) -> CacheEntry | None:
     """Return what a path in a cache is, None if it is nothing of ours."""
     if UNFINISHED_PATTERN.fullmatch(path.name):
         return _made(path, "unfinished", {}, path.stat().st_mtime, formats)
+    stated: Any = {}
     if KEY_PATTERN.fullmatch(path.name) and path.is_dir():
         told = path / LUNG_FILE
-        stated: dict[str, Any] = {}
         with contextlib.suppress(*DAMAGE):
             stated = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else {}
         used = told.stat().st_mtime if told.is_file() else path.stat().st_mtime
         return _made(path, "anatomy", stated, used, formats)
     if arrays := ARRAYS_PATTERN.fullmatch(path.name):
-        return _made(path, arrays[1], _header(path), path.stat().st_mtime, formats)
+        with contextlib.suppress(*DAMAGE), path.open("rb") as stream, np.load(stream) as stored:
+            stated = json.loads(str(stored["rest"]))
+        return _made(path, arrays[1], stated, path.stat().st_mtime, formats)
     return None
-
-
-def _header(path: Path) -> dict[str, Any]:
-    with contextlib.suppress(*DAMAGE), path.open("rb") as stream, np.load(stream) as stored:
-        return dict(json.loads(str(stored["rest"])))
-    return {}
 
 
 def _made(path: Path, kind: str, stated: Any, last_used: float, formats: Mapping[str, str]) -> CacheEntry:

@@ -70,11 +70,9 @@ def cases_in(folder: Path) -> list[Path]:
     files = folder if folder.name in _ATM_FOLDERS else next((part for part in parts if part.is_dir()), None)
     if files is not None:
         return [path for path in sorted(files.iterdir()) if _atm(path) is not None]
-    return [path for path in sorted(folder.iterdir(), key=_natural) if path.is_dir() and _aeropath(path)]
-
-
-def _natural(path: Path) -> tuple[int, str]:
-    return (int(path.name), "") if path.name.isdigit() else (1 << 31, path.name)
+    number = {path: int(path.name) if path.name.isdigit() else 1 << 31 for path in folder.iterdir()}
+    by_number = sorted(number, key=lambda path: (number[path], "" if path.name.isdigit() else path.name))
+    return [path for path in by_number if path.is_dir() and _aeropath(path)]
 
 
 def _aeropath(folder: Path) -> CtCase | None:

@@ -43,7 +43,9 @@ def mask_of(
     """
     require_numbers(values, name)
     if labels:
-        return _of_labels(values, name, labels)
+        require_label_values(values, name)
+        missing = [label for label in labels if not (values == label).any()]
+        return select(values, labels), tuple(f"{name} has no voxel of the label {n}." for n in missing)
     found = _values_in(values)
     low, high = found[0], found[-1]
     if not np.isfinite((low, high)).all():
@@ -101,13 +103,6 @@ def require_label_values(values: Array, name: str) -> None:
             expected="labels, which are whole numbers",
             remedy="Resample labels by the nearest neighbour; between two labels lies no third one",
         )
-
-
-def _of_labels(values: Array, name: str, labels: Sequence[int]) -> tuple[Mask, tuple[str, ...]]:
-    require_label_values(values, name)
-    mask = select(values, labels)
-    missing = [label for label in labels if not (values == label).any()]
-    return mask, tuple(f"{name} has no voxel of the label {label}." for label in missing)
 
 
 def _of_two(values: Array, name: str, low: float, high: float) -> tuple[Mask, tuple[str, ...]]:

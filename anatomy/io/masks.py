@@ -159,7 +159,6 @@ def _sample_obliquely(array: Array, source_from_target: Float, placed: Array) ->
         placed[:, :, k][inside] = array[tuple(at[inside].T)]
 
 
-_READERS = 2  # decompression releases the interpreter; more threads only raise the peak of memory
 SOLID = ("wall", "vessels", "fissures", "hepatic-vein", "portal-vein", "hepatic-artery")
 """Obstacles: none of their voxels may be lost where they are put on another grid."""
 EXTENT = ("lumen", "lung", "lobes")
@@ -213,6 +212,9 @@ def read_masks(
             the others.
     """
     paths = list(dict.fromkeys(source.path for source in sources))
+    names: dict[str, list[str]] = {}
+    for source in sources:
+        names.setdefault(source.role, []).append(source.path.name)
     if not paths:
         raise AnatomyError("No mask was given", expected="masks of airway, vessels and lung")
     grids = {path: read_grid(path, frame=frame) for path in paths}
@@ -222,7 +224,8 @@ def read_masks(
     gathered = _Gathered(grid, basis.name, grids[basis])
     folder = os.path.commonpath([os.path.abspath(path.parent) for path in paths])
     hashes: dict[str, str] = {}
-    with ThreadPoolExecutor(_READERS) as pool:
+    # Decompression releases the interpreter; more threads would only raise the peak of memory.
+    with ThreadPoolExecutor(2) as pool:
         read = pool.map(lambda path: _read_file(path, sources, frame), paths)
         for path, (file_grid, parts, digest, said) in zip(paths, read, strict=True):
             hashes[Path(os.path.relpath(os.path.abspath(path), folder)).as_posix()] = digest
@@ -230,7 +233,7 @@ def read_masks(
     return MaskSet(
         grid=grid,
         masks=gathered.masks,
-        files=_files_by_role(sources),
+        files={role: tuple(files) for role, files in names.items()},
         sources=hashes,
         lobes=gathered.lobes,
         nodule_labels=gathered.nodule_labels
@@ -340,13 +343,6 @@ def _unite(masks: dict[str, Mask], role: str, mask: Mask) -> None:
         masks[role] = masks[role] | mask
 
 
-def _files_by_role(sources: Sequence[MaskSource]) -> dict[str, tuple[str, ...]]:
-    names: dict[str, list[str]] = {}
-    for source in sources:
-        names.setdefault(source.role, []).append(source.path.name)
-    return {role: tuple(files) for role, files in names.items()}
-
-
 _BEYOND = {
     "lumen": "nothing counts as airway",
     "lung": "nothing counts as lung",
@@ -378,7 +374,8 @@ def placement(name: str, role: str, mask: Mask, grid: Grid, target: Grid, found:
         )
     low, high = box_in(target, grid)
     low, high = np.rint(np.maximum(low, 0)), np.rint(np.minimum(high, target.shape))
-    covered = f"{_times(high - low)} of the {_times(target.shape)} voxels, from ({_comma(low)}) on"
+    covered = f"{_listed(high - low, ' x ')} of the {_listed(target.shape, ' x ')} voxels, "
+    covered += f"from ({_listed(low, ', ')}) on"
     sentences = [f"{name} was placed by its header: it covers {covered}."]
     if found.is_resampled:
         half = float(np.linalg.norm(grid.spacing_mm)) / 2
@@ -424,9 +421,5 @@ def moved(
     return " ".join(sentences)
 
 
-def _times(numbers: object) -> str:
-    return " x ".join(f"{float(n):g}" for n in np.asarray(numbers))
-
-
-def _comma(numbers: object) -> str:
-    return ", ".join(f"{float(n):g}" for n in np.asarray(numbers))
+def _listed(numbers: object, between: str) -> str:
+    return between.join(f"{float(n):g}" for n in np.asarray(numbers))

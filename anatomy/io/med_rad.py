@@ -63,7 +63,9 @@ def load_med_rad(folder: Path) -> PatientImages:
     """
     sources = lung_sources(folder)
     require_roles(folder, sources)
-    doubles = require_single(folder, [source.path for source in sources], _doubled_lobes(sources))
+    lobes = combinations((source for source in sources if source.role == "lobes"), 2)
+    alike = ((a.path, b.path) for a, b in lobes if a.lobe == b.lobe)
+    doubles = require_single(folder, [source.path for source in sources], alike)
     masks = read_masks(sources)
     poses, hashes = text_poses(folder, masks.grid)
     return assemble(
@@ -75,12 +77,6 @@ def load_med_rad(folder: Path) -> PatientImages:
         warnings=(*doubles, *_not_read(folder, sources)),
         **poses,
     )
-
-
-def _doubled_lobes(sources: Sequence[MaskSource]) -> Iterator[tuple[Path, Path]]:
-    """Yield the pairs of files that are named after one lobe."""
-    of_lobes = [source for source in sources if source.role == "lobes"]
-    return ((a.path, b.path) for a, b in combinations(of_lobes, 2) if a.lobe == b.lobe)
 
 
 def _not_read(folder: Path, sources: Sequence[MaskSource]) -> Iterator[str]:
@@ -108,16 +104,13 @@ def lung_sources(folder: Path) -> list[MaskSource]:
     ]
     for role, names in LUNG_FILES.items():
         path = next((images[plain(name)] for name in names if plain(name) in images), None)
-        path = _of_a_case(images) if path is None and role == "lumen" else path
+        if path is None and role == "lumen":
+            # The name of the one bronchial tree may begin or end with that of its case.
+            holding = [path for stem, path in images.items() if "bronchialtree" in stem]
+            path = holding[0] if len(holding) == 1 else None
         if path is not None:
             sources.append(MaskSource(role=role, path=path))
     return [*sources, *numbered_nodules(images)]
-
-
-def _of_a_case(images: Mapping[str, Path]) -> Path | None:
-    """Return the one bronchial tree whose name begins or ends with that of its case."""
-    holding = [path for stem, path in images.items() if "bronchialtree" in stem]
-    return holding[0] if len(holding) == 1 else None
 
 
 def numbered_nodules(images: Mapping[str, Path]) -> list[MaskSource]:
@@ -141,7 +134,10 @@ def text_poses(folder: Path, grid: Grid) -> tuple[dict[str, Any], dict[str, str]
         FileError: If a file holds no pose or point.
         FrameError: If a position lies outside `grid`.
     """
-    texts = sorted(folder.glob("*.[tT][xX][tT]"), key=_natural)
+    texts = sorted(
+        folder.glob("*.[tT][xX][tT]"),
+        key=lambda path: ([int(digits) for digits in re.findall(r"\d+", path.stem)], path.name),
+    )
     start_files = [path for path in texts if re.search(r"start_?\d*$", path.stem.lower())]
     target_files = [path for path in texts if re.fullmatch(r"targets?_?\d*", path.stem.lower())]
     starts = tuple(read_pose(path, _FRAME_ON_DISK) for path in start_files)
@@ -161,10 +157,6 @@ def text_poses(folder: Path, grid: Grid) -> tuple[dict[str, Any], dict[str, str]
         "target_names": tuple(name for name, _ in targets),
     }
     return poses, {path.name: sha256(path) for path in (*start_files, *target_files)}
-
-
-def _natural(path: Path) -> tuple[list[int], str]:
-    return [int(digits) for digits in re.findall(r"\d+", path.stem)], path.name
 
 
 def require_roles(folder: Path, sources: list[MaskSource]) -> None:

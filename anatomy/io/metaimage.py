@@ -40,7 +40,9 @@ def open_metaimage(path: Path, components: int = 1) -> tuple[image_header.ImageH
     channels = fields.get("ElementNumberOfChannels", "1")
     if channels != str(components):
         raise image_header.not_of_components(path, channels[:40], components)
-    dtype = np.dtype((">" if _big_endian(fields) else "<") + _DTYPES[fields["ElementType"]])
+    big_endian = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "false"))
+    order = ">" if big_endian.lower() in ("true", "1") else "<"
+    dtype = np.dtype(order + _DTYPES[fields["ElementType"]])
     data_path, at = _data_file(fields, path, offset)
     sizes = tuple(int(n) for n in fields.get("DimSize", "").split()[:8])
     shape = image_header.image_shape(sizes, dtype.itemsize * components, path, data_path.stat().st_size)
@@ -84,11 +86,6 @@ def _require_plain(fields: Mapping[str, str], path: Path) -> None:
             expected="one image of three dimensions, stored as binary data",
             remedy="Save the image again, as 3D Slicer or ITK do",
         )
-
-
-def _big_endian(fields: Mapping[str, str]) -> bool:
-    stated = fields.get("BinaryDataByteOrderMSB", fields.get("ElementByteOrderMSB", "false"))
-    return stated.lower() in ("true", "1")
 
 
 def _data_file(fields: Mapping[str, str], path: Path, offset: int) -> tuple[Path, int]:

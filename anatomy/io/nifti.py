@@ -89,7 +89,9 @@ def _at_least(start: bytes, n_bytes: int, stream: Iterator[bytes]) -> bytes:
 def _header(
     fields: dict[str, tuple[Any, ...]], before_voxels: bytes, path: Path, frame: Frame | None, components: int
 ) -> image_header.ImageHeader:
-    dtype, sizes = _dtype(fields, path), _sizes(fields["dim"])
+    dtype, dim = _dtype(fields, path), fields["dim"]
+    rank = dim[0] if 3 <= dim[0] <= 7 else 0
+    sizes = dim[1:4] if rank and all(n == 1 for n in dim[4 : rank + 1]) else dim[1 : rank + 1]
     if components > 1:
         sizes = _sizes_of_field(fields, sizes, path, components)
     shape = image_header.image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
@@ -149,12 +151,6 @@ def _dtype(fields: dict[str, tuple[Any, ...]], path: Path) -> np.dtype[Any]:
         )
     order: str = fields["order"][0]
     return np.dtype(order + stored)
-
-
-def _sizes(dim: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the sizes without trailing ones beyond the third."""
-    rank = dim[0] if 3 <= dim[0] <= 7 else 0
-    return dim[1:4] if all(n == 1 for n in dim[4 : rank + 1]) and rank else dim[1 : rank + 1]
 
 
 def _scale(stored: tuple[float, float], path: Path) -> tuple[float, float]:

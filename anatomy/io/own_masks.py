@@ -4,7 +4,6 @@ import json
 import unicodedata
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,14 +24,7 @@ from anatomy.lobes import LOBES, lobe_named
 from anatomy.patient import PatientImages
 
 DESCRIPTION = "patient.toml"
-_ROLES = {
-    "lumen": "lumen",
-    "wall": "wall",
-    "vessels": "vessels",
-    "lung": "lung",
-    "fissures": "fissures",
-    "nodule": "nodules",
-}
+_ROLES = {name: name for name in ("lumen", "wall", "vessels", "lung", "fissures")} | {"nodule": "nodules"}
 _Files = str | tuple[str, ...]
 
 
@@ -130,12 +122,7 @@ def load_own_masks(description: Path) -> PatientImages:
         vessel_border_mm=keys.vessel_border_mm,
         sources=hashes,
         accepted=keys.accepted,
-        warnings=(
-            *_thick_slices(keys.thick_slices_mm),
-            *_accepted(keys.accepted),
-            *_from_elsewhere(keys.sources),
-            *keys.warnings,
-        ),
+        warnings=(*_warnings(keys), *keys.warnings),
     )
     return images if keys.motion is None else with_motion(images, keys.motion, description)
 
@@ -191,29 +178,21 @@ def require_thin_slices(path: str | Path) -> None:
         )
 
 
-def _thick_slices(distance_mm: float) -> tuple[str, ...]:
-    if not distance_mm:
-        return ()
-    return (
-        f"The masks were made from slices {distance_mm:.1f} mm apart: small airways and vessels are missing, "
-        "so a path that looks free may not be.",
-    )
-
-
-def _accepted(names: tuple[str, ...]) -> tuple[str, ...]:
-    if not names:
-        return ()
-    return (
-        f"The segmentation failed its check of {', '.join(names)}, and a person accepted that: look at the "
-        "masks before planning.",
-    )
-
-
-def _from_elsewhere(sources: Mapping[str, str]) -> tuple[str, ...]:
-    if not sources:
-        return ()
-    words = "; ".join(f"{name.replace('_', ' ')} from {source}" for name, source in sources.items())
-    return (f"Masks of other programs or people took the place of steps of the segmentation: {words}.",)
+def _warnings(keys: PatientFile) -> Iterator[str]:
+    """Yield what the segmentation that wrote a description makes doubtful."""
+    if keys.thick_slices_mm:
+        yield (
+            f"The masks were made from slices {keys.thick_slices_mm:.1f} mm apart: small airways and vessels "
+            "are missing, so a path that looks free may not be."
+        )
+    if keys.accepted:
+        yield (
+            f"The segmentation failed its check of {', '.join(keys.accepted)}, and a person accepted that: "
+            "look at the masks before planning."
+        )
+    if keys.sources:
+        words = "; ".join(f"{name.replace('_', ' ')} from {source}" for name, source in keys.sources.items())
+        yield f"Masks of other programs or people took the place of steps of the segmentation: {words}."
 
 
 def _read_content(path: Path) -> dict[str, Any]:
@@ -294,7 +273,7 @@ def _named_file(folder: Path, name: str) -> Path:
     )
     if (folder / (slashed := name.replace("\\", "/"))).is_file():
         remedy = f"Write {slashed}: every system takes / between folders"
-    elif any(map(partial(_are_alike, path.name), there)):
+    elif unicodedata.normalize("NFC", path.name) in {unicodedata.normalize("NFC", each) for each in there}:
         remedy = "A file there has the same name with its letters composed otherwise (Unicode NFC or NFD): "
         remedy += "rename the file in plain letters"
     else:
@@ -306,7 +285,3 @@ def _named_file(folder: Path, name: str) -> Path:
         expected="an existing file; names are relative to the folder of the patient.toml, or absolute",
         remedy=remedy,
     )
-
-
-def _are_alike(one: str, other: str) -> bool:
-    return unicodedata.normalize("NFC", one) == unicodedata.normalize("NFC", other)

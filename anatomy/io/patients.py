@@ -18,10 +18,6 @@ from anatomy.patient import PatientImages
 
 _SHOWN = 12
 """A long list shows this many of its names."""
-
-
-FILES_LOOKED_AT = 20
-"""The first files of a folder, so many, tell whether it holds DICOM; a few may be something else."""
 AIR_HU = -500.0
 """A CT of the chest holds voxels of less density; masks and label maps hold none below 0."""
 
@@ -70,7 +66,8 @@ def is_ct(path: Path) -> bool:
     """Return whether a path is a CT and no patient: a folder of DICOM slices, or an image that holds air."""
     if path.is_dir():
         files = (each for each in path.rglob("*") if each.is_file())
-        return not _here(path) and any(is_dicom(each) for each in islice(files, FILES_LOOKED_AT))
+        # The first files tell whether a folder holds DICOM; a few of them may be something else.
+        return not _here(path) and any(is_dicom(each) for each in islice(files, 20))
     return image_suffix(path) is not None and float(read_volume(path).array.min()) <= AIR_HU
 
 
@@ -100,7 +97,11 @@ def _refuse(folder: Path) -> NoReturn:
     require_no_ct_case(folder)
     if lung_sources(folder):
         if has_lobes(folder):
-            _refuse_lobes_alone(folder)
+            raise FileError(
+                f"{folder} holds lobes of TotalSegmentator, but neither airways nor vessels",
+                expected="output of the tasks total and lung_vessels in one folder",
+                remedy=f"Run TotalSegmentator -i CT.nii.gz -o {folder} --task lung_vessels",
+            )
         require_roles(folder, lung_sources(folder))
     within = patients_in(folder)
     if within:
@@ -118,14 +119,6 @@ def _refuse(folder: Path) -> NoReturn:
         expected="a folder of Med-RAD (bronchialTree, vessels, pleuralBoundary), output of TotalSegmentator "
         "(task lung_vessels), a case of AeroPath or ATM'22, or a folder with a patient.toml",
         remedy=describe_yourself(),
-    )
-
-
-def _refuse_lobes_alone(folder: Path) -> NoReturn:
-    raise FileError(
-        f"{folder} holds lobes of TotalSegmentator, but neither airways nor vessels",
-        expected="output of the tasks total and lung_vessels in one folder",
-        remedy=f"Run TotalSegmentator -i CT.nii.gz -o {folder} --task lung_vessels",
     )
 
 

@@ -56,7 +56,9 @@ def compile_ahead(
         commands: Such as "plan"; all that are known if empty.
         fewest: Fewer missing kernels are left to be compiled when they are called.
     """
-    missing = {n: call for n, call in _called(commands).items() if _code_file(call) is None}
+    called = [n for n, call in enumerate(_calls()) if not commands or call["commands"].intersection(commands)]
+    kernels = {n: _calls()[n] for n in called if _dispatcher(_calls()[n]) is not None}  # Some may be gone.
+    missing = {n: call for n, call in kernels.items() if _code_file(call) is None}
     if len(missing) < fewest:
         return 0
     done = 0
@@ -93,14 +95,6 @@ def _calls() -> tuple[Mapping[str, Any], ...]:
         for function, calls in functions.items()
         for kinds, users, size in calls
     )
-
-
-def _called(commands: list[str]) -> dict[int, Mapping[str, Any]]:
-    """Return the calls that commands make; kernels that are gone are left out."""
-    wanted = {
-        n: call for n, call in enumerate(_calls()) if not commands or call["commands"].intersection(commands)
-    }
-    return {n: call for n, call in wanted.items() if _dispatcher(call) is not None}
 
 
 def _code_file(call: Mapping[str, Any]) -> Path | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Array, Float32, Mask
+from anatomy.base.typed import Array, Float32, Mask, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom.branching import Centerlines, centerlines
@@ -78,9 +78,7 @@ class Phantom:
 
     def mask(self, *names: str) -> Mask:
         """Return the voxels `(ni, nj, nk)` that carry one of the named labels."""
-        table = np.zeros(256, dtype=np.bool_)
-        table[[LABELS[name] for name in names]] = True
-        return np.asarray(table[self.labels.array])
+        return _carrying(self.labels.array, names)
 
 
 def make_phantom(
@@ -186,13 +184,17 @@ def _wide(canvas: Canvas, tree: PlannedTree, base: int, from_mm: float) -> Mask:
     return np.asarray(table[owner])
 
 
+def _carrying(labels: UInt8, names: tuple[str, ...]) -> Mask:
+    table = np.zeros(256, dtype=np.bool_)
+    table[[LABELS[name] for name in names]] = True
+    return np.asarray(table[labels])
+
+
 def _images(canvas: Canvas, name: str, nodules: tuple[Nodule, ...], hilar: Mask | None) -> PatientImages:
     """Return the masks; `hilar` are the voxels of vessels that count as mediastinum, if any do."""
 
     def labelled(*names: str) -> Volume:
-        table = np.zeros(256, dtype=np.bool_)
-        table[[LABELS[n] for n in names]] = True
-        return Volume(grid=canvas.grid, array=table[canvas.labels])
+        return Volume(grid=canvas.grid, array=_carrying(canvas.labels, names))
 
     lung = (canvas.lobes > 0) & (canvas.labels != LABELS["bulla"])
     vessels = labelled("artery", "vein")

@@ -90,12 +90,9 @@ TEMPLATE = (
     _segment("LB10", "LB9+10", (0.10, 0.65, -0.78), 14, LEFT_LOWER),
 )
 CENTRAL = (
-    "right main bronchus",
-    "left main bronchus",
-    "right upper lobe bronchus",
-    "left upper lobe bronchus",
+    "right main bronchus", "left main bronchus", "right upper lobe bronchus", "left upper lobe bronchus",
     "left lower lobe bronchus",
-)
+)  # fmt: skip
 """Main bronchi and the lobar ones that leave them."""
 
 
@@ -149,14 +146,6 @@ def _segment_clouds(
     return clouds
 
 
-def _supplied(clouds: dict[str, Float]) -> dict[str, int]:
-    """Return how many points each bronchus of the template supplies."""
-    counts = {name: len(cloud) for name, cloud in clouds.items()}
-    for bronchus in reversed(TEMPLATE):
-        counts[bronchus.parent] = counts.get(bronchus.parent, 0) + counts.get(bronchus.name, 0)
-    return counts
-
-
 def grow_airways(
     territory: Territory, scale: float, rng: np.random.Generator, traits: Traits = PLAIN
 ) -> tuple[Sprouts, GrowthRule]:
@@ -168,7 +157,9 @@ def grow_airways(
     ends = _skeleton(scale, rng, traits.bronchus_length)
     resected = traits.resected_lobe
     clouds = _segment_clouds(ends, territory, resected)
-    counts = _supplied(clouds)
+    counts = {name: len(cloud) for name, cloud in clouds.items()}  # The points that each bronchus supplies.
+    for bronchus in reversed(TEMPLATE):
+        counts[bronchus.parent] = counts.get(bronchus.parent, 0) + counts.get(bronchus.name, 0)
     rule = GrowthRule(
         # This is the diameter in an adult [Weibel1963].
         root_diameter_mm=scale * 18.0 * (1 + 0.05 * rng.uniform(-1, 1)),
@@ -185,7 +176,7 @@ def grow_airways(
     sprouts.add(-1, trachea, rule.root_diameter_mm, 0, "trachea")
     for bronchus in TEMPLATE:
         stump = resected and bronchus.lobe == resected
-        if stump and _lobe_of(bronchus.parent) == resected:
+        if stump and any(each.name == bronchus.parent and each.lobe == resected for each in TEMPLATE):
             continue
         parent = index[bronchus.parent]
         start, end = sprouts.points[parent][-1], ends[bronchus.name][1]
@@ -203,10 +194,6 @@ def grow_airways(
     for name, cloud in clouds.items():
         grow(sprouts, index[name], cloud, rule, territory, rng)
     return sprouts, rule
-
-
-def _lobe_of(name: str) -> int:
-    return next((bronchus.lobe for bronchus in TEMPLATE if bronchus.name == name), 0)
 
 
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
@@ -277,7 +264,10 @@ def plan_patient(
     airways = _plan_airways(sprouts, spacing_mm)
     rim_mm = scale * traits.vessel_rim_mm
     arteries = _below_rim(_plan_arteries(sprouts, scale, vessels), territory, rim_mm)
-    tubes = _obstacles(airways, arteries)
+    tubes = Obstacles(
+        centres=np.vstack([airways.points_lps, arteries.points_lps]),
+        radii=np.concatenate([airways.outer_mm, arteries.outer_mm]),
+    )
     # Only tubes of a larger radius keep nodules away: thin ones run into them in patients, too.
     large = tubes.radii > 1.4 * scale
     nodules = place_nodules(territory, tubes.centres[large], tubes.radii[large], scale, rng, bullae)
@@ -288,7 +278,11 @@ def plan_patient(
     root_mm, calibre = rule.root_diameter_mm, vessels.calibre
     rule = replace(rule, smallest_diameter_mm=vessels.limit_mm, root_diameter_mm=calibre * root_mm)
     grown = grow_veins(territory, obstacles, rule, scale, rng)
-    veins = _plan_veins(grown, obstacles, scale, replace(vessels, calibre=1.0))
+    sprouts, radius = _vessel_part(grown, replace(vessels, calibre=1.0))
+    # Veins from this diameter on lie outside the lung and may be drawn there.
+    freedom = (np.array(sprouts.diameter_mm) > 6.0 * scale).astype(np.uint8)
+    freedom[0] = 2
+    veins = _vessels(sprouts, radius, obstacles, spacing_mm, len(sprouts.points[0]), freedom)
     veins = _below_rim(veins, territory, rim_mm)
     return PatientPlan(airways=airways, arteries=arteries, veins=veins, nodules=nodules, bullae=bullae)
 
@@ -344,27 +338,12 @@ def _plan_arteries(sprouts: Sprouts, scale: float, rule: VesselRule) -> PlannedT
     return _vessels(arteries, radius, obstacles, rule.spacing_mm, fixed, _freedom(arteries))
 
 
-def _plan_veins(grown: Sprouts, obstacles: Obstacles, scale: float, rule: VesselRule) -> PlannedTree:
-    veins, radius = _vessel_part(grown, rule)
-    # Veins from this diameter on lie outside the lung and may be drawn there.
-    freedom = (np.array(veins.diameter_mm) > 6.0 * scale).astype(np.uint8)
-    freedom[0] = 2
-    return _vessels(veins, radius, obstacles, rule.spacing_mm, len(veins.points[0]), freedom)
-
-
 def _below_rim(tree: PlannedTree, territory: Territory, rim_mm: float) -> PlannedTree:
     """Let vessels end below the rim; without a rim the tree is as it was."""
     if rim_mm == 0.0:
         return tree
     sprouts, radius, kept = ends_below_pleura(tree.sprouts, tree.outer_mm, tree.freedom, territory, rim_mm)
     return PlannedTree(sprouts=sprouts, inner_mm=radius, outer_mm=radius, freedom=tree.freedom[kept])
-
-
-def _obstacles(*trees: PlannedTree) -> Obstacles:
-    return Obstacles(
-        centres=np.vstack([tree.points_lps for tree in trees]),
-        radii=np.concatenate([tree.outer_mm for tree in trees]),
-    )
 
 
 def ends_below_pleura(

@@ -11,20 +11,9 @@ from anatomy.phantom.kernels import NODULE_OWNER, paint_tree
 from anatomy.phantom.plan import PlannedTree
 
 LABELS = {
-    "background": 0,
-    "soft_tissue": 1,
-    "lung": 2,
-    "lumen": 3,
-    "wall": 4,
-    "artery": 5,
-    "vein": 6,
-    "fissure": 7,
-    "nodule": 8,
-    "mediastinum": 9,
-    "heart": 10,
-    "bone": 11,
-    "bulla": 12,
-}
+    "background": 0, "soft_tissue": 1, "lung": 2, "lumen": 3, "wall": 4, "artery": 5, "vein": 6, "fissure": 7,
+    "nodule": 8, "mediastinum": 9, "heart": 10, "bone": 11, "bulla": 12,
+}  # fmt: skip
 SLAB = 4
 """Planes that are drawn at once: the arrays of a slab fit into the processor's cache."""
 HILUM_LPS = {-1.0: (-20.0, 5.0, -32.0), 1.0: (36.0, 8.0, -32.0)}

@@ -1,21 +1,24 @@
 """Pulmonary vessels: an artery beside every airway, veins grown into the gaps between them."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Bool, Float, Int
+from anatomy.base.typed import Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.branching import STEP_MM, Clearance, GrowthRule, Sprouts, grow, overlap_mm, smooth_line
 from anatomy.phantom.territory import Territory
 from anatomy.poses import unit
 
-TRUNK_KNOTS = ((14.0, -46.0, -58.0), (10.0, -40.0, -40.0), (6.0, -31.0, -23.0))
-"""Points of the central vessels of an adult, LPS mm from the carina, as in atlases."""
-RIGHT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (-6.0, -22.0, -24.0))
-LEFT_ARTERY_KNOTS = ((6.0, -31.0, -23.0), (18.0, -17.0, -2.0), (30.0, 2.0, 3.0))
-RIGHT_MAIN, LEFT_MAIN = 1, 2
+LEFT_MAIN = 2
+CENTRAL_KNOTS = {
+    0: ((14.0, -46.0, -58.0), (10.0, -40.0, -40.0), (6.0, -31.0, -23.0)),
+    1: ((6.0, -31.0, -23.0), (-6.0, -22.0, -24.0)),
+    LEFT_MAIN: ((6.0, -31.0, -23.0), (18.0, -17.0, -2.0), (30.0, 2.0, 3.0)),
+}
+"""Points of the trunk and of the right and left artery of an adult, LPS mm from the carina, as in atlases."""
 CENTRAL_ARTERIES = ("pulmonary trunk", "right pulmonary artery", "left pulmonary artery")
 
 # Per lobe: from the left atrium past the hilum to where the lobar vein begins to divide (adult, LPS mm).
@@ -93,7 +96,6 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
     ).clearance()
     # Arteries and airways share a sheath: about this much tissue lies between them.
     distance = outer_radius_mm + radius_mm + 0.5
-    central = {0: TRUNK_KNOTS, RIGHT_MAIN: RIGHT_ARTERY_KNOTS, LEFT_MAIN: LEFT_ARTERY_KNOTS}
     children = airways.children()
     side = np.tile(np.array((0.0, -1.0, 0.0)), (len(children), 1))
     # The left artery runs above and behind its bronchus, the right one in front.
@@ -101,10 +103,10 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
     arteries = Sprouts()
     for branch, line in enumerate(airways.points):
         parent = airways.parent[branch]
-        reference = side[branch] if branch in central else side[parent]
+        reference = side[branch] if branch in CENTRAL_KNOTS else side[parent]
         side[branch] = _plane_normal(airways, branch, children[branch], reference)
-        if branch in central:
-            knots = scale * np.array(central[branch])
+        if branch in CENTRAL_KNOTS:
+            knots = scale * np.array(CENTRAL_KNOTS[branch])
             goal = line[-1] + side[branch] * distance[branch]
             line = smooth_line(knots if branch == 0 else np.vstack([knots, goal]), STEP_MM)
         else:
@@ -117,15 +119,12 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
             side[branch] *= signs[-1] if other else 1
             line = lines[-1] if other else lines[0]
             line[0] = arteries.points[parent][-1]
-        name = CENTRAL_ARTERIES[branch] if branch in central else _artery_name(airways.name[branch])
+        # The artery beside RB6 is RA6, and that beside a lobar bronchus is called an artery.
+        beside = re.sub(r"^(.)B(?=\d)", r"\1A", airways.name[branch])
+        beside = beside.replace("bronchus", "artery").replace("bronchial", "arterial")
+        name = CENTRAL_ARTERIES[branch] if branch in CENTRAL_KNOTS else beside
         arteries.add(parent, line, 2 * radius_mm[branch], airways.lobe[branch], name)
     return arteries
-
-
-def _artery_name(airway_name: str) -> str:
-    if airway_name[1:2] == "B" and airway_name[2:3].isdigit():
-        return airway_name[0] + "A" + airway_name[2:]
-    return airway_name.replace("bronchus", "artery").replace("bronchial", "arterial")
 
 
 def grow_veins(
@@ -187,7 +186,9 @@ def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: floa
         trouble = np.asarray(np.abs(shift).sum(axis=1) > 0)
         _settle(position, shift, start, owners, fixed)
         # Points that may be pushed by their neighbours in the next round.
-        watched = np.flatnonzero(_spread(trouble, 6))
+        for _ in range(6):
+            trouble = trouble | np.roll(trouble, 1) | np.roll(trouble, -1)
+        watched = np.flatnonzero(trouble)
         watched = watched[watched >= fixed]
     distance, nearest = finder.query(position, k=NEIGHBOURS)
     clearance = (distance - obstacles.radii[nearest]).min(axis=1) - 0.5 * gap_mm
@@ -195,12 +196,6 @@ def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: floa
         tree.points[branch] = position[start[branch] : start[branch + 1]].copy()
     # A vessel keeps at least half of its radius where it must pass between others.
     return np.asarray(np.clip(clearance, 0.5 * radius, radius))
-
-
-def _spread(flags: Bool, steps: int) -> Bool:
-    for _ in range(steps):
-        flags = np.asarray(flags | np.roll(flags, 1) | np.roll(flags, -1))
-    return flags
 
 
 def _settle(position: Float, shift: Float, start: Int, owners: Int, fixed: int) -> None:

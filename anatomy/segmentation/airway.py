@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Array, Float, Int16, Mask
+from anatomy.base.typed import Float, Int16, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
 from anatomy.morphology import bounds, distance_mm, near, window
 from anatomy.segmentation.growing import Ground, grow
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 EDGE_MM = 3.0
 """How far the wall may lie from the rough central airway."""
-IN_PLANE = np.array([0, 1, 0])[:, None, None]
-"""Neighbours in an axial section alone, of (k, j, i)."""
 AROUND_MM, WIDE_MM = 15.0, 2.0
 """So near to it, air in which a ball of this radius fits belongs to it: the middle of a trachea has no walls
 around it to be seen by, and the tissue of the lung is nowhere so dark."""
@@ -73,6 +71,8 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     References:
         [Fu2018], III-A.2; [Aykac2003]
     """
+    from scipy import ndimage
+
     tell = progress or (lambda text: None)
     inside = lungs.mask
     if inside.shape != ct.array.shape:
@@ -84,10 +84,18 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     # The wall reaches less far beyond the lumen.
     margin = np.ceil(3.0 / ct.grid.spacing_mm).astype(np.int64)
     box = window(*bounds(inside | lungs.central_airway, margin))
-    hu = _hounsfield(ct.array[box])
+    values = ct.array[box]
+    if values.dtype != np.int16:
+        values = np.rint(values.astype(np.float32))
+    # Transposed and C-contiguous, as int16: between any two values lies less than 2^15.
+    hu = np.ascontiguousarray(np.clip(values, -GREATEST_HU, GREATEST_HU).T, dtype=np.int16)
     lung = np.ascontiguousarray(inside[box].T)
     spacing_mm = np.ascontiguousarray(ct.grid.spacing_mm[::-1])
-    smooth = _smoothed(hu, spacing_mm)
+    blurred = hu.astype(np.float32)
+    # Standard deviation of the smoothing that tells a dark voxel from noise.
+    ndimage.gaussian_filter(blurred, 0.6 / spacing_mm, output=blurred, truncate=2.0, mode="nearest")
+    smooth = np.asarray(np.rint(blurred, out=blurred), dtype=np.int16)
+    del blurred
     upright = 2 - int(np.argmax(np.abs(ct.grid.lps_from_ijk[2, :3] / ct.grid.spacing_mm)))
     depth = local_minima_map(hu, spacing_mm, upright)
     depth[(smooth > GREATEST_LUMEN_HU) & ~lung] = 0
@@ -111,26 +119,11 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     seed = lungs.trachea_seed_ijk - [s.start for s in box]
     grown = grow(ground, _start(ground, rough, (int(seed[2]), int(seed[1]), int(seed[0]))))
     lumen, wall = (np.zeros(inside.shape, dtype=np.bool_, order="F") for _ in range(2))
-    solid = _filled(grown.lumen)
+    solid, inner = grown.lumen, window(*bounds(grown.lumen))
+    solid[inner] = ndimage.binary_fill_holes(solid[inner])
     lumen[box] = solid.T
     wall[box] = (grown.wall & ~solid).T
     return Airways(lumen=lumen, wall=wall, leak_mm3=grown.undone * ct.grid.voxel_volume_mm3)
-
-
-def _hounsfield(values: Array) -> Int16:
-    """Return the transposed values as int16, C-contiguous: between any two lies less than 2^15."""
-    if values.dtype != np.int16:
-        values = np.rint(values.astype(np.float32))
-    return np.ascontiguousarray(np.clip(values, -GREATEST_HU, GREATEST_HU).T, dtype=np.int16)
-
-
-def _smoothed(hu: Int16, spacing_mm: Float) -> Int16:
-    from scipy.ndimage import gaussian_filter
-
-    smooth = hu.astype(np.float32)
-    # Standard deviation of the smoothing that tells a dark voxel from noise.
-    gaussian_filter(smooth, 0.6 / spacing_mm, output=smooth, truncate=2.0, mode="nearest")
-    return np.asarray(np.rint(smooth, out=smooth), dtype=np.int16)
 
 
 def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
@@ -142,7 +135,12 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
     reach = int(np.ceil(EDGE_MM / ground.spacing_mm.min()))
     inner = window(*bounds(certain, np.ceil(AROUND_MM / ground.spacing_mm).astype(np.int64)))
     wide = distance_mm(air[inner].T, ground.spacing_mm[::-1]).T >= WIDE_MM
-    wide &= ~_reaching_sides(wide)
+    # What reaches a side of the window in its axial section, beside the trachea, is air around the patient,
+    # or outside of the image that was scanned.
+    in_plane = ndimage.generate_binary_structure(3, 1) & np.array([False, True, False])[:, None, None]
+    labels, _ = ndimage.label(wide, structure=in_plane)
+    sides = np.concatenate([labels[:, [0, -1]].ravel(), labels[:, :, [0, -1]].ravel()])
+    wide &= ~np.isin(labels, np.unique(sides[sides > 0]))
     pieces, count = ndimage.label(wide | certain[inner])
     kept = np.bincount(pieces.ravel(), weights=certain[inner].ravel(), minlength=count + 1) > 0
     kept[0] = False
@@ -175,28 +173,6 @@ def _piece_at(air: Mask, seed: tuple[int, int, int]) -> Mask:
             remedy="Give another seed",
         )
     return np.asarray(labels == label)
-
-
-def _reaching_sides(air: Mask) -> Mask:
-    """Return the pieces of air `(nk, nj, ni)` that reach a side of the window in their axial section.
-
-    What goes on beside the trachea is air around the patient, or outside of the image that was scanned.
-    """
-    from scipy import ndimage
-
-    labels, _ = ndimage.label(air, structure=ndimage.generate_binary_structure(3, 1) * IN_PLANE)
-    sides = np.concatenate([labels[:, [0, -1]].ravel(), labels[:, :, [0, -1]].ravel()])
-    return np.isin(labels, np.unique(sides[sides > 0]))
-
-
-def _filled(lumen: Mask) -> Mask:
-    """Fill the holes that the lumen encloses."""
-    from scipy import ndimage
-
-    low, high = bounds(lumen)
-    inner = window(low, high)
-    lumen[inner] = ndimage.binary_fill_holes(lumen[inner])
-    return lumen
 
 
 _THREADS = 2

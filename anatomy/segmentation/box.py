@@ -226,7 +226,11 @@ def _along(values: Array, places: Float, cubic: bool) -> Array:
     if (first == places).all():
         return values[first]
     second, shares = np.minimum(first + 1, last), np.clip(places - first, 0.0, 1.0)
-    terms = _coefficients(values) if cubic else values
+    terms = values
+    if cubic:
+        from scipy.ndimage import spline_filter1d
+
+        terms = spline_filter1d(values, 3, axis=0, output=np.float32)
     found = np.zeros((len(places), *values.shape[1:]), dtype=values.dtype)
     for n, (below, above, share) in enumerate(zip(first, second, shares, strict=True)):
         for step, weight in _weights(float(share), cubic):
@@ -236,13 +240,6 @@ def _along(values: Array, places: Float, cubic: bool) -> Array:
             least, most = np.minimum(values[below], values[above]), np.maximum(values[below], values[above])
             np.clip(found[n], least, most, out=found[n])
     return found
-
-
-def _coefficients(values: Array) -> Array:
-    """Return the coefficients of the cubic splines along the first axis."""
-    from scipy.ndimage import spline_filter1d
-
-    return np.asarray(spline_filter1d(values, 3, axis=0, output=np.float32))
 
 
 def _weights(t: float, cubic: bool) -> list[tuple[int, float]]:

@@ -56,9 +56,13 @@ def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) 
     Raises:
         AnatomyError: If there is no column of air like a trachea, or the point does not lie in air.
     """
+    from scipy.ndimage import gaussian_filter
+
     found, first = False, None
-    for image in (ct, None):
-        image = image or _smoothed(ct)
+    for sigma in (0.0, 1.0):
+        # A standard deviation for images too noisy to follow the trachea in: smoothed, it is air throughout.
+        smooth = gaussian_filter(ct.hu, sigma, mode="nearest") if sigma else ct.hu
+        image = replace(ct, hu=np.asfortranarray(smooth))
         try:
             seeds = [seed_lps] if seed_lps is not None else _trachea_seeds(image, outside)
         except AnatomyError as error:
@@ -82,14 +86,6 @@ def _with_throat(ct: CoarseCt, outside: Mask, seed_lps: Float) -> Mask:
     barred, seed = outside.copy(order="F"), _given_seed(ct, seed_lps)
     barred[:, :, max(throat_level(air, seed, ct.spacing_mm[2]), int(seed[2]) + 1) :] = True
     return barred
-
-
-def _smoothed(ct: CoarseCt) -> CoarseCt:
-    """Return the image with less noise, in which a low-dose trachea is air throughout."""
-    from scipy.ndimage import gaussian_filter
-
-    # Standard deviation of the filter for images too noisy to follow the trachea in.
-    return replace(ct, hu=np.asfortranarray(gaussian_filter(ct.hu, 1.0, mode="nearest")))
 
 
 def _long_enough(ct: CoarseCt, found: CentralAirway) -> CentralAirway:
@@ -244,8 +240,7 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
 
     from anatomy.tree import tree_from_mask
 
-    low, high = bounds(grown)
-    low, high = np.maximum(low - 1, 0), np.minimum(high + 1, grown.shape)
+    low, high = bounds(grown, 1)
     box = window(low, high)
     part = np.asfortranarray(grown[box])
     depth = edt.edt(part, anisotropy=ct.spacing_mm, black_border=True)

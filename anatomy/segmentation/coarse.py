@@ -43,15 +43,19 @@ class CoarseCt:
         step = tuple(max(1, round(COARSE_MM / float(s))) for s in ct.grid.spacing_mm)
         blocks = _block_means(ct.array, step)
         order, flipped = towards_lps(ct.grid.lps_from_ijk[:3, :3])
+        matrix = ct.grid.lps_from_ijk.copy()
+        matrix[:3, :3] = matrix[:3, :3] * step
+        matrix[:3, 3] = ct.grid.lps((np.asarray(step) - 1) / 2)
         made = cls(
             hu=blocks,
-            grid=turned_grid(_block_grid(ct.grid, blocks.shape, step), order, flipped),
+            grid=turned_grid(Grid(shape=blocks.shape, lps_from_ijk=matrix), order, flipped),
             fine_shape=ct.grid.shape,
             step=(step[0], step[1], step[2]),
             order=order,
             flipped=flipped,
         )
-        object.__setattr__(made, "hu", np.asfortranarray(made._turned(blocks)))
+        turned = np.flip(np.transpose(blocks, order), axis=made._reversed_axes())
+        object.__setattr__(made, "hu", np.asfortranarray(turned))
         return made
 
     @property
@@ -97,10 +101,6 @@ class CoarseCt:
         i, j, k = (int(n) for n in self.grid.voxels(lps))
         return (i, j, k) if bool(self.grid.contains(lps)) else None
 
-    def _turned(self, blocks: Array) -> Array:
-        turned: Array = np.flip(np.transpose(blocks, self.order), axis=self._reversed_axes())
-        return turned
-
     def _turned_back(self, blocks: Array) -> Array:
         unflipped: Array = np.flip(blocks, axis=self._reversed_axes())
         return np.transpose(unflipped, np.argsort(self.order))
@@ -120,10 +120,3 @@ def _block_means(values: Array, step: tuple[int, ...]) -> Float32:
         count[where] += 1.0
     total /= count
     return total
-
-
-def _block_grid(grid: Grid, shape: tuple[int, ...], step: tuple[int, ...]) -> Grid:
-    matrix = grid.lps_from_ijk.copy()
-    matrix[:3, :3] = matrix[:3, :3] * step
-    matrix[:3, 3] = grid.lps((np.asarray(step) - 1) / 2)
-    return Grid(shape=(shape[0], shape[1], shape[2]), lps_from_ijk=matrix)

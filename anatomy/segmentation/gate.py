@@ -223,10 +223,11 @@ def plausibility(
     else:
         for name, lung in (("left", lungs.left), ("right", lungs.right)):
             if lung.any() and not ct.grid.values_at(lung, tree.points_lps, False).any():
+                gap_mm = tree.nearest_point_index.query(sampled(lung, ct.grid, SAMPLE_MM))[0].min()
                 found.append(
                     Finding(
                         name="bronchi",
-                        found=f"The airway ends {_gap_mm(ct, lung, tree):.0f} mm before the {name} lung, so "
+                        found=f"The airway ends {gap_mm:.0f} mm before the {name} lung, so "
                         "that no bronchus leads into it",
                         remedy=f"Look whether it is lung, and where the airway ends: {correct}",
                     )
@@ -237,12 +238,6 @@ def plausibility(
             warnings += missing_lung(lungs.left, lungs.right, ct.grid, tree.carina_lps)
     failed = tuple(each for each in found if each.verdict == REFUSED)
     return failed, (*warnings, *(each.found for each in found if each.verdict == DOUBTFUL))
-
-
-def _gap_mm(ct: Volume, lung: Mask, tree: AirwayTree) -> float:
-    from scipy.spatial import cKDTree
-
-    return float(cKDTree(sampled(lung, ct.grid, SAMPLE_MM)).query(tree.points_lps)[0].min())
 
 
 def _sizes(ct: Volume, lungs: Lungs, median: float) -> Iterator[Finding]:

@@ -33,11 +33,7 @@ class NetworkSettings:
         tuple[float, ...],
         Field(description="Voxel size it was trained on: right-left, front-back, feet-head; or the CT's"),
     ] = ()
-    tile: Annotated[tuple[int, int, int], Field(description="Voxels of a tile, in the same order")] = (
-        96,
-        96,
-        96,
-    )
+    tile: Annotated[tuple[int, int, int], Field(description="Voxels of a tile, in that order")] = (96, 96, 96)
     overlap: Annotated[
         float, quantity("Share of a tile that lies in the next one", at_least=0.0, below=1.0)
     ] = 0.25
@@ -147,17 +143,15 @@ def _tiled(run: _Runner, image: Float32, how: NetworkSettings) -> Float32:
     for axis, n in enumerate(tile):
         slope = 1.0 - np.abs(np.arange(n) - 0.5 * (n - 1)) / (0.5 * (n + 1))
         window = window * slope.astype(np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
-    starts = [_starts(n, t, how.overlap) for n, t in zip(padded.shape, tile, strict=True)]
+    starts = []
+    for n, t in zip(padded.shape, tile, strict=True):
+        count = 1 + int(np.ceil((n - t) / max(1.0, t * (1.0 - how.overlap))))
+        starts.append(sorted({round(at) for at in np.linspace(0, n - t, count)}))
     for start in itertools.product(*starts):
         box = tuple(slice(a, a + n) for a, n in zip(start, tile, strict=True))
         total[box] += window * run(padded[box])
         weights[box] += window
     return np.asarray((total / weights)[tuple(slice(0, n) for n in image.shape)])
-
-
-def _starts(size: int, tile: int, overlap: float) -> list[int]:
-    count = 1 + int(np.ceil((size - tile) / max(1.0, tile * (1.0 - overlap))))
-    return sorted({round(at) for at in np.linspace(0, size - tile, count)})
 
 
 class _Runner:

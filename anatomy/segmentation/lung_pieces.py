@@ -7,7 +7,7 @@ too wide for a closing of the lung, are filled.
 import numpy as np
 
 from anatomy.base.errors import AnatomyError
-from anatomy.base.typed import Float, Float32, Int, Int32, Mask
+from anatomy.base.typed import Float, Float32, Int32, Mask
 from anatomy.morphology import bounds, closed, distance_mm, largest_piece, near, window, without_holes
 from anatomy.segmentation.central_airway import CentralAirway, grow_from
 from anatomy.segmentation.coarse import CoarseCt
@@ -175,16 +175,12 @@ def _near_hull(lungs: Mask, ct: CoarseCt) -> Mask:
         depth = edt.edt(hull, anisotropy=ct.spacing_mm[:2], order="F", black_border=True)
         # Half the diameter of the largest nodule that is not called a mass, 30 mm.
         near[:, :, k] = hull & (depth <= 15.0)
-    _clear_edge(near, np.ceil(NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64))
-    return near
-
-
-def _clear_edge(mask: Mask, width: Int) -> None:
-    """Empty the border of an array: near the edge of the image a closing cannot tell notch from outside."""
-    for axis, n in enumerate(width):
-        layers = np.moveaxis(mask, axis, 0)
+    # Near the edge of the image a closing cannot tell notch from outside.
+    for axis, n in enumerate(np.ceil(NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64)):
+        layers = np.moveaxis(near, axis, 0)
         layers[:n] = False
         layers[-n:] = False
+    return near
 
 
 def coarse_lung_ex_vivo(

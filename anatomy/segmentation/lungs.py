@@ -224,9 +224,14 @@ def _airway_and_lung(
 
 
 def _coarse_sides(coarse: CoarseCt, tissue: Mask, airway: CentralAirway) -> tuple[Int32, tuple[str, ...]]:
-    """Label the right lung 1 and the left lung 2 on coarse voxels."""
+    """Label the right lung 1 and the left lung 2 on coarse voxels; a single one by its side."""
     sides = sides_from_right(tissue, coarse)
-    return (sides, ()) if sides is not None else _one_side(coarse, tissue, airway)
+    if sides is not None:
+        return sides, ()
+    centre = float(np.argwhere(tissue)[:, 0].mean())
+    side, name = (RIGHT, "right") if centre < airway.seed[0] else (LEFT, "left")
+    warning = f"Only one lung was found, or the two could not be told apart; it is taken as the {name} one."
+    return np.asfortranarray(tissue * np.int32(side)), (warning,)
 
 
 def _gas_warning(coarse: CoarseCt, gas: Mask) -> tuple[str, ...]:
@@ -238,14 +243,6 @@ def _gas_warning(coarse: CoarseCt, gas: Mask) -> tuple[str, ...]:
         f"({place}) mm: a pneumothorax, a bulla, or stomach or bowel beside the lung. It is no lung, and "
         "no needle is steered in it; a lung beside a pneumothorax lies elsewhere once it is drained.",
     )
-
-
-def _one_side(coarse: CoarseCt, tissue: Mask, airway: CentralAirway) -> tuple[Int32, tuple[str, ...]]:
-    """Name a single lung by the side of the trachea it lies on."""
-    centre = float(np.argwhere(tissue)[:, 0].mean())
-    side, name = (RIGHT, "right") if centre < airway.seed[0] else (LEFT, "left")
-    warning = f"Only one lung was found, or the two could not be told apart; it is taken as the {name} one."
-    return np.asfortranarray(tissue * np.int32(side)), (warning,)
 
 
 def _fine_lung(
@@ -286,9 +283,7 @@ def _with_wall(coarse: CoarseCt, main: Mask) -> Mask:
     """Grow the main airways by the thickness of their wall."""
     import edt
 
-    low, high = bounds(main)
-    low, high = np.maximum(low - 3, 0), np.minimum(high + 3, main.shape)
-    box = window(low, high)
+    box = window(*bounds(main, 3))
     grown = np.zeros(main.shape, dtype=np.bool_, order="F")
     grown[box] = edt.edt(np.asfortranarray(~main[box]), anisotropy=coarse.spacing_mm) <= WALL_MM
     return grown

@@ -141,13 +141,9 @@ def _of_file(image: str, path: Path, labels: tuple[int, ...], source: str) -> _R
             labels=labels,
         )
     found = Volume(grid=volume.grid, array=array)
-    read = _as_lobes(found, source) if image == "lobes" else _Read(volume=found, source=source)
-    return replace(read, said=said)
-
-
-def _as_lobes(volume: Volume, source: str) -> _Read:
-    lobes = lobe_numbers(volume, source)
-    return _Read(volume=Volume(grid=volume.grid, array=lobes), source=source)
+    if image == "lobes":
+        found = Volume(grid=volume.grid, array=lobe_numbers(found, source))
+    return _Read(volume=found, source=source, said=said)
 
 
 def _one_of_folder(image: str, folder: Path) -> _Read:

@@ -221,7 +221,10 @@ def quality_of(parts: Parts) -> Quality:
         "nodule": parts.nodule,
     }
     volumes = {name: float(np.count_nonzero(mask)) * litre for name, mask in counted.items()}
-    warnings = _volume_warnings(volumes)
+    both, (least, most) = volumes["right lung"] + volumes["left lung"], LIMITS["lungs_l"].usual
+    warnings = []
+    if not least <= both <= most:
+        warnings = [f"The lungs have {both:.2f} l in all; {least:g} to {most:g} l are usual in adults."]
     voxels, part = components(parts.nodule)
     nodules = tuple(nodule_size(voxels[part == n], parts.ct.grid) for n in range(part.max(initial=-1) + 1))
     tree = parts.tree
@@ -231,14 +234,6 @@ def quality_of(parts: Parts) -> Quality:
     ends = sum(len(tree.children(branch)) == 0 for branch in range(tree.n_branches))
     warnings += [*tree.report.warnings, *_leaks(tree)]
     return Quality(volumes_l=volumes, tree=tree, ends=ends, nodules=nodules, warnings=tuple(warnings))
-
-
-def _volume_warnings(volumes: dict[str, float]) -> list[str]:
-    both = volumes["right lung"] + volumes["left lung"]
-    least, most = LIMITS["lungs_l"].usual
-    if least <= both <= most:
-        return []
-    return [f"The lungs have {both:.2f} l in all; {least:g} to {most:g} l are usual in adults."]
 
 
 def _leaks(tree: AirwayTree) -> list[str]:

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.base.errors import GridMismatchError, SettingsError
+from anatomy.base.errors import AnatomyError, GridMismatchError, SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Float32, Int16, Mask, UInt8
 from anatomy.grid import Volume
-from anatomy.morphology import closed
+from anatomy.machine_code.ahead import usable_cores
+from anatomy.morphology import Window, bounds, closed, window
 
 if TYPE_CHECKING:
     from anatomy.segmentation.airway import Airways
-
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Self
-
-from anatomy.base.errors import AnatomyError
-from anatomy.machine_code.ahead import usable_cores
-from anatomy.morphology import Window, bounds, window
 
 SIGMAS_MM = (1.0, math.sqrt(2.0), 2.0, 2.0 * math.sqrt(2.0), 4.0)
 DEEPER_THAN_MM = (0.0, 1.0, 1.0, 2.0, 2.0 * math.sqrt(2.0))
@@ -249,7 +244,9 @@ def segment_vessels(
     edges = (space.hu >= towards_blood(lung_hu, EDGE_SHARE)) & ~airway & (space.n_scales > 0)
     # How far the response of a vessel's core carries to its edge.
     for _ in range(2):
-        best = _raised_at_edges(space, best, edges)
+        raised = best.copy()
+        space.share(partial(_raise_at_edges, best, edges, raised))
+        best = raised
     best[large] = 1.0
     found = space.whole(best, shape)
     everywhere = np.zeros(shape, dtype=np.bool_, order="F")
@@ -277,30 +274,22 @@ def _responses(
     response = np.zeros_like(best)
     at_scale = np.zeros(best.shape, dtype=np.uint8)
     settings = np.array([ALPHA, BETA, C_HU])
+    limits = (np.float64(REFERENCE_HU), np.float64(BRIGHTEST_HU))
     solid_scales = space.n_scales * solid
     for scale, (sigma, image) in enumerate(space.images()):
         if progress is not None:
             progress(f"vessels: scale {sigma:.1f} mm")
         add_vesselness_of(space, scale, sigma, image, settings, best)
-        _add_large(space, scale, sigma, image, solid_scales, response, at_scale)
+        # R_L is raised where `solid_scales` lets this scale apply, and the scale is noted.
+        given = (solid_scales, np.int64(scale), space.hessian_factors(sigma), *limits, response, at_scale)
+        space.share(partial(_add_large, image, space.hu, given))
     return best, response, at_scale
 
 
-def _add_large(
-    space: ScaleSpace,
-    scale: int,
-    sigma: float,
-    image: Float32,
-    scales: UInt8,
-    response: Float32,
-    at_scale: UInt8,
-) -> None:
-    """Raise `response` to R_L at one scale where `scales` lets it apply, and note the scale in `at_scale`."""
+def _add_large(image: Float32, hu: Int16 | Float32, given: tuple[Any, ...], first: int, last: int) -> None:
     from anatomy.segmentation.kernels.hessian import add_large_response
 
-    index, limits = np.int64(scale), (np.float64(REFERENCE_HU), np.float64(BRIGHTEST_HU))
-    given = (scales, index, space.hessian_factors(sigma), *limits, response, at_scale)
-    space.share(lambda first, last: add_large_response(image, space.hu, first, last, *given))
+    add_large_response(image, hu, first, last, *given)
 
 
 def require_large_radius(radius_mm: float) -> None:
@@ -385,16 +374,11 @@ def _distance_mm(mask: Mask, sides: Float, threads: int) -> Float32:
     )
 
 
-def _raised_at_edges(space: ScaleSpace, best: Float32, edges: Mask) -> Float32:
-    """Give the voxels of `edges` the greatest vesselness of their 26 neighbours: vessels keep their width.
-
-    The response fades before the vessel ends.
-    """
+def _raise_at_edges(best: Float32, edges: Mask, raised: Float32, first: int, last: int) -> None:
+    """Give the voxels of `edges` the greatest vesselness of their 26 neighbours: vessels keep their width."""
     from anatomy.segmentation.kernels.neighbours import take_greatest_neighbour
 
-    raised = best.copy()
-    space.share(lambda first, last: take_greatest_neighbour(best, first, last, edges, raised))
-    return raised
+    take_greatest_neighbour(best, first, last, edges, raised)
 
 
 ALPHA, BETA, C_HU = 0.5, 0.5, 70.0

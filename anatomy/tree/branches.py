@@ -45,7 +45,10 @@ def divide(mm: Float, parent: Int, depth_mm: Float, trunk_end: int) -> list[Node
     for node, above in enumerate(parent.tolist()):
         if above >= 0:
             children[above].append(node)
-    trunk = _path(parent, trunk_end)
+    trunk = [trunk_end]
+    while parent[trunk[-1]] >= 0:
+        trunk.append(int(parent[trunk[-1]]))
+    trunk.reverse()
     first = NodeBranch(nodes=trunk, parent=None, attach=-1)
     branches, at = [first], 0
     on_trunk = set(trunk)
@@ -60,13 +63,6 @@ def divide(mm: Float, parent: Int, depth_mm: Float, trunk_end: int) -> list[Node
                     branches.append(NodeBranch(nodes=nodes, parent=branch, attach=node))
         at += 1
     return _merge_close(branches, mm, depth_mm)
-
-
-def _path(parent: Int, end: int) -> list[int]:
-    nodes = [end]
-    while parent[nodes[-1]] >= 0:
-        nodes.append(int(parent[nodes[-1]]))
-    return nodes[::-1]
 
 
 def _merge_close(branches: list[NodeBranch], mm: Float, depth_mm: Float) -> list[NodeBranch]:

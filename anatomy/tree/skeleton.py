@@ -274,7 +274,11 @@ def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
         # side.
         if share < 0.15:
             _refuse(f"{size}, but all but {percent(share)} of the tree are on one side of its division")
-    widest = _widest_elsewhere(tree, trunk)
+    # The 95th percentile of the radius among nodes away from the trunk.
+    away, end = np.array([bool(near) for near in tree.neighbours]), trunk.nodes[-1]
+    away[trunk.nodes] = False
+    away &= np.linalg.norm(tree.mm - tree.mm[end], axis=1) > tree.depth_mm[end]
+    widest = float(np.percentile(tree.depth_mm[away], 95)) if away.any() else 0.0
     if widest > 1.25 * radius:
         _refuse(f"{size}, but other parts are wider ({widest:.1f} mm)")
     _require_upright(tree, trunk, lps_from_mm, size)
@@ -310,15 +314,6 @@ def _beyond(tree: SkeletonTree, nodes: list[int]) -> float:
     radius = tree.depth_mm[nodes[0]]
     outside = np.array(nodes)[(offset > radius) & (offset < BEYOND_RADII * radius)]
     return float(np.median(tree.depth_mm[outside if len(outside) else nodes[-1:]]))
-
-
-def _widest_elsewhere(tree: SkeletonTree, trunk: Trunk) -> float:
-    """Return the 95th percentile of the radius among nodes away from the trunk."""
-    away = np.array([bool(near) for near in tree.neighbours])
-    away[trunk.nodes] = False
-    end = trunk.nodes[-1]
-    away &= np.linalg.norm(tree.mm - tree.mm[end], axis=1) > tree.depth_mm[end]
-    return float(np.percentile(tree.depth_mm[away], 95)) if away.any() else 0.0
 
 
 def _lesser_lung_share(tree: SkeletonTree, trunk: Trunk) -> float:

@@ -12,13 +12,10 @@ from anatomy.morphology import at_label_borders, bounds, window
 RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
 LOBES: Mapping[int, str] = MappingProxyType(
     {
-        RIGHT_UPPER: "right upper lobe",
-        RIGHT_MIDDLE: "right middle lobe",
-        RIGHT_LOWER: "right lower lobe",
-        LEFT_UPPER: "left upper lobe",
-        LEFT_LOWER: "left lower lobe",
+        RIGHT_UPPER: "right upper lobe", RIGHT_MIDDLE: "right middle lobe", RIGHT_LOWER: "right lower lobe",
+        LEFT_UPPER: "left upper lobe", LEFT_LOWER: "left lower lobe",
     }
-)
+)  # fmt: skip
 """Number of a lobe in a volume of lobes, and its name; 0 is no lobe."""
 
 FISSURES_UNKNOWN = "no fissure mask, so that nobody knows whether a fissure is crossed"

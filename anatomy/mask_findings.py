@@ -11,12 +11,10 @@ from anatomy.display import point
 from anatomy.grid import Grid
 from anatomy.landmarks import SAMPLE_MM, directions
 from anatomy.lobes import LOBES, RIGHT_LOWER
-from anatomy.morphology import bounds, components, grown_by_one, lattice_of, sampled, window
+from anatomy.morphology import bounds, components, distance_mm, grown_by_one, lattice_of, sampled, window
 from anatomy.patient import PatientImages
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
 
-WALL_MM = 4.0
-"""Walls are up to 3 mm thick, and their inner voxels share a face with the lumen."""
 AROUND = np.vstack([np.eye(3), -np.eye(3)])
 """Directions in which what lies around a point is looked for."""
 LEAST_CUT, GREATEST_CUT = 0.01, 0.1
@@ -61,7 +59,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     if images.wall is not None:
         yield "wall_in_lumen", _shared(images.wall.array, lumen)
         yield "wall_in_vessels", _shared(images.wall.array, vessels)
-        yield "wall_at_lumen", _at_lumen(images.wall.array, lumen, images.grid)
+        yield "wall_at_lumen", share_at_lumen(images.wall.array, lumen, images.grid)
         # How much of the airway has a wall, in the part that has the least.
         around = (
             _around(images.wall.array, images.grid, tree.points_lps, tree.radius_mm + by).any(1)
@@ -164,19 +162,12 @@ def _of_airway(lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, 
     yield "least_ends", float(min(left, len(tips) - left))
 
 
-def _at_lumen(wall: Mask, lumen: Mask, grid: Grid) -> float:
-    """Return the share of a wall within `WALL_MM` of the lumen."""
+def share_at_lumen(wall: Mask, lumen: Mask, grid: Grid) -> float:
+    """Return the share of a wall near the lumen."""
     box = window(*bounds(wall | lumen))
-    near = _beyond_mm(lumen[box], grid) <= WALL_MM
+    # Walls are up to 3 mm thick, and their inner voxels share a face with the lumen.
+    near = distance_mm(~lumen[box], grid.spacing_mm) <= 4.0
     return float(np.count_nonzero(near & wall[box])) / _count(wall)
-
-
-def _beyond_mm(mask: Mask, grid: Grid) -> Float:
-    """Return how far from a mask every voxel lies; infinity if the mask is empty."""
-    import edt
-
-    sides = tuple(map(float, grid.spacing_mm))
-    return np.asarray(edt.edt(np.asfortranarray(~mask), anisotropy=sides, order="F"))
 
 
 def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, float]]:
@@ -187,7 +178,10 @@ def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, fl
     at = near[tuple((voxels - [axis.start for axis in box]).T)]
     touches = np.bincount(part, weights=at) > 0
     yield "nodules_at_lungs", float(touches[part].mean())
-    yield "nodules_beyond_lungs_mm", float(_beyond_mm(lung[box], grid)[nodules[box]].max(initial=0.0))
+    yield (
+        "nodules_beyond_lungs_mm",
+        float(distance_mm(~lung[box], grid.spacing_mm)[nodules[box]].max(initial=0.0)),
+    )
     largest = voxels[part == np.argmax(np.bincount(part))]
     yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
     yield "nodule_end", max(_flattest(voxels[:, axis], part) for axis in range(3))

@@ -120,8 +120,21 @@ def _build_into(
 
 @contextlib.contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `folder` and rename it on success."""
-    with _unfinished(folder.parent) as work:
+    """Yield a folder of this process's own beside `folder`, and give it that name when it is complete.
+
+    What killed processes left behind is removed first.  Where another process was first, its lung stays.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            remove_abandoned(folder.parent)
+            work = stack.enter_context(filled_folder(folder.parent))
+        except OSError as error:
+            raise FileError(
+                f"The cache folder {folder.parent} cannot be written: {error}",
+                remedy="Choose another with --cache or LUNGACCESS_CACHE",
+                expected="a folder that may be written to",
+            ) from error
         try:
             yield work
             _publish(work, folder)
@@ -131,23 +144,6 @@ def _new_folder(folder: Path) -> Iterator[Path]:
                 remedy="Free some disk space (about 1.5 GB a patient) or choose another cache folder",
                 expected="a folder that may be written to, with room on the disk",
             ) from error
-
-
-@contextlib.contextmanager
-def _unfinished(cache: Path) -> Iterator[Path]:
-    """Yield a folder that is this process's own, after those of killed processes were removed."""
-    with contextlib.ExitStack() as stack:
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            remove_abandoned(cache)
-            work = stack.enter_context(filled_folder(cache))
-        except OSError as error:
-            raise FileError(
-                f"The cache folder {cache} cannot be written: {error}",
-                remedy="Choose another with --cache or LUNGACCESS_CACHE",
-                expected="a folder that may be written to",
-            ) from error
-        yield work
 
 
 def _publish(work: Path, folder: Path) -> None:

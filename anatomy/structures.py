@@ -9,20 +9,10 @@ import numpy as np
 from anatomy.base.typed import Labels
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 
-__all__ = [
-    "AIRWAY",
-    "BITS",
-    "BRANCH_SHIFT",
-    "FIELD_BITS",
-    "FISSURE",
-    "LUMEN",
-    "MAX_BRANCHES",
-    "OBSTACLES",
-    "OUTSIDE",
-    "VESSEL",
-    "close_border",
-    "obstacle_bits",
-]
+__all__ = (
+    "AIRWAY", "BITS", "BRANCH_SHIFT", "FIELD_BITS", "FISSURE", "LUMEN", "MAX_BRANCHES", "OBSTACLES",
+    "OUTSIDE", "VESSEL", "close_border", "obstacle_bits",
+)  # fmt: skip
 
 MAX_BRANCHES = (1 << (16 - BRANCH_SHIFT)) - 1
 """Most branches that a label can tell apart."""
@@ -31,21 +21,13 @@ OBSTACLES = AIRWAY | VESSEL | OUTSIDE
 """A needle must always avoid these."""
 
 BITS: dict[str, int] = {
-    "airway": AIRWAY,
-    "vessel": VESSEL,
-    "outside": OUTSIDE,
-    "fissure": FISSURE,
-    "lumen": LUMEN,
-}
+    "airway": AIRWAY, "vessel": VESSEL, "outside": OUTSIDE, "fissure": FISSURE, "lumen": LUMEN,
+}  # fmt: skip
 
 FIELD_BITS: dict[str, int] = {
-    "airway": AIRWAY,
-    "vessel": VESSEL,
-    "pleura": OUTSIDE,
-    "fissure": FISSURE,
-    "obstacle": OBSTACLES,
+    "airway": AIRWAY, "vessel": VESSEL, "pleura": OUTSIDE, "fissure": FISSURE, "obstacle": OBSTACLES,
     "obstacle_fissure": OBSTACLES | FISSURE,
-}
+}  # fmt: skip
 """Clearance fields of a lung, and the structures each measures the distance to."""
 
 

@@ -29,11 +29,7 @@ REPLACE_TRIES = 20 if sys.platform == "win32" else 1
 
 
 def sha256(path: str | Path) -> str:
-    """Return the SHA-256 of the bytes of a file as hex digits.
-
-    Raises:
-        FileError: If the file cannot be read.
-    """
+    """Return the SHA-256 of the bytes of a file as hex digits; FileError if the file cannot be read."""
     with reading(path), open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -199,21 +195,13 @@ def _replace(source: Path, target: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write UTF-8 text, all of it or nothing.
-
-    Raises:
-        FileError: If the file cannot be written.
-    """
+    """Write UTF-8 text, all of it or nothing; FileError if the file cannot be written."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write plain values as indented JSON, all of it or nothing.
-
-    Raises:
-        FileError: If the file cannot be written.
-    """
+    """Write plain values as indented JSON, all of it or nothing; FileError if the file cannot be written."""
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 

@@ -255,21 +255,15 @@ def _allowed(cls: type, loc: Sequence[int | str]) -> str:
 
 
 _BOUND_WORDS: tuple[tuple[type, str, str], ...] = (
-    (annotated_types.Gt, "gt", "above"),
-    (annotated_types.Ge, "ge", "at least"),
-    (annotated_types.Lt, "lt", "below"),
-    (annotated_types.Le, "le", "at most"),
-)
+    (annotated_types.Gt, "gt", "above"), (annotated_types.Ge, "ge", "at least"),
+    (annotated_types.Lt, "lt", "below"), (annotated_types.Le, "le", "at most"),
+)  # fmt: skip
 
 
 _NOUNS: dict[object, str] = {
-    float: "a finite number",
-    int: "a whole number",
-    str: "a text that is not empty",
-    bool: "true or false",
-    tuple[str, ...]: "a list of texts",
-    tuple[float, float]: "a list of two finite numbers",
-}
+    float: "a finite number", int: "a whole number", str: "a text that is not empty", bool: "true or false",
+    tuple[str, ...]: "a list of texts", tuple[float, float]: "a list of two finite numbers",
+}  # fmt: skip
 
 
 def _class_at(cls: type, keys: Sequence[int | str]) -> type | None:

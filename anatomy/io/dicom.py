@@ -30,13 +30,8 @@ _GREY_KEYS = ("SamplesPerPixel", "PhotometricInterpretation")
 _UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleIntercept", *_GREY_KEYS)
 _NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEYS)
 _SERIES_KEYS = (
-    "RescaleType",
-    "SeriesInstanceUID",
-    "SeriesNumber",
-    "SeriesDescription",
-    "Modality",
-    "NumberOfFrames",
-)
+    "RescaleType", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames",
+)  # fmt: skip
 
 MOST_NAMED = 5
 """Damaged files that a message names: the others lie beside them."""

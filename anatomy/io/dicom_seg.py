@@ -49,11 +49,7 @@ veins, right and left lung, neoplasm; mass."""
 
 
 def highdicom() -> Any:
-    """Return the library that reads and writes the objects of DICOM.
-
-    Raises:
-        SettingsError: If it is not installed.
-    """
+    """Return the library that reads and writes the objects of DICOM; SettingsError if it is not installed."""
     try:
         return importlib.import_module("highdicom")
     except ModuleNotFoundError as error:

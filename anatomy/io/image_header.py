@@ -15,12 +15,8 @@ from anatomy.io.frames import MOST_COORDINATE_MM
 
 MOST_IMAGE_BYTES = 1 << 32
 """Most stored voxels of one image: four times a chest of 1024 x 1024 x 500 voxels of 16 bits."""
-MOST_INFLATION = 1032
-"""No stream of the deflate method becomes more than 1032 times as large."""
 MOST_HEADER_BYTES = 1 << 22
 """Longest header: those of real images, with segment names and label tables, have some ten thousand bytes."""
-DIRECTION_TOLERANCE = 1e-2
-"""A direction may be so much longer or shorter than 1: some programs write three digits."""
 
 ONE_NUMBER = (
     "one image of three dimensions with one number a voxel",
@@ -98,7 +94,8 @@ def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes:
             expected=f"at most {MOST_IMAGE_BYTES >> 30} GiB of voxels",
             remedy="Crop the image to the chest, or copy the file again if its header is damaged",
         )
-    if promised > stored_bytes * MOST_INFLATION:
+    # No stream of the deflate method becomes more than 1032 times as large.
+    if promised > stored_bytes * 1032:
         raise truncated(path, f"{stored_bytes} bytes cannot hold {promised // itemsize} voxels")
     return sizes[0], sizes[1], sizes[2]
 
@@ -144,7 +141,8 @@ def require_lengths(values: Sequence[float], name: str, path: Path) -> Float:
 def require_directions(vectors: Float, name: str, path: Path) -> None:
     """Raise FrameError unless vectors that are directions, the columns of `(3, n)`, have the length 1."""
     lengths = np.linalg.norm(vectors, axis=0)
-    if not (np.abs(lengths - 1.0) <= DIRECTION_TOLERANCE).all():
+    # A direction may be so much longer or shorter than 1: some programs write three digits.
+    if not (np.abs(lengths - 1.0) <= 1e-2).all():
         raise FrameError(
             f"{path} states a {name} whose vectors are {' '.join(f'{length:g}' for length in lengths)} long",
             expected="directions of length 1",

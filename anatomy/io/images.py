@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 NIFTI, NRRD, METAIMAGE = (".nii.gz", ".nii", ".gz"), (".seg.nrrd", ".nrrd"), (".mha", ".mhd")
 
-MOST_NOTE = 79
-"""Letters that the description in a NIfTI header has room for."""
 SUFFIXES = NIFTI + NRRD + METAIMAGE
 
 
@@ -214,7 +212,8 @@ def write_volume(
     array = volume.array.view(np.uint8) if volume.array.dtype == np.bool_ else volume.array
     image = itk_image(array, volume.grid)
     if note:
-        image.SetMetaData("ITK_FileNotes", note[:MOST_NOTE])
+        # Letters that the description in a NIfTI header has room for.
+        image.SetMetaData("ITK_FileNotes", note[:79])
     for key, value in (header or {}).items():
         image.SetMetaData(key, value)
     write_image(image, path)

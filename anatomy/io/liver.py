@@ -11,10 +11,8 @@ from anatomy.io.near_names import by_name, looks_like, plain, require_single
 from anatomy.liver import LiverImages
 
 LUMENS: Mapping[str, str] = {
-    "hepatic-vein": "hepaticVein",
-    "portal-vein": "portalVein",
-    "hepatic-artery": "hepaticArtery",
-}
+    "hepatic-vein": "hepaticVein", "portal-vein": "portalVein", "hepatic-artery": "hepaticArtery",
+}  # fmt: skip
 """What users call the vessels of a liver, and the names of their files."""
 
 

@@ -21,8 +21,6 @@ from anatomy.io.mask_values import PARTS, is_whole
 
 SHIFT_TOLERANCE = 0.05
 """Largest deviation of voxels that count as the same, in voxels: headers are rounded to some digits."""
-LARGEST_GROWTH = 4.0
-"""A box that holds two masks of one body is not larger than this many times the larger of them."""
 
 
 @frozen_record
@@ -87,7 +85,8 @@ def union_grid(reference: Grid, others: list[tuple[str, Grid]]) -> Grid:
         low, high = np.minimum(low, first), np.maximum(high, last)
         largest = max(np.prod(grid.shape), np.prod(reference.shape))
         finer = max(1.0, grid.voxel_volume_mm3 / reference.voxel_volume_mm3)
-        if not np.prod(high - low) <= LARGEST_GROWTH * largest * finer:
+        # A box that holds two masks of one body is not larger than this many times the larger of them.
+        if not np.prod(high - low) <= 4.0 * largest * finer:
             raise FrameError(
                 f"{name} lies apart from the other masks: its header says {grid.describe()}",
                 expected=f"a place near {reference.describe()}",
@@ -265,7 +264,8 @@ class _Gathered:
                     self.nodule_labels = np.zeros(self._grid.shape, dtype=np.uint16, order="F")
                 self.nodule_labels[on_grid & (self.nodule_labels == 0)] = source.nodule
             if source.role != "lobes":
-                _unite(self.masks, source.role, on_grid)
+                known = self.masks.get(source.role)
+                self.masks[source.role] = on_grid if known is None else known | on_grid
                 continue
             if self.lobes is None:
                 self.lobes = np.zeros(self._grid.shape, dtype=np.uint8, order="F")
@@ -332,15 +332,6 @@ def _by_label(source: MaskSource, mask: Mask, values: Array) -> list[tuple[MaskS
     if len(held) < 2 or not is_whole(held) or len(held) > PARTS["nodules"]:
         return [(source, mask)]
     return [(replace(source, labels=(n,), nodule=n), mask & (values == n)) for n in held.astype(int).tolist()]
-
-
-def _unite(masks: dict[str, Mask], role: str, mask: Mask) -> None:
-    if role not in masks:
-        masks[role] = mask
-    elif masks[role].flags.writeable:
-        masks[role] |= mask
-    else:
-        masks[role] = masks[role] | mask
 
 
 _BEYOND = {

@@ -37,11 +37,7 @@ def is_med_rad(folder: Path) -> bool:
 
 
 def require_no_brain(folder: Path) -> None:
-    """Refuse a brain of Med-RAD in words.
-
-    Raises:
-        FileError: If the folder is one.
-    """
+    """Refuse a brain of Med-RAD in words; FileError if the folder is one."""
     found = [name for name in _BRAIN if name in by_name(folder)]
     if "brain" in found and (len(found) > 1 or "vessels" in by_name(folder)):
         raise FileError(

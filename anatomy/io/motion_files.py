@@ -40,8 +40,6 @@ MEDIAN_MOTION_MM = 17.3
 """Median of the population's 95 % motion (exp 2.85)."""
 WORKING_MM = 4.0
 """Voxels that are registered: what is left of a good registration is 1 mm, and motion varies over cm."""
-CONTROL_MM = 40.0
-"""Distance of the control points of the spline: a lung has several along each axis."""
 ITERATIONS = 60
 """The optimiser makes at most so many on each level; in a lung it has converged before."""
 DEPTH_MM = 20.0
@@ -289,7 +287,8 @@ def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
             expected="two CTs, or two masks of the lungs",
         )
     size = np.array(fixed.GetSize()) * fixed.GetSpacing()
-    mesh = [max(int(round(n / CONTROL_MM)), 2) for n in size]
+    # Distance of the control points of the spline: a lung has several along each axis.
+    mesh = [max(int(round(n / 40.0)), 2) for n in size]
     start = SimpleITK.BSplineTransformInitializer(fixed, mesh)
     method = SimpleITK.ImageRegistrationMethod()
     if fixed_is_mask:

@@ -12,8 +12,6 @@ from anatomy.io.images import image_stem, images_in, read_volume
 
 _SHORT = 4
 """A name of so few letters is part of many words."""
-_NEAR = 0.7
-"""Least likeness (0 to 1) of a name that is offered for a missing one: a slip or two of the pen."""
 
 
 def plain(name: str) -> str:
@@ -75,5 +73,6 @@ def looks_like(names: Iterable[str], images: Mapping[str, Path]) -> Path | None:
     ]
     if holding:
         return holding[0]
-    near = [match for each in wanted for match in get_close_matches(each, images, n=1, cutoff=_NEAR)]
+    # Least likeness (0 to 1) of a name that is offered for a missing one: a slip or two of the pen.
+    near = [match for each in wanted for match in get_close_matches(each, images, n=1, cutoff=0.7)]
     return images[near[0]] if near else None

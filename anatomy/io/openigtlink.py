@@ -47,11 +47,7 @@ class Received:
 
 
 def require_pyigtl() -> Any:
-    """Return the module that makes and reads messages.
-
-    Raises:
-        SettingsError: If pyigtl is not installed.
-    """
+    """Return the module that makes and reads messages; SettingsError if pyigtl is not installed."""
     try:
         from pyigtl import messages
     except ImportError as error:

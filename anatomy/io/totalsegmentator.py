@@ -20,13 +20,9 @@ from anatomy.patient import PatientImages
 # with these two values alone is ambiguous.
 LUNG_VESSELS = {1: "lung_airways", 2: "lung_airways_wall", 3: "lung_arteries", 4: "lung_veins"}
 TOTAL_LOBES = {
-    10: "lung_upper_lobe_left",
-    11: "lung_lower_lobe_left",
-    12: "lung_upper_lobe_right",
-    13: "lung_middle_lobe_right",
-    14: "lung_lower_lobe_right",
-    16: "trachea",
-}
+    10: "lung_upper_lobe_left", 11: "lung_lower_lobe_left", 12: "lung_upper_lobe_right",
+    13: "lung_middle_lobe_right", 14: "lung_lower_lobe_right", 16: "trachea",
+}  # fmt: skip
 _LAST_LABEL_OF_TOTAL_1 = 104
 
 
@@ -117,23 +113,12 @@ def published_names(stem: str, values: set[float], path: Path) -> tuple[dict[int
 
 
 ROLES: Mapping[str, str] = {
-    "lung_airways": "lumen",
-    "lung_trachea_bronchia": "lumen",
-    "trachea": "lumen",
-    "lung_airways_wall": "wall",
-    "lung_arteries": "vessels",
-    "lung_veins": "vessels",
-    "lung_vessels": "vessels",
-    "lung_upper_lobe_left": "lobes",
-    "lung_lower_lobe_left": "lobes",
-    "lung_upper_lobe_right": "lobes",
-    "lung_middle_lobe_right": "lobes",
-    "lung_lower_lobe_right": "lobes",
-    "lung_left": "lung",
-    "lung_right": "lung",
-    "lung": "lung",
-    "lung_nodules": "nodules",
-}
+    "lung_airways": "lumen", "lung_trachea_bronchia": "lumen", "trachea": "lumen",
+    "lung_airways_wall": "wall", "lung_arteries": "vessels", "lung_veins": "vessels",
+    "lung_vessels": "vessels", "lung_upper_lobe_left": "lobes", "lung_lower_lobe_left": "lobes",
+    "lung_upper_lobe_right": "lobes", "lung_middle_lobe_right": "lobes", "lung_lower_lobe_right": "lobes",
+    "lung_left": "lung", "lung_right": "lung", "lung": "lung", "lung_nodules": "nodules",
+}  # fmt: skip
 _AIRWAY_NAMES = ("lung_airways", "lung_trachea_bronchia")
 
 

@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from anatomy.phantom.branching import Centerlines
     from anatomy.phantom.chest import LOBES
     from anatomy.phantom.files import write_phantom
-    from anatomy.phantom.nodules import Nodule
     from anatomy.phantom.patient import Phantom, make_phantom
     from anatomy.phantom.rasterize import LABELS
+    from anatomy.phantom.territory import Nodule
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -82,13 +82,8 @@ class Sprouts:
         tree, index = Sprouts(), {-1: -1}
         for branch, parent in enumerate(self.parent):
             if keep[branch] and parent in index:
-                index[branch] = tree.add(
-                    index[parent],
-                    self.points[branch],
-                    self.diameter_mm[branch],
-                    self.lobe[branch],
-                    self.name[branch],
-                )
+                what = self.diameter_mm[branch], self.lobe[branch], self.name[branch]
+                index[branch] = tree.add(index[parent], self.points[branch], *what)
         return tree
 
     def direction(self, branch: int) -> Float:
@@ -223,8 +218,6 @@ def centerlines(sprouts: Sprouts, radius_mm: Float, outer_radius_mm: Float, keep
 
 Clearance = Callable[[Float], Float]
 
-FEWEST_POINTS = 4
-"""A part with fewer points has no middle worth growing to."""
 SMALLEST_SHARE = 0.2
 """No branch supplies less of its parent's points: real forks are this uneven at most."""
 STEP_MM = 1.5
@@ -299,7 +292,8 @@ def grow(
     queue = deque([(branch, cloud)])
     while queue:
         parent, points = queue.popleft()
-        if len(points) < 2 * FEWEST_POINTS:
+        # A part with fewer points has no middle worth growing to.
+        if len(points) < 2 * 4:
             continue
         parts = split_cloud(points, sprouts.direction(parent), rng)
         if parts is None:

@@ -20,6 +20,7 @@ from anatomy.io.images import write_volume
 from anatomy.io.motion_files import write_vectors
 from anatomy.io.own_masks import DESCRIPTION, description_text
 from anatomy.motion.source import MotionSource
+from anatomy.patient import MASKS
 from anatomy.phantom.branching import Centerlines
 from anatomy.phantom.chest import LOBES
 from anatomy.phantom.patient import SCALES, Phantom
@@ -52,17 +53,8 @@ def write_phantom(
     """
     folder = require_writable_folder(folder)
     images = phantom.images
-    volumes: dict[str, Volume | None] = {
-        "lumen": images.lumen,
-        "wall": images.wall,
-        "vessels": images.vessels,
-        "lung": images.lung,
-        "fissures": images.fissures,
-        "nodules": images.nodules,
-        "ct": phantom.ct if with_ct else None,
-        "labels": phantom.labels,
-        "lobes": phantom.lobes,
-    }
+    volumes: dict[str, Volume | None] = {role: getattr(images, role) for role in MASKS}
+    volumes |= {"ct": phantom.ct if with_ct else None, "labels": phantom.labels, "lobes": phantom.lobes}
     for name, volume in volumes.items():
         if volume is not None:
             write_volume(folder / f"{name}.nii.gz", volume)
@@ -104,18 +96,10 @@ def _truth(phantom: Phantom) -> dict[str, Any]:
 
 
 def _tree(lines: Centerlines) -> dict[str, Any]:
-    return {
-        "points_lps": lines.points_lps.round(4).tolist(),
-        "radius_mm": lines.radius_mm.round(4).tolist(),
-        "outer_radius_mm": lines.outer_radius_mm.round(4).tolist(),
-        "branch_start": lines.branch_start.tolist(),
-        "branch_parent": lines.branch_parent.tolist(),
-        "generation": lines.generation.tolist(),
-        "horsfield_order": lines.horsfield_order.tolist(),
-        "strahler_order": lines.strahler_order.tolist(),
-        "lobe": lines.lobe.tolist(),
-        "names": list(lines.names),
-    }
+    lengths = ("points_lps", "radius_mm", "outer_radius_mm")
+    counts = ("branch_start", "branch_parent", "generation", "horsfield_order", "strahler_order", "lobe")
+    rounded = {name: getattr(lines, name).round(4).tolist() for name in lengths}
+    return rounded | {name: getattr(lines, name).tolist() for name in counts} | {"names": list(lines.names)}
 
 
 @frozen_value

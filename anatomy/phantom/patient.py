@@ -16,7 +16,6 @@ from anatomy.grid import Grid, Volume
 from anatomy.patient import PatientImages
 from anatomy.phantom.branching import Centerlines, centerlines
 from anatomy.phantom.chest import make_chest
-from anatomy.phantom.nodules import Bulla, Nodule
 from anatomy.phantom.plan import PlannedTree, plan_patient
 from anatomy.phantom.rasterize import (
     LABELS,
@@ -27,7 +26,7 @@ from anatomy.phantom.rasterize import (
     draw_tree,
     phantom_grid,
 )
-from anatomy.phantom.territory import make_territory
+from anatomy.phantom.territory import Bulla, Nodule, make_territory
 from anatomy.phantom.traits import PLAIN, RESECTED_INTO, Traits
 
 Size = Literal["adult", "small"]

@@ -16,8 +16,7 @@ from anatomy.base.typed import Bool, Float, Int, UInt8
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.branching import STEP_MM, GrowthRule, Sprouts, bent_line, grow, limit_turn
 from anatomy.phantom.chest import LOBES
-from anatomy.phantom.nodules import Bulla, Nodule, place_bullae, place_nodules
-from anatomy.phantom.territory import Territory
+from anatomy.phantom.territory import Bulla, Nodule, Territory, place_bullae, place_nodules
 from anatomy.phantom.traits import PLAIN, Traits
 from anatomy.phantom.vessels import Obstacles, copy_arteries, grow_veins, make_way
 from anatomy.poses import unit
@@ -198,8 +197,6 @@ def grow_airways(
 
 # A tube is drawn without gaps if its radius is at least half the diagonal of a voxel.
 GAPLESS_RADIUS = 0.87
-EMPHYSEMA_VESSEL_SHARE = 0.5
-"""Severe emphysema destroys vessels up to half as thick again."""
 CENTRAL_BRANCHES = 3
 """The trunk and the two main branches come first in the list."""
 
@@ -256,7 +253,8 @@ def plan_patient(
     """
     bullae = place_bullae(territory, traits.emphysema, scale, rng)
     # The diameter at which vessels end: in small patients later, in coarse voxels earlier.
-    limit_mm = traits.vessel_limit_mm * (1.0 + EMPHYSEMA_VESSEL_SHARE * traits.emphysema)
+    # Severe emphysema destroys vessels up to half as thick again.
+    limit_mm = traits.vessel_limit_mm * (1.0 + 0.5 * traits.emphysema)
     vessels = VesselRule(
         calibre=traits.vessel_calibre, limit_mm=limit_mm * max(scale, spacing_mm), spacing_mm=spacing_mm
     )
@@ -380,11 +378,4 @@ def ends_below_pleura(
         kept[branch], whole[branch], deep[branch] = True, count == len(along), was_deep[-1]
         points[branch] = points[branch][:count]
         radii.append(radius_mm[start[branch] : start[branch] + count])
-    cut = Sprouts(
-        parent=sprouts.parent,
-        points=points,
-        diameter_mm=sprouts.diameter_mm,
-        lobe=sprouts.lobe,
-        name=sprouts.name,
-    )
-    return cut.pruned(kept), np.concatenate(radii), kept
+    return replace(sprouts, points=points).pruned(kept), np.concatenate(radii), kept

@@ -6,12 +6,9 @@ from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIG
 from anatomy.phantom.chest import LOBES
 
 RESECTED_INTO = {
-    RIGHT_UPPER: RIGHT_MIDDLE,
-    RIGHT_MIDDLE: RIGHT_UPPER,
-    RIGHT_LOWER: RIGHT_MIDDLE,
-    LEFT_UPPER: LEFT_LOWER,
+    RIGHT_UPPER: RIGHT_MIDDLE, RIGHT_MIDDLE: RIGHT_UPPER, RIGHT_LOWER: RIGHT_MIDDLE, LEFT_UPPER: LEFT_LOWER,
     LEFT_LOWER: LEFT_UPPER,
-}
+}  # fmt: skip
 """Which lobe expands into the room of one that was resected: one beside it."""
 LEAST_STATURE, GREATEST_STATURE = 0.85, 1.2
 """The model has the proportions of an adult: farther away its fixed sizes, such as walls, mislead."""

@@ -30,10 +30,6 @@ NOISE_PERCENTILE = 97.0
 """This percentage of the lung lies below the shallowest minimum that is followed."""
 SAMPLE_STEP = 7
 """Every so many voxels of the lung are looked at to learn its noise."""
-GREATEST_LUMEN_HU = -250.0
-"""Outside the lungs no bronchus is so thin that its lumen is denser; fat beside bright vessels is."""
-OPEN_HU = -700.0
-"""Air of a main bronchus that is blurred or lined with mucus is thinner."""
 LOST_MM, LEAST_LOST_ML = 3.0, 0.1
 """Air of the central airway so far from the lumen is no edge of it; half a slice of it is that much."""
 GREATEST_HU = 16_383
@@ -98,7 +94,8 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     del blurred
     upright = 2 - int(np.argmax(np.abs(ct.grid.lps_from_ijk[2, :3] / ct.grid.spacing_mm)))
     depth = local_minima_map(hu, spacing_mm, upright)
-    depth[(smooth > GREATEST_LUMEN_HU) & ~lung] = 0
+    # Outside the lungs no bronchus is so thin that its lumen is denser; fat beside bright vessels is.
+    depth[(smooth > -250.0) & ~lung] = 0
     rough = np.ascontiguousarray(lungs.central_airway[box].T)
     sample = lung.reshape(-1)[::SAMPLE_STEP]
     lung_hu = float(np.median(smooth.reshape(-1)[::SAMPLE_STEP][sample]))
@@ -148,7 +145,8 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
     start = _piece_at(certain, seed)
     # What the central airway holds is lumen, also where it is not dark.
     around = window(*bounds(rough, reach))
-    held = (rough & (ground.smooth < OPEN_HU))[around]
+    # Air of a main bronchus that is blurred or lined with mucus is thinner.
+    held = (rough & (ground.smooth < -700.0))[around]
     far = distance_mm(~start[around].T, ground.spacing_mm[::-1]).T > LOST_MM
     if np.count_nonzero(held & far) * float(np.prod(ground.spacing_mm)) >= 1000.0 * LEAST_LOST_ML:
         certain[around] |= held
@@ -157,11 +155,7 @@ def _start(ground: Ground, rough: Mask, seed: tuple[int, int, int]) -> Mask:
 
 
 def _piece_at(air: Mask, seed: tuple[int, int, int]) -> Mask:
-    """Return the piece of air that a voxel lies in.
-
-    Raises:
-        AnatomyError: If it lies in none.
-    """
+    """Return the piece of air that a voxel lies in; AnatomyError if it lies in none."""
     from scipy import ndimage
 
     labels, _ = ndimage.label(air)

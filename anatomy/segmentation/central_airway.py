@@ -12,8 +12,6 @@ from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds, distance_mm, window
 from anatomy.segmentation.coarse import CoarseCt
 
-COLUMN_MEDIAN_HU = -920.0
-"""The middle of a trachea is nearly pure air; lung is above this."""
 COLUMN_HU = -850.0
 """The inside of a trachea is below this on coarse voxels."""
 SHORTEST_COLUMN_MM = 20.0
@@ -21,8 +19,6 @@ SHORTEST_COLUMN_MM = 20.0
 
 GROWTH_HU = tuple(float(t) for t in range(-960, -699, 20))
 """Thresholds of the growth, from pure air to where every airway would leak into the lung."""
-USUAL_REACH_MM = 20.0
-"""The cross-section of a trachea is the median over this length above and below a place in it."""
 NARROW, CLOSED, WIDER = 0.75, 0.6, 1.15
 """Shares of the trachea's cross-section: an open glottis is below the first, a closed one and partial slices
 are below the second, and larynx, pharynx or mouth are above the third."""
@@ -192,7 +188,8 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
             if not fits or max(width * dx, depth * dy) > 2.5 * min(width * dx, depth * dy):
                 continue
             inside = pieces[box] == piece
-            if np.median(plane[box][inside]) <= COLUMN_MEDIAN_HU:
+            # The middle of a trachea is nearly pure air; lung is above this.
+            if np.median(plane[box][inside]) <= -920.0:
                 chosen[(*box, k)] |= inside
     return chosen
 
@@ -327,7 +324,8 @@ def throat_level(air: Mask, seed_ijk: Int, slice_mm: float) -> int:
     The trachea narrows at the glottis, and above it the airway ends or becomes wider than the trachea.  Where
     it does neither, it is only narrow, as at mucus or a stenosis, and goes on.
     """
-    reach = max(1, round(USUAL_REACH_MM / slice_mm))
+    # The cross-section of a trachea is the median over this length above and below a place in it.
+    reach = max(1, round(20.0 / slice_mm))
     first, count = int(seed_ijk[2]), int(air.shape[2])
     lower = _areas(air, seed_ijk, range(first, max(first - reach, -1), -1))
     upper = _areas(air, seed_ijk, range(first, count))

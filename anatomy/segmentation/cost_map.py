@@ -26,14 +26,9 @@ def cost_map(
     Args:
         lung_mask ((ni, nj, nk) bool): Both lungs, filled.
         grid: The grid of all of them.
-        total_radius_mm: Radius of the needle and safety margin by which obstacles are grown, the paper's
-            `r_total`.  The default of 0 leaves them as they are: the planners keep their clearance by a
-            proved distance.
-
-            Growing is not conservative as printed.  It moves by whole voxels, and the step bound `2
-            sqrt(min(a_i s_i)^2 - r_total^2)` takes the tip for the centre of its voxel: a tip in a corner is
-            up to half a voxel's diagonal nearer to the obstacle.  Where `r_total` is a multiple of the voxel
-            size the bound is 0.  Maps grown this way are for comparison with the paper alone.
+        total_radius_mm: Radius of the needle and safety margin by which obstacles are grown, see
+            `inflation_voxels`.  The default of 0 leaves them as they are: the planners keep their clearance
+            by a proved distance.
 
     Returns:
         float32 in [0, 1], or infinite.
@@ -73,8 +68,9 @@ ROUNDING = 1e-6
 def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> Int:
     """Return by how many voxels obstacles grow along i, j and k: `ceil(r_total / s_i)` [Fu2018, sec. IV-B].
 
-    It stands for growing by a radius and proves nothing: an ellipsoid of voxels is no ball, and the tip is
-    not at the centre of its voxel.  Paths in grown obstacles are for comparison alone.
+    It stands for growing by a radius and proves nothing.  An ellipsoid of voxels is no ball, and the printed
+    step bound `2 sqrt(min(a_i s_i)^2 - r_total^2)` takes the tip for the centre of its voxel, although it may
+    be half a diagonal nearer to the obstacle.  Maps grown so are for comparison with the paper alone.
 
     The spacing `(3,)` is that along i, j, k; the total radius is that of the needle and the safety margin.
     """

@@ -19,14 +19,9 @@ CUBE_MM = 4.0
 """The shape of the chest is looked at on voxels of this size."""
 TOP_SHARE, BASE_SHARE = 0.1, 0.3
 """At these shares of the height the shoulders narrow the chest, and the diaphragm rises."""
-ABOVE_CARINA_MM = -10.0
-"""Below this, the heart takes part of the front."""
 LEAST_BACK, LEAST_BASE = 0.24, 0.48
 """Of the width of both lungs: so far behind and below the carina each reaches.  In healthy phantoms these are
 0.33 and 0.58 at least; with fluid at the back 0.13, and with the lower third gone 0.39."""
-LEAST_OF_OTHER = 0.5
-"""Share of the lung behind the carina, in the lowest third of the chest, that one side has of the other: 0.95
-in healthy phantoms, and at most 0.3 if 330 ml of one base are solid."""
 FITS = 20
 """The midline settles after so many weighted fits, in which levels that lack a lobe count less and less."""
 SOLID_HU, SOLID_RADIUS_MM, LEAST_SOLID_ML = -200.0, 6.0, 10.0
@@ -68,7 +63,9 @@ def _short(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> Iterator[s
         name: int(np.count_nonzero((p[:, 2] < low + BASE_SHARE * (high - low)) & (p[:, 1] > carina_lps[1])))
         for name, p in sides.items()
     }
-    if not (left | right)[:, :, 0].any() and min(deep.values()) < LEAST_OF_OTHER * max(deep.values()):
+    # Share of the lung behind the carina, in the lowest third of the chest, that one side has of the other:
+    # 0.95 in healthy phantoms, and at most 0.3 if 330 ml of one base are solid.
+    if not (left | right)[:, :, 0].any() and min(deep.values()) < 0.5 * max(deep.values()):
         name = min(deep, key=lambda side: deep[side])
         yield (
             f"Lung seems to be missing at the base of the {name} lung: behind, it holds "
@@ -110,7 +107,8 @@ def _zones(chest: Mask, first: Float, carina_lps: Float) -> Iterator[tuple[str, 
     base = levels[0] + BASE_SHARE * (levels[-1] - levels[0])
     top = levels[-1] - TOP_SHARE * (levels[-1] - levels[0])
     for k in levels:
-        upper = heights[k] > carina_lps[2] + ABOVE_CARINA_MM
+        # Below this, the heart takes part of the front.
+        upper = heights[k] > carina_lps[2] - 10.0
         if k > top or (k < base and not upper):
             continue
         plane = chest[:, :, k]

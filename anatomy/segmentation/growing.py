@@ -17,8 +17,6 @@ LOOKED_AT = 100
 """This many voxels are looked at for each place."""
 FAR_MM = 4.0
 """They lie so far from the lumen."""
-DEVIATIONS = 3.0
-"""An airway has a contrast so many standard deviations above that of such places."""
 WALL_HU = 60.0
 """The wall of an airway is this much brighter than the lung."""
 
@@ -249,7 +247,8 @@ def _false_contrast(
     np.maximum(contrast, 0.0, out=contrast)
     middle = float(np.median(contrast))
     # The standard deviation of normal values over their median distance from the median.
-    return middle + DEVIATIONS * 1.4826 * float(np.median(np.abs(contrast - middle)))
+    # An airway has a contrast so many standard deviations above that of such places.
+    return middle + 3.0 * 1.4826 * float(np.median(np.abs(contrast - middle)))
 
 
 def _find_starts(state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known: int, starts: Float) -> int:

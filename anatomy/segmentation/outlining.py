@@ -34,22 +34,13 @@ LEAST_CONTRAST_HU, LEAST_HALO_HU = 120.0, 170.0
 the second to be ground glass, since the spikes of real nodules raise it by up to 150 HU."""
 HALO_VOXELS = (1.6, 3.2)
 """Ground glass around a core is looked for between these distances from it, beyond the core's own blur."""
-SMOOTHING_MM = 0.6
-"""Standard deviation of the Gaussian that takes the noise from ground glass."""
 OPENINGS = (0.35, 0.45, 0.55, 0.65, 0.75)
 """Radii of the opening as shares of that of the largest ball in the nodule: the first that cuts it off is
 used."""
-MOST_EXTENT = 2.2
-"""A nodule reaches this many of its radii from its middle; a vessel runs on farther."""
-LEAST_AIR_AROUND = 0.45
-"""Least share of the surface that borders on lung: half a ball on the pleura has more, a leak into the chest
-wall or the diaphragm less."""
 LEAST_RADIUS_MM = 1.2
 """Radius of the largest ball in the smallest nodule that can be told from a vessel."""
 CELL_MM = 1.5
 """Spacing of the points of the pleura."""
-PLEURA_SHARE = 0.55
-"""Share of half the cube's side within which the pleura counts most."""
 SURFACE_STEPS, BELOW_WEIGHT = 30, 0.15
 """Steps of the fit, and the weight of points below the surface: nodules and vessels at the pleura."""
 
@@ -115,7 +106,8 @@ class _Cube:
         """HU without most of the noise."""
         from scipy.ndimage import gaussian_filter
 
-        return np.asarray(gaussian_filter(self.hu, SMOOTHING_MM / self.voxel_mm))
+        # Standard deviation of the Gaussian that takes the noise from ground glass.
+        return np.asarray(gaussian_filter(self.hu, 0.6 / self.voxel_mm))
 
     def outlined(self, most_mm: float) -> Mask | None:
         """Return the nodule, or None if it has a greater radius or does not come free."""
@@ -153,11 +145,14 @@ class _Cube:
         for share in OPENINGS:
             pieces = label(depth > share * radius)[0]
             core = pieces == pieces[tuple(middle)]
-            if from_middle[core].max() + share * radius > MOST_EXTENT * radius:
+            # A nodule reaches this many of its radii from its middle; a vessel runs on farther.
+            if from_middle[core].max() + share * radius > 2.2 * radius:
                 continue
             found = (distance_mm(~core, self.grid.spacing_mm) <= share * radius + 0.5 * self.voxel_mm) & dense
             ring = grown_by_one(found) & ~found
-            if np.count_nonzero(ring & self.lung & ~dense) >= LEAST_AIR_AROUND * np.count_nonzero(ring):
+            # Least share of the surface that borders on lung: half a ball on the pleura has more, a leak into
+            # the chest wall or the diaphragm less.
+            if np.count_nonzero(ring & self.lung & ~dense) >= 0.45 * np.count_nonzero(ring):
                 return np.asfortranarray(found)
         return None
 
@@ -190,7 +185,8 @@ class _Cube:
         if np.count_nonzero(seen) < 60:
             return none
         u, v, w = u[seen], v[seen], w[seen]
-        near = np.exp(-(u**2 + v**2) / (PLEURA_SHARE * self.reach_mm) ** 2)
+        # Share of half the cube's side within which the pleura counts most.
+        near = np.exp(-(u**2 + v**2) / (0.55 * self.reach_mm) ** 2)
         terms, weight = _second_order(u, v), near
         for _ in range(SURFACE_STEPS):
             factors = np.linalg.lstsq(terms * weight[:, None], w * weight, rcond=None)[0]

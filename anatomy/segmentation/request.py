@@ -30,13 +30,9 @@ from anatomy.segmentation.labels import lobe_numbers, sides_of_lobes
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM
 
 ROLES = {
-    "airway": "lumen",
-    "airway_wall": "wall",
-    "vessels": "vessels",
-    "lungs": "lung",
-    "lobes": "lobes",
+    "airway": "lumen", "airway_wall": "wall", "vessels": "vessels", "lungs": "lung", "lobes": "lobes",
     "fissures": "fissures",
-}
+}  # fmt: skip
 """The images of the folder that may come from elsewhere, and the role of each among masks."""
 LABELLED = ("lungs", "lobes", "fissures")
 """Images whose values mean something."""

@@ -15,6 +15,7 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
+from anatomy.mask_findings import share_at_lumen
 from anatomy.morphology import bounds, components, distance_mm, window
 from anatomy.nodule_size import NoduleSize, nodule_size
 from anatomy.plausibility import LIMITS, Finding
@@ -25,10 +26,6 @@ STEP_MM = 3.0
 """The step is wider than an airway's wall, and less than the distance of vessels."""
 SAMPLES = 200_000
 """The mean of so many voxels of a mask is known to 1 HU."""
-LEAST_COVERED = 0.8
-"""Share of the lungs that lobes cover: with less, one of them is missing."""
-WALL_MM, LEAST_AT_LUMEN = 4.0, 0.5
-"""Walls are up to 3 mm thick."""
 
 
 TISSUE_HU = (-50.0, 150.0)
@@ -318,9 +315,12 @@ def misplaced(
                 failed.append(_failure(name, f"only {percent(share)} of it lie in the lungs"))
         if name == "lobes":
             share = _share(mask & lungs, lungs)
-            if share < LEAST_COVERED:
+            # Share of the lungs that lobes cover: with less, one of them is missing.
+            if share < 0.8:
                 failed.append(_failure(name, f"it covers only {percent(share)} of the lungs"))
-        if name == "airway_wall" and (share := _at_lumen(mask, lumen, ct)) < LEAST_AT_LUMEN:
+        share = share_at_lumen(mask, lumen, ct.grid) if name == "airway_wall" and mask.any() else 1.0
+        # Walls are up to 3 mm thick.
+        if share < 0.5:
             failed.append(_failure(name, f"only {percent(share)} of it lie at the lumen"))
     return failed, warnings
 
@@ -343,12 +343,6 @@ def moved_by(ct: Volume, mask: Mask) -> Float:
 
 def _share(part: Mask, whole: Mask) -> float:
     return float(np.count_nonzero(part)) / max(float(np.count_nonzero(whole)), 1.0)
-
-
-def _at_lumen(wall: Mask, lumen: Mask, ct: Volume) -> float:
-    box = window(*bounds(wall | lumen))
-    near = distance_mm(np.asfortranarray(~lumen[box]), ct.grid.spacing_mm) <= WALL_MM
-    return float(near[wall[box]].mean()) if wall.any() else 1.0
 
 
 def _failure(name: str, why: str) -> Finding:

@@ -1,6 +1,7 @@
 """The steps of a segmentation; each is run only if what it is made from has changed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -107,14 +108,9 @@ class Steps:
         vessels = self._vessels(lungs, airway, nodule)
         lobes = self._lobes(lungs, airway, vessels, tree)
         cost = self._cost(lungs, airway, nodule, vessels)
-        return Parts(
-            ct=self._ct,
-            left=lungs.left,
-            right=lungs.right,
-            central_airway=lungs.central_airway,
-            lumen=airway["airway"],
-            wall=airway["airway_wall"],
-            tree=tree,
+        begun = Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree)
+        return replace(
+            begun,
             nodule=nodule,
             vesselness=vessels["vesselness"],
             large_vessels=vessels["vessels"],

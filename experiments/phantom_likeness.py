@@ -24,8 +24,12 @@ from experiments.support.anatomies import PATIENTS, require_data
 from experiments.support.likeness import DEPTHS_MM, FAR_MM, GENERATIONS, Likeness, likeness_of
 from experiments.support.reached import reached_of
 from experiments.support.results import Result, number, setting_of, study_parser, write_result
-from lungaccess.running.benchmark.synthetic.manifest import make_benchmark_phantom
-from lungaccess.running.benchmark.synthetic.phantoms import FAMILIES, BenchmarkPhantom, phantom_named
+from lungaccess.running.benchmark.synthetic.cases import (
+    FAMILIES,
+    BenchmarkPhantom,
+    make_benchmark_phantom,
+    phantom_named,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

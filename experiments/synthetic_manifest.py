@@ -19,12 +19,14 @@ from anatomy.build import build_lung
 from anatomy.io.patients import load_patient
 from anatomy.phantom import write_phantom
 from lungaccess.problem.peripheral import peripheral_targets
-from lungaccess.running.benchmark.synthetic.manifest import Entry, masks_sha256, unproved_phantom
-from lungaccess.running.benchmark.synthetic.phantoms import (
+from lungaccess.running.benchmark.synthetic.cases import (
     TARGETS_A_LUNG,
     VERSION,
     BenchmarkPhantom,
+    Entry,
     benchmark_phantoms,
+    masks_sha256,
+    unproved_phantom,
 )
 
 DIGITS = 3

@@ -12,7 +12,7 @@ from anatomy.structures import OUTSIDE, VESSEL
 from experiments.phantom_likeness import Measured, add_rows, draw
 from experiments.support.likeness import DEPTHS_MM, FAR_MM, Likeness, _far_from_carina, likeness_of
 from experiments.support.results import Result, small_png
-from lungaccess.running.benchmark.synthetic.phantoms import FAMILIES
+from lungaccess.running.benchmark.synthetic.cases import FAMILIES
 
 
 @pytest.fixture(scope="module")

@@ -201,9 +201,8 @@ def _text_targets() -> dict[str, Target]:
 
 def _results(folder: Path) -> None:
     from lungaccess.problem.system import load_system
-    from lungaccess.running.study.patients import Patient
     from lungaccess.running.study.results import ResultsFile
-    from lungaccess.running.study.runs import Problem, Run
+    from lungaccess.running.study.runs import Patient, Problem, Run
     from lungaccess.running.study.settings import PlannerChoice
     from tests.lungaccess.running.study.toys import toy_answer
 
@@ -222,8 +221,7 @@ def _results(folder: Path) -> None:
 
 def _read_results(folder: Path) -> None:
     from lungaccess.running.study.results import ResultsFile
-    from lungaccess.running.study.summary import summarise
-    from lungaccess.running.study.tables import QUERIES, differences, table
+    from lungaccess.running.study.tables import QUERIES, differences, summarise, table
 
     for left in folder.glob("results.db-*"):
         left.unlink()

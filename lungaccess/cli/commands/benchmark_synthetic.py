@@ -173,8 +173,7 @@ def score(
         out: File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
     """
     from lungaccess.running.benchmark.runs import require_table_file
-    from lungaccess.running.benchmark.synthetic.scoring import REFUSED, score_submission
-    from lungaccess.running.benchmark.synthetic.sheet import write_scores
+    from lungaccess.running.benchmark.synthetic.scoring import REFUSED, score_submission, write_scores
     from lungaccess.running.benchmark.synthetic.submission import read_submission
 
     if out is not None:
@@ -213,7 +212,7 @@ def sheet(
         csv: Also write the sheet as a .csv or .json file.
         brief: One line a planner, without families and devices.
     """
-    from lungaccess.running.benchmark.synthetic.sheet import read_scores, score_sheet, write_sheet
+    from lungaccess.running.benchmark.synthetic.scoring import read_scores, score_sheet, write_sheet
 
     if not scores:
         raise SettingsError("No scores were given", expected="one or more files", remedy="Name scores.json")
@@ -234,8 +233,8 @@ def schema() -> ExitCode:
 
 
 def _show_sheet(scores: "list[Score]", output: OutputOptions, *, by_family: bool = True) -> None:
-    from lungaccess.running.benchmark.synthetic.manifest import manifest_sha256
-    from lungaccess.running.benchmark.synthetic.sheet import HEADINGS, score_sheet
+    from lungaccess.running.benchmark.synthetic.cases import manifest_sha256
+    from lungaccess.running.benchmark.synthetic.scoring import HEADINGS, score_sheet
 
     lines = score_sheet(scores, by_family=by_family)
     if output.json:

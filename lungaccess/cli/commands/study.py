@@ -18,7 +18,7 @@ from lungaccess.cli.progress import progress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from lungaccess.running.study.summary import Group
+    from lungaccess.running.study.tables import Group
 
 
 study = App(
@@ -50,7 +50,7 @@ def run(
     from lungaccess.plans.version import software_kernels
     from lungaccess.running.study.driver import run_study
     from lungaccess.running.study.settings import read_study
-    from lungaccess.running.study.summary import summarise
+    from lungaccess.running.study.tables import summarise
 
     asked = read_study(study)
     with progress(asked.name) as shown:
@@ -85,7 +85,7 @@ def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     Args:
         results: Results file.
     """
-    from lungaccess.running.study.summary import summarise
+    from lungaccess.running.study.tables import summarise
 
     groups = summarise(results)
     if output.json:

@@ -31,10 +31,6 @@ from stages.needle import OMPL_PLANNERS, ArcPath, NeedleEnvironment, Query, obst
 
 SUFFIXES = (".csv", ".json")
 
-SLICE = 200
-"""Iterations between two looks at the clock: a fraction of a millisecond."""
-THERE_IS_ONE = "nothing found in the time given, though another planner found a path"
-
 
 @frozen_value
 class BenchmarkRow:
@@ -86,62 +82,44 @@ def run_query(
     Args:
         seeds: One run each; the resolution search draws nothing at random, so it runs once.
     """
-    rows = list(_runs(environment, query, published, radius_mm, tuple(planners), tuple(seeds), time_s))
-    known = any(row.solved for row in rows)
-    for row in rows:
-        yield replace(row, reason=THERE_IS_ONE) if known and not row.solved else row
-
-
-def _runs(
-    environment: NeedleEnvironment,
-    query: Query,
-    published: PublishedQuery,
-    radius_mm: float,
-    planners: tuple[str, ...],
-    seeds: tuple[int, ...],
-    time_s: float,
-) -> Iterator[BenchmarkRow]:
-    for planner in planners:
-        for seed in seeds[:1] if planner == "resolution" else seeds:
-            found = search_path(
-                environment,
-                query,
-                planner,
-                seed=None if planner in OMPL_PLANNERS else seed,
-                time_s=time_s,
-                clock=working_cpu_s,
-                portion=SLICE,
-            )
-            ruled_out = found.obstruction is not None and found.obstruction.proved
-            yield _row(environment, query, published, radius_mm, "" if ruled_out else planner, seed, found)
-            if ruled_out:
-                return
-
-
-def _row(
-    environment: NeedleEnvironment,
-    query: Query,
-    published: PublishedQuery,
-    radius_mm: float,
-    planner: str,
-    seed: int,
-    found: PathSearch,
-) -> BenchmarkRow:
-    named = BenchmarkRow(
+    about = BenchmarkRow(
         patient=published.patient,
         start=published.start,
         target=published.target,
         radius_mm=radius_mm,
-        planner=planner,
-        seed=seed if planner and planner not in OMPL_PLANNERS else None,
         needed_clearance_mm=environment.required_clearance_mm,
-        proved=found.proved,
     )
+    seeds, rows = tuple(seeds), list[BenchmarkRow]()
+    for planner, seed in [(p, s) for p in planners for s in (seeds[:1] if p == "resolution" else seeds)]:
+        drawn = None if planner in OMPL_PLANNERS else seed
+        # A portion of iterations between two looks at the clock takes a fraction of a millisecond.
+        found = search_path(
+            environment, query, planner, seed=drawn, time_s=time_s, clock=working_cpu_s, portion=200
+        )
+        ruled_out = found.obstruction is not None and found.obstruction.proved
+        own = about if ruled_out else replace(about, planner=planner, seed=drawn)
+        rows.append(_row(own, environment, query, found))
+        if ruled_out:
+            break
+    known = any(row.solved for row in rows)
+    reason = "nothing found in the time given, though another planner found a path"
+    for row in rows:
+        yield replace(row, reason=reason) if known and not row.solved else row
+
+
+def _row(
+    about: BenchmarkRow, environment: NeedleEnvironment, query: Query, found: PathSearch
+) -> BenchmarkRow:
     if found.path is None:
-        return replace(named, reason=_reason(found))
+        proved = "proved" if found.proved else "not proved"
+        reason = f"{found.outcome} in the time given (not proved)"
+        if found.obstruction is not None:
+            reason = f"{reason_in_words(found.obstruction)} ({proved})"
+        return replace(about, proved=found.proved, reason=reason)
     first = found.first_path or found.path
     return replace(
-        named,
+        about,
+        proved=found.proved,
         solved=True,
         first_cpu_ms=None if found.first_path_s is None else 1e3 * found.first_path_s,
         first_length_mm=_length(first, query),
@@ -149,12 +127,6 @@ def _row(
         clearance_mm=_clearance(environment, query, found.path),
         arcs=tuple(found.path.arc_records()),
     )
-
-
-def _reason(found: PathSearch) -> str:
-    if found.obstruction is None:
-        return f"{found.outcome} in the time given (not proved)"
-    return f"{reason_in_words(found.obstruction)} ({'proved' if found.proved else 'not proved'})"
 
 
 def _length(path: ArcPath, query: Query) -> float:
@@ -233,7 +205,6 @@ HEADINGS = (
     "patient", "start", "target", "R, mm", "planner", "solved", "first, ms", "first, mm", "final, mm",
     "clearance, mm",
 )  # fmt: skip
-PEER_HEADINGS = ("peer solved", "peer first, ms", "peer, mm")
 
 
 def summary_rows(
@@ -246,8 +217,8 @@ def summary_rows(
     groups: dict[tuple[object, ...], list[BenchmarkRow]] = defaultdict(list)
     for row in rows:
         groups[row.patient, row.start, row.target, row.radius_mm, row.planner].append(row)
-    headings = (*HEADINGS, *(PEER_HEADINGS if peer is not None else ()), "reason")
-    return headings, [_summary(group, peer) for group in groups.values()]
+    of_peer = () if peer is None else ("peer solved", "peer first, ms", "peer, mm")
+    return (*HEADINGS, *of_peer, "reason"), [_summary(group, peer) for group in groups.values()]
 
 
 def _summary(group: list[BenchmarkRow], peer: Mapping[Key, PeerResult] | None) -> tuple[str, ...]:

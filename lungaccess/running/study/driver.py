@@ -16,9 +16,8 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
 from anatomy.base.unfinished import sole_writer
 from lungaccess.plans.version import software_kernels
-from lungaccess.running.study.answers import CRASH, UNKNOWN, Answer
 from lungaccess.running.study.results import ResultsFile
-from lungaccess.running.study.runs import Problem, Run, runs_of
+from lungaccess.running.study.runs import CRASH, UNKNOWN, Answer, Problem, Run, runs_of
 from lungaccess.running.study.settings import Study, StudyError
 from stages.needle import require_planner
 
@@ -174,14 +173,13 @@ def _failed(run: Run, error: BaseException) -> Answer:
 
 
 T = TypeVar("T")
-RETRIES = 2
-"""How often dask tries a run again at once: workers and disks may fail for a moment."""
 LEAST_RUNS = 4
 """Runs are also handed over while the workers are still starting."""
+RETRIES = 2
+"""How often dask tries a run again at once: workers and disks may fail for a moment."""
 CONNECT_S = 20.0
 """A scheduler that does not answer for so long is taken to be absent."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
 DASK_CONFIG = {
     # Dask would warn whenever this process is busy with a patient.
     "distributed.admin.tick.limit": "1h",
@@ -271,7 +269,11 @@ def interruptions_noted() -> Iterator[Callable[[], None]]:
     if threading.current_thread() is not threading.main_thread():
         yield stop_if_interrupted
         return
-    ours = [each for each in INTERRUPTIONS if signal.getsignal(each) is signal.default_int_handler]
+    ours = [
+        each
+        for each in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(each) is signal.default_int_handler
+    ]
     for each in ours:
         signal.signal(each, note)
     try:
@@ -301,9 +303,13 @@ def each_done(
 
     waiting, under_way = iter(asked), dict[str, T]()
     finished = as_completed(with_results=True, raise_errors=False)
-    backlog = Backlog(client)
+    limit, asked_s = LEAST_RUNS, -math.inf
     while True:
-        for piece in islice(waiting, max(0, backlog.limit() - len(under_way))):
+        # Asking takes a round trip to the scheduler; workers seldom come or go.
+        if time.monotonic() - asked_s > 5.0:
+            # One run is made, and two are waiting where they are needed next: so no worker is ever idle.
+            limit, asked_s = max(LEAST_RUNS, 3 * len(client.nthreads())), time.monotonic()
+        for piece in islice(waiting, max(0, limit - len(under_way))):
             future = client.submit(work, piece, *more, pure=False, retries=RETRIES)
             under_way[future.key] = piece
             finished.add(future)
@@ -319,21 +325,3 @@ def each_done(
         # Dask hands over an error as `sys.exc_info` returns it.
         yield under_way.pop(future.key), result if future.status == "finished" else result[1]
         future.release()
-
-
-class Backlog:
-    """The largest number of runs that the scheduler may hold, by the number of its workers."""
-
-    def __init__(self, client: "Client") -> None:
-        self._client = client
-        self._asked_s = -math.inf
-        self._limit = LEAST_RUNS
-
-    def limit(self) -> int:
-        """Return the largest number of runs that may be under way."""
-        # Asking takes a round trip to the scheduler; workers seldom come or go.
-        if time.monotonic() - self._asked_s > 5.0:
-            # One run is made, and two are waiting where they are needed next: so no worker is ever idle.
-            self._limit = max(LEAST_RUNS, 3 * len(self._client.nthreads()))
-            self._asked_s = time.monotonic()
-        return self._limit

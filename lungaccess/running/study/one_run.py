@@ -13,7 +13,7 @@ import time
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -34,16 +34,27 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request
 from lungaccess.problem.system import System
-from lungaccess.problem.target import Target, point_target
-from lungaccess.running.study import answers
-from lungaccess.running.study.patients import Patient, open_patient
-from lungaccess.running.study.runs import Problem, Run
+from lungaccess.problem.target import point_target
+from lungaccess.running.study.runs import (
+    EXACT,
+    INVALID_GOAL,
+    NO_PLAN,
+    PATH,
+    PLAN,
+    TIMEOUT,
+    UNKNOWN,
+    Answer,
+    Improvement,
+    Patient,
+    Problem,
+    Run,
+    open_patient,
+)
 from lungaccess.running.study.settings import StudyError
 from stages.needle import OMPL_TOLERANCE_MM, Query, violation
 
 KEPT_PATIENTS = 2
 """Runs come case by case, so that a worker needs the last patient and sometimes the next."""
-MIB = 2.0**20
 FIRST_CPU, SEARCH_CPU = "first_plan_cpu_s", "search_cpu_s"
 """A stored plan says both in its `timing`: processor time to the first plan, and of the whole search."""
 ANSWERS = (AnatomyError, PlanFileError, SettingsError, TargetError)
@@ -59,7 +70,7 @@ class Opened(NamedTuple):
     checker: Checker
 
 
-def answer(run: Run, cache: Path | None = None) -> answers.Answer:
+def answer(run: Run, cache: Path | None = None) -> Answer:
     """Make a run and return what it ended with.
 
     Args:
@@ -87,13 +98,13 @@ def prepare(problem: Problem, cache: Path | None = None) -> None:
             _atlas_of(problem, cache)
 
 
-def _here(run: Run, cache: Path | None) -> answers.Answer:
+def _here(run: Run, cache: Path | None) -> Answer:
     with _one_at_a_time:
         numba.set_num_threads(1)
         return _measured(run, cache)
 
 
-def _measured(run: Run, cache: Path | None) -> answers.Answer:
+def _measured(run: Run, cache: Path | None) -> Answer:
     opened = _opened(run.problem.patient, cache)
     began, cpu_began = time.perf_counter(), time.process_time()
     try:
@@ -102,39 +113,44 @@ def _measured(run: Run, cache: Path | None) -> answers.Answer:
         began, cpu_began = time.perf_counter(), time.process_time()
         made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
     except NoPlan as failure:
-        made = answers.Answer(
+        made = Answer(
             key=run.key,
-            outcome=answers.NO_PLAN,
-            status=answers.TIMEOUT,
+            outcome=NO_PLAN,
+            status=TIMEOUT,
             message=failure.found,
             advice=failure.advice,
             rejections=dict(failure.reasons),
         )
     except ANSWERS as error:
-        status = answers.INVALID_GOAL if isinstance(error, TargetError) else answers.UNKNOWN
-        made = answers.Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
+        status = INVALID_GOAL if isinstance(error, TargetError) else UNKNOWN
+        made = Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
     return replace(
         made,
         time_s=time.perf_counter() - began,
         cpu_s=time.process_time() - cpu_began,
-        memory_mb=psutil.Process().memory_info().rss / MIB,
+        memory_mb=psutil.Process().memory_info().rss / 2.0**20,
     )
 
 
-def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:
+def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     """Search for plans and let the best be checked."""
     problem, best = run.problem, None
-    improvements: list[answers.Improvement] = []
+    improvements: list[Improvement] = []
     target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
     began, first_s = time.process_time(), 0.0
-    request = _request(run, opened.lung, target)
-    plans = plan(request, atlas=atlas, counterfactuals=not run.planner.without_counterfactuals)
+    planner = run.planner
+    request = Request.of(
+        opened.lung, problem.system, target, goal=planner.goal or problem.objective, errors=problem.errors,
+        procedure=problem.procedure, method=planner.method, needle_planner=planner.needle_planner,
+        seed=run.seed, iterations=run.iterations, time_s=problem.time_s,
+    )  # fmt: skip
+    plans = plan(request, atlas=atlas, counterfactuals=not planner.without_counterfactuals)
     for best in plans:
         loss = request.goal.loss(best)
         # The last plan has the cost of the best, and a simpler motion of the scope.
         if np.isfinite(loss) and (not improvements or loss < improvements[-1].cost):
             improvements.append(
-                answers.Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
+                Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
             )
         first_s = first_s or time.process_time() - began
         if problem.first_plan:
@@ -144,10 +160,10 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:
     spent = {FIRST_CPU: first_s, SEARCH_CPU: time.process_time() - began}
     best = replace(best, chance=_chance(run, best, opened.lung), timing={**best.timing, **spent})
     report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
-    return answers.Answer(
+    return Answer(
         key=run.key,
-        outcome=answers.PLAN,
-        status=answers.EXACT,
+        outcome=PLAN,
+        status=EXACT,
         iterations=best.iterations,
         accepted=report.accepted,
         costs=dict(best.costs),
@@ -156,16 +172,6 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> answers.Answer:
         plan=best.to_json(),
         digest=best.digest,
     )
-
-
-def _request(run: Run, lung: Lung, target: Target) -> Request:
-    """Return what a run asks of the planner."""
-    problem, planner = run.problem, run.planner
-    return Request.of(
-        lung, problem.system, target, goal=planner.goal or problem.objective, errors=problem.errors,
-        procedure=problem.procedure, method=planner.method, needle_planner=planner.needle_planner,
-        seed=run.seed, iterations=run.iterations, time_s=problem.time_s,
-    )  # fmt: skip
 
 
 def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:
@@ -190,23 +196,17 @@ def _opened(patient: Patient, cache: Path | None) -> Opened:
 
 def _atlas_of(problem: Problem, cache: Path | None) -> Atlas:
     spacing = (problem.rotations, problem.stop_spacing_mm, problem.site_spacing_mm)
-    return _atlas(problem.patient, problem.system, spacing, cache)
+    return _atlas(problem.patient, problem.system, cache, *spacing)
 
 
 @lru_cache(maxsize=KEPT_PATIENTS)
-def _atlas(patient: Patient, system: System, spacing: tuple[int, float, float], cache: Path | None) -> Atlas:
-    rotations, stop_mm, site_mm = spacing
-    return open_atlas(
-        _opened(patient, cache).lung,
-        system,
-        rotations=rotations,
-        stop_spacing_mm=stop_mm,
-        site_spacing_mm=site_mm,
-        cache=cache,
-    )
+def _atlas(patient: Patient, system: System, cache: Path | None, *spacing: Any) -> Atlas:
+    names = ("rotations", "stop_spacing_mm", "site_spacing_mm")
+    lung = _opened(patient, cache).lung
+    return open_atlas(lung, system, cache=cache, **dict(zip(names, spacing, strict=True)))
 
 
-def _in_own_process(run: Run, cache: Path | None) -> answers.Answer:
+def _in_own_process(run: Run, cache: Path | None) -> Answer:
     """Make a run in a fresh process, as a library with one seed a process needs."""
     words = [sys.executable, "-m", "lungaccess.running.study.one_run", *([str(cache)] if cache else [])]
     done = subprocess.run(words, input=run.to_json(), capture_output=True, encoding="utf-8", errors="replace")
@@ -216,7 +216,7 @@ def _in_own_process(run: Run, cache: Path | None) -> answers.Answer:
             expected="a process that ends with 0",
             remedy="Start the study again; it goes on from what is stored",
         )
-    return answers.Answer.from_mapping(json.loads(done.stdout))
+    return Answer.from_mapping(json.loads(done.stdout))
 
 
 def main(words: list[str]) -> int:
@@ -231,7 +231,7 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def needle_answer(run: Run, lung: Lung) -> answers.Answer:
+def needle_answer(run: Run, lung: Lung) -> Answer:
     """Search for a needle path and let `stages.needle.path.violation` look at it.
 
     Raises:
@@ -259,9 +259,7 @@ def needle_answer(run: Run, lung: Lung) -> answers.Answer:
         time_s=problem.time_s,
     )
     if found.path is None:
-        return answers.Answer(
-            key=run.key, outcome=answers.NO_PLAN, status=answers.TIMEOUT, message=found.outcome
-        )
+        return Answer(key=run.key, outcome=NO_PLAN, status=TIMEOUT, message=found.outcome)
     record = found.record()
     first_s = record["path"].pop("first_path_s")
     costs = record["path"]["costs"]
@@ -269,14 +267,14 @@ def needle_answer(run: Run, lung: Lung) -> answers.Answer:
     query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
     tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.environment.goal_tolerance_mm
     why = violation(found.environment, query, found.path, goal_tolerance_mm=tolerance_mm)
-    return answers.Answer(
+    return Answer(
         key=run.key,
-        outcome=answers.PATH,
-        status=answers.EXACT,
+        outcome=PATH,
+        status=EXACT,
         message=why,
         accepted=not why,
         costs=costs,
-        improvements=(answers.Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
+        improvements=(Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
         plan=text,
         digest=hashlib.sha256(text.encode()).hexdigest(),
     )

@@ -1,19 +1,21 @@
 """The runs of a study: every case, target and start with every planner and seed, each with its key."""
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, fields, replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, field, fields, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 from anatomy.base.checksums import canonical_sha256
-from anatomy.base.errors import LungaccessError
+from anatomy.base.errors import FileError, LungaccessError
 from anatomy.base.records import frozen_value
 from anatomy.base.settings import to_mapping
+from anatomy.build import lung_key
 from anatomy.io.frames import parse_point
 from anatomy.lung import Lung
-from lungaccess.plans.version import software_version
+from anatomy.patient import PatientImages
+from lungaccess.plans.version import software_kernels, software_version
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.peripheral import peripheral_targets
@@ -21,8 +23,96 @@ from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.request import goal_of
 from lungaccess.problem.system import System, load_system, system_fingerprint
 from lungaccess.problem.target import nodule_target
-from lungaccess.running.study.patients import Patient, open_patient, patient_of
-from lungaccess.running.study.settings import Case, PlannerChoice, Study
+from lungaccess.running.study.settings import PHANTOM, Case, PhantomPatient, PlannerChoice, Study
+
+
+@frozen_value
+class Patient:
+    """A patient by content, and where to read it where no cache holds it.
+
+    Args:
+        anatomy: "phantom", or an absolute folder.
+        spacing_mm: Of the synthetic patient.
+        sources (tuple of (str, str)): Name and SHA-256 of every input.
+    """
+
+    anatomy: str
+    seed: int
+    size: str
+    spacing_mm: float | None
+    sources: tuple[tuple[str, str], ...]
+
+    @property
+    def key(self) -> str:
+        """Key of the lung made from these inputs."""
+        return lung_key(dict(self.sources))
+
+
+def patient_of(case: Case, folder: Path, cache: Path | None = None) -> Patient:
+    """Return the patient of a case; a relative folder is relative to `folder`.
+
+    Raises:
+        LungaccessError: If the patient cannot be read.
+    """
+    from anatomy.io.inputs import input_hashes
+
+    made = case.phantom
+    if case.anatomy == PHANTOM:
+        place, sources = PHANTOM, _phantom_sources(made)
+    else:
+        place = str((folder / case.anatomy).resolve())
+        sources = input_hashes(Path(place))
+    return Patient(
+        anatomy=place,
+        seed=made.seed,
+        size=made.size,
+        spacing_mm=made.spacing_mm,
+        sources=tuple(sorted(sources.items())),
+    )
+
+
+def open_patient(patient: Patient, cache: Path | None = None) -> Lung:
+    """Return the lung of a patient, from the cache or newly built.
+
+    Raises:
+        FileError: If what is read is not what the study was set up with.
+        LungaccessError: If the patient cannot be read.
+    """
+    from anatomy.store import open_lung
+
+    return open_lung(dict(patient.sources), lambda: _read(patient), cache=cache, accept=())
+
+
+def _read(patient: Patient) -> PatientImages:
+    from anatomy.io.inputs import input_hashes
+    from anatomy.io.patients import load_patient
+
+    if patient.anatomy == PHANTOM:
+        images = _phantom_images(
+            PhantomPatient(seed=patient.seed, size=patient.size, spacing_mm=patient.spacing_mm)  # type: ignore[arg-type]
+        )
+        found = dict(images.sources)
+    else:
+        images, found = load_patient(Path(patient.anatomy)), input_hashes(Path(patient.anatomy))
+    if found != dict(patient.sources):
+        raise FileError(
+            f"The files of {patient.anatomy} differ from those the study began with",
+            expected="the same files on every machine",
+            remedy="Copy the patient's folder again, and start the study once more",
+        )
+    return images
+
+
+@lru_cache(maxsize=16)
+def _phantom_sources(made: PhantomPatient) -> dict[str, str]:
+    return dict(_phantom_images(made).sources)
+
+
+def _phantom_images(made: PhantomPatient) -> PatientImages:
+    from anatomy.phantom import make_phantom
+
+    return make_phantom(seed=made.seed, spacing_mm=made.spacing_mm, size=made.size).images
+
 
 OF_THEIR_OWN_CLASS = ("patient", "system", "errors", "procedure")
 """The fields of a problem that are not plain values."""
@@ -229,3 +319,77 @@ def _stated(lung: Lung, words: str) -> tuple[Point, str]:
 def _point(values: Any) -> Point:
     x, y, z = (float(value) for value in values)
     return x, y, z
+
+
+PLAN, PATH, NO_PLAN = "plan", "path", "no plan"
+"""Outcomes of runs; another one is the class of the error that ended the run."""
+
+STATUS = (
+    "Unknown status", "Invalid start", "Invalid goal", "Unrecognized goal type", "Timeout",
+    "Approximate solution", "Exact solution", "Crash",
+)  # fmt: skip
+"""OMPL's words for the end of a run, by number."""
+UNKNOWN, INVALID_GOAL, TIMEOUT, EXACT, CRASH = 0, 2, 4, 6, 7
+"""The numbers of those that runs end with."""
+
+
+@frozen_value
+class Improvement:
+    """A plan that is better than those before."""
+
+    time_s: float
+    iteration: int
+    cost: float
+
+
+@frozen_value
+class Answer:
+    """What a run ended with.
+
+    Args:
+        outcome: `PLAN`, `PATH`, `NO_PLAN`, or the class of the error that ended the run.
+        status: Number of OMPL's word for it in `STATUS`.
+        kernels: Digest of the kernels of the process that made the run.
+        failed: Whether the run could not be made: a file was missing, the machine had no memory, a worker was
+            lost.  Such a run is made again when the study is started the next time.
+        message, advice: Why there is no plan, and what would help.
+        time_s, cpu_s: Of the whole run, without opening the patient.
+        memory_mb: Resident memory of the process after the run, MiB.
+        accepted: Whether the independent check accepts the plan; for a needle path, whether nothing objects
+            to it.
+        costs: By the keys of `stages.needle.TERMS`.
+        findings: What the check looked at; see `lungaccess.judging.checking.findings.Finding.to_mapping`.
+        rejections: The reasons of `NoPlan`, counted.
+        plan: JSON of the plan or of the needle's path; "" if there is none.
+        digest: Hash of the plan without its times.
+    """
+
+    key: str
+    outcome: str
+    status: int
+    kernels: str = field(default_factory=software_kernels)
+    failed: bool = False
+    message: str = ""
+    advice: str = ""
+    time_s: float = 0.0
+    cpu_s: float = 0.0
+    memory_mb: float = 0.0
+    iterations: int = 0
+    accepted: bool = False
+    costs: Mapping[str, float] = field(default_factory=dict)
+    improvements: tuple[Improvement, ...] = ()
+    findings: tuple[Mapping[str, Any], ...] = ()
+    rejections: Mapping[str, int] = field(default_factory=dict)
+    plan: str = ""
+    digest: str = ""
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is a plan or path."""
+        return self.outcome in (PLAN, PATH)
+
+    @staticmethod
+    def from_mapping(values: Mapping[str, Any]) -> "Answer":
+        """Return the answer that `dataclasses.asdict` made plain."""
+        made = tuple(Improvement(**each) for each in values["improvements"])
+        return Answer(**{**values, "improvements": made, "findings": tuple(values["findings"])})

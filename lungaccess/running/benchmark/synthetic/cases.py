@@ -15,32 +15,196 @@ Scope tips of a case: where a scope can stand, with the motion that leads there.
 They let a planner start from a bronchoscope without having one of its own.  A submission names one by number.
 """
 
+import hashlib
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from anatomy.base.errors import FileError, SettingsError
+import numpy as np
+
+from anatomy.base.errors import AnatomyError, FileError, SettingsError
 from anatomy.base.files import read_json, require_writable_folder, write_json, write_text
 from anatomy.base.records import frozen_value
 from anatomy.base.settings import to_mapping
 from anatomy.lung import Lung
-from anatomy.phantom import write_phantom
+from anatomy.patient import PatientImages
+from anatomy.phantom import Phantom, make_phantom, write_phantom
+from anatomy.phantom.patient import Size
+from anatomy.phantom.traits import Traits
 from lungaccess.planning.coupled.atlas import motions_of
 from lungaccess.problem.system import load_system, preset_text
-from lungaccess.running.benchmark.synthetic.manifest import (
-    Point,
-    entries,
-    make_benchmark_phantom,
-    manifest_sha256,
-)
-from lungaccess.running.benchmark.synthetic.phantoms import (
-    SYSTEMS,
-    VERSION,
-    BenchmarkPhantom,
-    benchmark_phantoms,
-    phantom_named,
-)
+
+VERSION = "synthetic-v1"
+"""Name of the benchmark; other phantoms, targets, devices or rules are another version."""
+Family = Literal["adult", "child", "resected", "emphysematous", "breathing"]
+FAMILIES: tuple[Family, ...] = ("adult", "child", "resected", "emphysematous", "breathing")
+OF_A_FAMILY = 10
+SYSTEMS = ("thin-scope", "ultrathin", "therapeutic-scope")
+"""The three devices: presets, as `lungaccess presets NAME` prints them."""
+TARGETS_A_LUNG = 10
+ADULT_MM, CHILD_MM = 1.0, 0.8
+"""Edges of the voxels: those of a usual reconstruction, finer for the narrower airways of a child."""
+BRONCHUS_LENGTH, VESSEL_LIMIT_MM, VESSEL_RIM_MM, HILAR_VESSEL_MM = 1.35, 0.9, 5.0, 9.0
+"""Set so that the medians of a phantom come near those of two patients' masks, see the measurements."""
+LOBES = ("right upper", "left upper", "right lower", "left lower", "right middle")
+
+
+@frozen_value
+class BenchmarkPhantom:
+    """One phantom of the benchmark.
+
+    Args:
+        name: Family and number, such as "adult-01".
+        number: 1 to `OF_A_FAMILY`.
+        breathes: Whether the patient comes with the motion of its breath.
+    """
+
+    name: str
+    family: Family
+    number: int
+    seed: int
+    size: Size
+    spacing_mm: float
+    traits: Traits
+    breathes: bool
+
+
+def benchmark_phantoms() -> tuple[BenchmarkPhantom, ...]:
+    """Return the phantoms, the first of each family first: so any beginning has all families."""
+    return tuple(_phantom(family, number) for number in range(1, OF_A_FAMILY + 1) for family in FAMILIES)
+
+
+def phantom_named(name: str) -> BenchmarkPhantom:
+    """Return the phantom of that name.
+
+    Raises:
+        SettingsError: If there is none.
+    """
+    for each in benchmark_phantoms():
+        if each.name == name:
+            return each
+    raise SettingsError(
+        f"{VERSION} has no phantom {name!r}",
+        expected=f"a family and a number from 01 to {OF_A_FAMILY}, families: {', '.join(FAMILIES)}",
+        remedy="Name one such as adult-01",
+    )
+
+
+def _phantom(family: Family, number: int) -> BenchmarkPhantom:
+    """Spread the traits evenly over the numbers, each in another order, so that no two go together."""
+    child = family == "child"
+    traits = Traits(
+        stature=_spread(0.95, 1.13, number, 3),
+        flow_exponent=_spread(1.9, 2.1, number, 7),
+        vessel_calibre=_spread(1.3, 1.7, number, 1),
+        bronchus_length=BRONCHUS_LENGTH,
+        vessel_limit_mm=VESSEL_LIMIT_MM,
+        vessel_rim_mm=VESSEL_RIM_MM,
+        hilar_vessel_mm=HILAR_VESSEL_MM,
+        # These shares of the fissures are open in turn: every second phantom has complete ones.
+        open_fissures=(0.0, 0.45)[number % 2],
+        resected=LOBES[(number - 1) % len(LOBES)] if family == "resected" else "",
+        emphysema=_spread(0.3, 1.0, number, 9) if family == "emphysematous" else 0.0,
+    )
+    return BenchmarkPhantom(
+        name=f"{family}-{number:02d}",
+        family=family,
+        number=number,
+        # Seeds run on from here, so that no phantom of the tests or of the documentation is among them.
+        seed=28_000 + 100 * FAMILIES.index(family) + number,
+        size="small" if child else "adult",
+        spacing_mm=CHILD_MM if child else ADULT_MM,
+        traits=traits,
+        breathes=family == "breathing",
+    )
+
+
+def _spread(low: float, high: float, number: int, stride: int) -> float:
+    """Return one of ten evenly spaced values; a stride without a common factor with 10 meets each once."""
+    return round(low + (high - low) * ((number * stride) % OF_A_FAMILY) / (OF_A_FAMILY - 1), 4)
+
+
+MANIFEST = "manifest.json"
+MASKS = ("lumen", "wall", "vessels", "lung", "fissures")
+"""An answer depends on these masks; CT, labels and lobes are for looking at."""
+Point = tuple[float, float, float]
+
+
+@frozen_value
+class Entry:
+    """What is fixed of one phantom.
+
+    Args:
+        masks_sha256: Of grid and masks, see `masks_sha256`.
+        targets_lps (tuple of (float, float, float)): LPS mm; target 1 is the first.
+    """
+
+    masks_sha256: str
+    targets_lps: tuple[Point, ...]
+
+
+def masks_sha256(images: PatientImages) -> str:
+    """Return the SHA-256 (hex) of grid and masks: what is written to files, whatever compresses them."""
+    digest = hashlib.sha256()
+    # NIfTI keeps the grid in single precision: what was read from files has the hash of what was written.
+    grid = np.asarray(images.grid.lps_from_ijk, dtype="<f4") + np.float32(0.0)
+    digest.update(json.dumps([list(images.grid.shape), grid.tolist()]).encode())
+    for name in MASKS:
+        volume = getattr(images, name)
+        digest.update(name.encode())
+        voxels = np.zeros(0, dtype=np.bool_) if volume is None else np.asarray(volume.array > 0).T
+        digest.update(np.packbits(voxels).tobytes())
+    return digest.hexdigest()
+
+
+@cache
+def entries() -> Mapping[str, Entry]:
+    """Return the manifest by the names of the phantoms."""
+    content = json.loads(files(__package__).joinpath(MANIFEST).read_text(encoding="utf-8"))
+    return {
+        name: Entry(
+            masks_sha256=entry["masks_sha256"],
+            targets_lps=tuple((float(x), float(y), float(z)) for x, y, z in entry["targets_lps"]),
+        )
+        for name, entry in content["phantoms"].items()
+    }
+
+
+@cache
+def manifest_sha256() -> str:
+    """Return the SHA-256 (hex) of the manifest: the benchmark in one number."""
+    return hashlib.sha256(files(__package__).joinpath(MANIFEST).read_bytes()).hexdigest()
+
+
+def unproved_phantom(case: BenchmarkPhantom) -> Phantom:
+    """Make a phantom, whether or not it is that of the manifest."""
+    made = make_phantom(
+        seed=case.seed, size=case.size, spacing_mm=case.spacing_mm, traits=case.traits, precise=True
+    )
+    return replace(made, images=replace(made.images, name=case.name))
+
+
+def make_benchmark_phantom(case: BenchmarkPhantom) -> Phantom:
+    """Make a phantom of the benchmark.
+
+    Raises:
+        AnatomyError: If its masks are not those of the manifest: the generator, or a library below it, has
+            changed.
+    """
+    made = unproved_phantom(case)
+    wanted, found = entries()[case.name].masks_sha256, masks_sha256(made.images)
+    if found != wanted:
+        raise AnatomyError(
+            f"The masks of {case.name} made here have the hash {found[:16]}",
+            expected=f"{wanted[:16]}, as the manifest of {VERSION} says",
+            remedy="Install the versions that constraints.txt names; a changed generator needs a new version",
+        )
+    return made
+
 
 BENCHMARK, CASE = "benchmark.json", "case.json"
 RULES = (
@@ -101,8 +265,10 @@ def write_benchmark(
     """
     cases = tuple(phantom_named(name) for name in names) or benchmark_phantoms()
     say = progress or (lambda _words, _share: None)
-    require_writable_folder(folder)
-    _write_devices(folder / "devices")
+    devices = require_writable_folder(folder / "devices")
+    for name in SYSTEMS:
+        write_text(devices / f"{name}.toml", preset_text(name))
+        write_json(devices / f"{name}.json", to_mapping(load_system(name)))
     for number, case in enumerate(cases):
         say(f"making {case.name}", number / len(cases))
         home = folder / case.name
@@ -112,13 +278,6 @@ def write_benchmark(
     about = {"benchmark": VERSION, "manifest_sha256": manifest_sha256(), "rules": list(RULES)}
     write_json(folder / BENCHMARK, {**about, "devices": list(SYSTEMS), "phantoms": present})
     return cases
-
-
-def _write_devices(folder: Path) -> None:
-    require_writable_folder(folder)
-    for name in SYSTEMS:
-        write_text(folder / f"{name}.toml", preset_text(name))
-        write_json(folder / f"{name}.json", to_mapping(load_system(name)))
 
 
 def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips: bool) -> None:

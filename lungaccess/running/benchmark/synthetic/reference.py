@@ -5,17 +5,18 @@ from pathlib import Path
 
 from anatomy.base.errors import SettingsError
 from lungaccess.plans.plan import Plan
-from lungaccess.running.benchmark.synthetic.answers import answer_of_plan
-from lungaccess.running.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
-from lungaccess.running.benchmark.synthetic.manifest import entries
-from lungaccess.running.benchmark.synthetic.phantoms import (
+from lungaccess.running.benchmark.synthetic.cases import (
     SYSTEMS,
     TARGETS_A_LUNG,
     VERSION,
     BenchmarkPhantom,
+    BenchmarkQuery,
+    all_queries,
+    entries,
     phantom_named,
+    require_cases,
 )
-from lungaccess.running.benchmark.synthetic.submission import Submission, SubmittedAnswer
+from lungaccess.running.benchmark.synthetic.submission import Submission, SubmittedAnswer, answer_of_plan
 from lungaccess.running.study.one_run import FIRST_CPU, SEARCH_CPU
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.settings import AtlasGrid, Budget, Case, PlannerChoice, Study

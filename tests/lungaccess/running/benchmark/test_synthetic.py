@@ -17,27 +17,37 @@ from anatomy.io.patients import load_patient as read_images
 from anatomy.phantom import write_phantom
 from experiments.synthetic_manifest import measured_entry
 from lungaccess.plans.plan import Plan
-from lungaccess.running.benchmark.synthetic import manifest
-from lungaccess.running.benchmark.synthetic.answers import answer_of_plan
-from lungaccess.running.benchmark.synthetic.cases import BenchmarkQuery, all_queries, require_cases
-from lungaccess.running.benchmark.synthetic.manifest import (
-    entries,
-    make_benchmark_phantom,
-    masks_sha256,
-    unproved_phantom,
-)
-from lungaccess.running.benchmark.synthetic.phantoms import (
+from lungaccess.running.benchmark.synthetic import cases as manifest
+from lungaccess.running.benchmark.synthetic.cases import (
     FAMILIES,
     OF_A_FAMILY,
     SYSTEMS,
+    BenchmarkQuery,
+    all_queries,
     benchmark_phantoms,
+    entries,
+    make_benchmark_phantom,
+    masks_sha256,
     phantom_named,
+    require_cases,
+    unproved_phantom,
 )
 from lungaccess.running.benchmark.synthetic.reference import method_choice
-from lungaccess.running.benchmark.synthetic.scoring import CLAIMED, MISSING, REFUSED, SOLVED, Score, refuted
-from lungaccess.running.benchmark.synthetic.sheet import read_scores, score_sheet, write_scores, write_sheet
+from lungaccess.running.benchmark.synthetic.scoring import (
+    CLAIMED,
+    MISSING,
+    REFUSED,
+    SOLVED,
+    Score,
+    read_scores,
+    refuted,
+    score_sheet,
+    write_scores,
+    write_sheet,
+)
 from lungaccess.running.benchmark.synthetic.submission import (
     SCHEMA,
+    answer_of_plan,
     read_submission,
     submission_of,
     submission_schema,

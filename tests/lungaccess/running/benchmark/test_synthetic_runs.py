@@ -28,9 +28,9 @@ from lungaccess.running.benchmark.synthetic.scoring import (
     SOLVED,
     Score,
     refuted,
+    score_sheet,
     score_submission,
 )
-from lungaccess.running.benchmark.synthetic.sheet import score_sheet
 from lungaccess.running.benchmark.synthetic.submission import Submission, SubmittedAnswer, read_submission
 from lungaccess.running.study.driver import run_study
 from lungaccess.running.study.results import ResultsFile

@@ -12,9 +12,7 @@ import pytest
 from lungaccess.problem.system import load_system
 from lungaccess.running.design import Design, design_of, search
 from lungaccess.running.study import driver
-from lungaccess.running.study.answers import NO_PLAN, TIMEOUT, Answer
-from lungaccess.running.study.patients import Patient
-from lungaccess.running.study.runs import Problem, Run
+from lungaccess.running.study.runs import NO_PLAN, TIMEOUT, Answer, Patient, Problem, Run
 from tests.lungaccess.running.study.toys import content, toy_answer
 
 TARGETS = 9

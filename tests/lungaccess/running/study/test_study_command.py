@@ -17,11 +17,9 @@ import pytest
 
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.running.study.answers import NO_PLAN, TIMEOUT
 from lungaccess.running.study.results import ResultsFile
-from lungaccess.running.study.runs import Run
-from lungaccess.running.study.summary import summarise
-from lungaccess.running.study.tables import QUERIES, TEXTS, TRUTHS, export_csv, export_parquet
+from lungaccess.running.study.runs import NO_PLAN, TIMEOUT, Run
+from lungaccess.running.study.tables import QUERIES, TEXTS, TRUTHS, export_csv, export_parquet, summarise
 from tests.lungaccess.running.study.toys import toy_answer
 
 TOML = """

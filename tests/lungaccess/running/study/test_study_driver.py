@@ -19,10 +19,9 @@ from distributed import LocalCluster
 
 from anatomy.base.errors import FileError
 from lungaccess.running.study import driver, one_run
-from lungaccess.running.study.answers import Answer
 from lungaccess.running.study.driver import StudyDone, open_results, run_study
 from lungaccess.running.study.results import ResultsFile
-from lungaccess.running.study.runs import Run
+from lungaccess.running.study.runs import Answer, Run
 from lungaccess.running.study.settings import Study, StudyError, study_of
 from lungaccess.running.study.tables import differences
 from tests.lungaccess.running.study.toys import content, toy_answer

@@ -14,9 +14,8 @@ import pytest
 
 from anatomy.base.errors import FileError
 from lungaccess.running.study import results as results_module
-from lungaccess.running.study.answers import CRASH
 from lungaccess.running.study.results import APPLICATION_ID, ResultsFile
-from lungaccess.running.study.runs import Run
+from lungaccess.running.study.runs import CRASH, Run
 from lungaccess.running.study.tables import differences
 from tests.lungaccess.running.study.toys import toy_answer
 

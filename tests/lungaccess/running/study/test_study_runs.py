@@ -19,11 +19,9 @@ from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.system import load_system
 from lungaccess.running.study import one_run, summarise
-from lungaccess.running.study.answers import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN
 from lungaccess.running.study.one_run import answer, needle_answer
-from lungaccess.running.study.patients import open_patient
 from lungaccess.running.study.results import ResultsFile
-from lungaccess.running.study.runs import Run, runs_of
+from lungaccess.running.study.runs import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN, Run, open_patient, runs_of
 from lungaccess.running.study.settings import PlannerChoice, study_of
 from tests.lungaccess.running.study.toys import NEAR, content
 
@@ -239,7 +237,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from lungaccess.planning.one_stage.needle import plan_needle
-from lungaccess.running.study.patients import open_patient
+from lungaccess.running.study.runs import open_patient
 from lungaccess.running.study.runs import Run
 from lungaccess.problem.target import point_target
 from anatomy.base.errors import SettingsError

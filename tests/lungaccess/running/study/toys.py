@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lungaccess.running.study.answers import EXACT, PLAN, Answer, Improvement
-from lungaccess.running.study.runs import Run
+from lungaccess.running.study.runs import EXACT, PLAN, Answer, Improvement, Run
 
 NEAR = "lps:-81.25,51,-33.5"
 OUTSIDE = "lps:300,0,0"

@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.constraints import TIP_WITHIN_MM, tips_near
     from lungaccess.planning.diverse_plans import Alternative, with_front
-    from lungaccess.planning.driver import ProgressEvent, atlas_event
+    from lungaccess.planning.driver import TIP_WITHIN_MM, ProgressEvent, atlas_event, tips_near
     from lungaccess.planning.one_system import run
     from lungaccess.planning.searches import NEED_A_NEEDLE, planners, register_planner
     from lungaccess.planning.tour import TourAnswer, lesions_of, plan_tour, read_lesions, tour_record

@@ -10,12 +10,10 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
-from lungaccess.planning.constraints import holds, place_part
 from lungaccess.planning.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.planning.coupled.search.base import AtlasBound
-from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
-from lungaccess.planning.coupled.search.separated_arcs import separated_candidates
-from lungaccess.planning.driver import ProgressEvent
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, separated_candidates
+from lungaccess.planning.driver import ProgressEvent, holds, place_part
 from lungaccess.planning.one_system import run
 from lungaccess.planning.searches import plan_of, search_of
 from lungaccess.planning.success.ratings import Rating, rating_of

@@ -2,9 +2,8 @@
 
 from collections.abc import Callable, Iterator
 
-from lungaccess.planning.constraints import place_part
 from lungaccess.planning.coupled.atlas import Atlas, build_atlas, require_same
-from lungaccess.planning.driver import Finder, ProgressEvent, atlas_event, drive
+from lungaccess.planning.driver import Finder, ProgressEvent, atlas_event, drive, place_part
 from lungaccess.planning.searches import CostFinder, require_method
 from lungaccess.planning.success.finder import ContestFinder
 from lungaccess.plans.plan import Plan

@@ -18,10 +18,10 @@ from lungaccess.planning.coupled.cost_bound import GapGoal, guided
 from lungaccess.planning.coupled.explanation import explain, explain_window
 from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
 from lungaccess.planning.coupled.layer_bound import beside_in_window_mm, cost_bound
+from lungaccess.planning.coupled.search.aimed_tubes import TubeSearch
 from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step
-from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
-from lungaccess.planning.coupled.search.tube_search import TubeSearch
+from lungaccess.planning.coupled.search.needle_planner import KuntzSearch
 from lungaccess.planning.coupled.search.window_search import WindowSearch, WindowTubeSearch, window_search
 from lungaccess.planning.driver import Turn
 from lungaccess.plans.assemble import assemble

@@ -19,8 +19,8 @@ from anatomy.lung import Lung
 from anatomy.motion.source import MotionSource
 from anatomy.patient import PatientImages
 from anatomy.store import open_lung
-from lungaccess.planning.coupled import atlas_store
-from lungaccess.planning.coupled.atlas_store import open_atlas
+from lungaccess.planning.coupled import atlas as atlas_store
+from lungaccess.planning.coupled.atlas import open_atlas
 from stages.tube import ShapeGrid, ShapeLimits, design_shapes, open_shapes
 from tests.anatomy.stored_toy import SOURCES, require_same
 from tests.anatomy.toys import toy

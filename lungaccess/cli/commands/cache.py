@@ -73,7 +73,7 @@ def clear(*, output: CacheOptions = CacheOptions()) -> ExitCode:
 def _entries(folder: Path) -> "tuple[CacheEntry, ...]":
     from anatomy.base.cache_entries import cache_entries
     from anatomy.store import stored_format
-    from lungaccess.planning.coupled.atlas_store import atlas_format
+    from lungaccess.planning.coupled.atlas import atlas_format
     from lungaccess.uncertainty.risk.resting import resting_format
     from stages.tube import shapes_format
 

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.coupled.atlas import Atlas, atlas_part, build_atlas
-    from lungaccess.planning.coupled.atlas_store import atlas_is_kept, open_atlas
+    from lungaccess.planning.coupled.atlas import Atlas, atlas_is_kept, atlas_part, build_atlas, open_atlas
     from lungaccess.planning.coupled.counterfactuals import Counterfactual, needle_changes, scope_changes
     from lungaccess.planning.coupled.exits import FeasibleExits, feasible_exits
     from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
@@ -16,13 +15,13 @@ if TYPE_CHECKING:
         Incumbent,
         ParallelSearch,
         PlanSearch,
+        SearchSettings,
         Step,
         evaluated_step,
     )
     from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
     from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
-    from lungaccess.planning.coupled.search.kuntz2015 import KuntzSearch
+    from lungaccess.planning.coupled.search.needle_planner import KuntzSearch
     from lungaccess.planning.coupled.search.reach_scans import Scan, reach_scan
-    from lungaccess.planning.coupled.search.settings import SearchSettings
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

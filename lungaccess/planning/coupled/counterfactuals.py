@@ -11,8 +11,7 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from lungaccess.planning.coupled.atlas import Atlas, build_atlas
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
-from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
-from lungaccess.planning.coupled.search.separated_arcs import separated_candidates
+from lungaccess.planning.coupled.search.direct_candidates import direct_candidates, separated_candidates
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan

@@ -13,7 +13,7 @@ from anatomy.lung import Lung
 from lungaccess.planning.coupled.atlas import Atlas, require_same
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
-from lungaccess.planning.coupled.search.tube_reach import tubes_clearance_mm
+from lungaccess.planning.coupled.search.reach_scans import tubes_clearance_mm
 from lungaccess.plans.costs import obstacle_clearance_mm
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target

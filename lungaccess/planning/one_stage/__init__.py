@@ -5,18 +5,23 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.one_stage.from_scope import ScopeReplanner
     from lungaccess.planning.one_stage.needle import (
         NeedleAnswer,
         NeedleQuestion,
+        PathSearch,
         needle_question,
         pierced_branches,
         plan_needle,
+        search_path,
     )
-    from lungaccess.planning.one_stage.needle_search import PathSearch, search_path
     from lungaccess.planning.one_stage.obstruction import obstruction_rows, reason_in_words
-    from lungaccess.planning.one_stage.replan import measured_pose, replan_from_scope, replan_from_tube
-    from lungaccess.planning.one_stage.rest import RestOfPlan
+    from lungaccess.planning.one_stage.replan import (
+        RestOfPlan,
+        ScopeReplanner,
+        measured_pose,
+        replan_from_scope,
+        replan_from_tube,
+    )
     from lungaccess.planning.one_stage.route import RouteSource, open_source, route_record, widest_end
     from lungaccess.planning.one_stage.scope import (
         ADVICE_FILE,

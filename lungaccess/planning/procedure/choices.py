@@ -12,8 +12,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float
 from anatomy.lung import Lung
 from lungaccess.planning.procedure.kernels.decisions import Choices
-from lungaccess.planning.procedure.residuals import Residuals
-from lungaccess.planning.procedure.spread import Spread
+from lungaccess.planning.procedure.spread import Residuals, Spread
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import Procedure

@@ -28,18 +28,21 @@ from lungaccess.planning.procedure.choices import (
     with_choices,
 )
 from lungaccess.planning.procedure.decision import Action, Decision, Measurements
-from lungaccess.planning.procedure.fusion import (
+from lungaccess.planning.procedure.kernels import decisions as kernel
+from lungaccess.planning.procedure.kernels.spread import Sizes
+from lungaccess.planning.procedure.spread import (
+    ASIDE,
+    Residuals,
+    around,
     as_measured,
+    bend_per_mm,
     fused,
     fused_share,
     mean_pose,
     scope_moves,
+    sizes,
     tip_moves,
 )
-from lungaccess.planning.procedure.kernels import decisions as kernel
-from lungaccess.planning.procedure.kernels.spread import Sizes
-from lungaccess.planning.procedure.residuals import Residuals
-from lungaccess.planning.procedure.spread import ASIDE, around, bend_per_mm, sizes
 from lungaccess.plans.assemble import needle_part, tube_part
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan

@@ -12,9 +12,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from lungaccess.planning.procedure.choices import scope_frames
-from lungaccess.planning.procedure.fusion import as_measured
 from lungaccess.planning.procedure.policy import LEAST_CHANCE, Chosen, OnTheWay, Policy, rest_of
 from lungaccess.planning.procedure.report import NO_PATH, ProcedureReport, StageReport
+from lungaccess.planning.procedure.spread import as_measured
 from lungaccess.planning.procedure.truth import (
     ARCS,
     Attempt,

@@ -7,9 +7,9 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
-from lungaccess.planning.procedure.fusion import as_measured
 from lungaccess.planning.procedure.kernels.decisions import deviated_planar
 from lungaccess.planning.procedure.policy import Chosen
+from lungaccess.planning.procedure.spread import as_measured
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import NeedleSteering

@@ -5,17 +5,18 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
+    from lungaccess.planning.reachability.layers import Regions
     from lungaccess.planning.reachability.reach_map import (
         KINDS,
         NOT_COUNTED,
         STATES,
         ReachMap,
+        ReachPart,
+        ReachStream,
         RegionReach,
         compare_reach,
         map_reach,
     )
-    from lungaccess.planning.reachability.reach_stream import ReachPart, ReachStream
-    from lungaccess.planning.reachability.regions import Regions
     from lungaccess.planning.reachability.unreachable import (
         MOST_BOXES,
         OpenPlace,

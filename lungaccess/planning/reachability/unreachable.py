@@ -18,7 +18,13 @@ from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER
-from lungaccess.planning.reachability.deployment_space import DeploymentSpace, divided_space, in_tasks
+from lungaccess.planning.reachability.deployment_space import (
+    DeploymentSpace,
+    divided_space,
+    in_tasks,
+    place_pieces,
+    places_of_tips,
+)
 from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment
 from lungaccess.planning.reachability.kernels.deployment_boxes import BOX_COLUMNS, PLACE_X
 from lungaccess.planning.reachability.kernels.unreachable import (
@@ -29,7 +35,6 @@ from lungaccess.planning.reachability.kernels.unreachable import (
     rule_out,
 )
 from lungaccess.planning.reachability.layers import THREADS
-from lungaccess.planning.reachability.tip_places import place_pieces, places_of_tips
 from lungaccess.problem.system import System
 from stages.needle import NOT_BOUNDED, backward_reach, needle_environment
 from stages.needle.infeasibility.kernels import BackwardReach

@@ -7,9 +7,15 @@ import numpy as np
 from anatomy import poses
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
-from lungaccess.planning.refinement.curve import aimed, path_of
-from lungaccess.planning.refinement.problem import ARC_COUNTS, Problem, Weights, program_weights
-from lungaccess.planning.refinement.shape_model import joints_of
+from lungaccess.planning.refinement.layout import joints_of
+from lungaccess.planning.refinement.problem import (
+    ARC_COUNTS,
+    Problem,
+    Weights,
+    aimed,
+    path_of,
+    program_weights,
+)
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task

@@ -16,12 +16,11 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.words import percent
 from lungaccess.planning import searches
-from lungaccess.planning.constraints import holds
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.search.base import AtlasBound, Step
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
-from lungaccess.planning.coupled.search.variation import SMALLEST, random_change, varied
-from lungaccess.planning.driver import Turn, no_plan_beside
+from lungaccess.planning.coupled.search.window_search import SMALLEST, random_change, varied
+from lungaccess.planning.driver import Turn, holds, no_plan_beside
 from lungaccess.planning.success.passes import with_passes
 from lungaccess.planning.success.ratings import (
     ChanceRating,

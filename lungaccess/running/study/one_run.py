@@ -23,8 +23,7 @@ from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
 from lungaccess.judging.checking import Checker
-from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.atlas_store import open_atlas
+from lungaccess.planning.coupled.atlas import Atlas, open_atlas
 from lungaccess.planning.one_stage import plan_needle
 from lungaccess.planning.one_system import run as plan
 from lungaccess.planning.success.estimate import FRESH_SEED, chance_of, estimate_success

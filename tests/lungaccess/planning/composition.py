@@ -21,8 +21,8 @@ from anatomy.build import build_lung
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
 from lungaccess.judging import answer, answer_with_several
-from lungaccess.planning.constraints import holds
 from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
+from lungaccess.planning.driver import holds
 from lungaccess.planning.success import finder, ratings
 from lungaccess.problem.request import Request, StatedPlace
 from lungaccess.problem.system import System, load_system

@@ -14,10 +14,15 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Labels
 from anatomy.structures import AIRWAY, LUMEN, OUTSIDE
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT
-from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, branch_of, chord_mm
+from lungaccess.planning.coupled.kuntz2015_fcl.needle import (
+    SAGITTA_MM,
+    NeedleRRT,
+    Obstacles,
+    branch_of,
+    chord_mm,
+)
 from lungaccess.planning.coupled.search.base import SearchInParts, Step
-from lungaccess.planning.coupled.search.kuntz2015 import Placement, random_placements
+from lungaccess.planning.coupled.search.needle_planner import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.system import System
@@ -58,7 +63,7 @@ class ReferenceSearch(SearchInParts):
     validated too.  A path that is found is yielded only if the planner's proof accepts it.
 
     Args:
-        task, atlas, rejects: See `lungaccess.planning.coupled.search.kuntz2015.KuntzSearch`.
+        task, atlas, rejects: See `lungaccess.planning.coupled.search.needle_planner.KuntzSearch`.
         rrt_iterations: Samples of each RRT: the same seed then gives the same plans.
         rrt_time_s: Processor time of each RRT instead, 0.05 in the paper.  Such a run cannot be repeated
             exactly.

@@ -15,17 +15,18 @@ from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.candidate import SCOPE_POSE
 from lungaccess.planning.coupled.kernels.local_search import sample_deployments
 from lungaccess.planning.coupled.search.base import (
+    ESTIMATE_SLACK,
     DirectSearch,
     Incumbent,
     SearchInParts,
+    SearchSettings,
     Step,
+    different,
     evaluated_step,
 )
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
-from lungaccess.planning.coupled.search.entries import different
 from lungaccess.planning.coupled.search.local_search import LocalSearch, LocalSearchRun, TubeChoice
 from lungaccess.planning.coupled.search.needle_planner import PLANNER, NamedNeedlePlanner, needle_searches
-from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task

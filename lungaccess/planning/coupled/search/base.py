@@ -4,14 +4,61 @@ import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from anatomy.base.records import frozen_value
+from anatomy.base.settings import quantity, settings
 from anatomy.base.typed import Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
+from stages.tube import Deployments
+
+ESTIMATE_SLACK = 1.03
+"""Estimates of the kernels that exceed the best cost by more are dropped: few are over 1 % too large."""
+
+
+@settings
+class SearchSettings:
+    """How the search shares its iterations among its phases; `docs/explanation/planning.md` explains them.
+
+    The defaults are free choices; the results on that page were measured with them.
+
+    Args:
+        kept_slack: Direct arcs that cost up to so many times the cheapest may be starts of local searches.
+        starts: Direct arcs with which the first successive halving begins.  More of them find a good region
+            more surely, and leave less work for each.
+        rungs: Rungs of a successive halving.
+        rung_iterations: Iterations of each local search on the first rung; they double from rung to rung.
+        perturbations: Perturbed copies of the best candidate that join the successive halving of each round.
+        samplings: Iterations of local sampling in each round; with one or more, every round has an iteration.
+        needle_searches: Runs of the needle's optimal search in each round.
+        needle_iterations: Iterations of such a run in the first pass over the deployments; they double three
+            times.
+        intensifications: How often in each round the local search from the best candidate is evaluated in
+            full.
+        intensification_iterations: Iterations of that local search before each of these evaluations.
+        refine_every: Rounds between two joint refinements, which take as long as several rounds.
+    """
+
+    kept_slack: Annotated[float, quantity("slack of kept direct arcs", at_least=1.0, at_most=100.0)] = 1.5
+    starts: Annotated[int, quantity("starts of the first halving", at_least=1, at_most=10_000)] = 8
+    rungs: Annotated[int, quantity("rungs of a halving", at_least=1, at_most=30)] = 5
+    rung_iterations: Annotated[int, quantity("iterations on the first rung", at_least=1, at_most=10_000)] = 3
+    perturbations: Annotated[int, quantity("perturbed copies a round", at_least=0, at_most=1000)] = 2
+    samplings: Annotated[int, quantity("local samplings a round", at_least=1, at_most=1000)] = 6
+    needle_searches: Annotated[int, quantity("needle searches a round", at_least=0, at_most=1000)] = 4
+    needle_iterations: Annotated[
+        int, quantity("iterations of a needle search", at_least=1, at_most=1_000_000)
+    ] = 300
+    intensifications: Annotated[int, quantity("intensifications a round", at_least=0, at_most=1000)] = 2
+    intensification_iterations: Annotated[
+        int, quantity("iterations of an intensification", at_least=1, at_most=10_000)
+    ] = 20
+    refine_every: Annotated[int, quantity("rounds between joint refinements", at_least=1)] = 16
 
 
 @frozen_value
@@ -167,3 +214,24 @@ def evaluated_step(
     if not math.isfinite(cost):
         return Step(iteration=iteration, phase=phase)
     return Step(iteration=iteration, phase=phase, candidate=candidate, cost=cost)
+
+
+CELL_MM = 5.0
+"""Size of the cells within which tips of the tubes count as similar: about the reach of a local search."""
+
+
+def different(entries: Deployments, ordered: Int) -> Int:
+    """Return the first of every group of similar deployments, in the order given.
+
+    Similar are those that leave the same branch and end in the same cell of CELL_MM with about the same
+    tangent.
+
+    Args:
+        ordered ((N,) int64): Which of them, the best first.
+    """
+    places = np.floor(entries.positions[ordered] / CELL_MM)
+    # Tangents are similar if each component, times this, rounds to the same whole number.
+    towards = np.rint(entries.tangents[ordered] * 2.0)
+    keys = np.column_stack([entries.branch[ordered], places, towards]).astype(np.int64)
+    _groups, first = np.unique(keys, axis=0, return_index=True)
+    return ordered[np.sort(first)]

@@ -10,8 +10,13 @@ from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, cost_bounds, evaluate_arcs
 from lungaccess.planning.coupled.kernels.tubes_cost import costs_in_tissue
-from lungaccess.planning.coupled.search.base import Incumbent, Step, evaluated_step
-from lungaccess.planning.coupled.search.settings import ESTIMATE_SLACK, SearchSettings
+from lungaccess.planning.coupled.search.base import (
+    ESTIMATE_SLACK,
+    Incumbent,
+    SearchSettings,
+    Step,
+    evaluated_step,
+)
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator, blocker_counts
 from lungaccess.problem.task import Task

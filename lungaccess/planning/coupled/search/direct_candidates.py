@@ -1,9 +1,14 @@
 """The simplest ways to a target from the deployments of an atlas, with a needle and without one."""
 
+import math
+from collections.abc import Iterator
 from typing import Protocol
+
+import numpy as np
 
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.kernels.direct_arcs import choose_separated
 from lungaccess.planning.coupled.search.aimed_tubes import AimedTubes
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.candidate import Candidate
@@ -56,3 +61,82 @@ def direct_candidates(
     """
     made = AimedTubes if task.system.needle is None else DirectArcs
     return made(task, atlas, evaluator, aims)
+
+
+SAMPLES = 17
+"""Points of each path that are compared; between two of them a path strays less than 1 mm from a line."""
+NEAREST, SAMPLED, LEAST_OF_BRANCH = 1000, 2000, 100
+"""The deployments that are evaluated: the nearest ones, and about so many of all, evenly spaced; at least so
+many of every branch."""
+
+
+def separated_candidates(arcs: DirectCandidates, count: int, separation_mm: float) -> Iterator[Candidate]:
+    """Yield proved ways to the target that are separated, the cheapest of each branch first, then the others.
+
+    The nearest deployments are evaluated with an even sample of the others, then further samples, but only
+    as long as there are not enough plans.
+    """
+    near = arcs.promising
+    pool, pool_costs = np.zeros(0, dtype=np.int64), np.zeros(0)
+    proved: dict[int, Candidate | None] = {}
+    chosen: list[int] = []
+    for sample in _samples(arcs.atlas.deployments.branch[near]):
+        blockers, costs, _best = arcs.evaluate(near[sample], math.inf)
+        arcs.evaluator.blocked.update(arcs.reasons(blockers))
+        clear = np.flatnonzero(blockers == 0)
+        pool, pool_costs = np.append(pool, near[sample][clear]), np.append(pool_costs, costs[clear])
+        chosen = _chosen(arcs, pool[np.argsort(pool_costs, kind="stable")], count, separation_mm, proved)
+        if len(chosen) == count:
+            break
+    for entry in chosen:
+        candidate = proved[entry]
+        if candidate is not None:
+            yield candidate
+
+
+def _samples(branch: Int) -> Iterator[Int]:
+    """Yield parts of deployments, given by their branches (N,), that together are all of them.
+
+    The first part holds the first deployments, and evenly spaced ones of every branch.
+    """
+    everyone = np.arange(len(branch))
+    grouped = np.argsort(branch, kind="stable")
+    _names, first, group, sizes = np.unique(
+        branch[grouped], return_index=True, return_inverse=True, return_counts=True
+    )
+    strides = np.maximum(np.minimum(len(branch) // SAMPLED, sizes // LEAST_OF_BRANCH), 1)
+    part = np.zeros(len(branch), dtype=np.int64)
+    part[grouped] = (everyone - first[group]) % strides[group]
+    part[:NEAREST] = 0
+    for number in range(int(part.max(initial=0)) + 1):
+        yield np.flatnonzero(part == number)
+
+
+def _chosen(
+    arcs: DirectCandidates,
+    ordered: Int,
+    count: int,
+    separation_mm: float,
+    proved: dict[int, Candidate | None],
+) -> list[int]:
+    """Choose separated deployments from clear ones by rising cost; `proved` keeps the proofs."""
+    lines = arcs.lines(ordered, SAMPLES)
+    order = _branches_first(arcs.atlas.deployments.branch[ordered])
+    while True:
+        refused = [n for n, entry in enumerate(ordered.tolist()) if proved.get(entry, True) is None]
+        places = np.zeros(count, dtype=np.int64)
+        found = choose_separated(lines, order[~np.isin(order, refused)], float(separation_mm), places)
+        chosen: list[int] = ordered[places[:found]].tolist()
+        unproved = [entry for entry in chosen if entry not in proved]
+        for entry in unproved:
+            proved[entry] = arcs.proved(entry)
+        if all(proved[entry] is not None for entry in chosen):
+            return chosen
+
+
+def _branches_first(branch: Int) -> Int:
+    """Return the order in which the first of every branch comes before all others."""
+    _names, first = np.unique(branch, return_index=True)
+    first = np.sort(first)
+    rest = np.setdiff1d(np.arange(len(branch)), first)
+    return np.concatenate([first, rest])

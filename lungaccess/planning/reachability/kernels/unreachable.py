@@ -60,7 +60,7 @@ MOST_WAITING = 400
 
 
 class Pieces(NamedTuple):
-    """Pieces of the airway as the kernels take them, see `lungaccess.planning.reachability.tip_places`.
+    """Pieces of the airway as the kernels take them, see `lungaccess.planning.reachability.deployment_space`.
 
     Args:
         frames: (P, 3, 3) float64.

@@ -12,9 +12,8 @@ import pytest
 import lungaccess as la
 from anatomy.base.errors import FileError
 from anatomy.lung import Lung
-from lungaccess.planning.coupled import atlas_store
-from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.atlas_store import atlas_format, atlas_is_kept, open_atlas
+from lungaccess.planning.coupled import atlas as atlas_store
+from lungaccess.planning.coupled.atlas import Atlas, atlas_format, atlas_is_kept, open_atlas
 from stages.tube import design_shapes
 from stages.tube.design_shapes import shapes_format
 

@@ -13,12 +13,11 @@ import pytest
 import lungaccess as la
 from anatomy.base.errors import SettingsError, TargetError
 from anatomy.lung import Lung
-from lungaccess.planning.constraints import holds, place_part
 from lungaccess.planning.coupled.layer_bound import beside_in_window_mm, cost_bound
 from lungaccess.planning.coupled.search.base import ParallelSearch, Step
 from lungaccess.planning.coupled.search.direct_candidates import direct_candidates
-from lungaccess.planning.coupled.search.variation import random_change, varied
-from lungaccess.planning.coupled.search.window_search import window_search
+from lungaccess.planning.coupled.search.window_search import random_change, varied, window_search
+from lungaccess.planning.driver import holds, place_part
 from lungaccess.planning.searches import parallel_steps, planners
 from lungaccess.problem.request import Request, StatedPlace
 from lungaccess.problem.system import System, load_system

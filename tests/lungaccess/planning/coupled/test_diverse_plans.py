@@ -19,7 +19,7 @@ from lungaccess.cli import app as cli
 from lungaccess.planning import Alternative, diverse_plans, with_front
 from lungaccess.planning.coupled import DirectArcs
 from lungaccess.planning.coupled.kernels.direct_arcs import choose_separated
-from lungaccess.planning.coupled.search.separated_arcs import SAMPLES, _branches_first, _samples
+from lungaccess.planning.coupled.search.direct_candidates import SAMPLES, _branches_first, _samples
 from lungaccess.problem.request import Request
 from lungaccess.problem.target import Target
 from stages.needle.path import direct_path

@@ -21,8 +21,14 @@ from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 from experiments import noplan_attack
 from lungaccess.planning.coupled import ReferenceSearch
-from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT, sample_ahead
-from lungaccess.planning.coupled.kuntz2015_fcl.obstacles import SAGITTA_MM, Obstacles, Solid, chord_mm
+from lungaccess.planning.coupled.kuntz2015_fcl.needle import (
+    SAGITTA_MM,
+    NeedleRRT,
+    Obstacles,
+    Solid,
+    chord_mm,
+    sample_ahead,
+)
 from lungaccess.planning.coupled.kuntz2015_fcl.search import (
     FOUND,
     OUT_OF_WORKSPACE,

@@ -14,12 +14,12 @@ from anatomy.lung import Lung
 from experiments.support.mutants import twisted
 from experiments.support.mutants.mutant import Case
 from lungaccess.planning.coupled import AtlasSearch
-from lungaccess.planning.coupled.search.kuntz2015 import random_placements
 from lungaccess.planning.coupled.search.local_search import LocalSearch
+from lungaccess.planning.coupled.search.needle_planner import random_placements
 from lungaccess.planning.one_stage.replan import replan_from_scope
 from lungaccess.planning.reachability import UnreachableProof
 from lungaccess.planning.refinement import refine
-from lungaccess.planning.refinement.shape_model import ShapeModel, joints_of, terms
+from lungaccess.planning.refinement.layout import ShapeModel, joints_of, terms
 from lungaccess.plans.assemble import assemble
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target

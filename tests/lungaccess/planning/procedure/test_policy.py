@@ -18,8 +18,15 @@ from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from lungaccess.planning.one_stage import ScopeReplanner
 from lungaccess.planning.procedure import simulated
-from lungaccess.planning.procedure.fusion import as_measured, fused, fused_share, scope_moves, tip_moves
-from lungaccess.planning.procedure.residuals import Residuals, fused_size
+from lungaccess.planning.procedure.spread import (
+    Residuals,
+    as_measured,
+    fused,
+    fused_share,
+    fused_size,
+    scope_moves,
+    tip_moves,
+)
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors

@@ -20,7 +20,13 @@ from anatomy.structures import AIRWAY, FISSURE, OBSTACLES, OUTSIDE
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning.coupled import direct_candidates, reach_scan
-from lungaccess.planning.reachability.layers import _earlier_neighbours, voxel_seeds
+from lungaccess.planning.reachability.layers import (
+    LEFT,
+    RIGHT,
+    _earlier_neighbours,
+    lung_regions,
+    voxel_seeds,
+)
 from lungaccess.planning.reachability.reach_map import (
     KINDS,
     NOT_COUNTED,
@@ -29,7 +35,6 @@ from lungaccess.planning.reachability.reach_map import (
     map_reach,
     reach_grid,
 )
-from lungaccess.planning.reachability.regions import LEFT, RIGHT, lung_regions
 from lungaccess.plans.assemble import assemble
 from lungaccess.problem.task import Task
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment

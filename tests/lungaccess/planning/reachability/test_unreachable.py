@@ -23,11 +23,11 @@ from anatomy.poses import bending_directions
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
+from lungaccess.planning.reachability.deployment_space import PlacePiece
 from lungaccess.planning.reachability.kernels import blocked
 from lungaccess.planning.reachability.kernels import deployment_boxes as boxes
 from lungaccess.planning.reachability.kernels import unreachable as kernel
 from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment
-from lungaccess.planning.reachability.tip_places import PlacePiece
 from lungaccess.planning.reachability.unreachable import UnreachableProof, _may_be_left
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.system import System

@@ -16,10 +16,17 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES
 from lungaccess.planning.refinement import boxes, refine
-from lungaccess.planning.refinement.curve import aimed, path_of, rows_of, split
 from lungaccess.planning.refinement.geometry import Geometry
 from lungaccess.planning.refinement.joint import Reconstruction
-from lungaccess.planning.refinement.problem import LocalAxis, Problem, program_weights
+from lungaccess.planning.refinement.problem import (
+    LocalAxis,
+    Problem,
+    aimed,
+    path_of,
+    program_weights,
+    rows_of,
+    split,
+)
 from lungaccess.planning.refinement.program import Program, program
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate

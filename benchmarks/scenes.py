@@ -16,8 +16,8 @@ from anatomy.grid import Grid
 if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.patient import PatientImages
-    from lungaccess.planning.coupled import AtlasSearch
     from lungaccess.planning.coupled.atlas import Atlas
+    from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
     from stages.needle.environment import NeedleEnvironment
     from stages.scope.tour.subtree import Subtree
     from stages.tube.mechanics import TubeMechanics
@@ -89,7 +89,7 @@ def images(edge: int) -> PatientImages:
 
 def direct_search(targets: int) -> tuple[Callable[[Float], AtlasSearch], Float]:
     """Return what makes a search for a point of a synthetic lung, and peripheral points."""
-    from lungaccess.planning.coupled import AtlasSearch
+    from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
     from lungaccess.problem.peripheral import peripheral_targets
     from lungaccess.problem.target import point_target
     from lungaccess.problem.task import Task

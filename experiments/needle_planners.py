@@ -42,7 +42,7 @@ from experiments.support.needle.runs import (
     solved_by_other,
 )
 from experiments.support.results import Result, setting_of, study_parser, write_result
-from lungaccess.running.benchmark import UncObstacles, unc_obstacles
+from lungaccess.running.benchmark.published import UncObstacles, unc_obstacles
 from lungaccess.showing.report import style
 from stages.needle.search.planners import searches
 

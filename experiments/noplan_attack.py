@@ -25,10 +25,9 @@ import lungaccess as la
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import atomic_write
 from anatomy.base.typed import Float
-from lungaccess.planning.coupled import ReferenceSearch
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import Obstacles
-from lungaccess.planning.coupled.kuntz2015_fcl.search import FOUND, obstacles_for
+from lungaccess.planning.coupled.kuntz2015_fcl.search import FOUND, ReferenceSearch, obstacles_for
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.plan import Plan

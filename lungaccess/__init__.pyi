@@ -59,10 +59,10 @@ from lungaccess.problem.request import register_goal as register_goal
 from lungaccess.problem.system import with_tool as with_tool
 from lungaccess.problem.tools import Tool as Tool
 from lungaccess.problem.tools import load_tool as load_tool
-from lungaccess.running.design import read_design as read_design
-from lungaccess.running.design import run_design as run_design
-from lungaccess.running.study import read_study as read_study
-from lungaccess.running.study import run_study as run_study
+from lungaccess.running.design.search import run_design as run_design
+from lungaccess.running.design.settings import read_design as read_design
+from lungaccess.running.study.driver import run_study as run_study
+from lungaccess.running.study.settings import read_study as read_study
 from lungaccess.showing.report.html import plan_page as plan_page
 from lungaccess.showing.report.html.notebook import view as view
 from lungaccess.showing.slicer import export_slicer as export_slicer

@@ -19,8 +19,8 @@ from lungaccess.cli.examples import EXAMPLES
 from lungaccess.planning.one_stage import load_tubes
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.system import load_system
-from lungaccess.running.design import read_design
-from lungaccess.running.study import read_study
+from lungaccess.running.design.settings import read_design
+from lungaccess.running.study.settings import read_study
 from tests.pages import PAGES, ROOT, RUN, SHOWN, blocks, name_of
 
 LEAST_RUN_SHARE = 0.9

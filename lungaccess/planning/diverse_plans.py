@@ -1,22 +1,20 @@
 """A diverse plan set: plans to one target that are separated, and which of them are Pareto-optimal."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas, build_atlas, require_same
 from lungaccess.planning.coupled.search.base import AtlasBound
-from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, separated_candidates
+from lungaccess.planning.coupled.search.direct_candidates import separated_candidates
 from lungaccess.planning.driver import ProgressEvent, holds, place_part
 from lungaccess.planning.one_system import run
 from lungaccess.planning.searches import plan_of, search_of
-from lungaccess.planning.success.ratings import Rating, rating_of
+from lungaccess.planning.success.ratings import rating_of
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.insertion import with_simplest_motion
 from lungaccess.plans.plan import Plan
@@ -118,31 +116,12 @@ def _others(request: Request, atlas: Atlas, count: int, separation_mm: float) ->
     search, rating = search_of(request, task, atlas), rating_of(request)
     if not isinstance(search, AtlasBound):
         return
-    arcs: DirectCandidates = search.arcs
-    if rating is not None:
-        arcs = RankedArcs(arcs, rating)
-    for each in separated_candidates(arcs, count, separation_mm):
+    expected = None if rating is None else partial(rating.expected, search.arcs)
+    for each in separated_candidates(search.arcs, count, separation_mm, expected):
         made = plan_of(request, task, atlas, each, 0, 0.0)
         if holds(request, made):
             # Draws of the chance that each of the other plans states: one half is then known to 1.5 %.
             yield made if rating is None else rating.stated(made, 1000)
-
-
-class RankedArcs:
-    """Direct ways whose cost is what a rating expects of them, better first; see `DirectCandidates`."""
-
-    def __init__(self, arcs: DirectCandidates, rating: Rating) -> None:
-        self._arcs, self._rating = arcs, rating
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._arcs, name)
-
-    def evaluate(self, chosen: Int, slack: float, best: float = math.inf) -> tuple[Int, Float, float]:
-        """Return what blocks the ways from deployments, and how little is expected of each."""
-        blockers, costs, _best = self._arcs.evaluate(chosen, slack)
-        clear = blockers == 0
-        costs[clear] = -self._rating.expected(self._arcs, chosen[clear])
-        return blockers, costs, float(costs.min(initial=best))
 
 
 def are_separated(one: Plan, other: Plan, separation_mm: float) -> bool:

@@ -14,10 +14,9 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.plugins import registered
 from anatomy.base.words import did_you_mean
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.cost_bound import GapGoal, guided
 from lungaccess.planning.coupled.explanation import explain, explain_window
 from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
-from lungaccess.planning.coupled.layer_bound import beside_in_window_mm, cost_bound
+from lungaccess.planning.coupled.layer_bound import GapGoal, beside_in_window_mm, cost_bound, guided
 from lungaccess.planning.coupled.search.aimed_tubes import TubeSearch
 from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import ParallelSearch, PlanSearch, SearchFactory, Step

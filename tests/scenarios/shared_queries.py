@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from experiments.support.needle.queries import Validator, environment_of, hard_queries, load_obstacles
-from lungaccess.running.benchmark import UncObstacles
+from lungaccess.running.benchmark.published import UncObstacles
 from stages.needle import path as needle_query
 from stages.needle.search.planners import searches
 from tests.scenarios.cases import NEEDLE_ITERATIONS, SHARED_QUERIES

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from anatomy.base.typed import Float
-from lungaccess.planning.coupled import AtlasSearch, Step
 from lungaccess.planning.coupled.atlas import Atlas
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
+from lungaccess.planning.coupled.search.base import Step
 from lungaccess.planning.refinement import refine
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target

@@ -6,9 +6,9 @@ import time
 from typing import Any
 
 from anatomy.base.typed import Float
-from lungaccess.planning.coupled import ReferenceSearch
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import NeedleRRT, Obstacles
+from lungaccess.planning.coupled.kuntz2015_fcl.search import ReferenceSearch
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.task import Task
 from stages.needle.path import ArcPath

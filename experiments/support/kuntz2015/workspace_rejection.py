@@ -19,10 +19,9 @@ import numpy as np
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from lungaccess.planning.coupled import ReferenceSearch
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import Obstacles
-from lungaccess.planning.coupled.kuntz2015_fcl.search import FOUND, obstacles_for
+from lungaccess.planning.coupled.kuntz2015_fcl.search import FOUND, ReferenceSearch, obstacles_for
 from lungaccess.problem.task import Task
 from stages.needle.environment import needle_environment, workspace_lengths
 

@@ -22,7 +22,12 @@ from anatomy.base.typed import Float
 from anatomy.io.frames import LPS_FROM_RAS
 from anatomy.io.med_rad import load_med_rad
 from anatomy.structures import OBSTACLES
-from lungaccess.running.benchmark import UNC_GOAL_TOLERANCE_MM, UncObstacles, unc_needle, unc_obstacles
+from lungaccess.running.benchmark.published import (
+    UNC_GOAL_TOLERANCE_MM,
+    UncObstacles,
+    unc_needle,
+    unc_obstacles,
+)
 from stages.needle.device import Needle
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.path import ArcPath

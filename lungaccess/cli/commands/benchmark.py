@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from anatomy.organ import Organ
     from anatomy.patient import PatientImages
     from lungaccess.problem.system import System
-    from lungaccess.running.benchmark import BenchmarkRow
-    from lungaccess.running.benchmark.runs import Pose
+    from lungaccess.running.benchmark.runs import BenchmarkRow, Pose
 
 Rules = Literal["ours", "unc"]
 DEFAULT_PLANNERS = "rrt,optimal,resolution,decide,control.RRT"
@@ -64,8 +63,8 @@ def med_rad(
         peer: JSON file of another planner's recorded results, shown beside.
         out: File for all runs: .csv, or .json, which holds the arcs of the paths, too.
     """
-    from lungaccess.running.benchmark import read_peer, summary_rows, write_rows
-    from lungaccess.running.benchmark.runs import require_table_file
+    from lungaccess.running.benchmark.published import read_peer
+    from lungaccess.running.benchmark.runs import require_table_file, summary_rows, write_rows
 
     names = _planners(planners)
     device = system.load()
@@ -110,8 +109,8 @@ def _rows(
     output: PatientOptions,
 ) -> "Iterator[BenchmarkRow]":
     """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
-    from lungaccess.running.benchmark import BenchmarkRow, patients_of, published_queries, run_query
-    from lungaccess.running.benchmark.published import why_no_query
+    from lungaccess.running.benchmark.published import patients_of, published_queries, why_no_query
+    from lungaccess.running.benchmark.runs import BenchmarkRow, run_query
 
     paths = list(patients_of(folder))
     for path in paths:
@@ -135,7 +134,7 @@ def _posing(
     path: Path, rules: Rules, device: "System", output: PatientOptions
 ) -> "tuple[Pose, Organ | PatientImages | LiverImages]":
     """Return what makes environments of a patient by the rules, and the patient."""
-    from lungaccess.running.benchmark import posed_by_unc, posed_in_lung
+    from lungaccess.running.benchmark.runs import posed_by_unc, posed_in_lung
 
     if rules == "ours":
         lung = output.load_organ(path)

@@ -39,7 +39,8 @@ def design(
         workers: How many processes on this machine; as many as it has cores if not given.
     """
     from anatomy.base.settings import settings_toml
-    from lungaccess.running.design import design_of, read_design, run_design
+    from lungaccess.running.design.search import run_design
+    from lungaccess.running.design.settings import design_of, read_design
     from lungaccess.showing.report import front_png
 
     asked = read_design(design) if design else design_of(tomllib.loads(template_text("design")))

@@ -11,7 +11,8 @@ from anatomy.base.words import percent, range_of_hundred
 from anatomy.poses import spread_directions
 from anatomy.structures import obstacle_bits
 from lungaccess.judging.explanation.blocking import region_of
-from lungaccess.planning.coupled import DirectCandidates, reach_scan
+from lungaccess.planning.coupled import reach_scan
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.planning.one_system import run
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan

@@ -1,10 +1,10 @@
 """A proved lower bound of the cost of every plan to a target; docs/theory/cost_bound.md derives it."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,41 +25,14 @@ from lungaccess.planning.coupled.kernels.cost_to_go import (
     fill_shell,
 )
 from lungaccess.planning.coupled.kernels.deployment_box import BOUND, BOX_COLUMNS, TIP, TubeSurroundings
-from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
-from lungaccess.planning.coupled.search.base import Step, evaluated_step
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from stages.needle.kernels import Limits
-from stages.tube import deployed, design_arrays, shape_of_arrays, tube_constants, tube_environment
+from stages.tube import tube_constants, tube_environment
 from stages.tube.kernels import INSERTION_STEP_MM, MAX_EXTENSION, TubeEnvironment, greatest_insertions
 
-STEADY_STEPS, MOST_TIMES = 16, 8
-"""After each so many steps without a cheaper plan they are so many more, up to so many times as many."""
 QUEUES = 2
 """Queues of boxes, each in a thread of its own: of every second scope tip.  More would be other plans."""
-
-
-class LowerBound(Protocol):
-    """What bounds from below what plans to a target cost."""
-
-    @property
-    def settled(self) -> bool:
-        """Whether it rises no more."""
-
-    @property
-    def value(self) -> float:
-        """The bound."""
-
-    @property
-    def known(self) -> float:
-        """The bound as far as it is known without waiting."""
-
-    @property
-    def lowest(self) -> Sequence[tuple[int, float, float, float]]:
-        """Scope tip, rotation (rad) and insertions (mm) of some deployments that may cost least."""
-
-    def start(self, cost: float, boxes: int) -> None:
-        """Begin to improve it, knowing the cost of a plan; the property `value` waits for the end."""
 
 
 class CostBound:
@@ -218,69 +191,6 @@ class BoxQueue:
         inner = rows[:, INNER]
         columns = rows[:, TIP], rows[:, ROTATION], np.clip(rows[:, OUTER], 0.0, inner), inner
         return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
-
-
-def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Iterator[Step]:
-    """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
-
-    Each of those becomes the search's best candidate, which it then improves.  Who takes the steps improves
-    the bound, which may go on while the search takes its next step.
-    """
-    design = design_arrays(search.atlas.system.tubes)
-    for step in steps:
-        yield step
-        if bound.settled or search.incumbent.step is None:
-            continue
-        for tip, rotation, outer, inner in bound.lowest:
-            made = deployed(design, [inner, outer][: len(design.radii)], np.zeros(len(design.radii)))
-            if made is None:
-                continue
-            scope_tip = search.atlas.motions.tip(tip)
-            candidate = search.evaluator.direct(scope_tip, rotation, shape_of_arrays(made))
-            found = evaluated_step(search.evaluator, "lower bound", candidate, step.iteration)
-            if found.cost < search.incumbent.cost:
-                yield search.incumbent.improved(found)
-
-
-class GapGoal:
-    """The goal that a plan costs at most so much more than the best possible, proved.
-
-    Args:
-        gap: Share of the best possible cost.
-
-    Raises:
-        SettingsError: If the gap is negative or not finite.
-    """
-
-    def __init__(self, bound: LowerBound, gap: float) -> None:
-        if not 0.0 <= gap < math.inf:
-            raise SettingsError(
-                f"The gap is {gap}", expected="a share of 0 or more", remedy="State 0.05 for five per cent"
-            )
-        self.bound, self._gap = bound, gap
-        self._cost, self._steady, self._ahead = math.inf, 0, 0
-
-    def is_met(self, cost: float) -> bool:
-        """Tell whether a plan of this cost is so near to the best possible.
-
-        If it is not, the bound is improved in other threads: the more, the longer the cost has stayed the
-        same.  Then some of the next calls do not wait for them.
-        """
-        self._steady = self._steady + 1 if cost == self._cost else 0
-        self._cost = cost
-        self._ahead -= 1
-        if self._ahead > 0:
-            return cost <= (1.0 + self._gap) * self.bound.known
-        met = cost <= (1.0 + self._gap) * self.bound.value
-        if not met:
-            times = min(1 + self._steady // STEADY_STEPS, MOST_TIMES)
-            # Steps of a search, at most, before both threads are waited for: more boxes take both more
-            # equally long.
-            self._ahead = min(times, 4)
-            # Boxes that are divided beside one step of a search: in two threads they take as long, or twice
-            # as long.
-            self.bound.start(cost, times * 500)
-        return met
 
 
 def _environment(task: Task, tips: Float, limit: float, beside_mm: float) -> BoundEnvironment:

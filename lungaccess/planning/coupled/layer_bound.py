@@ -7,6 +7,7 @@ values, of the least cost of a mm on each layer of one value.
 
 import itertools
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -15,12 +16,17 @@ from anatomy.base.typed import Float
 from anatomy.kernels.field import TRANSFORM_ROUNDING, UNITS_PER_MM
 from anatomy.structures import LUMEN, obstacle_bits
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.cost_bound import CostBound, LowerBound
+from lungaccess.planning.coupled.cost_bound import CostBound
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
+from lungaccess.planning.coupled.search.base import Step, evaluated_step
 from lungaccess.plans.evaluator import TIP_OFF_MM, CandidateEvaluator
 from lungaccess.problem.task import Task
 from lungaccess.uncertainty.breathing.window import TOLERANCE_MM, require_motion
 from stages.needle.kernels import CLEARANCE_FLOOR_MM
+from stages.tube import deployed, design_arrays, shape_of_arrays
 
+STEADY_STEPS, MOST_TIMES = 16, 8
+"""After each so many steps without a cheaper plan they are so many more, up to so many times as many."""
 LAYER_MM = 0.1
 """Thickness of the layers: a small part of a wall, which costs most."""
 SHIFTED_MM = 5.0
@@ -137,6 +143,9 @@ class LayerBound:
         return np.where(blocked, 0.0, np.minimum(low + diagonal, high + 0.5 * diagonal))
 
 
+LowerBound = CostBound | LayerBound
+
+
 def cost_bound(task: Task, atlas: Atlas, beside_mm: float = 0.0) -> LowerBound:
     """Return the best bound that is known for the system of a task; see `CostBound` and `LayerBound`."""
     boxed = task.system.needle is not None and task.system.tubes.planar
@@ -158,3 +167,66 @@ def beside_in_window_mm(task: Task, phases: tuple[float, float]) -> float:
             remedy="Leave out the gap, or ask for phases that hold that of the masks",
         )
     return TOLERANCE_MM
+
+
+def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Iterator[Step]:
+    """Yield the steps of a search, and cheaper plans from the boxes with the lowest bound.
+
+    Each of those becomes the search's best candidate, which it then improves.  Who takes the steps improves
+    the bound, which may go on while the search takes its next step.
+    """
+    design = design_arrays(search.atlas.system.tubes)
+    for step in steps:
+        yield step
+        if bound.settled or search.incumbent.step is None:
+            continue
+        for tip, rotation, outer, inner in bound.lowest:
+            made = deployed(design, [inner, outer][: len(design.radii)], np.zeros(len(design.radii)))
+            if made is None:
+                continue
+            scope_tip = search.atlas.motions.tip(tip)
+            candidate = search.evaluator.direct(scope_tip, rotation, shape_of_arrays(made))
+            found = evaluated_step(search.evaluator, "lower bound", candidate, step.iteration)
+            if found.cost < search.incumbent.cost:
+                yield search.incumbent.improved(found)
+
+
+class GapGoal:
+    """The goal that a plan costs at most so much more than the best possible, proved.
+
+    Args:
+        gap: Share of the best possible cost.
+
+    Raises:
+        SettingsError: If the gap is negative or not finite.
+    """
+
+    def __init__(self, bound: LowerBound, gap: float) -> None:
+        if not 0.0 <= gap < math.inf:
+            raise SettingsError(
+                f"The gap is {gap}", expected="a share of 0 or more", remedy="State 0.05 for five per cent"
+            )
+        self.bound, self._gap = bound, gap
+        self._cost, self._steady, self._ahead = math.inf, 0, 0
+
+    def is_met(self, cost: float) -> bool:
+        """Tell whether a plan of this cost is so near to the best possible.
+
+        If it is not, the bound is improved in other threads: the more, the longer the cost has stayed the
+        same.  Then some of the next calls do not wait for them.
+        """
+        self._steady = self._steady + 1 if cost == self._cost else 0
+        self._cost = cost
+        self._ahead -= 1
+        if self._ahead > 0:
+            return cost <= (1.0 + self._gap) * self.bound.known
+        met = cost <= (1.0 + self._gap) * self.bound.value
+        if not met:
+            times = min(1 + self._steady // STEADY_STEPS, MOST_TIMES)
+            # Steps of a search, at most, before both threads are waited for: more boxes take both more
+            # equally long.
+            self._ahead = min(times, 4)
+            # Boxes that are divided beside one step of a search: in two threads they take as long, or twice
+            # as long.
+            self.bound.start(cost, times * 500)
+        return met

@@ -7,10 +7,8 @@ from anatomy.base.facade import lazy_exports
 if TYPE_CHECKING:
     from lungaccess.planning.one_stage.needle import (
         NeedleAnswer,
-        NeedleQuestion,
         PathSearch,
         needle_question,
-        pierced_branches,
         plan_needle,
         search_path,
     )
@@ -22,18 +20,16 @@ if TYPE_CHECKING:
         replan_from_scope,
         replan_from_tube,
     )
-    from lungaccess.planning.one_stage.route import RouteSource, open_source, route_record, widest_end
+    from lungaccess.planning.one_stage.route import open_source, route_record, widest_end
     from lungaccess.planning.one_stage.scope import (
         ADVICE_FILE,
         CAMERA_FILE,
         ScopeAdvice,
-        ScopeRegion,
         advise_scope,
         safe_scope_region,
         save_advice,
     )
     from lungaccess.planning.one_stage.tubes import (
-        BareTubes,
         TubeAnswer,
         compare_sequences,
         deploy_tubes,

@@ -12,7 +12,8 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float
 from anatomy.lung import Lung
 from lungaccess.planning.procedure.kernels.decisions import Choices
-from lungaccess.planning.procedure.spread import Residuals, Spread
+from lungaccess.planning.procedure.kernels.spread import Sizes
+from lungaccess.planning.procedure.spread import Spread
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import Procedure
@@ -49,21 +50,21 @@ def scope_frames(starts: Float) -> Float:
     return frames
 
 
-def residual_rows(left: Residuals) -> Float:
+def residual_rows(left: Sizes) -> Float:
     """Return what is left of the errors of scope and tubes in some draws, as kernels take it."""
     # Seed of these draws, which have nothing to do with those of a simulated procedure.
     rng = np.random.default_rng(1)
     drawn = {
-        "scope_mm": left.scope_mm * rng.standard_normal((DRAWS, 3)),
-        "tilt_rad": left.scope_rad * rng.standard_normal((DRAWS, 2)),
-        "rotation_rad": left.rotation_rad * rng.standard_normal(DRAWS),
-        "insertion_mm": left.insertion_mm * rng.standard_normal((DRAWS, 2)),
-        "target_mm": left.target_mm * rng.standard_normal((DRAWS, 3)),
+        "scope_mm": left.scope * rng.standard_normal((DRAWS, 3)),
+        "tilt_rad": left.scope_turn * rng.standard_normal((DRAWS, 2)),
+        "rotation_rad": left.rotation * rng.standard_normal(DRAWS),
+        "insertion_mm": left.insertion * rng.standard_normal((DRAWS, 2)),
+        "target_mm": left.target * rng.standard_normal((DRAWS, 3)),
     }
     return in_rows(Deviations(**(no_deviations(DRAWS, 0) | drawn)))
 
 
-def planned_choice(plan: Plan, left: Residuals) -> Choices:
+def planned_choice(plan: Plan, left: Sizes) -> Choices:
     """Return the planned deployment alone."""
     tube, frame = plan.tube, np.array(plan.scope.lps_from_scope_tip)
     tubes = np.zeros((0, 11))
@@ -110,7 +111,7 @@ def with_choices(planned: Choices, system: System, made: list[Deployment], frame
 
 def offered(
     plan: Plan, lung: Lung, system: System, errors: ErrorModel, procedure: Procedure, radius_mm: float,
-    left: Residuals, frames: Float,
+    left: Sizes, frames: Float,
 ) -> Offer:  # fmt: skip
     """Return the planned deployment, and the likeliest from some scope tips `(K, 4, 4)` that may be measured.
 

@@ -29,18 +29,15 @@ from lungaccess.planning.procedure.choices import (
 )
 from lungaccess.planning.procedure.decision import Action, Decision, Measurements
 from lungaccess.planning.procedure.kernels import decisions as kernel
-from lungaccess.planning.procedure.kernels.spread import Sizes
 from lungaccess.planning.procedure.spread import (
     ASIDE,
-    Residuals,
     around,
     as_measured,
-    bend_per_mm,
     fused,
     fused_share,
     mean_pose,
     scope_moves,
-    sizes,
+    sizes_of,
     tip_moves,
 )
 from lungaccess.plans.assemble import needle_part, tube_part
@@ -164,7 +161,6 @@ class Policy:
         self.assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)
         self.errors = model_for(errors or load_errors(), plan, lung)
         self.procedure = procedure or load_procedure()
-        self._left = Residuals.of(self.errors, self.procedure, self.assessor.stretch)
         self._target = np.asarray(plan.goal_lps)
         # Fissures are obstacles of what follows exactly where they are of the plan.
         # The way is planned again to where the tip has to end, so that nothing has to go on from there.
@@ -173,6 +169,8 @@ class Policy:
         share = self.procedure.least_margin_share
         margins = {each.name: share * getattr(whole.margins, each.name) for each in fields(whole.margins)}
         self.system = replace(whole, margins=replace(whole.margins, **margins))
+        aside_mm = self.aside_mm if self.procedure.tubes.measured else 0.0
+        self._left = sizes_of(self.system, self.errors, self.procedure, self.assessor.stretch, aside_mm)
         arcs = [] if plan.needle is None else plan.needle.arcs
         self._planned = np.array([(a.length_mm, a.roll_rad, a.curvature_per_mm) for a in arcs]).reshape(-1, 3)
         path = ArcPath(lps_from_start=np.eye(4), arcs=self._planned)
@@ -246,8 +244,10 @@ class Policy:
         found, chances = np.zeros((count, 3), dtype=np.int64), np.zeros(count)
         arcs = np.zeros((count, max(LONGEST, len(self._planned)), 3))
         x, y, z = self._target.tolist()
+        # Another needle than one that is planned again behind the tubes starts blindly.
+        known = self._left, self._left._replace(tip_known=False, tip=0.0)
         kernel.choose_tubes(
-            self._scene, self._sizes, *self._tube_arrays, choices, self._planned, self._vias,
+            self._scene, known, *self._tube_arrays, choices, self._planned, self._vias,
             self.plan.exemption.branch, (x, y, z), (np.ascontiguousarray(frames), placed.drawn),
             found, chances, arcs,
         )  # fmt: skip
@@ -321,7 +321,7 @@ class Policy:
     def tips_measured(self, chosen: Chosen, measured: Float, count: int = 1) -> Float:
         """Return where tips of the tubes most likely are, `(N, 4, 4)`, see `scopes_measured`."""
         stage, root = self.procedure.tubes, math.sqrt(count)
-        moves = tip_moves(chosen.frames, chosen.tips, self._left, bend_per_mm(self.plan.system))
+        moves = tip_moves(chosen.frames, chosen.tips, self._left)
         noise = stage.position_mm / root, math.radians(stage.direction_deg) / root
         return fused(chosen.tips, moves, measured, *noise)
 
@@ -330,7 +330,7 @@ class Policy:
         stage = self.procedure.tubes
         if stage.measured:
             return np.diag(np.repeat((stage.position_mm, math.radians(stage.direction_deg)), 3) ** 2)
-        moves = tip_moves(lps_from_scope_tip, lps_from_tip, self._left, bend_per_mm(self.plan.system))
+        moves = tip_moves(lps_from_scope_tip, lps_from_tip, self._left)
         return np.asarray(moves @ moves.T)
 
     def targets_measured(self, measured: Float) -> Float:
@@ -374,7 +374,7 @@ class Policy:
         found, chances = np.zeros((len(tips), 3), dtype=np.int64), np.zeros(len(tips))
         found[:, 1], arcs = counts, np.array(arcs)
         kernel.choose_needles(
-            self._scene, self._sizes[0], np.ascontiguousarray(tips), branches, np.ascontiguousarray(targets),
+            self._scene, self._left, np.ascontiguousarray(tips), branches, np.ascontiguousarray(targets),
             ASIDES, found, chances, arcs,
         )  # fmt: skip
         return found, chances, arcs
@@ -413,7 +413,7 @@ class Policy:
             max_turn_rad=max(limits.max_turn_rad - way.turned_rad, 0.0),
             exempt_mm=max(limits.exempt_mm - way.inserted_mm, 0.0),
         )
-        known = self._sizes[0]._replace(
+        known = self._left._replace(
             tip_known=True, tip=steering.position_mm, tip_turn=math.radians(steering.direction_deg),
             exempt=left.exempt_mm,
         )  # fmt: skip
@@ -564,14 +564,6 @@ class Policy:
             aside=self.aside_mm, with_needle=plan.needle is not None,
             replanned=tubes or self.procedure.needle.closed_loop,
         )  # fmt: skip
-
-    @cached_property
-    def _sizes(self) -> tuple[Sizes, Sizes]:
-        """What is left of the errors for a needle that is planned again behind the tubes, and for another."""
-        aside = self.aside_mm if self.procedure.tubes.measured else 0.0
-        blind = replace(self._left, tip_mm=None)
-        known, unknown = (sizes(self.system, left, self.errors, aside) for left in (self._left, blind))
-        return known, unknown
 
     @cached_property
     def _tube_arrays(self) -> tuple[object, Float]:

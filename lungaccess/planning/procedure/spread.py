@@ -10,7 +10,6 @@ from functools import cached_property
 
 import numpy as np
 
-from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.motion.source import share_of_motion
@@ -22,62 +21,44 @@ from lungaccess.problem.task import fissures_are_obstacles
 from stages.tube import Deployments
 
 
-@frozen_record
-class Residuals:
-    """Sizes of what a procedure leaves of the errors by measuring, mm and rad; a bias counts as spread.
+def sizes_of(
+    system: System, errors: ErrorModel, procedure: Procedure, stretch: float, aside_mm: float = 0.0
+) -> kernel.Sizes:
+    """Return what a procedure leaves of the errors by measuring, with the devices; a bias counts as spread.
+
+    Without a needle no length of the tubes is exempt.
 
     Args:
-        scope_mm, scope_rad: Of the scope's tip when the tubes are planned; see `fused_size` where it is
-            measured.
-        rotation_rad, insertion_mm: Of the tubes.
-        tip_mm, tip_rad: Of the tip of the tubes when the needle is planned; None where it follows from scope
-            and tubes.
-        curvature, roll_rad, stop_mm: Of the needle: the logarithm of its curvature's factor, roll and
-            insertion.
-        target_mm, foot_mm: Of the target, along each axis, and beside that of the target towards the feet.
+        stretch: That of `Draws`.
+        aside_mm: How far beside the target the needle may aim.
     """
-
-    scope_mm: float
-    scope_rad: float
-    rotation_rad: float
-    insertion_mm: float
-    tip_mm: float | None
-    tip_rad: float
-    curvature: float
-    roll_rad: float
-    stop_mm: float
-    target_mm: float
-    foot_mm: float
-
-    @staticmethod
-    def of(errors: ErrorModel, procedure: Procedure, stretch: float) -> "Residuals":
-        """Return what a procedure leaves of errors; `stretch` is that of `Draws`."""
-        placed, aimed = errors.term("scope_position").rms, errors.term("target_position").rms
-        angles = ("scope_direction", "tube_rotation", "needle_roll")
-        turned, rotated, rolled = (math.radians(errors.term(kind).rms) for kind in angles)
-        scope, tubes, image, needle = (
-            procedure.scope, procedure.tubes, procedure.imaging, procedure.needle,
-        )  # fmt: skip
-        steered, breath = needle.closed_loop, abs(stretch) * errors.term(BREATHING).size
-        foot = math.hypot(aimed, breath)
-        if scope.measured:
-            placed = fused_size(placed, scope.position_mm)
-            turned = fused_size(turned, math.radians(scope.direction_deg))
-        if image.measured:
-            aimed, foot = fused_size(aimed, image.position_mm), fused_size(foot, image.position_mm)
-        return Residuals(
-            scope_mm=placed,
-            scope_rad=turned,
-            rotation_rad=rotated,
-            insertion_mm=errors.tube_insertion.rms,
-            tip_mm=tubes.position_mm if tubes.measured else needle.position_mm if steered else None,
-            tip_rad=math.radians(tubes.direction_deg if tubes.measured else needle.direction_deg),
-            curvature=0.0 if steered else errors.term(CURVATURE).size,
-            roll_rad=0.0 if steered else rolled,
-            stop_mm=errors.needle_insertion.rms,
-            target_mm=aimed,
-            foot_mm=math.sqrt(max(foot**2 - aimed**2, 0.0)),
-        )
+    placed, aimed = errors.term("scope_position").rms, errors.term("target_position").rms
+    angles = ("scope_direction", "tube_rotation", "needle_roll")
+    turned, rotated, rolled = (math.radians(errors.term(kind).rms) for kind in angles)
+    scope, image, steering = procedure.scope, procedure.imaging, procedure.needle
+    steered, breath = steering.closed_loop, abs(stretch) * errors.term(BREATHING).size
+    foot = math.hypot(aimed, breath)
+    if scope.measured:
+        placed = fused_size(placed, scope.position_mm)
+        turned = fused_size(turned, math.radians(scope.direction_deg))
+    if image.measured:
+        aimed, foot = fused_size(aimed, image.position_mm), fused_size(foot, image.position_mm)
+    tubes, needle = system.tubes, system.needle
+    # The tip of the tubes follows from scope and tubes where nothing measures it.
+    tip = procedure.tubes if procedure.tubes.measured else steering
+    tip_known = needle is not None and (procedure.tubes.measured or steered)
+    return kernel.Sizes(
+        scope=placed, scope_turn=turned, rotation=rotated, insertion=errors.tube_insertion.rms,
+        tip_known=tip_known, tip=tip.position_mm if tip_known else 0.0,
+        tip_turn=math.radians(tip.direction_deg),
+        curvature=0.0 if steered else errors.term(CURVATURE).size, roll=0.0 if steered else rolled,
+        stop=0.0 if needle is None else errors.needle_insertion.rms,
+        target=aimed, breathing=math.sqrt(max(foot**2 - aimed**2, 0.0)), bend=bend_per_mm(system),
+        steepest=1.0 if needle is None else needle.max_curvature_per_mm * errors.needle_curvature.median,
+        slack=errors.term(CURVATURE).size, aside=aside_mm, tube_radius=tubes.inner.radius_mm,
+        needle_radius=0.0 if needle is None else needle.radius_mm,
+        exempt=-1.0 if needle is None else needle.exit_exemption_mm,
+    )  # fmt: skip
 
 
 def fused_size(expected: float, measured: float) -> float:
@@ -116,7 +97,6 @@ class Spread:
     ) -> None:
         height = share_of_motion(lung.height_share(target_lps))
         scope = share_of_motion(lung.height_share(tips[0, :3])) if len(tips) else height
-        left = Residuals.of(errors, procedure, height - scope)
         aside = ASIDE * radius_mm if procedure.tubes.measured else 0.0
         self._radius_mm = radius_mm
         self._replanned = system.needle is not None and (
@@ -129,7 +109,7 @@ class Spread:
             ends = np.ascontiguousarray(np.broadcast_to(target_lps, ends.shape))
         kernel.find_spread(
             around(lung, with_fissures=fissures_are_obstacles(lung, system)),
-            sizes(system, left, errors, aside), np.ascontiguousarray(tips), ends,
+            sizes_of(system, errors, procedure, height - scope, aside), np.ascontiguousarray(tips), ends,
             deployments.tangents, deployments.exit_mm, deployments.inner_mm,
             (x, y, z), self._found,
         )  # fmt: skip
@@ -178,23 +158,6 @@ def around(lung: Lung, *, with_fissures: bool) -> kernel.Around:
     )  # fmt: skip
 
 
-def sizes(system: System, left: Residuals, errors: ErrorModel, aside_mm: float) -> kernel.Sizes:
-    """Return the errors and devices for the kernels; without a needle no length of the tubes is exempt."""
-    needle, tubes = system.needle, system.tubes
-    tip_mm = None if needle is None else left.tip_mm
-    return kernel.Sizes(
-        scope=left.scope_mm, scope_turn=left.scope_rad, rotation=left.rotation_rad,
-        insertion=left.insertion_mm, tip_known=tip_mm is not None, tip=tip_mm or 0.0,
-        tip_turn=left.tip_rad, curvature=left.curvature, roll=left.roll_rad,
-        stop=0.0 if needle is None else left.stop_mm,
-        target=left.target_mm, breathing=left.foot_mm, bend=bend_per_mm(system),
-        steepest=1.0 if needle is None else needle.max_curvature_per_mm * errors.needle_curvature.median,
-        slack=errors.term(CURVATURE).size, aside=aside_mm, tube_radius=tubes.inner.radius_mm,
-        needle_radius=0.0 if needle is None else needle.radius_mm,
-        exempt=-1.0 if needle is None else needle.exit_exemption_mm,
-    )  # fmt: skip
-
-
 def bend_per_mm(system: System) -> float:
     """Return the curvature with which the inner tube bends on as it goes farther; 0 where it is not one."""
     return system.tubes.free_curvature_per_mm if system.tubes.planar else 0.0
@@ -224,23 +187,19 @@ def scope_moves(expected: Float, position_mm: float, direction_rad: float) -> Fl
     return moves
 
 
-def tip_moves(lps_from_scope_tip: Float, expected: Float, left: Residuals, bend_per_mm: float) -> Float:
-    """Return what one standard deviation of each error moves the pose of the tubes' tip by, see `fused`.
-
-    Args:
-        bend_per_mm: Curvature with which the tubes bend on as they go farther out.
-    """
+def tip_moves(lps_from_scope_tip: Float, expected: Float, left: kernel.Sizes) -> Float:
+    """Return what one standard deviation of each error moves the pose of the tubes' tip by, see `fused`."""
     axes, ahead = np.moveaxis(lps_from_scope_tip[..., :3, :3], -1, 0), expected[..., :3, 2]
     arm = expected[..., :3, 3] - lps_from_scope_tip[..., :3, 3]
     about = np.cross(axes[2], ahead)
     about = about / np.maximum(np.linalg.norm(about, axis=-1, keepdims=True), LEAST)
     moves = np.zeros((*expected.shape[:-2], 6, 7))
-    moves[..., :3, :3] = left.scope_mm * np.eye(3)
-    for column, size in enumerate((left.scope_rad, left.scope_rad, left.rotation_rad)):
+    moves[..., :3, :3] = left.scope * np.eye(3)
+    for column, size in enumerate((left.scope_turn, left.scope_turn, left.rotation)):
         moves[..., :3, 3 + column] = size * np.cross(axes[column], arm)
         moves[..., 3:, 3 + column] = size * axes[column]
-    moves[..., :3, 6] = left.insertion_mm * ahead
-    moves[..., 3:, 6] = left.insertion_mm * bend_per_mm * about
+    moves[..., :3, 6] = left.insertion * ahead
+    moves[..., 3:, 6] = left.insertion * left.bend * about
     return moves
 
 

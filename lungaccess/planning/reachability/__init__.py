@@ -5,13 +5,11 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.reachability.layers import Regions
     from lungaccess.planning.reachability.reach_map import (
         KINDS,
         NOT_COUNTED,
         STATES,
         ReachMap,
-        ReachPart,
         ReachStream,
         RegionReach,
         compare_reach,

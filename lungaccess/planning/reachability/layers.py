@@ -16,7 +16,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.lobes import LOBES
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES, obstacle_bits
-from lungaccess.planning.coupled import Scan
+from lungaccess.planning.coupled.search.reach_scans import Scan
 from stages.needle import BLOCK_MM
 
 SLAB_MM = BLOCK_MM

@@ -85,7 +85,7 @@ def run_design(
 
     Every run is kept in the folder's `results.db`: a search that was stopped goes on from there.  The same
     search finds the same, whatever ended it on the way and however many workers it has.  Parameters and
-    errors are those of `lungaccess.running.study.run_study`, and moreover:
+    errors are those of `lungaccess.running.study.driver.run_study`, and moreover:
 
     Raises:
         SettingsError: If the validator refuses every device.

@@ -9,7 +9,7 @@ import numpy as np
 import lungaccess as la
 from anatomy.base.errors import TargetError
 from anatomy.lung import Lung
-from lungaccess.planning.coupled import AtlasSearch
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task

@@ -22,8 +22,8 @@ from lungaccess.planning import read_lesions
 from lungaccess.planning.one_stage import load_tubes
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
-from lungaccess.running.design import read_design
-from lungaccess.running.study import read_study
+from lungaccess.running.design.settings import read_design
+from lungaccess.running.study.settings import read_study
 from tests.lungaccess.cli.every_command import commands
 
 QUICK = ("presets", "template", "tubes", "shapes", "doctor", "completion")

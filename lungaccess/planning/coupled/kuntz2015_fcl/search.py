@@ -21,7 +21,7 @@ from lungaccess.planning.coupled.kuntz2015_fcl.needle import (
     branch_of,
     chord_mm,
 )
-from lungaccess.planning.coupled.search.base import SearchInParts, Step
+from lungaccess.planning.coupled.search.base import ParallelSearch, Step
 from lungaccess.planning.coupled.search.needle_planner import Placement, random_placements
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -55,7 +55,7 @@ class Refusal:
     candidate: Candidate
 
 
-class ReferenceSearch(SearchInParts):
+class ReferenceSearch(ParallelSearch):
     """Random placements, FCL, a needle RRT each, keep the best: the yardstick of the planner.
 
     The algorithm is as printed, but for what the paper leaves open or safety asks for.  The scope takes poses

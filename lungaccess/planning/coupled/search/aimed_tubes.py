@@ -21,7 +21,7 @@ from lungaccess.planning.coupled.kernels.aimed_tubes import (
 )
 from lungaccess.planning.coupled.search.base import (
     ESTIMATE_SLACK,
-    SearchInParts,
+    ParallelSearch,
     Step,
     different,
     evaluated_step,
@@ -302,7 +302,7 @@ ROWS_MM = (evenly(0.25, 4.0), evenly(0.02, 0.26))
 as far as the next, then between the best of these and its neighbours."""
 
 
-class TubeSearch(SearchInParts):
+class TubeSearch(ParallelSearch):
     """Aims the tubes at the target from the tips of the atlas, then from tips along the motions of the best.
 
     It ends when it has looked along the motions of all tips with a deployment to the target that differ.

@@ -18,7 +18,7 @@ from lungaccess.planning.coupled.search.base import (
     ESTIMATE_SLACK,
     DirectSearch,
     Incumbent,
-    SearchInParts,
+    ParallelSearch,
     SearchSettings,
     Step,
     different,
@@ -95,7 +95,7 @@ class LocalSearchRounds:
         return evaluated_step(self._evaluator, self.phase, self._local_search.candidate(run))
 
 
-class AtlasSearch(SearchInParts):
+class AtlasSearch(ParallelSearch):
     """Direct arcs of the whole atlas, then rounds of local search, sampling, needle search and refinement."""
 
     def __init__(

@@ -106,25 +106,6 @@ class AtlasBound(PlanSearch, Protocol):
     arcs: Any
 
 
-@runtime_checkable
-class ParallelSearch(PlanSearch, Protocol):
-    """A search that can be continued in several processes; see `lungaccess.planning.searches`."""
-
-    incumbent: "Incumbent"
-
-    def direct_steps(self) -> Iterator[Step]:
-        """Do what one process does alone, before the others begin."""
-
-    def further_steps(self) -> Iterator[Step]:
-        """Continue from there, without end or until all is tried; each step is an iteration."""
-
-    def take_part(self, number: int, parts: int) -> None:
-        """Do part `number` of `parts` of the work from here on, with random numbers of its own."""
-
-    def is_futile(self, iteration: int) -> bool:
-        """Tell whether nothing will be found after so many iterations without a candidate."""
-
-
 class DirectSearch(Protocol):
     """What looks at the simplest ways from the entries of an atlas before a search goes on from the best.
 
@@ -171,8 +152,8 @@ class Incumbent:
         return Step(iteration=step.iteration, phase=step.phase)
 
 
-class SearchInParts(ABC):
-    """What all searches have in common that can be continued in several processes: a `ParallelSearch`.
+class ParallelSearch(ABC):
+    """A search that can be continued in several processes; see `lungaccess.planning.searches`.
 
     Attributes:
         share (tuple of 2 int): The part of the work that it does, and of how many.
@@ -190,19 +171,19 @@ class SearchInParts(ABC):
                 return
 
     def direct_steps(self) -> Iterator[Step]:
-        """Do what one process does alone: nothing."""
+        """Do what one process does alone, before the others begin: nothing."""
         return iter(())
 
     @abstractmethod
     def further_steps(self) -> Iterator[Step]:
-        """See `ParallelSearch`."""
+        """Continue from there, without end or until all is tried; each step is an iteration."""
 
     def take_part(self, number: int, parts: int) -> None:
-        """Do part `number` of `parts` of the work from here on."""
+        """Do part `number` of `parts` of the work from here on, with random numbers of its own."""
         self.share = (number, parts)
 
     def is_futile(self, iteration: int) -> bool:
-        """Tell that the search goes on as long as it can."""
+        """Tell whether nothing will be found after so many iterations without a candidate: never."""
         return False
 
 

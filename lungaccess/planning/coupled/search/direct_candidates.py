@@ -1,8 +1,7 @@
 """The simplest ways to a target from the deployments of an atlas, with a needle and without one."""
 
 import math
-from collections.abc import Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -15,38 +14,9 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 
-
-class DirectCandidates(Protocol):
-    """Ways to the target of a task, at most one from each entry of an atlas.
-
-    They are the direct arcs of the needle, or without one the tubes aimed at the target.
-    """
-
-    task: Task
-    atlas: Atlas
-    evaluator: CandidateEvaluator
-
-    @property
-    def promising(self) -> Int:
-        """The entries (N,) from which the target may be reached, the nearest first."""
-
-    def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
-        """Return for entries (E,) what blocks them, 0 for nothing, their estimated costs, and the least."""
-
-    def reasons(self, blockers: Int) -> dict[str, int]:
-        """Return what blocks entries (E,) in words, and how many of them."""
-
-    def clear(self) -> Int:
-        """Return the entries (C,) with a clear way, the best first."""
-
-    def candidate(self, entry: int) -> Candidate | None:
-        """Return the way from an entry as a candidate, None if the tubes are refused."""
-
-    def proved(self, entry: int) -> Candidate | None:
-        """Return the way from an entry as a candidate, None if its proof fails."""
-
-    def lines(self, chosen: Int, samples: int) -> Float:
-        """Return points (E, samples, 3) of what the costs are of, LPS mm."""
+DirectCandidates = DirectArcs | AimedTubes
+"""Ways to the target of a task, at most one from each entry of an atlas: the direct arcs of the needle, or
+without one the tubes aimed at the target."""
 
 
 def direct_candidates(
@@ -70,11 +40,16 @@ NEAREST, SAMPLED, LEAST_OF_BRANCH = 1000, 2000, 100
 many of every branch."""
 
 
-def separated_candidates(arcs: DirectCandidates, count: int, separation_mm: float) -> Iterator[Candidate]:
+def separated_candidates(
+    arcs: DirectCandidates, count: int, separation_mm: float, expected: Callable[[Int], Float] | None = None
+) -> Iterator[Candidate]:
     """Yield proved ways to the target that are separated, the cheapest of each branch first, then the others.
 
     The nearest deployments are evaluated with an even sample of the others, then further samples, but only
     as long as there are not enough plans.
+
+    Args:
+        expected: Returns what is expected of clear entries; the more, the better.  If None, cost decides.
     """
     near = arcs.promising
     pool, pool_costs = np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -84,7 +59,9 @@ def separated_candidates(arcs: DirectCandidates, count: int, separation_mm: floa
         blockers, costs, _best = arcs.evaluate(near[sample], math.inf)
         arcs.evaluator.blocked.update(arcs.reasons(blockers))
         clear = np.flatnonzero(blockers == 0)
-        pool, pool_costs = np.append(pool, near[sample][clear]), np.append(pool_costs, costs[clear])
+        found = near[sample][clear]
+        worth = costs[clear] if expected is None else -expected(found)
+        pool, pool_costs = np.append(pool, found), np.append(pool_costs, worth)
         chosen = _chosen(arcs, pool[np.argsort(pool_costs, kind="stable")], count, separation_mm, proved)
         if len(chosen) == count:
             break

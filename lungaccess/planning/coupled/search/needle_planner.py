@@ -14,7 +14,7 @@ from anatomy.base.typed import Float
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.search.base import (
     Incumbent,
-    SearchInParts,
+    ParallelSearch,
     SearchSettings,
     Step,
     different,
@@ -183,7 +183,7 @@ def random_placements(task: Task, atlas: Atlas, number: int = 0) -> Iterator[Pla
         )
 
 
-class KuntzSearch(SearchInParts):
+class KuntzSearch(ParallelSearch):
     """Algorithm 1 of [Kuntz2015]: random placement, workspace rejection, RRT, keep the best.
 
     Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not hold

@@ -1,7 +1,8 @@
 """Which of many points a system reaches: by its needle, by its tubes alone, or in phases of the breath."""
 
 import math
-from typing import TYPE_CHECKING, Protocol
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,7 +48,32 @@ STEP_MM = 0.25
 """Spacing of the points at which the clearance of a needle or of tubes is looked up; half is taken off."""
 
 
-class TubeReachScan:
+class _PointByPoint(ABC):
+    """Asks about points one after the other; as `stages.needle.ReachScan`."""
+
+    _in_phases = False
+
+    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
+        """Try points (N, 3), LPS mm; neither seeds nor neighbours matter."""
+        places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
+        kinds, entries = np.full(len(places), UNREACHED, dtype=np.uint8), np.full(len(places), -1)
+        cost, clearance, share = (np.zeros(len(places)) for _ in range(3))
+        for n, point in enumerate(places):
+            found = self._best(point)
+            if found is not None:
+                kinds[n] = DIRECT
+                entries[n], cost[n], clearance[n], share[n] = found
+        window_share = share if self._in_phases else None
+        return Reached(
+            kinds=kinds, cost=cost, clearance_mm=clearance, entries=entries, window_share=window_share
+        )
+
+    @abstractmethod
+    def _best(self, point: Float) -> tuple[int, float, float, float] | None:
+        """Return entry, cost, clearance and share of the breath of the best way to a point."""
+
+
+class TubeReachScan(_PointByPoint):
     """The deployments of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
 
     A point is reached directly if the tubes, aimed at it from the scope tip of some deployment that ends
@@ -66,36 +92,16 @@ class TubeReachScan:
         )
         self._tips = cKDTree(atlas.deployments.positions) if atlas.deployments.count else None
 
-    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
-        """Try all points, one after the other; neither seeds nor neighbours matter.
-
-        Args:
-            points: (N, 3) float64, LPS mm.
-        """
-        places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
-        kinds, entries = np.full(len(places), UNREACHED, dtype=np.uint8), np.full(len(places), -1)
-        cost, clearance = np.zeros(len(places)), np.zeros(len(places))
-        for n, point in enumerate(places):
-            found = self._best(point)
-            if found is not None:
-                entries[n], cost[n], clearance[n] = found
-                kinds[n] = DIRECT
-        return Reached(kinds=kinds, cost=cost, clearance_mm=clearance, entries=entries)
-
-    def _best(self, point: Float) -> tuple[int, float, float] | None:
-        """Return entry, cost and clearance of the cheapest of some deployments to a point."""
+    def _best(self, point: Float) -> tuple[int, float, float, float] | None:
         if self._tips is None:
             return None
-        for within_mm in (FIRST_MM, LAST_MM):
-            found = self._best_within(self._tips, point, within_mm)
-            if found is not None:
-                return found
-        return None
+        found = self._best_within(self._tips, point, FIRST_MM)
+        return found or self._best_within(self._tips, point, LAST_MM)
 
     def _best_within(
         self, places: "cKDTree", point: Float, within_mm: float
-    ) -> tuple[int, float, float] | None:
-        """Return the same for deployments that end within a distance of the point."""
+    ) -> tuple[int, float, float, float] | None:
+        """Return the cheapest of some deployments that end within a distance of the point."""
         atlas, made = self._atlas, self._atlas.deployments
         close = np.array(places.query_ball_point(point, within_mm, return_sorted=True), dtype=np.int64)
         away_mm = np.linalg.norm(made.positions[close] - point, axis=1)
@@ -110,7 +116,8 @@ class TubeReachScan:
         best = int(found[:, COST].argmin())
         if not np.isfinite(found[best, COST]):
             return None
-        return int(chosen[best]), float(found[best, COST]), self._clearance_mm(int(chosen[best]), found[best])
+        entry, cost = int(chosen[best]), float(found[best, COST])
+        return entry, cost, self._clearance_mm(entry, found[best]), 0.0
 
     def _clearance_mm(self, entry: int, found: Float) -> float:
         """Return a lower bound of the clearance of what was found."""
@@ -136,7 +143,7 @@ def tubes_clearance_mm(atlas: Atlas, path: ArcPath, branch: int) -> float:
     return max(least - 0.5 * STEP_MM, 0.0)
 
 
-class WindowReachScan:
+class WindowReachScan(_PointByPoint):
     """The direct ways of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
 
     A point is reached if an arc of the needle, or the tubes alone, to an aim beside it is proved clear and on
@@ -146,32 +153,22 @@ class WindowReachScan:
         lung: With a motion, which that of the atlas need not have.
     """
 
+    _in_phases = True
+
     def __init__(self, lung: Lung, atlas: Atlas, phases: tuple[float, float]) -> None:
         self._lung, self._atlas, self._phases = lung, atlas, phases
         self._field = lung.obstacle_field(with_fissures=atlas.with_fissures)
 
-    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
-        """Try all points, one after the other; neither seeds nor neighbours matter.
-
-        Args:
-            points: (N, 3) float64, LPS mm.
-        """
-        places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
-        kinds = np.full(len(places), UNREACHED, dtype=np.uint8)
-        cost, clearance, share = np.zeros(len(places)), np.zeros(len(places)), np.zeros(len(places))
-        for n, point in enumerate(places):
-            target = Target(lps_mm=point, origin="point")
-            task = Task(lung=self._lung, system=self._atlas.system, target=target)
-            search = window_search(task, self._atlas, self._phases, widest=False)
-            found = [step for step in search.direct_steps() if step.candidate is not None]
-            if found and found[-1].candidate is not None:
-                kinds[n], cost[n] = DIRECT, found[-1].cost
-                clearance[n] = self._clearance_mm(found[-1].candidate)
-                candidate = found[-1].candidate
-                plan = assemble(task, candidate, iteration=0, timing={})
-                share[n] = breathing_window(plan, self._lung).share
-        entries = np.full(len(places), -1, dtype=np.int64)
-        return Reached(kinds=kinds, cost=cost, clearance_mm=clearance, entries=entries, window_share=share)
+    def _best(self, point: Float) -> tuple[int, float, float, float] | None:
+        target = Target(lps_mm=point, origin="point")
+        task = Task(lung=self._lung, system=self._atlas.system, target=target)
+        search, best = window_search(task, self._atlas, self._phases, widest=False), None
+        for step in search.direct_steps():
+            best = best if step.candidate is None else step
+        if best is None or best.candidate is None:
+            return None
+        window = breathing_window(assemble(task, best.candidate, iteration=0, timing={}), self._lung)
+        return -1, best.cost, self._clearance_mm(best.candidate), window.share
 
     def _clearance_mm(self, candidate: Candidate) -> float:
         """Return a lower bound of the clearance of a needle beyond the exempt length, or of the tubes."""
@@ -183,11 +180,8 @@ class WindowReachScan:
         return max(float(beyond.min(initial=math.inf)) - 0.5 * STEP_MM, 0.0) if len(beyond) else 0.0
 
 
-class Scan(Protocol):
-    """Tells which of many points are reached, and how well."""
-
-    def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
-        """Try points (N, 3), LPS mm; see `stages.needle.ReachScan.reach`."""
+Scan = ReachScan | TubeReachScan | WindowReachScan
+"""What tells which of many points are reached, and how well."""
 
 
 def reach_scan(

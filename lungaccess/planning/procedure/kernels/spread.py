@@ -32,12 +32,15 @@ class Around(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """What does not depend on the deployment, in mm and rad: errors as `Residuals` has them, and devices.
+    """What does not depend on the deployment, in mm and rad: errors that are left, and devices.
 
-    `tip_known` tells whether `tip` and `tip_turn` count instead of what comes before them.  `bend` is the
-    curvature in 1/mm with which the inner tube bends on, `steepest` that of which the needle is capable in
-    tissue as it mostly is, `slack` the share by which that differs from patient to patient, and `aside` how
-    far beside the target the needle may aim.
+    `scope` and `scope_turn` are those of the scope's tip when the tubes are planned, `tip` and `tip_turn`
+    those of the tubes' tip when the needle is planned; `tip_known` tells whether these count instead of what
+    comes before them.  `curvature`, the logarithm of its factor, `roll` and `stop` are the needle's, `target`
+    is along each axis, and `breathing` beside it towards the feet.  `bend` is the curvature in 1/mm with
+    which the inner tube bends on, `steepest` that of which the needle is capable in tissue as it mostly is,
+    `slack` the share by which that differs from patient to patient, and `aside` how far beside the target the
+    needle may aim.
     """
 
     scope: float

@@ -16,7 +16,7 @@ from anatomy.fields import distance_field
 from anatomy.grid import Grid
 from anatomy.kernels.field import most_distance
 from anatomy.lung import Lung
-from lungaccess.planning.coupled.cost_bound import QUEUES, CostBound, GapGoal, cost_to_go
+from lungaccess.planning.coupled.cost_bound import QUEUES, CostBound, cost_to_go
 from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, ROTATION
 from lungaccess.planning.coupled.kernels.cost_bound import BoundEnvironment, between, bound_box
 from lungaccess.planning.coupled.kernels.cost_to_go import cost_from
@@ -30,6 +30,7 @@ from lungaccess.planning.coupled.kernels.deployment_box import (
     tubes_at,
     tubes_blocked,
 )
+from lungaccess.planning.coupled.layer_bound import GapGoal
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.target import Target, point_target

@@ -8,7 +8,8 @@ import pytest
 import lungaccess as la
 from anatomy.lung import Lung
 from anatomy.structures import FISSURE, OBSTACLES
-from lungaccess.planning.coupled import DirectArcs, atlas_part
+from lungaccess.planning.coupled import DirectArcs
+from lungaccess.planning.coupled.atlas import atlas_part
 from lungaccess.planning.coupled.exits import PLACE_MM
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task

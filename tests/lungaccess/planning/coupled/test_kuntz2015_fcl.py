@@ -20,7 +20,6 @@ from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, BRANCH_SHIFT, LUMEN, OUTSIDE, VESSEL
 from experiments import noplan_attack
-from lungaccess.planning.coupled import ReferenceSearch
 from lungaccess.planning.coupled.kuntz2015_fcl.needle import (
     SAGITTA_MM,
     NeedleRRT,
@@ -32,6 +31,7 @@ from lungaccess.planning.coupled.kuntz2015_fcl.needle import (
 from lungaccess.planning.coupled.kuntz2015_fcl.search import (
     FOUND,
     OUT_OF_WORKSPACE,
+    ReferenceSearch,
     TubeValidator,
     frame_at,
     line_between,

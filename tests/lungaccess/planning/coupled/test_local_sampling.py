@@ -11,8 +11,12 @@ import lungaccess as la
 from anatomy.base.settings import override
 from anatomy.build import build_lung
 from anatomy.phantom import make_phantom
-from lungaccess.planning.coupled import AtlasSearch
-from lungaccess.planning.coupled.search.atlas_search import SPREADS, LocalSampling, nearly_reaching
+from lungaccess.planning.coupled.search.atlas_search import (
+    SPREADS,
+    AtlasSearch,
+    LocalSampling,
+    nearly_reaching,
+)
 from lungaccess.planning.coupled.search.local_search import LocalSearch
 from lungaccess.problem.peripheral import peripheral_targets
 from lungaccess.problem.target import point_target

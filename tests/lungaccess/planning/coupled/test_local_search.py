@@ -9,8 +9,8 @@ import pytest
 
 import lungaccess as la
 from anatomy.lung import Lung
-from lungaccess.planning.coupled import AtlasSearch
 from lungaccess.planning.coupled.kernels.direct_arcs import PRUNED_BY_BOUND
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.base import different
 from lungaccess.planning.coupled.search.local_search import SHIFTS_MM, LocalSearch, path_through
 from lungaccess.plans.candidate import Candidate

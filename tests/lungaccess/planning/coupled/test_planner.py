@@ -13,14 +13,9 @@ import lungaccess as la
 from anatomy.base.errors import SettingsError, TargetError
 from anatomy.lung import Lung
 from lungaccess.planning import ProgressEvent, searches
-from lungaccess.planning.coupled import (
-    AtlasSearch,
-    DirectArcs,
-    Incumbent,
-    SearchSettings,
-    Step,
-    evaluated_step,
-)
+from lungaccess.planning.coupled import DirectArcs
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
+from lungaccess.planning.coupled.search.base import Incumbent, SearchSettings, Step, evaluated_step
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task

@@ -10,7 +10,7 @@ import pytest
 
 import lungaccess as la
 from anatomy.lung import Lung
-from lungaccess.planning.coupled import AtlasSearch
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.refinement import refine
 from lungaccess.plans.assemble import assemble
 from lungaccess.problem.system import System

@@ -13,7 +13,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from experiments.support.mutants import twisted
 from experiments.support.mutants.mutant import Case
-from lungaccess.planning.coupled import AtlasSearch
+from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
 from lungaccess.planning.coupled.search.local_search import LocalSearch
 from lungaccess.planning.coupled.search.needle_planner import random_placements
 from lungaccess.planning.one_stage.replan import replan_from_scope

@@ -19,7 +19,8 @@ from lungaccess.cli.app import main
 from lungaccess.cli.commands import needle
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.judging.checking import check_needle_alone
-from lungaccess.planning.one_stage import pierced_branches, plan_needle, reason_in_words
+from lungaccess.planning.one_stage import plan_needle, reason_in_words
+from lungaccess.planning.one_stage.needle import pierced_branches
 from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, nodule_target
 from stages.needle import Passage

@@ -19,12 +19,12 @@ from anatomy.lung import Lung
 from lungaccess.planning.one_stage import ScopeReplanner
 from lungaccess.planning.procedure import simulated
 from lungaccess.planning.procedure.spread import (
-    Residuals,
     as_measured,
     fused,
     fused_share,
     fused_size,
     scope_moves,
+    sizes_of,
     tip_moves,
 )
 from lungaccess.plans.no_plan import NoPlan
@@ -87,10 +87,9 @@ def test_an_exact_measurement_is_believed_and_a_needless_one_is_not() -> None:
 def test_a_wrong_rotation_is_told_from_where_the_tip_is() -> None:
     """A tip that a turn of the tubes has moved is found along that turn, more exactly than it is measured."""
     scope, tip = np.eye(4), poses.pose(np.array([10.0, 0.0, 30.0]), [0.6, 0.0, 0.8], [0.8, 0.0, -0.6])
-    left = Residuals.of(load_errors("gated-ct"), load_procedure("measured-tip"), 0.0)
-    only = dict.fromkeys(("scope_mm", "scope_rad", "insertion_mm"), 0.0)
-    turned = Residuals(**(vars(left) | only))
-    moves = tip_moves(scope, tip, turned, 0.0)
+    left = sizes_of(SYSTEM, load_errors("gated-ct"), load_procedure("measured-tip"), 0.0)
+    turned = left._replace(scope=0.0, scope_turn=0.0, insertion=0.0)
+    moves = tip_moves(scope, tip, turned)
     assert np.linalg.matrix_rank(moves) == 1
     true = poses.pose(np.zeros(3), [0.0, 0.0, 1.0], [math.cos(0.05), math.sin(0.05), 0.0]) @ tip
     measured = as_measured(true, 0.7, 1.0, np.array([1.0, 1.0, 1.0, 0.0, 1.0]))

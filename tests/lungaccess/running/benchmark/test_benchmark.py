@@ -18,17 +18,15 @@ from anatomy.poses import pose
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning.one_stage import search_path
-from lungaccess.running.benchmark import (
+from lungaccess.running.benchmark.published import (
+    NO_STARTS,
     UNC_GOAL_TOLERANCE_MM,
-    BenchmarkRow,
-    posed_by_unc,
+    patients_of,
     published_queries,
     read_peer,
-    run_query,
-    summary_rows,
-    write_rows,
+    why_no_query,
 )
-from lungaccess.running.benchmark.published import NO_STARTS, patients_of, why_no_query
+from lungaccess.running.benchmark.runs import BenchmarkRow, posed_by_unc, run_query, summary_rows, write_rows
 from stages.needle import ArcPath
 
 RUN = {

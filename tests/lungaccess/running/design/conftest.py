@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from lungaccess.problem.system import load_system
-from lungaccess.running.design import Design, design_of, search
+from lungaccess.running.design import search
+from lungaccess.running.design.settings import Design, design_of
 from lungaccess.running.study import driver
 from lungaccess.running.study.runs import NO_PLAN, TIMEOUT, Answer, Patient, Problem, Run
 from tests.lungaccess.running.study.toys import content, toy_answer

@@ -21,9 +21,8 @@ from anatomy.base.files import require_writable_folder, write_text
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.problem.system import load_system
-from lungaccess.running.design import Contender, Design, design_of, run_design
-from lungaccess.running.design.search import chosen, front_of
-from lungaccess.running.design.settings import Number, device, near, value_at
+from lungaccess.running.design.search import chosen, front_of, run_design
+from lungaccess.running.design.settings import Contender, Design, Number, design_of, device, near, value_at
 from lungaccess.running.study.results import ResultsFile
 from tests.lungaccess.cli.killing import START, require_gone, started
 from tests.lungaccess.running.design.conftest import BENT, TARGETS, TURN, ToyWorkers, design_content

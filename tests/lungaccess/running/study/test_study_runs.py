@@ -18,11 +18,12 @@ from lungaccess.problem import peripheral
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.system import load_system
-from lungaccess.running.study import one_run, summarise
+from lungaccess.running.study import one_run
 from lungaccess.running.study.one_run import answer, needle_answer
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.runs import EXACT, INVALID_GOAL, NO_PLAN, PATH, PLAN, Run, open_patient, runs_of
 from lungaccess.running.study.settings import PlannerChoice, study_of
+from lungaccess.running.study.tables import summarise
 from tests.lungaccess.running.study.toys import NEAR, content
 
 

@@ -16,7 +16,8 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.judging.appraisal import Headline
 from lungaccess.planning import Alternative, with_front
-from lungaccess.planning.procedure import ProcedureReport, StageReport
+from lungaccess.planning.procedure import ProcedureReport
+from lungaccess.planning.procedure.report import StageReport
 from lungaccess.planning.success import chance_of
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors

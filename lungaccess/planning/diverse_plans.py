@@ -76,11 +76,7 @@ def alternatives(
     of a search by cost, or in the rounds of a contest.  The others are direct ways from the atlas, those
     without a needle tubes aimed at the target, whose parts beyond the lumen are separated: the best through
     each airway branch comes first, then the others.  Each plan is proved and complete as any other, and
-    states what the goal is of it.
-
-    Args:
-        request: For one system.
-        atlas, counterfactuals, on_progress: See `lungaccess.planning.driver.run`.
+    states what the goal is of it.  Further parameters are those of `lungaccess.planning.one_system.run`.
 
     Raises:
         NoPlan: If no plan was found.

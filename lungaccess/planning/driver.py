@@ -96,13 +96,9 @@ PROGRESS_EVERY_S = 0.1
 
 @frozen_value
 class ProgressEvent:
-    """The progress of a search.
+    """The progress of a search; its time is without that of the atlas, and a message replaces the phase.
 
-    Args:
-        elapsed_s: Planning time, without that of the atlas.
-        best_cost: What is left to improve of the best plan, see `Goal.loss`; None as long as there is no
-            plan.
-        phase, message: What the search does; the message replaces the phase where it is not empty.
+    `best_cost` is what is left to improve of the best plan, see `Goal.loss`; None without one.
     """
 
     iteration: int
@@ -114,11 +110,9 @@ class ProgressEvent:
 
 @frozen_record
 class Turn:
-    """One step of a finder.
+    """One step of a finder: its iteration is 0 for what comes before the iterations.
 
-    Args:
-        iteration: 0 for what comes before the iterations, then counted from 1.
-        make: Returns a plan that is better than all before, of the planning time in seconds.
+    `make` returns a plan that is better than all before, of the planning time in seconds.
     """
 
     iteration: int

@@ -24,8 +24,8 @@ def run(
 
     Args:
         atlas: Made with `build_atlas` beforehand; made here if None.
-        counterfactuals: Whether a `NoPlan` looks for the change of device that would help, which takes up to
-            some ten seconds.
+        counterfactuals: Whether a `NoPlan` looks for the change of device that would help, in some ten
+            seconds.
         on_progress: Gets a `ProgressEvent` about ten times a second.
 
     Raises:

@@ -44,15 +44,12 @@ ITERATIONS = 100
 
 @frozen_record
 class TourAnswer:
-    """Tours to M lesions.
+    """Tours to M lesions; lesions without an exit are left out, with why.
 
     Args:
-        lesions_lps: (M, 3) float64, LPS mm.
-        left_out: Numbers of lesions without an exit, and why.
         least_resistance: The shortest tour over the exits of the circuit with the least resistance [Pan2025];
             None if there are too many combinations.
-        one_by_one_mm: Length of a tour in which the scope returns to the root between any two lesions, over
-            the exits of `shortest`.
+        one_by_one_mm: Length of a tour in which the scope returns to the root between any two lesions.
         plan_required: Whether an exit counted only if a coupled plan from there exists.
     """
 
@@ -123,19 +120,16 @@ def plan_tour(
     atlas: Atlas | None = None,
     iterations: int = ITERATIONS,
 ) -> TourAnswer:
-    """Plan the shortest tour to all lesions, and the one by least resistance beside it.
+    """Plan the shortest tour to all lesions `(M, 3)`, LPS mm, and the one by least resistance beside it.
 
     A lesion without an exit is left out of the tour, and named in the answer.  That no plan was found does
     not prove that there is none.
 
     Args:
-        lesions_lps: (M, 3) float64, LPS mm.
         rule: By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
         reading: How resistances are merged: "printed" or "reduced", see `stages.scope.tour.subtree`.
-        tissue_weight: How many mm of the scope's travel a mm between exit and lesion is worth; 0 for the
-            shortest tour.
-        atlas: If given, an exit counts only if a coupled plan from there was found: scope, tubes and needle,
-            all proved; see `coupled_plan_test`.
+        tissue_weight: How many mm of the scope's travel a mm between exit and lesion is worth.
+        atlas: If given, an exit counts only if a coupled plan from there was found: see `coupled_plan_test`.
         iterations: Of the coupled planner for a lesion that no direct arc reaches; 0 for direct arcs alone.
 
     Raises:

@@ -41,10 +41,8 @@ TURNED_COARSER = 2
 class Atlas:
     """All accepted deployments of a system in a lung; independent of any target and of the needle.
 
-    Args:
-        motions: Every scope tip with the proved motion that brings the device there.
-        deployments: `deployments.site` indexes the tips of `motions`.
-        index: Made from the deployments: finds those with a target in the needle's workspace, for any needle.
+    The `site` of a deployment is a tip of `motions`, each of which has a proved motion; `index`, made from
+    the deployments, finds those with a target in the needle's workspace, for any needle.
     """
 
     lung: Lung
@@ -107,9 +105,8 @@ def build_atlas(
 ) -> Atlas:
     """Find the motions of the scope, enumerate rotations and insertions at their tips, and keep what is safe.
 
-    Args:
-        rotations: Evenly spaced rotations of the tubes, and further ones where tube or exit is near a limit.
-        stop_spacing_mm, site_spacing_mm: Spacing of insertions and of scope tips along the airway.
+    Rotations are spaced evenly, with further ones where tube or exit is near a limit; `site_spacing_mm` is
+    the spacing of scope tips along the airway.
     """
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)

@@ -96,9 +96,8 @@ class CostBound:
     def start(self, cost: float, boxes: int) -> None:
         """Begin to divide so many boxes in other threads; `finish` waits for them.
 
-        Args:
-            cost: That of a plan: deployments that cost as much need not be told apart.  The first calls only
-                begin with the boxes of some scope tips each.
+        Deployments that cost as much as a plan, `cost`, need not be told apart.  The first calls only begin
+        with the boxes of some scope tips each.
         """
         self.finish()
         if self.settled:
@@ -210,13 +209,10 @@ def bound_environment(
     tips: Float,
     limit: float,
 ) -> BoundEnvironment:
-    """Return what the bounds look at.
+    """Return what the bounds look at from scope tips (S, 9), LPS mm.
 
-    Args:
-        weights (tuple of 2 float): Those of a path's integral of 1 / clearance, and of its length.
-        target_lps: (3,) float64.
-        tips ((S, 9) float64): Scope tips, LPS mm.
-        limit: A cost that no path need be told to exceed.
+    The weights are those of a path's integral of 1 / clearance and of its length; `limit` is a cost that no
+    path need be told to exceed.
     """
     x, y, z = target_lps.tolist()
     return BoundEnvironment(
@@ -260,13 +256,11 @@ def cost_to_go(
     places: Float,
     limit: float,
 ) -> CostToGo:
-    """Return lower bounds of what paths to a target still cost.
+    """Return lower bounds of what paths to a target (LPS mm) still cost, in a corner field of all obstacles.
 
     Args:
-        field, geometry: Corner field of the distance to all obstacles.
         limits: Of a needle no longer than half a circle of its greatest curvature.
         weights (tuple of 2 float): Of the integral of 1 / clearance, and of the length in mm.
-        target_lps (tuple of 3 float): LPS mm.
         places ((N, 3) float64): Where needles start, about; LPS mm.  The window looks at those that are near.
         limit: Costs above are not told apart.
     """

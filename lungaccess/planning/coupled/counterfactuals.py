@@ -59,10 +59,9 @@ class Counterfactual:
 def find_counterfactuals(task: Task, atlas: Atlas) -> tuple[Counterfactual, ...]:
     """Return the changes of one parameter that reach the target by its simplest way, the smallest first.
 
-    The parameters are the needle's curvature and diameter, with the deployments of the atlas, and the
-    diameter of the scope, with what a thinner one could reach beyond them.  Each is changed alone, and no
-    more than a single arc of the needle, or without one the tubes aimed at the target, demand.  Whether such
-    a device exists, and what else it would need, is not asked.
+    Each of curvature and diameter of the needle and diameter of the scope is changed alone, no more than a
+    single arc of the needle, or without one the tubes aimed at the target, demand.  Whether such a device
+    exists, and what else it would need, is not asked.
     """
     of_needle = [] if task.system.needle is None else needle_changes(task, atlas)
     found = [*of_needle, *scope_changes(task, atlas)]

@@ -40,12 +40,11 @@ class FeasibleExits:
     Args:
         entries ((C,) int64): Numbers of the deployments in the atlas, the least costly of each place first.
         place ((C,) int64): Place of exit of each, from 0 by the least cost of the place.
-        cost, length_mm ((C,) float64): Estimated cost under the objective, and length, of the arc.
+        cost ((C,) float64): Estimated under the objective.
         exit_lps, clearance_mm ((P, 3) and (P,) float64): Of the least costly deployment of each place: where
             its axis leaves the lumen, LPS mm, and a lower bound of the distance of its arc from every
             obstacle, beyond the exempt length in the pierced wall.
-        in_workspace, tried: Deployments with the target in the needle's workspace, or from which tubes are
-            aimed at it, and how many of them this answer is of.
+        in_workspace, tried: Deployments from which the target may be reached, and those this answer is of.
         blocked: How many arcs were stopped, by what stopped them.
     """
 
@@ -95,7 +94,6 @@ def feasible_exits(
     answer shows most places already.  The same input gives the same answers.
 
     Args:
-        objective: By which the arcs are put in order, as for `lungaccess.planning.searches.CostFinder`.
         scope_tips ((T,) int64): Only exits from these tips of the atlas.
 
     Raises:

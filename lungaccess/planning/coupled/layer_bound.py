@@ -39,10 +39,8 @@ class LayerBound:
     Without a needle the costs begin where the tubes leave the lumen, and the layers are those of one distance
     from it: this holds for every place of the scope.  With a needle they begin at the tip of the tubes, and
     the layers are spheres about the target from as far as the tubes come; it holds for scope tips up to
-    SHIFTED_MM beside those of the atlas, and is 0 where the tubes are long enough to reach the target.
-
-    Args:
-        beside_mm: How far beside the target the devices may end.
+    SHIFTED_MM beside those of the atlas, and is 0 where the tubes are long enough to reach the target.  The
+    devices may end up to `beside_mm` beside the target.
     """
 
     lowest: tuple[tuple[int, float, float, float], ...] = ()
@@ -192,10 +190,7 @@ def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Ite
 
 
 class GapGoal:
-    """The goal that a plan costs at most so much more than the best possible, proved.
-
-    Args:
-        gap: Share of the best possible cost.
+    """The goal that a plan costs at most a share `gap` more than the best possible, proved.
 
     Raises:
         SettingsError: If the gap is negative or not finite.

@@ -48,15 +48,14 @@ SLICE = 500
 
 @frozen_record
 class PathSearch:
-    """What one search found.
+    """What one search found: the best path and the first one, proved clear and within all limits.
 
     Args:
         outcome: "path"; "no path", if there is a proof; a search's own words for its end; else "nothing
             found".
-        path, first_path: The best path and the first one: proved clear and within all limits.
         cost: Of the path under the objective, as estimated within the search.
-        open_passage: Where a path would have to pass, if neither a path was found nor a proof that there is
-            none.
+        open_passage: Where a path would have to pass, if neither a path nor a proof that there is none was
+            found.
     """
 
     outcome: str
@@ -170,14 +169,13 @@ WALL_MM = 3.0
 
 @frozen_record
 class NeedleAnswer(PathSearch):
-    """What a planner found, and what it was asked.
+    """What a planner found, and what it was asked; planners of OMPL look at no objective.
 
     Args:
-        branches: Branches of the airway tree whose wall the start is taken to have pierced, the nearest
-            first; none if no airway is near.
+        branches: Branches whose wall the start is taken to have pierced, the nearest first; none if no airway
+            is near.
         at_wall: Whether the needle begins so near to the lumen that it pierces the wall itself.
         lobe: Where what stands in the way lies; "" if the lobes are not known.
-        objective: What it was asked to make small; planners of OMPL look at none.
     """
 
     branches: tuple[int, ...]
@@ -250,15 +248,10 @@ def plan_needle(
     iterations: int | None = None,
     time_s: float | None = None,
 ) -> NeedleAnswer:
-    """Plan the needle of a system, with its margins, from a pose to a target.
+    """Plan the needle of a system, with its margins, from a pose `(4, 4)`, +z forward, to a target.
 
-    Args:
-        lps_from_start ((4, 4) float64): +z is the direction of insertion.
-        planner: One of `stages.needle.NEEDLE_PLANNERS`.  Those of OMPL look at no objective, end by time
-            alone, and can be seeded once in a process, so each call needs a process of its own.
-        objective: What is made small; see `stages.needle.objective.Objective.of`.
-        iterations, time_s (optional): The search ends by whichever comes first, or by itself.  At least one
-            is needed.
+    Parameters are those of `search_path`, and a limit is needed.  A planner of OMPL needs a process of its
+    own.
 
     Raises:
         SettingsError: If there is no such planner or objective, no limit, or a cost map is missing; if OMPL
@@ -308,14 +301,10 @@ class NeedleQuestion:
 
 
 def needle_question(lung: Organ, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
-    """Ask for a path of a system's needle, with its margins, and the exemption that its start has.
-
-    Args:
-        lps_from_start: (4, 4) float64.
-        target_lps: (3,) float64, LPS mm.
+    """Ask for a path of a system's needle, with its margins, and the exemption that its start `(4, 4)` has.
 
     Raises:
-        TargetError: If the target is the point of the start.
+        TargetError: If the target (LPS mm) is the point of the start.
     """
     # The searches take no shorter arc.
     if np.linalg.norm(lps_from_start[:3, 3] - target_lps) < 1e-6:

@@ -55,12 +55,9 @@ from stages.tube import Deployment, Enumerator, SiteEnumerator, design_arrays
 class RestOfPlan:
     """What is left to do from a measured pose: proved clear and within all limits.
 
-    Args:
-        lps_from_measured ((4, 4) float64): The pose as it was taken: that of the scope's tip, or of the
-            tube's tip where there is no deployment.
-        deployment: Of the tubes, where they are left to do.
-        path: Of the needle, or without one of the tubes in tissue.
-        branch: Branch whose wall is exempt at the exit; -1 for none.
+    The pose, as it was taken, is that of the scope's tip, or of the tube's tip where there is no deployment
+    left.  The path is that of the needle, or without one of the tubes in tissue.  `branch` is that whose wall
+    is exempt at the exit; -1 for none.
     """
 
     task: Task
@@ -324,16 +321,15 @@ def replan_from_scope(
     """Plan tubes and needle from where the tip of the scope really is.
 
     With a tool the needle goes on until the tool is at the target, and takes enough of the nodule.  The
-    deployments from this one pose are enumerated as in an atlas, as far as the target lies in the
-    needle's workspace; the cheapest clear direct arc is the first answer, or what the needle's own search
-    finds, and a local search improves it.  Without a needle the tubes are aimed at the target.  The same
-    input and seed give the same answer.
+    deployments from this one pose are enumerated as in an atlas, as far as the target lies in the needle's
+    workspace; the cheapest clear direct arc is the first answer, or what the needle's own search finds, and a
+    local search improves it.  Without a needle the tubes are aimed at the target.  The same input and seed
+    give the same answer.
 
     Args:
-        lps_from_scope_tip ((4, 4) float64): The pose as measured: +z forward, +x the way a positive bend
-            turns the tip, up in the picture.
-        tries: Variations of rotation, insertions and needle that improve the first answer; 0 for a faster
-            one.
+        lps_from_scope_tip ((4, 4) float64): As measured: +z forward, +x the way a positive bend turns the
+            tip.
+        tries: Variations of rotation, insertions and needle that improve the first answer; 0 for none.
         searches: Deployments from which the needle's own search starts where no direct arc is clear.
 
     Raises:
@@ -358,13 +354,8 @@ def replan_from_tube(
 ) -> RestOfPlan:
     """Plan the needle from where the tip of the tubes really is; see `replan_from_scope`.
 
-    SettingsError is raised if the system has no needle: then nothing is left to plan.
-
-    A tip near an airway is taken to have pierced its wall, as `plan_needle` does.
-
-    Args:
-        lps_from_tip ((4, 4) float64): The pose as measured; +z is the direction of insertion.
-        iterations: Of the needle's search, which begins with the direct arc.
+    SettingsError is raised if the system has no needle: then nothing is left to plan.  A tip near an airway
+    is taken to have pierced its wall, as `plan_needle` does.  The needle's search begins with the direct arc.
     """
     frame = measured_pose(lung, lps_from_tip, "tube")
     task = _task(lung, system, target, objective, seed)

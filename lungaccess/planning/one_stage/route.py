@@ -62,7 +62,6 @@ def open_source(
         lumen: Which vessel of a liver, a key of `anatomy.io.liver.LUMENS`; needed for one.
         frame: Frame of a centreline file or mask that states none.
         pixel_mm: Size of a pixel of a drawing; needed for one.
-        accept (collection of str): Checks of a patient's masks whose failure is accepted.
 
     Raises:
         SettingsError: If a drawing has no pixel size, or a liver is given and no vessel.

@@ -38,11 +38,9 @@ ADVICE_FILE, CAMERA_FILE = "advice.json", "camera.mrk.json"
 
 @frozen_record
 class ScopeAdvice:
-    """The path of a scope to a lesion, with instructions.
+    """The path of a scope to a lesion, with instructions; why it ends before the goal, "" if it does not.
 
-    Args:
-        why_stopped: Why it ends before the goal; "" if it does not.
-        thinner: What thinner scopes would reach; empty if this one reaches the goal.
+    `thinner` is what thinner scopes would reach; empty if this one reaches the goal.
     """
 
     path: ScopePath
@@ -82,12 +80,8 @@ def advise_scope(
 ) -> ScopeAdvice:
     """Find a path of a system's scope from the trachea to a lesion, with its true radius clear of the wall.
 
-    The goal is the lumen voxel nearest to the lesion's centre, if possible one in the lesion where the scope
-    fits.
-
-    Args:
-        system: Its scope is used.
-        lesion_lps ((3,) float64, LPS mm): Centre of the lesion, anywhere.
+    The goal is the lumen voxel nearest to the lesion's centre (LPS mm, anywhere), if possible one in the
+    lesion where the scope fits.
 
     Raises:
         AnatomyError: If the scope fits nowhere in the trachea.
@@ -130,9 +124,7 @@ WORDS = {words: kind for kind, words in KINDS.items()}
 class ScopeRegion:
     """Poses of the scope's tip that were tried: whether tubes and needle reach the target from there.
 
-    Args:
-        lps_from_scope_tip ((4, 4) float64): As planned.
-        tried: A start too near to an obstacle is a tip that does not fit into the airway.
+    A start too near to an obstacle is a tip that does not fit into the airway.
     """
 
     lps_from_scope_tip: Float
@@ -173,13 +165,10 @@ def safe_scope_region(
 ) -> ScopeRegion:
     """Try poses of the scope's tip around the planned one: from each, tubes and needle are planned anew.
 
-    A tip fits into the airway if its centre is as deep in the lumen as the scope's radius, or as the planned
-    tip where that is less.  What is found is proved clear, exactly to the target; what is not found proves
-    nothing.  The same input and seed give the same answer.
-
-    Args:
-        offset_mm, tilt_deg: Largest distance and angle from the planned tip.
-        poses: About how many are tried.
+    About `poses` of them lie within a distance and an angle.  A tip fits into the airway if its centre is as
+    deep in the lumen as the scope's radius, or as the planned tip where that is less.  What is found is
+    proved clear, exactly to the target; what is not found proves nothing.  The same input and seed give the
+    same answer.
 
     Raises:
         PlanFileError: If the plan was made for another lung.

@@ -60,12 +60,10 @@ class BareTubes:
 
 @frozen_value
 class TubeAnswer:
-    """A deployment as in [Kuntz2015], and what it does.
+    """A deployment as in [Kuntz2015], and what it does; bare tubes have no system.
 
-    Args:
-        system: None for bare tubes.
-        final: The deployed tubes; if they snap before, an equilibrium that this sequence does not reach.
-        deployed: All steps; None if the tubes snap.
+    `final` are the deployed tubes: if they snap before, an equilibrium that this sequence does not reach.
+    Then there are no steps in `deployed`.
     """
 
     name: str
@@ -130,10 +128,8 @@ def deploy_tubes(
 ) -> TubeAnswer:
     """Turn, insert both tubes, insert the inner one, and look at every step.
 
-    Args:
-        outer_mm, inner_mm: How far the tubes come out of the scope.
-        rotation_rad: Direction of the inner tube's bend about +z of the scope tip, from its +x, as in a plan.
-        relative_rad: How much farther the base of the outer tube is turned.
+    The direction of the inner tube's bend about +z of the scope tip is `rotation_rad` from its +x, as in a
+    plan, and the base of the outer tube is turned `relative_rad` farther.
 
     Raises:
         SettingsError: If the insertions are impossible, nothing comes out, or an angle is more than a turn.
@@ -263,10 +259,7 @@ def tubes_of(device: System | BareTubes) -> tuple[Tube, ...]:
 
 
 def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None) -> TubeShapes:
-    """Return the shapes of a design, from the cache if they are there.
-
-    Args:
-        device: The limits are those of the system; bare tubes have those of `ShapeLimits()`.
+    """Return the shapes of a design, from the cache if they are there; bare tubes have default limits.
 
     Raises:
         SettingsError, FileError: As `stages.tube.open_shapes`.

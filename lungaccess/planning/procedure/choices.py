@@ -29,12 +29,9 @@ DRAWS = 16
 
 @frozen_record
 class Offer:
-    """Deployments to choose from, the planned one first.
+    """Deployments to choose from as the kernels take them, the planned one first.
 
-    Args:
-        choices: As the kernels take them.
-        deployed (tuple of (float, int)): Rotation and shape of each but the planned one, see
-            `DeploymentValidator.choose`.
+    `deployed` has rotation and shape of each but that one, see `DeploymentValidator.choose`.
     """
 
     choices: Choices

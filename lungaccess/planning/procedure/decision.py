@@ -41,8 +41,8 @@ class Measurements:
 
     Args:
         scope, tubes, needle (tuple of poses): Of the tips, each as often as it was measured where it stood;
-            the mean of several is taken.  A new deployment or another place of the needle begins a new record
-            of its stage.
+            the mean of several is taken.  A new deployment or another place of the needle begins a new
+            record.
         target_lps (tuple of 3 floats or None): The target as an image shows it before the needle starts.
         placements: How often the scope has been placed, this time included.
     """
@@ -89,14 +89,12 @@ class Measurements:
 
 @frozen_record
 class Decision:
-    """What to do next.
+    """What to do next, with the chance of success of the best way to go on, which is `tube` and `needle`.
 
     Args:
-        chance: Estimated chance of success of the best way to go on, which is `tube` and `needle`.
         again: Chance that placing the scope again promises; 0 where it may not be.
         lps_from_device ((4, 4) float64): Where the tip that was measured last most likely is, LPS mm.
         tube: How the tubes are to be deployed; None where they are out.
-        needle: Where the needle is to go; None without one.
         branch: The branch that is pierced.
     """
 

@@ -76,8 +76,7 @@ class Insertion:
         lps_from_tip ((N, 4, 4) float64): Where the tip really was, the start first.
         inserted_mm ((N,) float64): Length of needle at each of these poses.
         touched: Names of the forbidden structures that tubes or needle touch.
-        target_lps ((3,) float64, LPS mm): Where the target really is.
-        tip_error_mm: Distance from the tip to it, wherever the insertion ended.
+        target_lps, tip_error_mm: Where the target really is, LPS mm, and how far from it the tip ended.
         factor: True curvature over the commanded one.
         believed_factor: What is believed of it in the end; nan of a needle that nobody watched.
     """
@@ -133,10 +132,8 @@ class Summary:
 class InsertionStudy:
     """What came of the same needles, inserted blindly and with the tracker.
 
-    Args:
-        errors: Of needle and target alone.
-        tolerance_mm: A tip that ends no farther from the target has reached it.
-        query, path: What was inserted.
+    The errors are of needle and target alone.  A tip that ends no farther than `tolerance_mm` from the target
+    has reached it.
     """
 
     steering: NeedleSteering

@@ -73,11 +73,9 @@ _SEED = 2
 
 
 class Placed(NamedTuple):
-    """Where N tips of the scope are that were measured.
+    """Most likely poses `(N, 4, 4)` of tips of the scope that were measured.
 
-    Args:
-        frames ((N, 4, 4) float64): Their most likely poses.
-        drawn ((N, DRAWS, 3) float64): Places where each may be.
+    `drawn` `(N, DRAWS, 3)` are places where each may be.
     """
 
     frames: Float
@@ -89,11 +87,9 @@ class Chosen:
     """What was chosen in N procedures.
 
     Args:
-        frames ((N, 4, 4) float64): Most likely poses of the scope's tip.
-        tips ((N, 4, 4) float64): Where the needle is expected to start.
+        frames, tips ((N, 4, 4) float64): Most likely poses of the scope's tip, and where the needle starts.
         found ((N, 3) int64): Number of the deployment, arcs of the needle's path, and pierced branch.
-        arcs ((N, A, 3) float64): Paths of the needle.
-        changed ((N,) bool): Whether the path is another one than was planned before.
+        arcs, changed ((N, A, 3), (N,)): Paths of the needle, and whether they are others than planned before.
         tubes ((N, 11) float64): Planar tubes as kernels take them; none of others.
         deployed: Of each procedure, where the system has no needle or its tubes are not planar; else empty.
     """
@@ -116,12 +112,9 @@ class Chosen:
 
 
 class OnTheWay(NamedTuple):
-    """A needle on its way.
+    """A needle on its way: arcs `(A, 3)` that were to follow, and what lies behind from the tip of the tubes.
 
-    Args:
-        rest ((A, 3) float64): Arcs that were to follow.
-        inserted_mm, turned_rad: What lies behind, from the tip of the tubes.
-        reference ((3,) float64): Direction of the needle at that tip.
+    `reference` `(3,)` is the direction of the needle at that tip.
     """
 
     rest: Float
@@ -134,8 +127,7 @@ class OnTheWay(NamedTuple):
 class Policy:
     """Tells what to do next in a procedure that carries out a plan; what it prepares serves all answers.
 
-    Attributes:
-        errors: By which measurements are weighed against what was expected.
+    Measurements are weighed by the errors against what was expected.
 
     Args:
         errors: The preset `breath-hold` if None.
@@ -304,12 +296,9 @@ class Policy:
         return (*worth, *[0.0] * (scope.placements - len(worth)))
 
     def goes_on(self, chances: Float, left: int, *, tubes_out: bool = False) -> Bool:
-        """Tell which procedures go on with what was chosen: the others place the scope again, or stop.
+        """Tell which procedures go on with what was chosen (N,): the others place the scope again, or stop.
 
-        Args:
-            chances: (N,) float64.
-            left: How often the scope may be placed again.
-            tubes_out: Whether the tubes are out already.
+        The scope may be placed again `left` times.
         """
         # Tubes that are out are drawn back only where another placement promises so many times as much, since
         # each leaves a channel in tissue.
@@ -398,11 +387,8 @@ class Policy:
     ) -> tuple[Float, float, bool]:
         """Return the arcs `(A, 3)` left for a needle on its way, their chance, and if any path is proved.
 
-        Args:
-            way: What has been done and was to follow.
-            lps_from_tip ((4, 4) float64): Where the needle's tip is taken to be.
-            target: (3,) float64, LPS mm.
-            curvature_share: Share of its largest curvature that the needle reaches in this tissue.
+        The needle's tip is taken to be at `lps_from_tip`; `curvature_share` is the share of its largest
+        curvature that the needle reaches in this tissue.
         """
         limits, count, steering = self._scene.limits, len(way.rest), self.procedure.needle
         turned = math.acos(min(max(float(way.reference @ lps_from_tip[:3, 2]), -1.0), 1.0))

@@ -12,11 +12,10 @@ NO_PATH = "no path left"
 
 @frozen_value
 class StageReport:
-    """What planning again after one stage did.
+    """What planning again after one stage did; of the replans, `without_path` found none.
 
     Args:
         stage: "scope", "tube" or "needle": what was measured.
-        without_path: Of these, how many found none.
         corrected_mm: Median distance from the target at which the plan so far would have ended if it had gone
             on from the pose as measured; nan where the stage was not measured.
     """

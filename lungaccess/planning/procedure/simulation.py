@@ -90,16 +90,10 @@ def simulate_procedure(
     """Return how often a procedure succeeds that measures on its way and plans the rest again.
 
     Each sample is a new patient.  The scope is placed and measured; the tubes go out and are measured; the
-    needle is inserted, blindly or measured on its way.  After each measurement `Policy` says what to do next.
-    What the devices then really did is looked at by the kernel of `assess`.  The same seed gives the same
-    report, whatever the number of processes; without measuring it is that of `assess` with these draws.
-
-    Args:
-        errors: The preset `breath-hold` if None.
-        procedure: The preset `open-loop` if None.
-        radius_mm: Radius of the goal; see `RiskAssessor`.
-        processes: How many processes share the work; one does all where the system cannot fork, as on
-            Windows.
+    needle is inserted, blindly or measured on its way.  After each measurement `Policy`, whose parameters
+    these are, says what to do next.  What the devices then really did is looked at by the kernel of `assess`.
+    The same seed gives the same report, whatever the number of processes, which is one where the system
+    cannot fork; without measuring it is that of `assess` with these draws.
 
     Raises:
         PlanFileError, SettingsError: See `RiskAssessor`; also if there are no samples or processes.
@@ -430,12 +424,10 @@ def steered(
     doubt: Float,
     rng: np.random.Generator,
 ) -> Steered:
-    """Return what comes of a needle that is measured on its way.
+    """Return what comes of a needle that begins with a path and is measured on its way.
 
-    Args:
-        path: What it begins with.
-        true_tip ((4, 4) float64): Where it truly starts.
-        doubt ((6, 6) float64): Covariance of where it is taken to start, see `stages.needle.Unknown`.
+    It truly starts at `true_tip` (4, 4); `doubt` (6, 6) is the covariance of where it is taken to start, see
+    `stages.needle.Unknown`.
     """
     steering = policy.procedure.needle
     query = Query(lps_from_start=path.lps_from_start, target=target, branch=branch)

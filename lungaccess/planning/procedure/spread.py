@@ -74,14 +74,11 @@ there for the errors that come after."""
 
 
 class Spread:
-    """Direct arcs of the needle from deployments to one target, with what the errors do to each.
+    """Direct arcs of the needle from N deployments to one target, with what the errors do to each.
 
-    Without a needle the tubes end at the target, where a needle of no length shows what the errors do.
-
-    Args:
-        tips ((N, 9) float64): Point, direction and +x of the scope tip of each deployment, LPS mm.
-        deployments: N of them.
-        radius_mm: Radius of the goal.
+    Without a needle the tubes end at the target, where a needle of no length shows what the errors do.  The
+    tips `(N, 9)` are point, direction and +x of the scope tip of each, LPS mm; `radius_mm` is that of the
+    goal.
     """
 
     def __init__(

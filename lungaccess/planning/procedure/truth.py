@@ -166,10 +166,8 @@ def unknown_of(errors: ErrorModel, steering: NeedleSteering, start: Float) -> Un
 class Steered:
     """What came of one needle that was measured and planned again on its way.
 
-    Args:
-        arcs ((A, 3) float64): True arcs from the true tip of the tubes.
-        stopped: Why it stopped before its end.
-        factor: What is believed in the end of the true curvature over the commanded one.
+    Its true arcs `(A, 3)` begin at the true tip of the tubes; `factor` is what is believed in the end of the
+    true curvature over the commanded one.
     """
 
     arcs: Float
@@ -191,10 +189,9 @@ def insert_needle(
 ) -> Steered:
     """Insert a needle from a true tip of the tubes, watched by a tracker and planned again on its way.
 
-    Args:
-        environment: In which the needle goes on without a new path as long as the old one is clear.
-        query, path: What is planned for, from where the tip is taken to be, and the path to follow first.
-        attempt, true_tip, steering, unknown, rng: See `SteeredTruth` and `Belief`.
+    It is planned for `query`, from where the tip is taken to be, and follows `path` first; in the environment
+    it goes on without a new path as long as the old one is clear.  For the rest see `SteeredTruth` and
+    `Belief`.
     """
     needle = TrueNeedle(SteeredTruth(attempt, steering, rng), true_tip, 0.0)
     belief = Belief(query, unknown, steering.latency_mm)

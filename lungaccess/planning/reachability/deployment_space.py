@@ -152,13 +152,9 @@ TASK_BOXES = 2048
 
 @frozen_record
 class DeploymentSpace:
-    """Boxes that hold all deployments of a system in a lung, M of P pieces of the airway.
+    """Boxes `(M, BOX_COLUMNS)` that hold all deployments of a system in a lung, with the piece of each.
 
-    Args:
-        boxes ((M, BOX_COLUMNS) float64): See `lungaccess.planning.reachability.kernels.deployment_boxes`.
-        owners ((M,) int32): The piece of each.
-        measures ((M,) float64): Of each: mm^3 of places x rad^2 of directions x rad of rotations x mm^2 of
-            insertions.
+    `measures` are mm^3 of places x rad^2 of directions x rad of rotations x mm^2 of insertions.
     """
 
     pieces: tuple[PlacePiece, ...]
@@ -179,10 +175,7 @@ def divided_space(
 ) -> DeploymentSpace:
     """Halve the boxes of all pieces, the largest first, and drop those that hold no deployment.
 
-    Args:
-        environment: Its `passable` does not count.
-        insertions ((N,) float64): See `greatest_insertions`.
-        between: Called now and then.
+    The `passable` of the environment does not count; `between` is called now and then.
     """
     arrays = _as_arrays(pieces)
     boxes, owners = _first_boxes(tubes, float(insertions.max()), pieces)

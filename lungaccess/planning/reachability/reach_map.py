@@ -64,12 +64,10 @@ STATES: dict[str, tuple[str, ...]] = {
 
 @frozen_value
 class RegionReach:
-    """How much of a region a system reaches.
+    """How much of a region, in mL of lung tissue that is no obstacle, a system reaches.
 
-    Args:
-        volume_ml: Lung tissue that is no obstacle.
-        shares: Its shares by the order of `KINDS`; all 0 if there is no such tissue.
-        median_cost, median_clearance_mm: Of what is reached; nan if nothing is.
+    The shares are by the order of `KINDS`, all 0 if there is no such tissue; medians are of what is reached,
+    nan if nothing is.
     """
 
     name: str
@@ -94,16 +92,14 @@ class RegionReach:
 
 @frozen_record
 class ReachMap:
-    """What a system reaches in a lung.
+    """What a system reaches in a lung; all volumes are on one grid.
 
     Args:
         kinds (Volume of uint8): `NOT_COUNTED` or one of `KINDS` at each voxel, classified by its centre.
         cost, clearance_mm (Volume of float32): Estimated integral of 1 / clearance of the best path found,
             and the clearance that it keeps beyond the exempt length of the needle; 0 where there is none.
-        deployment (Volume of int32): Number of the deployment of the atlas from which that path starts; -1
-            where there is none.
-        regions: Side and lobe of each voxel, on the same grid.
-        trees: Random trees for each point, see `map_reach`.
+        deployment (Volume of int32): Number of the deployment of the atlas from which that path starts, or
+            -1.
         resumed_layers: Layers of voxels that an earlier run had finished.
         phases (tuple of 2 floats or None): Phases of the breath in all of which voxels count as reached; None
             for the masks' alone.
@@ -241,13 +237,12 @@ def map_reach(
     resumed or not.
 
     Args:
-        spacing_mm: Side of the map's voxels.
         arcs, trees: See `stages.needle.reach.ReachScan`.
         phases (tuple of 2 floats): Phases of the breath in all of which a voxel has to be reached, by single
             arcs; a voxel takes a hundred times as long, so that a spacing of 10 mm is apt.
         atlas: Made with `build_atlas` beforehand; made here if None.
-        work: Folder where finished layers are kept, so that a later call with the same inputs goes on from
-            there.  Emptied of them when the map is complete.
+        work: Folder where finished layers are kept until the map is complete, so that a later call with the
+            same inputs goes on from there.
 
     Raises:
         SettingsError: If spacing, arcs or trees are out of range, trees are asked for without a needle, or
@@ -351,13 +346,10 @@ FIRST_POINTS, MOST_POINTS = 32, 256
 
 @frozen_record
 class ReachPart:
-    """What became of N points of a grid.
+    """What became of N points of a grid, by the numbers of their voxels, C order: one of `KINDS` each.
 
-    Args:
-        voxels ((N,) int64): Numbers of the voxels in the grid, C order.
-        kinds ((N,) uint8): One of `lungaccess.planning.reachability.KINDS`.
-        entries ((N,) int64): The deployment of the atlas whose arc is proved clear; -1 where there is none.
-        share: Share of the grid's counted voxels that is known with this part.
+    `entries` are deployments of the atlas whose arcs are proved clear, -1 for none; `share` is that of the
+    counted voxels that is known with this part.
     """
 
     voxels: Int
@@ -369,11 +361,7 @@ class ReachPart:
 class ReachStream:
     """Tells which points of a coarse grid a system reaches by single arcs, part by part.
 
-    Args:
-        atlas: The deployments, made for this lung, scope and tubes.
-
-    Attributes:
-        counted ((M,) int64): Numbers of the voxels whose centre lies in lung tissue that is no obstacle.
+    `counted` (M,) are numbers of the voxels whose centre lies in lung tissue that is no obstacle.
 
     Raises:
         SettingsError: If the atlas belongs to another lung or system.
@@ -389,12 +377,9 @@ class ReachStream:
     def parts(self, around_lps: ArrayLike, known: Int | None = None) -> Iterator[ReachPart]:
         """Yield all counted voxels, those nearest to a point `(3,)` LPS mm first.
 
-        What neighbouring points have in common is found once, so that parts become larger.
-
-        Args:
-            known ((V,) int64): A deployment for each voxel of the grid, -1 for none, from which another
-                needle reached it: where its arc is clear for this needle, too, the voxel is in the first
-                part.
+        What neighbouring points have in common is found once, so that parts become larger.  `known` (V,) are
+        the deployments, -1 for none, from which another needle reached the voxels of the grid: where that arc
+        is clear for this needle, too, the voxel is in the first part.
         """
         points = self.grid.lps(np.stack(np.unravel_index(self.counted, self.grid.shape), axis=1))
         order = np.argsort(np.linalg.norm(points - np.asarray(around_lps), axis=1), kind="stable")

@@ -48,11 +48,10 @@ class OpenPlace:
     """A stretch of an airway branch from which deployments could not be ruled out.
 
     Args:
-        branch, generation: See `anatomy.airway_tree.AirwayTree`.
         name: The number of the branch, with its lobe if that is known.
         points_lps ((N, 3) float64): Its tree points, LPS mm.
-        tip_lps ((3,) float64): Place of the scope tip, LPS mm, in the middle of a part that was left.
-        insertions_mm: Of the outer and the inner tube there.
+        tip_lps, insertions_mm: Place of the scope tip, LPS mm, and insertions of the outer and the inner tube
+            in the middle of a part that was left.
         share: Of the deployment space that is open here.
         narrowest: Whether such a part was too small to halve; else the budget ended before.
     """
@@ -120,14 +119,12 @@ NO_NEEDLE = Limits(**dict.fromkeys(Limits._fields, 0.0) | {"kappa": 1.0})
 
 @frozen_record
 class ReachVerdict:
-    """Whether a target is proved unreachable, and what is left if not.
+    """Whether a target is proved unreachable; if not, nothing is known of it but what is left.
 
     Args:
-        proved: If not, nothing is known of the target.
-        share_ruled_out: Share of the deployment space that is proved not to reach the target; 1 if all of it
-            is.
-        finished: Whether every box is ruled out or has a part that is too small to halve; else the budget was
-            used up.
+        share_ruled_out: Share of the deployment space that is proved not to reach the target.
+        finished: Whether every box is ruled out or has a part that is too small to halve; else the budget
+            ended.
         open_places: Where the deployments start that could not be ruled out, the largest share first.
         rests_on: On which masks a proof rests, and what of them is in doubt.
     """

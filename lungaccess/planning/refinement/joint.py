@@ -32,7 +32,7 @@ BETTER = 1e-3
 
 
 def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) -> Candidate | None:
-    """Improve everything about a candidate together.
+    """Improve everything about a proved candidate together.
 
     A nonlinear program moves the place where the scope stops, the tubes and all arcs of the needle at once.
     What it finds is put back into the numbers of a plan and proved by the evaluator, so nothing is returned
@@ -40,13 +40,12 @@ def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) ->
     a time.
 
     Args:
-        candidate: Proved by the evaluator.
         iterations: Most steps of the program's solver, each time it runs (two or three times a call).  For
             each number a program is built at the first call, which takes a second or two.
 
     Returns:
         Cheaper than the one given by BETTER or more, or None; always None for an objective that the program
-        cannot express: see `lungaccess.planning.refinement.problem.program_weights`.
+        cannot express: see `program_weights`.
     """
     weights = program_weights(task)
     if len(candidate.path.arcs) > ARC_COUNTS[-1] or weights is None:
@@ -82,11 +81,9 @@ def _refined(
 
 @frozen_record
 class Placement:
-    """Proved scope and tubes, and the program's variables there.
+    """Proved scope and tubes, and the program's variables `x` there, whose site counts from `tip`.
 
-    Args:
-        share: Share of the step from the candidate (0) to what the program found (1).
-        x ((n,) float64): The site counts from `tip`.
+    `share` is that of the step from the candidate (0) to what the program found (1).
     """
 
     share: float

@@ -38,13 +38,10 @@ N_FEATURES = 3 * (CURVE_DEGREE + 1) + 10
 
 @frozen_value
 class Layout:
-    """The shape of a program.
+    """The shape of a program: how many arcs and tubes there are, and how many tubes are turned.
 
-    Args:
-        tubes, turned: How many tubes there are, and how many of them are turned against the others.
-        weighs_tubes: Whether the objective looks at the tubes, too.
-        zone_points, tube_points, wall_points: Samples of the needle's exempt length, and of the tubes behind
-            and before the exit.
+    `zone_points`, `tube_points` and `wall_points` are samples of the needle's exempt length, and of the tubes
+    behind and before the exit.
     """
 
     arcs: int
@@ -180,13 +177,7 @@ def _end(places: dict[str, slice]) -> int:
 
 @frozen_record
 class Numbers:
-    """The numbers of one call of a program.
-
-    Args:
-        parameters: (P,) float64.
-        lower, upper ((n,) float64): Bounds of the variables.
-        least, most ((m,) float64): Bounds of the constraints.
-    """
+    """The parameters of one call of a program, and bounds of its variables and of its constraints."""
 
     parameters: Float
     lower: Float
@@ -207,12 +198,8 @@ class ShapeModel:
     """The features of a design's shapes near one of them.
 
     Features are the Chebyshev coefficients of the curve by its share of the length, point, direction and +x
-    of the tip, all in the frame of the scope tip, and what has to be free beside the tubes.
-
-    Args:
-        shape: The one about which the polynomials are made.
-        most_mm: No tube is inserted farther.
-        constant: Whether only that shape is asked for.
+    of the tip, all in the frame of the scope tip, and what has to be free beside the tubes.  No tube is
+    inserted farther than `most_mm`; only the one shape is asked for if the model is to be constant.
 
     Attributes:
         centre, lower, upper ((m,) float64): The joints of the shape and how far they may be moved: all

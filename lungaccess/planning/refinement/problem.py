@@ -159,13 +159,9 @@ def program_weights(task: Task) -> Weights | None:
 
 
 class Problem:
-    """The program's numbers for one candidate.
+    """The program's numbers for one candidate, which has at most as many arcs as the last of ARC_COUNTS.
 
-    Args:
-        candidate: With at most as many arcs as the last of ARC_COUNTS.
-
-    Attributes:
-        start ((n,) float64): The candidate as variables.
+    `start` is the candidate as variables.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, candidate: Candidate, weights: Weights) -> None:

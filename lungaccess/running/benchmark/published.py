@@ -46,12 +46,7 @@ NO_STARTS = "no query: the patient came without start poses"
 
 @frozen_record
 class PublishedQuery:
-    """One start pose and one target of a patient, both counted from 1.
-
-    Args:
-        lps_from_start: (4, 4) float64.
-        target_lps: (3,) float64, LPS mm.
-    """
+    """One start pose `(4, 4)` and one target of a patient, LPS mm, both counted from 1."""
 
     patient: str
     start: int
@@ -146,10 +141,7 @@ class UncObstacles:
     ) -> NeedleEnvironment:
         """Return the labels in a box about start and target, less the exempt ball, as an environment.
 
-        Args:
-            lps_from_start: (4, 4) float64.
-            target_lps: (3,) float64, LPS mm.
-            exempt_mm: Obstacle voxels whose centres lie so near to the start do not count.
+        Obstacle voxels whose centres lie within `exempt_mm` of the start do not count.
         """
         ends = np.stack([lps_from_start[:3, 3], target_lps])
         # Obstacles are cut out so far around a query; a path that leaves this box is too long.
@@ -192,11 +184,9 @@ def unc_obstacles(images: PatientImages | LiverImages) -> UncObstacles:
 class PeerResult:
     """What was recorded for one query: the kind of run that solved it most often, and then soonest.
 
-    Args:
-        runs, solved: Of this kind.
-        first_cpu_ms, length_mm: Medians of its solved runs: processor time to the first path, and the length
-            of the last one with the distance that it leaves to the target.
-        refused: Whether the peer refused the query before planning: no run was made.
+    Time and length are medians of its solved runs: processor time to the first path, and the length of the
+    last one with the distance that it leaves to the target.  Where the peer refused the query, no run was
+    made.
     """
 
     planner: str

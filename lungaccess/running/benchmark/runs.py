@@ -44,8 +44,7 @@ class BenchmarkRow:
         clearance_mm, needed_clearance_mm: Least distance from the path's axis to obstacles, where the exit is
             not exempt, and what it must be.
         reason: Why there is no path; "" if there is one.
-        arcs: The last path from the published start: "length_mm", "roll_rad" and "curvature_per_mm" of each
-            arc, as `stages.needle.ArcPath` has them; no arcs if there is none.
+        arcs: The last path from the published start, as `ArcPath.arc_records` has it.
     """
 
     patient: str

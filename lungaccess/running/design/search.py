@@ -30,8 +30,7 @@ class DesignFound:
 
     Args:
         counted: The devices that were tried on every target, the one that the search began with first.
-        front: Those of them that no other surpasses; the first, which has most of the first criterion, is the
-            best.
+        front: Those of them that no other surpasses; the first has most of the first criterion.
         tried: Devices that were tried on some targets.
         refused (mapping of str to (int, str)): How many the validator of devices refused, and its words, by
             the key that it objects to.

@@ -210,12 +210,9 @@ def value_at(system: System, path: str) -> Any:
 
 @frozen_value
 class Contender:
-    """A device, for each target counted whether the check accepts a plan, and what is made large.
+    """A device, for each target whether the check accepts a plan, and the criteria of the search.
 
-    Args:
-        chances: For each target, the chance of success of its plan; 0 without one, or where no errors are
-            stated.
-        values: The criteria of the search, in their order.
+    The chance of success of a plan is 0 without one, or where no errors are stated.
     """
 
     system: System

@@ -56,12 +56,9 @@ def run_study(
 ) -> StudyDone:
     """Make the runs of a study that a results file does not have, and store them there one by one.
 
-    The results file is made if it is not there.
-
-    Args:
-        scheduler: Address of a running dask scheduler; processes on this machine if None.
-        workers: How many processes on this machine; as many as there are cores if None.
-        cache: Folder of prepared anatomies and atlases, on every machine; the usual one if None.
+    The results file is made if it is not there.  A dask scheduler at an address, or else so many processes on
+    this machine, make the runs; all cores if None.  Every machine has the cache of prepared anatomies and
+    atlases.
 
     Raises:
         SettingsError: If both a scheduler and a number of workers are given.
@@ -288,13 +285,8 @@ def each_done(
 ) -> Iterator[tuple[T, Any]]:
     """Yield each piece of work with what became of it, in the order in which they end.
 
-    Only a few pieces wait at the scheduler at any time.
-
-    Args:
-        work: Receives a piece and `more`, on a worker.
-
-    Yields:
-        The piece with what `work` returned for it, or the error that it raised at every try.
+    `work` receives a piece and `more`, on a worker; what became of it is what it returned, or the error that
+    it raised at every try.  Only a few pieces wait at the scheduler at any time.
 
     Raises:
         StudyError: If the scheduler is lost.

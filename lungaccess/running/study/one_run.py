@@ -72,9 +72,6 @@ class Opened(NamedTuple):
 def answer(run: Run, cache: Path | None = None) -> Answer:
     """Make a run and return what it ended with.
 
-    Args:
-        cache: Folder of prepared anatomies and atlases; `anatomy.base.cache.default_cache()` if None.
-
     Raises:
         FileError: If a file cannot be read or written here; whatever else is not the run's own answer is
             raised, too.

@@ -355,10 +355,9 @@ class Answer:
         message, advice: Why there is no plan, and what would help.
         time_s, cpu_s: Of the whole run, without opening the patient.
         memory_mb: Resident memory of the process after the run, MiB.
-        accepted: Whether the independent check accepts the plan; for a needle path, whether nothing objects
-            to it.
+        accepted: Whether the independent check accepts the plan; nothing objects to the path of a needle.
         costs: By the keys of `stages.needle.TERMS`.
-        findings: What the check looked at; see `lungaccess.judging.checking.findings.Finding.to_mapping`.
+        findings: What the check looked at, see `Finding.to_mapping`.
         rejections: The reasons of `NoPlan`, counted.
         plan: JSON of the plan or of the needle's path; "" if there is none.
         digest: Hash of the plan without its times.

@@ -51,16 +51,12 @@ class Case:
 
     Args:
         anatomy: "phantom", or a patient's folder; a relative one is relative to the study's file.
-        phantom: Which one, for the anatomy "phantom".
         system: Preset, or TOML file relative to the study's file.
         fissures_allowed: Whether fissures may be crossed; None for what the system says.
-        objective: What plans are made good at, unless a planner states a goal; see
-            `lungaccess.problem.request.goal_of`.
+        objective: What plans are made good at, unless a planner states a goal; see `goal_of`.
         errors, procedure: Error model and procedure under which the chance of success of each plan is
-            counted: presets, or TOML files relative to the study's file.  Without errors no chance is
-            counted.
-        targets: "ras:x,y,z", "lps:x,y,z", "nodule" or "nodule N".
-        peripheral: Random targets, after those that are stated.
+            counted: presets, or TOML files relative to the study's file.  Without errors none is counted.
+        targets: "ras:x,y,z", "lps:x,y,z", "nodule" or "nodule N"; `peripheral` adds random ones.
         starts: For needle planners: numbers of the start poses that came with the patient.
     """
 
@@ -91,12 +87,11 @@ class PlannerChoice:
 
     Args:
         kind: "plan" for all three stages, "needle" for the needle alone from the case's start poses.
-        method: One of `lungaccess.planning.searches.planners`; for the needle, one of
-            `stages.needle.NEEDLE_PLANNERS`.
+        method: One of `lungaccess.planning.searches.planners`, or for the needle of `NEEDLE_PLANNERS`.
         goal: For "plan", what plans are made good at instead of the case's objective, such as "success".
         own_process: Whether each run has a fresh process; OMPL's planners have one in any case.
-        without_counterfactuals: Whether a run of "plan" that finds nothing goes without the search for a
-            device that would.
+        without_counterfactuals: Whether a run that finds nothing goes without the search for a device that
+            would.
     """
 
     name: Annotated[str, text("name of the planner in tables")]

@@ -98,13 +98,10 @@ def table(results: ResultsFile, name: str) -> Table:
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """Compare every row of two results files, but for times and memory.
+    """Compare every row of two results files, but for times and memory; return at most `MOST` differences.
 
     Runs, costs over iterations, findings, rejections and plans are compared value by value; a number must be
     the same to the last bit.
-
-    Returns:
-        What differs, in words, at most `MOST`; empty if nothing does.
 
     Raises:
         FileError: If a file cannot be read.
@@ -141,10 +138,7 @@ def _short(row: tuple[Any, ...]) -> str:
 
 
 def export_csv(path: Path, folder: Path) -> list[Path]:
-    """Write the tables of a results file as CSV with a heading; numbers are written without loss.
-
-    Returns:
-        The files written.
+    """Write the tables of a results file as CSV with a heading, numbers without loss; return the files.
 
     Raises:
         FileError: If the results cannot be read or the folder cannot be written.
@@ -229,15 +223,12 @@ ORDER BY p.case_name, p.objective, c.name, r.key"""
 
 @frozen_value
 class Group:
-    """The runs of one case with one planner.
+    """The runs of one case with one planner; those that `failed` will be made again and count nowhere else.
 
     Args:
-        failed: Of the runs, those that could not be made and will be made again; they count nowhere else.
-        solved_share: Share of the runs with a plan.
         accepted_share: Share of the plans that the check accepts; 0 if there is none.
         first_plan_s: Median and largest planning time of the first plan.
-        cost: Median cost of the best plans.
-        success: Median chance of success of the best plans; None where the study counts none.
+        cost, success: Medians of the best plans; the chance is None where the study counts none.
     """
 
     case: str

@@ -29,12 +29,10 @@ def chord_mm(curvature_per_mm: float) -> float:
 
 
 class Solid:
-    """Some voxels of a lung as solid boxes.
+    """The voxels of a lung whose labels `holds` accepts, as solid boxes.
 
-    Args:
-        holds: Tells from labels `(...,)` uint16 which voxels belong to it.
-        low, high ((3,) int64): Window of voxels; the solid is known in it only.  By default the whole grid,
-            and OUTSIDE beyond it.
+    It is known in a window of voxels from `low` to `high` alone; by default in the whole grid, and OUTSIDE
+    beyond.
     """
 
     def __init__(
@@ -49,12 +47,9 @@ class Solid:
         self._surface = MeshDistance(box_surface(holds(labels), grid, beyond=beyond))
 
     def is_near(self, line_lps: Float, distance_mm: float) -> bool:
-        """Tell whether a polyline comes as near as `distance_mm` to the solid, or lies inside it.
+        """Tell whether a polyline `(N, 3)`, LPS mm, comes within `distance_mm` of the solid, or into it.
 
         A line that does not touch the surface lies on one side of it.
-
-        Args:
-            line_lps: (N, 3) float64, LPS mm.
         """
         if self._holds(self._lung.grid.values_at(self._lung.labels, line_lps, OUTSIDE)).any():
             return True
@@ -239,13 +234,10 @@ class NeedleRRT:
         iterations: int | None = None,
         time_s: float | None = None,
     ) -> ArcPath | None:
-        """Return a path from a start pose to the goal, or None when the budget is spent.
+        """Return a path from a start pose `(4, 4)` to the goal, or None when the budget is spent.
 
-        Args:
-            lps_from_start: (4, 4) float64.
-            goal_lps: (3,) float64, LPS mm.
-            iterations: Samples drawn; each is followed by one step towards the goal.
-            time_s: Processor time of this thread.
+        Each of the `iterations` is a sample and one step towards the goal; `time_s` is processor time of this
+        thread.
         """
         tree = Tree(lps_from_start)
         deadline = math.inf if time_s is None else time.thread_time() + time_s

@@ -63,12 +63,9 @@ class ReferenceSearch(ParallelSearch):
     validated too.  A path that is found is yielded only if the planner's proof accepts it.
 
     Args:
-        task, atlas, rejects: See `lungaccess.planning.coupled.search.needle_planner.KuntzSearch`.
         rrt_iterations: Samples of each RRT: the same seed then gives the same plans.
-        rrt_time_s: Processor time of each RRT instead, 0.05 in the paper.  Such a run cannot be repeated
-            exactly.
-        obstacles: Those of another search in the same lung; its meshes, which take long to make, are then
-            shared.
+        rrt_time_s: Processor time of each RRT instead, 0.05 in the paper, which cannot be repeated exactly.
+        obstacles: Those of another search in the same lung, whose meshes take long to make.
 
     Attributes:
         counts: What became of the placements: `FOUND`, or why none was.

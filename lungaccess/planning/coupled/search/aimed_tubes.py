@@ -92,10 +92,8 @@ class TubeAiming:
 
         Args:
             ends ((3,) or (K, 3) float64, LPS mm): Where they are to end.
-            tips: (K, 9) float64.
-            allowed ((K,) bool): Which of them the scope can take.
+            tips, allowed ((K, 9) float64 and (K,) bool): Scope tips, and which of them the scope can take.
             row_of ((N,) int64): The tip of each attempt.
-            starts: From which each begins.
             enough: So many deployments end the attempts; 0 to make all of them.
 
         Returns:
@@ -208,16 +206,12 @@ def reasons_of(why: Int) -> dict[str, int]:
 class AimedTubes:
     """The deployments, from the scope tips of an atlas, that end at the target of a task or beside it.
 
-    Args:
-        evaluator: Made of the task if None.
-        aims ((S, 3) float64): Where the tubes from each scope tip end, LPS mm, nan for none; at the target if
-            None.
+    Parameters are those of `DirectArcs`.
 
     Attributes:
         promising ((N,) int64): Entries of the atlas from which the tubes are aimed, one for each scope tip,
             the nearest first.
-        nearest_mm: Distance of the target from the nearest tip of the tubes in the atlas; infinite if there
-            is none.
+        nearest_mm: Distance of the target from the nearest tip of the tubes in the atlas, or infinite.
     """
 
     def __init__(
@@ -306,11 +300,7 @@ class TubeSearch(ParallelSearch):
     """Aims the tubes at the target from the tips of the atlas, then from tips along the motions of the best.
 
     It ends when it has looked along the motions of all tips with a deployment to the target that differ.
-
-    Attributes:
-        blocked: How many attempts were refused, by the reason.
-        clear ((C,) int64): After the direct steps the entries of the atlas with a deployment to the target,
-            the cheapest first.
+    After the direct steps `clear` (C,) has the entries with a deployment to the target, the cheapest first.
     """
 
     def __init__(self, task: Task, atlas: Atlas, aimed: AimedTubes | None = None) -> None:

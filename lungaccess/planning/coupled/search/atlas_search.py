@@ -218,12 +218,7 @@ SPREADS = np.array([math.radians(15.0), 2.0])
 
 
 class LocalSampling:
-    """Samples deployments near entries of an atlas.
-
-    Args:
-        local_search: Has the arguments of the kernels.
-        chosen ((N,) int64): Entries of the atlas, at least one.
-    """
+    """Samples deployments near entries `chosen` (N,) of an atlas, at least one."""
 
     def __init__(
         self, local_search: LocalSearch, arcs: DirectArcs, chosen: Int, rng: np.random.Generator
@@ -277,13 +272,10 @@ def sampling_near_target(
 
 
 def nearly_reaching(atlas: Atlas, needle: Needle, target: Float, most: int) -> Int:
-    """Return `most` entries whose single arc to the target exceeds the needle's limits, nearest misses first.
+    """Return `most` entries whose single arc to a target (LPS mm) exceeds the limits, nearest misses first.
 
     A miss is how far the target lies from the needle's workspace, or less.  It counts in relation to how far
     a variation of the deployment moves that workspace: a few mm, and more with the distance from the tubes.
-
-    Args:
-        target: (3,) float64, LPS mm.
     """
     entries = atlas.deployments
     offset = target - entries.positions

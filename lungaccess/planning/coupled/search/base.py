@@ -31,16 +31,11 @@ class SearchSettings:
         kept_slack: Direct arcs that cost up to so many times the cheapest may be starts of local searches.
         starts: Direct arcs with which the first successive halving begins.  More of them find a good region
             more surely, and leave less work for each.
-        rungs: Rungs of a successive halving.
         rung_iterations: Iterations of each local search on the first rung; they double from rung to rung.
-        perturbations: Perturbed copies of the best candidate that join the successive halving of each round.
         samplings: Iterations of local sampling in each round; with one or more, every round has an iteration.
-        needle_searches: Runs of the needle's optimal search in each round.
-        needle_iterations: Iterations of such a run in the first pass over the deployments; they double three
-            times.
-        intensifications: How often in each round the local search from the best candidate is evaluated in
-            full.
-        intensification_iterations: Iterations of that local search before each of these evaluations.
+        needle_iterations: Iterations of a needle search in the first pass over the deployments; they double
+            three times.
+        intensifications: How often a round evaluates the local search from the best candidate in full.
         refine_every: Rounds between two joint refinements, which take as long as several rounds.
     """
 
@@ -63,13 +58,9 @@ class SearchSettings:
 
 @frozen_value
 class Step:
-    """One step of a search.
+    """One step of a search, with what it did in words for the user, and a proved candidate if it found one.
 
-    Args:
-        iteration: 0 for what comes before the iterations, then counted from 1.
-        phase: What the search did, in words for the user.
-        candidate: A proved candidate, if the step found one.
-        cost: Its cost under the task's objective; infinite without a candidate.
+    Its iteration is 0 for what comes before the iterations; without a candidate the cost is infinite.
     """
 
     iteration: int
@@ -81,12 +72,9 @@ class Step:
 class PlanSearch(Protocol):
     """A search for whole plans: the planner drives it and makes plans of its candidates.
 
-    A search is made from a `Task` and an `Atlas`.  Its name in
-    `lungaccess.planning.searches.planners` is the `method` of the planner and of the command line.
-
-    Attributes:
-        blocked: How many direct arcs were stopped, by what stopped them, for the reasons of a `NoPlan`.  It
-            may stay empty.
+    A search is made from a `Task` and an `Atlas`.  Its name in `lungaccess.planning.searches.planners` is the
+    `method` of planner and command line.  `blocked` counts what stopped direct arcs, for the reasons of a
+    `NoPlan`; it may stay empty.
     """
 
     blocked: Counter[str]
@@ -202,13 +190,10 @@ CELL_MM = 5.0
 
 
 def different(entries: Deployments, ordered: Int) -> Int:
-    """Return the first of every group of similar deployments, in the order given.
+    """Return the first of every group of similar deployments, in the order given, (N,).
 
     Similar are those that leave the same branch and end in the same cell of CELL_MM with about the same
     tangent.
-
-    Args:
-        ordered ((N,) int64): Which of them, the best first.
     """
     places = np.floor(entries.positions[ordered] / CELL_MM)
     # Tangents are similar if each component, times this, rounds to the same whole number.

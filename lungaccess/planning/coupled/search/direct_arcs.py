@@ -36,8 +36,7 @@ class DirectArcs:
             None.
 
     Attributes:
-        in_workspace ((N,) int64): The deployments whose workspace of the needle holds the target, the nearest
-            first.
+        in_workspace ((N,) int64): The deployments that have the target in reach, the nearest first.
     """
 
     def __init__(
@@ -73,15 +72,10 @@ class DirectArcs:
                 yield rows, self._aims[site[rows[0]]]
 
     def blockers(self, chosen: Int, environment: NeedleEnvironment | None = None) -> tuple[Int, Float, Float]:
-        """Return what blocks the arcs from deployments, their lengths and their integrals of 1 / clearance.
+        """Return what blocks the arcs from deployments (N,), their lengths and integrals of 1 / clearance.
 
-        Args:
-            chosen: (N,) int64.
-
-        Returns:
-            - blockers ((N,) int64) - 0 for arcs that are proved clear, -1 where no arc keeps the needle's
-              limits, else a voxel label.
-            - lengths, inverse_clearance ((N,) float64)
+        A blocker is 0 for an arc that is proved clear, -1 where no arc keeps the needle's limits, else a
+        voxel label.
         """
         entries = self.atlas.deployments
         found = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen)), np.zeros(len(chosen))
@@ -171,7 +165,6 @@ class DirectArcs:
         """Evaluate the arcs from deployments, less and less of them as cheap ones are found.
 
         Args:
-            chosen: (N,) int64.
             slack, best: Arcs that cost more than `slack` times the cheapest so far, at first `best`, are not
                 tested.
 

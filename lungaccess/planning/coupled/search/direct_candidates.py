@@ -22,12 +22,9 @@ without one the tubes aimed at the target."""
 def direct_candidates(
     task: Task, atlas: Atlas, evaluator: CandidateEvaluator | None = None, aims: Float | None = None
 ) -> DirectCandidates:
-    """Return the simplest ways to the target of a task, or to aims beside it.
+    """Return the simplest ways to the target of a task, or to aims beside it; parameters are of `DirectArcs`.
 
-    Args:
-        evaluator: What proves them, for instance also for phases of the breath; made of the task if None.
-        aims ((S, 3) float64): Where the ways from each scope tip of the atlas end, LPS mm, nan for none; at
-            the target if None.
+    The evaluator proves them, for instance also for phases of the breath.
     """
     made = AimedTubes if task.system.needle is None else DirectArcs
     return made(task, atlas, evaluator, aims)

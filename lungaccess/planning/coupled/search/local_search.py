@@ -85,12 +85,10 @@ class TubeChoice:
 
 @dataclass(kw_only=True, eq=False)
 class LocalSearchRun:
-    """The state of a local search that began at one candidate.
+    """The state of a local search that began at one candidate, whose paths end at `goal`.
 
     Args:
-        goal (tuple of 3 floats): Where its paths end.
-        vias ((MAX_VIAS, 3) float64): The best choice so far; see
-            `lungaccess.planning.coupled.kernels.candidate`.
+        vias ((MAX_VIAS, 3) float64): Those of the best choice so far, see `kernels.candidate`.
         cost: Estimated cost of that choice; infinite before the search has begun.
         evaluated_cost: The estimated cost at which the choice was last evaluated in full.
     """
@@ -105,12 +103,7 @@ class LocalSearchRun:
 
 
 class LocalSearch:
-    """Improves candidates of one task.
-
-    Attributes:
-        needle: Argument of the kernels; see `lungaccess.planning.coupled.kernels.candidate`.
-        target: tuple of 3 floats.
-    """
+    """Improves candidates of one task; `needle` is as the kernels take it, see `kernels.candidate`."""
 
     def __init__(self, evaluator: CandidateEvaluator, rng: np.random.Generator) -> None:
         self._evaluator, self._rng = evaluator, rng

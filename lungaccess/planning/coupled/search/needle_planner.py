@@ -95,13 +95,8 @@ def needle_searches(
     """Search for needle paths from deployments, the least lower bound of the cost first, pass after pass.
 
     A pass ends where the lower bound reaches the cost of the best candidate.  Each run is an iteration, and
-    so is the end of a pass.
-
-    Args:
-        share: Number of this process, and how many processes share the deployments.
-
-    Yields:
-        The candidate is where a local search may begin.  The step has it only if there is no plan yet.
+    so is the end of a pass.  The candidate is where a local search may begin; the step has it only if there
+    is no plan yet.  `share` is the number of this process, and how many share the deployments.
     """
     nothing = Step(iteration=0, phase=PHASE)
     if not len(arcs.in_workspace):
@@ -144,11 +139,8 @@ def _with_path(
 class Placement:
     """Where scope and tubes are placed.
 
-    Args:
-        rotation_rad: Rotation of all tubes.
-        insertions_mm, rotations_rad ((n,) float64): Insertion of each tube, the outermost first, and how much
-            farther it is turned.
-        needle_seed: Seed of the needle's RRT from there.
+    All tubes are turned by `rotation_rad`; `(n,)` insertions and further rotations begin with the outermost.
+    `needle_seed` is that of the needle's RRT from there.
     """
 
     tip: ScopeTip
@@ -187,11 +179,8 @@ class KuntzSearch(ParallelSearch):
     """Algorithm 1 of [Kuntz2015]: random placement, workspace rejection, RRT, keep the best.
 
     Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not hold
-    the target; line 9 runs the RRT, here for a fixed number of iterations so that runs repeat.
-
-    Args:
-        atlas: Only its motions of the scope are used.
-        rejects: Whether line 8 is carried out; the paper compares with a run without it.
+    the target, unless `rejects` is false, with which the paper compares; line 9 runs the RRT, here for a
+    fixed number of iterations so that runs repeat.
     """
 
     phase = "Algorithm 1"

@@ -77,10 +77,8 @@ class TubeReachScan(_PointByPoint):
     """The deployments of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
 
     A point is reached directly if the tubes, aimed at it from the scope tip of some deployment that ends
-    nearby, are proved clear.  It may be used by several threads at once.
-
-    Args:
-        deployments: Of so many deployments to a point the cheapest is told.
+    nearby, are proved clear.  Of so many `deployments` to a point the cheapest is told.  It may be used by
+    several threads at once.
     """
 
     def __init__(self, atlas: Atlas, *, deployments: int = DEFAULT_ARCS) -> None:
@@ -147,10 +145,7 @@ class WindowReachScan(_PointByPoint):
     """The direct ways of an atlas, to be asked about any number of points; as `stages.needle.ReachScan`.
 
     A point is reached if an arc of the needle, or the tubes alone, to an aim beside it is proved clear and on
-    target in all of the phases.
-
-    Args:
-        lung: With a motion, which that of the atlas need not have.
+    target in all of the phases.  The lung has a motion, which that of the atlas need not have.
     """
 
     _in_phases = True

@@ -75,8 +75,8 @@ def varied(
 
     Args:
         turn_rad: By which all tubes are turned.
-        shifts: Of outer and inner tube, mm.  Behind them by how much each is turned against the others, the
-            innermost first, rad.
+        shifts: Of outer and inner tube, mm; then how far each is turned against the others, the innermost
+            first.
         end ((3,) float64): Where the devices end, LPS mm; what the evaluator aims at if None.
     """
     tubes, old, tip = evaluator.task.system.tubes, candidate.deployment, candidate.tip
@@ -131,7 +131,6 @@ class WindowEvaluator(CandidateEvaluator):
     """Proves candidates also for a window of breathing, and aims at where the target moves about.
 
     Args:
-        task: Of a patient with motion.
         phases (tuple of 2 floats or None): Phases that every window has to hold.
         widest: Whether a wider window counts before cost.
 
@@ -244,8 +243,7 @@ class WindowDirectSearch:
 
     Attributes:
         clear ((C,) int64): After the search the entries with a clear way, the best first.
-        blockers ((N,) int64): What blocks the promising entries in the masks' phase; see
-            `DirectCandidates.evaluate`.
+        blockers ((N,) int64): What blocks the promising entries in the masks' phase.
         refused: What ends the window too early, by entry.
     """
 

@@ -55,12 +55,9 @@ LOBES = ("right upper", "left upper", "right lower", "left lower", "right middle
 
 @frozen_value
 class BenchmarkPhantom:
-    """One phantom of the benchmark.
+    """One phantom of the benchmark; its name is family and number, such as "adult-01".
 
-    Args:
-        name: Family and number, such as "adult-01".
-        number: 1 to `OF_A_FAMILY`.
-        breathes: Whether the patient comes with the motion of its breath.
+    One that breathes comes with the motion of its breath.
     """
 
     name: str
@@ -136,12 +133,7 @@ Point = tuple[float, float, float]
 
 @frozen_value
 class Entry:
-    """What is fixed of one phantom.
-
-    Args:
-        masks_sha256: Of grid and masks, see `masks_sha256`.
-        targets_lps (tuple of (float, float, float)): LPS mm; target 1 is the first.
-    """
+    """What is fixed of one phantom: the hash of grid and masks, and its targets, LPS mm."""
 
     masks_sha256: str
     targets_lps: tuple[Point, ...]

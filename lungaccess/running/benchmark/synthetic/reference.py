@@ -54,12 +54,9 @@ def benchmark_study(
     iterations: int | None = ITERATIONS,
     time_s: float | None = None,
 ) -> Study:
-    """Return the study that runs methods on a folder of cases.
+    """Return the study that runs methods, METHOD or METHOD+NEEDLE_PLANNER, on a folder of cases.
 
     Args:
-        methods: METHOD or METHOD+NEEDLE_PLANNER; see `lungaccess.planning.searches.planners` and
-            `stages.needle.NEEDLE_PLANNERS`.
-        systems: Among `SYSTEMS`.
         targets: The first so many of each lung of a phantom; all if None.
         iterations, time_s (optional): Budget of a query; iterations can be repeated exactly.
 

@@ -62,10 +62,8 @@ class Score:
         status: "solved", "refused", "no plan", "claimed unreachable", "proved unreachable" or "no answer".
         reason: Why it is refused: what the check found.
         cost: Integral of 1 / clearance over the needle; this and all below only where it is solved.
-        success: Estimated chance of success under the errors `breath-hold` without correction; None if not
-            asked for.
-        breath_share: Share of the breath in which the plan is proved clear and on target, of phantoms that
-            breathe.
+        success: Estimated chance of success under the errors `breath-hold` without correction, if asked for.
+        breath_share: Share of the breath in which the plan is proved, of phantoms that breathe.
         not_checked: What the check could not look at; "" for nothing.
         first_cpu_s, cpu_s: Processor time, as the submission states it.
     """
@@ -100,7 +98,6 @@ def score_submission(
     """Yield the score of every query of the phantoms in a folder, phantom by phantom.
 
     Args:
-        cache: Folder of prepared anatomies; the usual one if None.
         samples: Deviated plans for the chance of success; 0 for no estimate.
         certify_boxes: Budget of a proof that a target claimed unreachable is so; 0 for no proof.
         only_answered: Whether queries without an answer are left out.

@@ -24,38 +24,19 @@ from anatomy.base.errors import AnatomyError, FileError, LungaccessError
 from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import KernelsNotKeptWarning
 from lungaccess.cli import plan_tables, result_folder, terminal
-from lungaccess.cli.commands.advise import advise
-from lungaccess.cli.commands.alternatives import alternatives
 from lungaccess.cli.commands.benchmark import benchmark
-from lungaccess.cli.commands.cache import cache
-from lungaccess.cli.commands.certify import certify
-from lungaccess.cli.commands.check import check
-from lungaccess.cli.commands.demo import demo
-from lungaccess.cli.commands.design import design
-from lungaccess.cli.commands.doctor import doctor
-from lungaccess.cli.commands.export import export
-from lungaccess.cli.commands.info import info, presets
-from lungaccess.cli.commands.insert import insert
-from lungaccess.cli.commands.needle import needle
-from lungaccess.cli.commands.phantom import phantom
-from lungaccess.cli.commands.plan import plan
-from lungaccess.cli.commands.reach import reach
-from lungaccess.cli.commands.replan import replan
-from lungaccess.cli.commands.report import report
-from lungaccess.cli.commands.risk import risk
-from lungaccess.cli.commands.route import route
-from lungaccess.cli.commands.segment import segment
-from lungaccess.cli.commands.selftest import selftest
-from lungaccess.cli.commands.shapes import shapes
-from lungaccess.cli.commands.start_region import start_region
-from lungaccess.cli.commands.steps import steps
-from lungaccess.cli.commands.stream import stream
+from lungaccess.cli.commands.check import check, insert, window
+from lungaccess.cli.commands.devices import design, presets, shapes, tubes
+from lungaccess.cli.commands.exchange import export, stream, template
+from lungaccess.cli.commands.installation import cache, doctor, selftest
+from lungaccess.cli.commands.later_stages import needle, replan
+from lungaccess.cli.commands.patients import info, phantom, segment
+from lungaccess.cli.commands.plan import alternatives, demo, plan
+from lungaccess.cli.commands.reachability import certify, reach
+from lungaccess.cli.commands.risk import risk, start_region
+from lungaccess.cli.commands.scope_alone import advise, route, tour
+from lungaccess.cli.commands.see import report, steps, view
 from lungaccess.cli.commands.study import study
-from lungaccess.cli.commands.template import template
-from lungaccess.cli.commands.tour import tour
-from lungaccess.cli.commands.tubes import tubes
-from lungaccess.cli.commands.view import view
-from lungaccess.cli.commands.window import window
 from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXAMPLES, EXIT_CODES, START_PAGE, epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.terminal import error_console

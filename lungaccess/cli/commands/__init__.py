@@ -1,1 +1,1 @@
-"""The commands of the command line, one module each; `lungaccess.cli.app` puts them together."""
+"""The commands of the command line, by what they are about; `lungaccess.cli.app` puts them together."""

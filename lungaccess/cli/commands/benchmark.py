@@ -1,6 +1,9 @@
-"""The commands `lungaccess benchmark ...`: published queries run with several planners."""
+"""The commands `lungaccess benchmark ...`: published queries and synthetic patients, run and scored."""
+
+from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -8,12 +11,12 @@ from cyclopts import App, Parameter
 
 from anatomy.base.errors import LungaccessError, SettingsError
 from lungaccess.cli import terminal
-from lungaccess.cli.commands.benchmark_synthetic import synthetic
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Count, Seconds
-from lungaccess.cli.options import PatientOptions, SystemOptions
+from lungaccess.cli.numbers import Count, CountOrNone, Processes, SamplesOrNone, Seconds
+from lungaccess.cli.options import CacheOptions, OutputOptions, PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
+from lungaccess.cli.result_folder import claim_folder
 
 if TYPE_CHECKING:
     from anatomy.liver import LiverImages
@@ -21,6 +24,234 @@ if TYPE_CHECKING:
     from anatomy.patient import PatientImages
     from lungaccess.problem.system import System
     from lungaccess.running.benchmark.runs import BenchmarkRow, Pose
+    from lungaccess.running.benchmark.synthetic.scoring import Score
+
+NAME = "synthetic-v1"
+synthetic = App(
+    name=NAME,
+    help="A benchmark that anybody may ship: 50 synthetic patients, 20 targets each, three devices.",
+    help_epilogue=epilogue(f"benchmark {NAME} make"),
+)
+
+
+def names_of(text: str | None) -> tuple[str, ...]:
+    """Return the names in a text that are separated by commas; none if there is no text.
+
+    Raises:
+        SettingsError: If a name is empty.
+    """
+    if text is None:
+        return ()
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise SettingsError(
+            f"A name is empty in {text!r}",
+            expected="names separated by commas",
+            remedy="Leave the option out to take all",
+        )
+    return names
+
+
+@synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} make"))
+def make(
+    *,
+    out: Path = Path("SYNTHETIC"),
+    phantoms: str | None = None,
+    ct: Annotated[bool, Parameter(negative="")] = False,
+    tips: bool = True,
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
+    """Write the cases as files: masks, targets, devices, and scope tips with the motions that lead there.
+
+    What is there already stays; every phantom is compared with the hash of the manifest.
+
+    Args:
+        out: Folder of the cases.
+        phantoms: Names separated by commas, such as adult-01,child-03; all fifty if not given.
+        ct: Also the CTs, about 25 MB each; no rule needs them.
+        tips: Also the scope tips, from which a planner without a bronchoscope of its own can start.
+    """
+    from lungaccess.running.benchmark.synthetic.cases import write_benchmark
+
+    claim_folder(out, ())
+    with progress("making synthetic patients") as shown:
+        made = write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
+    if output.json:
+        terminal.show_json({"folder": str(out), "phantoms": [each.name for each in made]})
+        return ExitCode.OK
+    terminal.say(
+        f"Written to {out}: {len(made)} phantoms, their queries in case.json, the rules in benchmark.json"
+    )
+    terminal.say(f"Run a method with: lungaccess benchmark {NAME} run {out}")
+    return ExitCode.OK
+
+
+@synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} run"))
+def run(
+    folder: Path,
+    *,
+    methods: str = "atlas",
+    phantoms: str | None = None,
+    devices: str | None = None,
+    targets: Annotated[Count | None, Parameter(name="--targets")] = None,
+    iterations: Annotated[Count | None, Parameter(name="--iterations")] = 100,
+    time_s: Annotated[Seconds | None, Parameter(name="--time")] = None,
+    out: Path = Path("results.db"),
+    answers: Path | None = None,
+    scheduler: str | None = None,
+    workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
+    output: CacheOptions = CacheOptions(),
+) -> ExitCode:
+    """Run methods of lungaccess on the cases, as a study; stop it at any time and start it again.
+
+    Exit code 1 if a run could not be made.
+
+    Args:
+        folder: The cases, as `make` wrote them.
+        methods: METHOD or METHOD+NEEDLE_PLANNER, separated by commas, such as
+            atlas,kuntz2015,kuntz2015+control.RRT.
+        phantoms: Names separated by commas; those of the folder if not given.
+        devices: Presets separated by commas; all three if not given.
+        targets: The first so many of each lung of a phantom; all ten if not given.
+        iterations: Budget of a query beyond the direct arcs, which can be repeated exactly.
+        time_s: Budget in seconds beside it, for planners of OMPL.
+        out: Results file (SQLite); made if it is not there.
+        answers: Folder for one submission a method, METHOD.json, to be scored.
+        scheduler: Address of a running dask scheduler; this machine if not given.
+        workers: How many processes on this machine.
+    """
+    from lungaccess.running.benchmark.synthetic.reference import benchmark_study
+    from lungaccess.running.study.driver import run_study
+
+    devices_asked = {"systems": names_of(devices)} if devices is not None else {}
+    study = benchmark_study(
+        folder, names_of(methods), phantoms=names_of(phantoms), targets=targets, iterations=iterations,
+        time_s=time_s, **devices_asked,
+    )  # fmt: skip
+    with progress(NAME) as shown:
+        done = run_study(
+            study, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
+        )
+    written = [] if answers is None else _write_answers(out, answers)
+    if output.json:
+        terminal.show_json(asdict(done) | {"results": str(out), "answers": [str(path) for path in written]})
+        return ExitCode.of(not done.failed)
+    terminal.say(
+        f"{done.runs} runs: {done.stored_before} were stored, {done.added} added, {done.failed} could not be "
+        f"made. Written to {out}"
+    )
+    for path in written:
+        terminal.say(f"Score with: lungaccess benchmark {NAME} score {path} {folder}")
+    return ExitCode.of(not done.failed)
+
+
+def _write_answers(results: Path, folder: Path) -> list[Path]:
+    from anatomy.base.files import require_writable_folder
+    from lungaccess.running.benchmark.synthetic.reference import submissions_of
+    from lungaccess.running.benchmark.synthetic.submission import write_submission
+
+    require_writable_folder(folder)
+    written = []
+    for each in submissions_of(results):
+        written.append(folder / f"{each.planner}.json")
+        write_submission(each, written[-1])
+    return written
+
+
+@synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} score"))
+def score(
+    submission: Path,
+    folder: Path,
+    *,
+    samples: SamplesOrNone = 1000,
+    certify: CountOrNone = 0,
+    only_answered: Annotated[bool, Parameter(negative="")] = False,
+    out: Path | None = None,
+    output: CacheOptions = CacheOptions(),
+) -> ExitCode:
+    """Score a submission by the independent check alone; exit code 1 if an answer is refused.
+
+    Args:
+        submission: JSON file of poses and arcs; docs/reference/submission.md describes it.
+        folder: The cases, as `make` wrote them.
+        samples: Deviated plans for the chance of success of each; 0 for no estimate.
+        certify: Budget, in ranges of deployments, of the proof that a target claimed unreachable is so; 0 for
+            no proof.
+        only_answered: Leave out queries without an answer, which otherwise count as not solved.
+        out: File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
+    """
+    from lungaccess.running.benchmark.runs import require_table_file
+    from lungaccess.running.benchmark.synthetic.scoring import REFUSED, score_submission, write_scores
+    from lungaccess.running.benchmark.synthetic.submission import read_submission
+
+    if out is not None:
+        require_table_file(out)
+    handed_in = read_submission(submission)
+    with progress(f"scoring {handed_in.planner}") as shown:
+        scores = list(
+            score_submission(
+                handed_in, folder, cache=output.cache, samples=samples, certify_boxes=certify,
+                only_answered=only_answered, progress=shown.step,
+            )
+        )  # fmt: skip
+    if out is not None:
+        write_scores(scores, out)
+    refusals = [each for each in scores if each.status == REFUSED]
+    _show_sheet(scores, output)
+    if not output.json:
+        for each in refusals:
+            terminal.say(f"{each.query} is refused: {each.reason}")
+        if out is not None:
+            terminal.say(f"All scores are in {out}")
+    return ExitCode.of(not refusals)
+
+
+@synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} sheet"))
+def sheet(
+    *scores: Path,
+    csv: Path | None = None,
+    brief: Annotated[bool, Parameter(negative="")] = False,
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
+    """Print the score sheet of one or several planners.
+
+    Args:
+        scores: JSON files that `score --out` wrote.
+        csv: Also write the sheet as a .csv or .json file.
+        brief: One line a planner, without families and devices.
+    """
+    from lungaccess.running.benchmark.synthetic.scoring import read_scores, score_sheet, write_sheet
+
+    if not scores:
+        raise SettingsError("No scores were given", expected="one or more files", remedy="Name scores.json")
+    rows = [each for path in scores for each in read_scores(path)]
+    if csv is not None:
+        write_sheet(score_sheet(rows, by_family=not brief), csv)
+    _show_sheet(rows, output, by_family=not brief)
+    return ExitCode.OK
+
+
+@synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} schema"))
+def schema() -> ExitCode:
+    """Print the JSON Schema of a submission."""
+    from lungaccess.running.benchmark.synthetic.submission import submission_schema
+
+    terminal.show_json(submission_schema())
+    return ExitCode.OK
+
+
+def _show_sheet(scores: list[Score], output: OutputOptions, *, by_family: bool = True) -> None:
+    from lungaccess.running.benchmark.synthetic.cases import manifest_sha256
+    from lungaccess.running.benchmark.synthetic.scoring import HEADINGS, score_sheet
+
+    lines = score_sheet(scores, by_family=by_family)
+    if output.json:
+        about = {"benchmark": NAME, "manifest_sha256": manifest_sha256()}
+        refused = {each.query: each.reason for each in scores if each.reason}
+        terminal.show_json({**about, "sheet": [asdict(line) for line in lines], "refused": refused})
+        return
+    terminal.show_wide([terminal.table(f"Scores of {NAME}", HEADINGS, [line.cells() for line in lines])])
+
 
 Rules = Literal["ours", "unc"]
 DEFAULT_PLANNERS = "rrt,optimal,resolution,decide,control.RRT"
@@ -101,13 +332,13 @@ def med_rad(
 def _rows(
     folder: Path,
     rules: Rules,
-    device: "System",
+    device: System,
     radii: tuple[float, ...],
     planners: tuple[str, ...],
     seeds: range,
     budget_s: float,
     output: PatientOptions,
-) -> "Iterator[BenchmarkRow]":
+) -> Iterator[BenchmarkRow]:
     """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
     from lungaccess.running.benchmark.published import patients_of, published_queries, why_no_query
     from lungaccess.running.benchmark.runs import BenchmarkRow, run_query
@@ -131,8 +362,8 @@ def _rows(
 
 
 def _posing(
-    path: Path, rules: Rules, device: "System", output: PatientOptions
-) -> "tuple[Pose, Organ | PatientImages | LiverImages]":
+    path: Path, rules: Rules, device: System, output: PatientOptions
+) -> tuple[Pose, Organ | PatientImages | LiverImages]:
     """Return what makes environments of a patient by the rules, and the patient."""
     from lungaccess.running.benchmark.runs import posed_by_unc, posed_in_lung
 
@@ -165,7 +396,7 @@ def _planners(text: str) -> tuple[str, ...]:
     return names
 
 
-def _radii(text: str | None, rules: Rules, device: "System") -> tuple[float, ...]:
+def _radii(text: str | None, rules: Rules, device: System) -> tuple[float, ...]:
     if text is None and rules == "ours":
         return (device.require_needle("The benchmark of needles").min_radius_of_curvature_mm,)
     try:

@@ -1,16 +1,21 @@
-"""The command `lungaccess plan`."""
+"""The commands that plan all stages: `lungaccess demo`, `plan` and `alternatives`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.panel import Panel
 
+from anatomy.base.errors import AnatomyError
+from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import NotNegative
+from lungaccess.cli.numbers import Count, NotNegative, Seconds, Seed
 from lungaccess.cli.options import (
+    CacheOptions,
     ErrorOptions,
     PatientFolder,
     PatientOptions,
@@ -20,19 +25,100 @@ from lungaccess.cli.options import (
     TargetOptions,
     ToolText,
 )
-from lungaccess.cli.plan_search import RESULTS, PlanJob, plan_and_report
+from lungaccess.cli.plan_search import RESULTS, PlanJob, plan_and_report, system_of
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
+from lungaccess.problem.goals import SUCCESS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from anatomy.lung import Lung
     from lungaccess.cli.plan_search import PlanJob
+    from lungaccess.judging.appraisal import Appraisal
     from lungaccess.judging.explanation import Explanation
+    from lungaccess.planning import Alternative
     from lungaccess.planning.coupled import Atlas
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.system import System
+
+
+def demo(
+    *,
+    out: Path = Path("demo-output"),
+    # The cost has settled by then, and a first visitor does not wait long.
+    budget: Seconds = 3.0,
+    # The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps.
+    seed: Seed = 1,
+    force: Force = False,
+    output: CacheOptions = CacheOptions(),
+) -> ExitCode:
+    """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it.
+
+    Args:
+        out: Folder for plan.json, the pictures and report.html.
+        budget: Planning time in seconds.
+        seed: Seed of the patient and of the search.
+    """
+    from lungaccess.cli.anatomy_tables import anatomy_tables
+    from lungaccess.problem.target import stated_target
+
+    search = SearchOptions(budget=budget, seed=seed)
+    claim_folder(out, RESULTS, force=force)
+    with progress("making a synthetic patient") as shown:
+        lung = demo_lung(seed, output.cache, shown.step)
+    target, systems = stated_target(None, 1), SystemOptions().candidates()
+    if not output.json:
+        terminal.show(anatomy_tables(lung)[1:3])
+    guide = what_to_look_at(out)
+    job = PlanJob(asked=search.asked(systems), target=target, out=out, output=output, guide=guide)
+    return _first_reachable_nodule(lung, job)
+
+
+def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> Lung:
+    """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
+
+    An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
+    """
+    from anatomy.phantom import make_phantom
+    from anatomy.store import open_lung
+
+    # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
+    images = make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
+    return open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
+
+
+def _first_reachable_nodule(lung: Lung, job: PlanJob) -> ExitCode:
+    """Plan to the nodules in their order until one can be reached."""
+    from lungaccess.plans.no_plan import NoPlan
+    from lungaccess.problem.target import stated_target
+
+    failure: NoPlan | None = None
+    for number in range(1, len(lung.targets_lps) + 1):
+        try:
+            return plan_and_report(lung, replace(job, target=stated_target(None, number)))
+        except NoPlan as error:
+            terminal.progress_console.print(f"Nodule {number} cannot be reached; trying the next one.")
+            failure = error
+    raise failure or AnatomyError(
+        "The synthetic patient has no nodule",
+        remedy="Choose another --seed",
+        expected="a patient with a nodule",
+    )
+
+
+def what_to_look_at(out: Path) -> Panel:
+    """Return a guide to the pictures of a plan."""
+    lines = (
+        f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its "
+        "wall at the diamond, the magenta needle passes the vessels and ends in the green nodule. R and L "
+        "are the patient's right and left. In the two cuts, no full red or grey reaches the dashed lines; "
+        "in the graph, no curve enters the red area outside the blue one.",
+        f"{out / 'tree.png'}: the airway tree by generation; every branch lies inside the airway.",
+        f"{out / 'report.html'}: all of it in 3-D, playing along a slider; open it in a browser.",
+    )
+    return Panel("\n".join(lines), title="what to look at", title_align="left")
+
 
 PICTURE, PAGE = "no_plan.png", "no_plan.html"
 
@@ -166,3 +252,144 @@ def show_explanation(explanation: Explanation) -> None:
             f"The explanation took {explanation.time_s:.1f} s of processor time, without compiling kernels; "
             "a longer --explain-time tries the rest."
         )
+
+
+TRADE_OFF = "trade_off.svg"
+COLUMNS = (
+    *("plan", "succeeds", "window", "branch", "gen."),
+    *("clear", "pleura", "tissue", "near", "map", "front"),
+)
+NOTE = (
+    "succeeds: of 100; gen.: generation of the scope's tip; clear, pleura: least distance of tubes and "
+    "needle from any obstacle and from the pleura, mm, as the plan states it; tissue: way in tissue, mm; "
+    "near, map: nearness to obstacles and cost map along the needle; front: no other plan is better in one "
+    "of succeeds, clear and tissue and as good in the others.  The plan that succeeds most often of several "
+    "owes part of it to luck, which its interval does not count"
+)
+WINDOW_NOTE = "window: share of the breath in which the plan is proved, %; the front counts it, too"
+
+
+def alternatives(
+    patient: PatientFolder,
+    *,
+    target: TargetOptions = TargetOptions(),
+    system: SystemOptions = SystemOptions(),
+    count: Count = 15,
+    separation: NotNegative = 5.0,
+    search: SearchOptions = SearchOptions(),
+    errors: ErrorOptions = ErrorOptions(),
+    out: Path = Path("lungaccess-alternatives"),
+    force: Force = False,
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
+    """Show plans to one target that differ, check each, and write them.
+
+    Those that no other beats in success, length and clearance together are marked: the Pareto front.
+
+    Args:
+        count: How many plans at most.
+        separation: The needles of every two plans lie somewhere at least so many mm from each other.
+        out: Folder for plan-01.json and so on, and trade_off.svg.
+    """
+    from anatomy.base.files import write_text
+    from lungaccess.judging import answer_with_several
+    from lungaccess.judging.appraisal import Appraiser
+    from lungaccess.planning import with_front
+    from lungaccess.planning.coupled import open_atlas
+    from lungaccess.showing.report.html import trade_off_svg
+
+    stated, systems = target.stated(), system.candidates()
+    asked = search.asked(systems, errors.given(), errors.given_procedure())
+    claim_folder(out, ("plan-*.json", TRADE_OFF), force=force)
+    lung = output.load(patient)
+    request = asked.request(lung, stated.resolve(lung))
+    with progress("searching") as shown:
+
+        def atlas_of(device: System) -> Atlas:
+            return open_atlas(lung, device, cache=output.cache, progress=shown.share)
+
+        found = answer_with_several(request, count=count, separation_mm=separation, atlas_of=atlas_of)
+    chosen, by_success = system_of(found[0].plan, systems), request.goal is SUCCESS
+    given = (None, None) if by_success else (request.errors, request.procedure)
+    appraiser = Appraiser(lung, given[0], procedure=given[1])
+    appraisals = []
+    with progress("checking") as shown:
+        for number, each in enumerate(found, start=1):
+            each.plan.save(out / f"plan-{number:02d}.json")
+            appraisals.append(appraiser.appraise(each.plan, chosen, target_lps=request.target.lps_mm))
+            shown.share(number / len(found))
+    found = with_front([each.plan for each in found], [each.headline.chance for each in appraisals])
+    if drawing := trade_off_svg(found):
+        write_text(out / TRADE_OFF, drawing)
+    refused = sum(not each.accepted for each in appraisals)
+    if output.json:
+        terminal.show_json(_records(found, appraisals, out, lung.cost is not None))
+        return ExitCode.of(not refused)
+    _show(lung, found, appraisals)
+    if found[0].plan.system_choice:
+        terminal.say(" ".join(found[0].plan.system_choice))
+    terminal.say(f"Written to {out}; the check refuses {refused} of {len(found)}")
+    return ExitCode.of(not refused)
+
+
+def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal]) -> None:
+    """Print the headline of the plan that succeeds most often, then one row a plan."""
+    from lungaccess.cli.plan_tables import show_headline
+
+    best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
+    terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")
+    show_headline(appraisals[best].headline)
+    has_map = lung.cost is not None
+    has_window = lung.motion is not None
+    columns = [name for name in COLUMNS if (has_map or name != "map") and (has_window or name != "window")]
+    rows = [
+        _row(number, each, appraisal, has_map)
+        for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True), start=1)
+    ]
+    terminal.show([terminal.table(f"Plans to the target in {lung.name}", columns, rows)])
+    terminal.say(NOTE)
+    if has_window:
+        terminal.say(WINDOW_NOTE)
+
+
+def _success(appraisal: Appraisal) -> float:
+    """Return the estimated chance; of a refused plan less than of any other."""
+    success = appraisal.headline.success
+    return -1.0 if success is None else success.value
+
+
+def _records(
+    found: tuple[Alternative, ...], appraisals: list[Appraisal], out: Path, has_map: bool
+) -> list[dict[str, object]]:
+    """Return each plan's file, appraisal and criteria as plain values."""
+    from lungaccess.plans.costs import known_costs
+
+    return [
+        {
+            "plan": str(out / f"plan-{number:02d}.json"),
+            **appraisal.to_mapping(),
+            "on_front": bool(each.on_front),
+            "branch": int(each.plan.tube.exit.branch),
+            "generation": int(each.plan.scope.generation),
+            "criteria": known_costs(each.criteria, has_map=has_map),
+        }
+        for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True), start=1)
+    ]
+
+
+def _row(number: int, each: Alternative, appraisal: Appraisal, has_map: bool) -> tuple[str, ...]:
+
+    success = appraisal.headline.success
+    return (
+        f"{number:02d}",
+        "refused" if success is None else of_hundred(success.value),
+        *([] if each.plan.window is None else [of_hundred(each.plan.window.share)]),
+        str(each.plan.tube.exit.branch),
+        str(each.plan.scope.generation),
+        f"{each.criteria['clearance_mm']:.2f}",
+        f"{each.criteria['pleura_mm']:.2f}",
+        f"{each.criteria['length_in_tissue_mm']:.1f}",
+        f"{each.criteria['inverse_clearance']:.2f}",
+        *([f"{each.criteria['cost_map']:.2f}"] if has_map else []),
+        "yes" if each.on_front else "",
+    )

@@ -15,7 +15,7 @@ from anatomy.io.frames import read_pose
 from anatomy.io.own_masks import PatientFile
 from anatomy.segmentation.nodules import nodule_from_contours
 from lungaccess.cli import app as cli
-from lungaccess.cli.commands.template import FILES
+from lungaccess.cli.commands.exchange import FILES
 from lungaccess.cli.examples import EXAMPLES
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning import read_lesions

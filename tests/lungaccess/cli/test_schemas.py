@@ -9,7 +9,7 @@ from typing import Any, get_args
 import pytest
 
 from lungaccess.cli import app as cli
-from lungaccess.cli.commands.template import FILES, SCHEMAS, Kind, schema_text, template_text
+from lungaccess.cli.commands.exchange import FILES, SCHEMAS, Kind, schema_text, template_text
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system, shipped_names, to_mapping

@@ -64,7 +64,7 @@ pytestmark = pytest.mark.usefixtures("wide_terminal")
 @pytest.fixture
 def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the picture out where a test does not look at it."""
-    monkeypatch.setattr("lungaccess.cli.commands.tubes._draw", lambda *_: None)
+    monkeypatch.setattr("lungaccess.cli.commands.devices._draw", lambda *_: None)
 
 
 def run(tmp_path: Path, *words: str) -> int:

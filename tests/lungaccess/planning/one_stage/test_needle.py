@@ -16,7 +16,7 @@ from anatomy.phantom import Phantom, write_phantom
 from anatomy.poses import pose
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OBSTACLES, OUTSIDE, VESSEL
 from lungaccess.cli.app import main
-from lungaccess.cli.commands import needle
+from lungaccess.cli.commands import later_stages
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.judging.checking import check_needle_alone
 from lungaccess.planning.one_stage import plan_needle, reason_in_words
@@ -216,7 +216,7 @@ def test_an_open_question_tells_where_a_path_would_pass(small_lung: Lung, system
     assert still_open.record()["open_passage"]["width_mm"] == 0.4
     console = Console(width=200)
     with console.capture() as shown:
-        console.print(*needle._tables(still_open, is_lung=True))
+        console.print(*later_stages._needle_tables(still_open, is_lung=True))
     assert "0.40 mm wide, 5.0 mm ahead" in shown.get() and "0.03 mm" in shown.get()
 
 

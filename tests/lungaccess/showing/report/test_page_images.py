@@ -15,7 +15,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.images import write_volume
 from anatomy.lung import Lung
 from anatomy.segmentation.folder import SegmentationFolder, digest_of_ct
-from lungaccess.cli.shown_ct import shown_ct
+from lungaccess.cli.commands.see import shown_ct
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report import pack
 from lungaccess.showing.report.html import deployment, meshes, movie, volumes

@@ -1,19 +1,24 @@
-"""The command `lungaccess segment`: from a CT to a patient folder for planning."""
+"""The commands `lungaccess segment`, `info` and `phantom`: folders of patients, made and described."""
+
+from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+from rich.table import Table
 
 from anatomy.base.errors import AnatomyError
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.frames import parse_point
 from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM
-from lungaccess.cli import terminal
+from lungaccess.cli import anatomy_tables, terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.numbers import Positive
-from lungaccess.cli.options import OutputOptions
+from lungaccess.cli.numbers import Positive, Seed
+from lungaccess.cli.options import OutputOptions, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
-from lungaccess.cli.result_folder import claim_folder
+from lungaccess.cli.result_folder import Force, claim_folder, require_empty_folder
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -153,7 +158,7 @@ def segment(
     return ExitCode.OK
 
 
-def _tables(result: "Segmentation", quality: "Quality") -> "list[Table]":
+def _tables(result: Segmentation, quality: Quality) -> list[Table]:
     volumes = [(name, f"{volume:.3f}") for name, volume in quality.volumes_l.items() if volume]
     tree = quality.tree
     airway = [("ends", f"{quality.ends}")]
@@ -182,9 +187,91 @@ def _tables(result: "Segmentation", quality: "Quality") -> "list[Table]":
     return [each for each in made if each.row_count]
 
 
-def _written(result: "Segmentation") -> str:
+def _written(result: Segmentation) -> str:
     words = f"Written to {result.folder}: patient.toml, its masks, quality.json, segmentation.json."
     if result.kept_description:
         words += " patient.toml was edited by hand and is kept as it was."
     goal = "--nodule" if result.parts.nodule.any() else "--target ras:x,y,z"
     return f"{words}\nPlan with: lungaccess plan {result.folder} {goal}"
+
+
+def info(
+    patient: PatientFolder,
+    *,
+    out: Path | None = None,
+    details: Annotated[bool, Parameter(negative="")] = False,
+    force: Force = False,
+    output: PatientOptions = PatientOptions(),
+) -> ExitCode:
+    """Show what was understood of a patient: volumes, airway tree, sources and warnings.
+
+    Args:
+        out: Folder for tree.png, a picture of the airway tree, and motion.png; for a liver organ.png.
+        details: List every repair of the airway tree.
+    """
+    if out is not None:
+        claim_folder(out, ("tree.png", "motion.png", "organ.png"), force=force)
+    lung = output.load_organ(patient, thick_slices=True, refuse=False)
+    if output.json:
+        terminal.show_json(anatomy_tables.organ_record(lung))
+    else:
+        terminal.show(anatomy_tables.anatomy_tables(lung, details=details))
+        terminal.show_warnings(lung.warnings)
+    if out is not None:
+        from anatomy.lung import Lung
+        from lungaccess.showing.report import motion_png, organ_png, tree_png
+
+        if isinstance(lung, Lung):
+            what, picture = "tree", tree_png(lung, out / "tree.png")
+        else:
+            what, picture = "organ", organ_png(lung, out / "organ.png")
+        if not output.json:
+            terminal.say(f"Picture of the {what}: {picture}")
+        if isinstance(lung, Lung) and lung.motion is not None:
+            picture = motion_png(lung, out / "motion.png")
+            if not output.json:
+                terminal.say(f"Picture of the breathing: {picture}")
+    return ExitCode.OK
+
+
+def phantom(
+    *,
+    out: Path = Path("PATIENT"),
+    seed: Seed = 2,
+    size: Literal["adult", "small"] = "adult",
+    spacing: Positive | None = None,
+    breathing: Annotated[bool, Parameter(negative="")] = False,
+    force: Force = False,
+    output: OutputOptions = OutputOptions(),
+) -> ExitCode:
+    """Write a synthetic patient: masks, CT and the truth about it; no data are needed.
+
+    Args:
+        out: Folder for patient.toml, masks and CT.
+        seed: Seed of the patient: another one, another patient.
+        size: small: 0.7 times an adult, a child of about ten years.
+        spacing: Edge of the voxels, mm; 1 for the adult, 1.25 for the small patient.
+        breathing: Also motion.nrrd, how the lungs breathe; the masks show end-inhale.
+    """
+    from anatomy.phantom import make_phantom, write_phantom
+
+    require_empty_folder(out, force=force)
+    with progress("making a synthetic patient"):
+        made = make_phantom(seed=seed, spacing_mm=spacing, size=size)
+    with progress(f"writing {out}"):
+        write_phantom(made, out, breathing=breathing)
+    nodules = [
+        {"lps_mm": nodule.centre_lps.tolist(), "radius_mm": float(nodule.radius_mm)}
+        for nodule in made.nodules
+    ]
+    if output.json:
+        terminal.show_json({"folder": str(out), "name": made.images.name, "nodules": nodules})
+        return ExitCode.OK
+    rows = [
+        ("lps:" + ",".join(f"{value:.1f}" for value in nodule.centre_lps), f"{2.0 * nodule.radius_mm:.1f}")
+        for nodule in made.nodules
+    ]
+    terminal.show([terminal.table(f"Nodules of {made.images.name}", ("centre, mm", "diameter, mm"), rows)])
+    terminal.say(f"Written to {out}: patient.toml, its masks, ct.nii.gz, truth.json.")
+    terminal.say(f"Plan with: lungaccess plan {out} --nodule")
+    return ExitCode.OK

@@ -20,7 +20,7 @@ import lungaccess as la
 from anatomy.base.settings import override
 from experiments.support.needle_load.arrivals import needle_arrivals
 from experiments.support.needle_load.tissue import LUNG_N_MM2, held_shape
-from lungaccess.problem.needle_load import stiffness_ratio
+from lungaccess.problem.channel import stiffness_ratio
 from lungaccess.problem.system import System
 from stages.tube import BEND_RAD, ShapeLimits, TubeShapes, straightening, tube_shapes
 from stages.tube.mechanics import TubeMechanics

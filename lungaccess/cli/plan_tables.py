@@ -14,7 +14,7 @@ from rich.text import Text
 
 from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
-from lungaccess.judging.appraisal.grade import Grade
+from lungaccess.judging.appraisal.headline import Grade
 from stages.needle import Objective
 
 if TYPE_CHECKING:

@@ -1,13 +1,16 @@
 """A candidate for a plan: the choices of all three stages, from which everything else follows."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from anatomy import poses
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from anatomy.lung import Lung
 from lungaccess.plans.curves import SHORTEST_MM, pieces_beyond, radii_at
 from lungaccess.problem.system import System
 from stages.needle import LENGTH, ArcPath, InTissue
-from stages.scope import ScopeTip
+from stages.scope import Bronchoscope, ScopeTip, TipRow, in_tip_region, prover_of
 from stages.tube import Deployment, pieces_of_arcs
 
 
@@ -73,3 +76,32 @@ def with_tool_in_place(system: System, path: ArcPath) -> ArcPath:
 def wall_in_path_mm(system: System, deployment: Deployment) -> float:
     """Return how much of a candidate's path lies in the wall that is pierced: a needle begins beyond it."""
     return deployment.wall_run_mm if system.needle is None else 0.0
+
+
+class TipRows:
+    """Moves tips of a scope along the motions to them."""
+
+    def __init__(self, lung: Lung, scope: Bronchoscope) -> None:
+        self._tree = lung.tree
+        self._prover = prover_of(lung, scope)
+
+    def along(self, tip: ScopeTip, shifts_mm: ArrayLike) -> TipRow:
+        """Return the tips whose base stops so much farther, and which of them the scope may take."""
+        return self._prover.row(tip.motion, shifts_mm)
+
+    def tip(self, row: TipRow, index: int) -> ScopeTip:
+        """Return a tip of a row with its motion."""
+        point, forward, sideways = np.split(row.tips[index], 3)
+        nearest, _inside = in_tip_region(self._tree, row.tips[index : index + 1])
+        return ScopeTip(
+            motion=row.motion_to(index),
+            lps_from_scope_tip=poses.pose(point, forward, sideways),
+            tree_point=int(nearest[0]),
+        )
+
+    def moved(self, tip: ScopeTip, shift_mm: float) -> ScopeTip | None:
+        """Return a tip moved along its motion, None if the scope may not take it."""
+        if shift_mm == 0.0:
+            return tip
+        row = self.along(tip, [shift_mm])
+        return self.tip(row, 0) if row.proved[0] else None

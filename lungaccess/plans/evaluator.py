@@ -11,6 +11,7 @@ from anatomy.base.typed import Float, Float32, Int
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.plans.candidate import (
     Candidate,
+    TipRows,
     parts_in_tissue,
     tubes_in_tissue,
     wall_in_path_mm,
@@ -18,7 +19,6 @@ from lungaccess.plans.candidate import (
 )
 from lungaccess.plans.costs import path_beyond, path_cost
 from lungaccess.plans.kernels.tissue import Wanted, taken_at
-from lungaccess.plans.tip_rows import TipRows
 from lungaccess.plans.tissue import wanted_of
 from lungaccess.problem.task import Task
 from stages.needle import (

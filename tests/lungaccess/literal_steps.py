@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from lungaccess.judging.checking.boxes import Boxes
-from lungaccess.judging.checking.scope import least_gap_mm
-from lungaccess.judging.checking.scope_motion import Motion, motion_of
+from lungaccess.judging.checking.scope import Motion, least_gap_mm, motion_of
 
 ADVANCE = re.compile(r"advance ([\d.]+) mm, until ([\d.]+) mm are inserted")
 TWIST = re.compile(

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lungaccess.planning.procedure.insertion import InsertionStudy
-    from lungaccess.uncertainty.breathing.in_tissue import CarriedNeedle
+    from lungaccess.uncertainty.breathing.moving import CarriedNeedle
 
 
 def check(
@@ -150,7 +150,7 @@ def window(
 
     from lungaccess.plans.file import plain
     from lungaccess.plans.plan import Plan
-    from lungaccess.uncertainty.breathing.in_tissue import carried_needle
+    from lungaccess.uncertainty.breathing.moving import carried_needle
     from lungaccess.uncertainty.breathing.window import breathing_window
 
     for file, suffix in ((out, ".json"), (picture, ".png")):

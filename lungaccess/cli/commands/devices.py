@@ -37,7 +37,7 @@ def presets(*, show: str | None = None, output: OutputOptions = OutputOptions())
         show: Print the TOML file of this system: edit it, and hand it over with --system FILE.
     """
     from anatomy.base.settings import to_mapping
-    from lungaccess.problem.needle_load import system_warnings
+    from lungaccess.problem.channel import system_warnings
     from lungaccess.problem.preset_order import presets_by_invasiveness
     from lungaccess.problem.system import load_system, needle_preset_names, preset_text, tube_preset_names
 

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
         appraise,
         plan_record,
     )
-    from lungaccess.judging.appraisal.grade import Grade
-    from lungaccess.judging.appraisal.headline import Geometry, Headline
+    from lungaccess.judging.appraisal.headline import Geometry, Grade, Headline
     from lungaccess.judging.appraisal.limits import LIMITS_TITLE, SHOWN_LIMITS, Limit, limits_of
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -6,16 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.completion import Motions, completed_plan
 from lungaccess.judging.checking.deployment import check_deployment
-from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.findings import PASS, CheckReport, Finding, Findings
 from lungaccess.judging.checking.needle_load import check_needle_load
-from lungaccess.judging.checking.outcome import check_tubes_at_target
+from lungaccess.judging.checking.outcome import TISSUE, check_tubes_at_target
 from lungaccess.judging.checking.record import check_record
 from lungaccess.judging.checking.scope import check_scope
 from lungaccess.judging.checking.steering import check_needle
-from lungaccess.judging.checking.tool import TISSUE
 from lungaccess.judging.checking.window import check_window
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.goals import goals

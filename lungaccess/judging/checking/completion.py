@@ -15,11 +15,10 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from lungaccess.judging.checking import shapes
-from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.outcome import recomputed_costs
 from lungaccess.judging.checking.record import wanted_clearance_mm
-from lungaccess.judging.checking.scope import beyond_carina_mm, branches_to
-from lungaccess.judging.checking.scope_motion import motion_of
+from lungaccess.judging.checking.scope import beyond_carina_mm, branches_to, motion_of
 from lungaccess.judging.checking.steering import turning
 from lungaccess.judging.checking.wall_exit import (
     WALL_ANGLE_TOLERANCE_RAD,

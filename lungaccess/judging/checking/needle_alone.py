@@ -8,15 +8,14 @@ from numpy.typing import ArrayLike
 
 from anatomy import structures
 from anatomy.base.typed import Bool, Float
+from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.clearances import (
     CLEARANCE_TOLERANCE_MM,
     REACH_MM,
     check_clear,
     structures_known,
 )
-from lungaccess.judging.checking.environment import Environment
-from lungaccess.judging.checking.findings import CheckReport, Findings
-from lungaccess.judging.checking.poses import POSITION_TOLERANCE_MM, check_rigid
+from lungaccess.judging.checking.findings import POSITION_TOLERANCE_MM, CheckReport, Findings, check_rigid
 from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.judging.checking.space import branch_of, has, labels_at, region_around
 from lungaccess.judging.checking.steering import check_limits, run_of_frames

@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from anatomy.base.errors import LungaccessError
-from lungaccess.judging.checking.findings import Findings
-from lungaccess.judging.checking.poses import angle_between
+from lungaccess.judging.checking.findings import Findings, angle_between
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.tube.device import Tube

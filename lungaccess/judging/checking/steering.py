@@ -7,26 +7,25 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.base.typed import Float
+from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.clearances import (
     REACH_MM,
     check_clear,
     check_stated_clearance,
     structures_known,
 )
-from lungaccess.judging.checking.environment import Environment
-from lungaccess.judging.checking.findings import Findings
-from lungaccess.judging.checking.outcome import check_costs, check_target, forbidden_bits
-from lungaccess.judging.checking.poses import (
+from lungaccess.judging.checking.findings import (
     ANGLE_TOLERANCE_RAD,
     LENGTH_TOLERANCE_MM,
     POSITION_TOLERANCE_MM,
+    Findings,
     angle_between,
     check_rigid,
     check_same_pose,
 )
+from lungaccess.judging.checking.outcome import check_costs, check_target, check_tool, forbidden_bits
 from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.judging.checking.space import Select, airway_except, branch_of, has, labels_at
-from lungaccess.judging.checking.tool import check_tool
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.needle.device import Needle

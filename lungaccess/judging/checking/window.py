@@ -16,8 +16,8 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.meshes import MeshDistance, SurfaceMesh
 from lungaccess.judging.checking import shapes
+from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.deployment import OUT_OF_LUMEN_MM, RIM_POINTS, WALL_ZONE_MM
-from lungaccess.judging.checking.environment import Environment
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.outcome import forbidden_bits
 from lungaccess.judging.checking.shapes import Curve, Piece, cut_at, integrate

@@ -6,9 +6,8 @@ from dataclasses import field
 from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.words import of_hundred
 from lungaccess.judging.answering import Attempt
-from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking
+from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, StartMap
 from lungaccess.judging.explanation.neighbours import Neighbour, ReachedShare
-from lungaccess.judging.explanation.starts import StartMap
 from lungaccess.planning.coupled import Counterfactual
 from lungaccess.planning.reachability import ReachVerdict
 from lungaccess.plans.no_plan import NoPlan

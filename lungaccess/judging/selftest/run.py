@@ -20,7 +20,7 @@ import numpy as np
 from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_value
-from lungaccess.judging.selftest import breath_cases, deployment_cases, needle_cases, scope_cases
+from lungaccess.judging.selftest import deployment_cases, motion_cases, needle_cases
 from lungaccess.judging.selftest.scenes import Case
 
 TOLERANCE = 1e-9
@@ -59,7 +59,7 @@ KINDS: Mapping[str, Kind] = {
         deployment_cases.tubes, (0, 1, 2, 3, 4, 5, 6, 7),
     ),
     "scope motions": Kind(
-        "a motion of the scope touches no wall, at and between its states", scope_cases.motions, (3, 4, 6)
+        "a motion of the scope touches no wall, at and between its states", motion_cases.motions, (3, 4, 6)
     ),
     "start region": Kind(
         "the needle reaches its target from every start of the region", needle_cases.start_region, (1, 2, 3)
@@ -73,7 +73,7 @@ KINDS: Mapping[str, Kind] = {
     ),
     "window": Kind(
         "devices are clear and on target in all phases of a stretch of the breath, or in none",
-        breath_cases.windows, (1, 4, 7),
+        motion_cases.windows, (1, 4, 7),
     ),
 }  # fmt: skip
 """The kinds by name."""

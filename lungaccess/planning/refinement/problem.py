@@ -19,9 +19,8 @@ from lungaccess.planning.refinement.layout import (
     Numbers,
     ShapeModel,
 )
-from lungaccess.plans.candidate import Candidate
+from lungaccess.plans.candidate import Candidate, TipRows
 from lungaccess.plans.evaluator import CandidateEvaluator
-from lungaccess.plans.tip_rows import TipRows
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, arc_transform, bend_direction
 from stages.scope import ScopeTip, evenly

@@ -12,7 +12,7 @@ import pytest
 from anatomy.base.errors import FileError, SettingsError
 from anatomy.base.settings import override, parse, to_mapping
 from docs.write_tables import device_keys
-from lungaccess.problem.needle_load import needle_load, system_warnings
+from lungaccess.problem.channel import needle_load, system_warnings
 from lungaccess.problem.system import (
     System,
     load_system,

@@ -10,8 +10,8 @@ from anatomy.base.typed import Bool, Float
 from anatomy.lung import Lung
 from anatomy.meshes import point_distances_mm
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
-from lungaccess.judging.appraisal.grade import Grade
-from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.appraisal.headline import Grade
+from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.space import Select, airway_except, has, labels_at
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingWindow

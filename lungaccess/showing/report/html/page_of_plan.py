@@ -15,7 +15,7 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.judging.advice import Advice
 from lungaccess.judging.appraisal import Appraisal, Appraiser, Headline, Limit
-from lungaccess.judging.appraisal.grade import Grade, grade_of_chance
+from lungaccess.judging.appraisal.headline import Grade, grade_of_chance
 from lungaccess.planning import with_front
 from lungaccess.plans.chance import Chance
 from lungaccess.plans.plan import Plan

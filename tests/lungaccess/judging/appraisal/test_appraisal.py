@@ -19,7 +19,7 @@ from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from lungaccess.cli.plan_tables import GRADE_STYLES
 from lungaccess.judging.appraisal import Appraisal, Appraiser, Geometry, Grade, Headline, limits_of
-from lungaccess.judging.appraisal.grade import FAIR_FROM, GOOD_FROM, grade_of_chance
+from lungaccess.judging.appraisal.headline import FAIR_FROM, GOOD_FROM, grade_of_chance
 from lungaccess.judging.checking import Finding
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lungaccess.judging.checking import shapes
-from lungaccess.judging.checking.scope import least_gap_mm
-from lungaccess.judging.checking.scope_motion import Motion, motion_of, screws
+from lungaccess.judging.checking.scope import Motion, least_gap_mm, motion_of, screws
 from stages.scope.motion import ScopeMotion
 
 SECTION_MM = 16.0

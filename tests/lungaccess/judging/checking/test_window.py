@@ -18,15 +18,15 @@ from anatomy.structures import LUMEN
 from experiments.support.warped_voxels import BruteForce
 from lungaccess.judging.appraisal import Headline
 from lungaccess.judging.checking import check
-from lungaccess.judging.checking.environment import Environment
+from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.window import Breath, check_window
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim, BreathingWindow
 from lungaccess.uncertainty.breathing.aim import MovingTarget
 from lungaccess.uncertainty.breathing.devices import device_points
-from lungaccess.uncertainty.breathing.in_tissue import carried_needle
 from lungaccess.uncertainty.breathing.kernels.rigid import Rigid, carried, rate_bounds, turned
+from lungaccess.uncertainty.breathing.moving import carried_needle
 from lungaccess.uncertainty.breathing.window import breathing_window, with_window
 from tests.lungaccess.motions import motion_by
 

@@ -14,7 +14,7 @@ from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh, point_distances_mm
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.judging.appraisal.grade import Grade
+from lungaccess.judging.appraisal.headline import Grade
 from lungaccess.judging.checking.window import Breath
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim, BreathingWindow

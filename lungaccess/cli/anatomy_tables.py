@@ -84,13 +84,8 @@ def organ_record(lung: Organ) -> dict[str, Any]:
         ],
         "sources": dict(lung.sources),
         "warnings": list(lung.warnings),
-        "checks": checks_record(lung),
+        "checks": [asdict(each) for each in lung.findings],
     }
-
-
-def checks_record(lung: Organ) -> list[dict[str, str]]:
-    """Return what the checks of the masks found, as plain values."""
-    return [asdict(each) for each in lung.findings]
 
 
 def checks_table(lung: Organ) -> Table:
@@ -231,7 +226,10 @@ def _bronchus_rows(lung: Lung) -> list[terminal.Row]:
 
 
 def _tree_tables(lung: Lung, details: bool) -> list[Table]:
-    repairs = _repair_rows(lung) if details else []
+    repairs = [
+        (kind, ", ".join(f"{c:.1f}" for c in each.position_lps), f"{each.length_mm:.1f}")
+        for kind, each in (_repairs(lung) if details else ())
+    ]
     return [
         terminal.table(
             "Bronchi with a name",
@@ -248,7 +246,6 @@ def _tree_tables(lung: Lung, details: bool) -> list[Table]:
 
 
 def _motion_tables(lung: Lung) -> list[Table]:
-    """Return what is known of the breathing; nothing where nothing is."""
     motion = lung.motion
     if motion is None:
         return []
@@ -292,16 +289,7 @@ def _patient_rows(lung: Organ) -> list[terminal.Row]:
     return rows
 
 
-def _repair_rows(lung: Lung) -> list[terminal.Row]:
-    """Return every change the airway tree needed, with its place."""
-    return [
-        (kind, ", ".join(f"{c:.1f}" for c in each.position_lps), f"{each.length_mm:.1f}")
-        for kind, each in _repairs(lung)
-    ]
-
-
 def _repairs(lung: Lung) -> list[tuple[str, Repair]]:
-    """Return every change the airway tree needed, with its kind."""
     report = lung.tree.report
     return [
         *(("gap bridged", each) for each in report.gaps_bridged),

@@ -40,6 +40,7 @@ from lungaccess.cli.commands.study import study
 from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXAMPLES, EXIT_CODES, START_PAGE, epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.terminal import error_console
+from lungaccess.plans.version import software_version
 
 _TOO_LARGE = AnatomyError(
     "There is not enough memory for this patient",
@@ -48,20 +49,11 @@ _TOO_LARGE = AnatomyError(
 )
 
 
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("lungaccess")
-    except PackageNotFoundError:
-        return "unknown (not installed)"
-
-
 app = App(
     name="lungaccess",
     help="Plan access to a lung nodule with three stages: bronchoscope, concentric tubes, steerable needle.",
     help_epilogue=f"{EXAMPLE_OF_ALL}\n\n{EXIT_CODES}",
-    version=_version,
+    version=software_version,
     console=terminal.help_console,
     result_action="return_value",
     suppress_keyboard_interrupt=False,
@@ -208,9 +200,7 @@ def _answer(words: list[str]) -> int:
 
 
 def _crashed(error: Exception, words: list[str], as_json: bool) -> ExitCode:
-    """Write a report of an error of the program itself, and say where it is."""
-
-    crash = write_report(error, words, _version())
+    crash = write_report(error, words, software_version())
     terminal.show_error(crash, title="crash")
     if as_json:
         terminal.show_json({"error": crash.to_mapping()})
@@ -247,9 +237,6 @@ def _unusable(error: OSError) -> FileError:
     )
 
 
-__all__ = ["app", "main"]
-
-
 class CrashError(LungaccessError):
     """The program itself is at fault, whatever the input was."""
 
@@ -274,7 +261,6 @@ def write_report(error: Exception, words: Sequence[str], version: str) -> CrashE
 
 
 _GUESS = re.compile(r"\s*(Did you mean [^?]*\?)")
-_AVAILABLE = re.compile(r"\s*Available commands: .*", re.DOTALL)
 _NOUNS = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
@@ -287,7 +273,7 @@ def usage_error(error: CycloptsError) -> UsageError:
     error.verbose = False
     command = " ".join(error.command_chain or ())
     found, expected = _found_and_expected(error)
-    found = _AVAILABLE.sub("", found)
+    found = re.sub(r"\s*Available commands: .*", "", found, flags=re.DOTALL)
     guess = _GUESS.search(found)
     explained = _see_help(command)
     remedy = f"{guess.group(1)} {explained}" if guess else explained
@@ -313,13 +299,15 @@ def _found_and_expected(error: CycloptsError) -> tuple[str, str]:
     """Return what the user wrote, and what could stand there."""
     argument, written = error.argument, str(error)
     if isinstance(error, exceptions.ValidationError) and argument is not None:
-        return f"{_name(argument)} is {_value(argument)}", error.exception_message
+        words = " ".join(token.value for token in argument.tokens)
+        return f"{_name(argument)} is {words}", error.exception_message
     if isinstance(error, exceptions.MissingArgumentError) and argument is not None:
         name, what = (error.keyword, "has no value") if error.keyword else (_name(argument), "is missing")
         return f"{name} {what}", argument.parameter.help or f"a value for {_name(argument)}"
     if isinstance(error, exceptions.CoercionError) and error.token is not None:
         name = error.token.keyword or ("A value" if argument is None else _name(argument))
-        return f"{name} is {error.token.value!r}. {_guess(written)}", _kind(error)
+        guess = _GUESS.search(written)
+        return f"{name} is {error.token.value!r}. {guess.group(1) if guess else ''}", _kind(error)
     if isinstance(error, exceptions.UnknownCommandError):
         return written, "a command of lungaccess"
     if isinstance(error, exceptions.UnknownOptionError):
@@ -335,15 +323,6 @@ def _kind(error: exceptions.CoercionError) -> str:
     if choices:
         return f"one of {choices.group(1)}"
     return _NOUNS.get(error.target_type or str, "a value of another kind")
-
-
-def _guess(text: str) -> str:
-    found = _GUESS.search(text)
-    return found.group(1) if found else ""
-
-
-def _value(argument: Argument) -> str:
-    return " ".join(token.value for token in argument.tokens)
 
 
 def _name(argument: Argument) -> str:

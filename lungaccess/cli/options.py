@@ -126,8 +126,15 @@ class PatientOptions(CacheOptions):
         return load_lung(patient, self.cache, thick_slices, self.accept)
 
     def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> Organ:
-        """Return a patient's lung, or a liver of Med-RAD; see `load_organ`."""
-        return load_organ(patient, self.cache, thick_slices, self.accept if refuse else None)
+        """Return a patient's lung or a liver of Med-RAD, and show what is being done; see `load_lung`."""
+        from anatomy.io.liver import is_liver
+        from lungaccess.problem.patients import load_organ
+
+        accept = self.accept if refuse else None
+        if not is_liver(patient):
+            return load_lung(patient, self.cache, thick_slices, accept)
+        with progress(f"reading {patient}"):
+            return load_organ(patient, accept=accept)
 
 
 @Parameter(name="*")
@@ -454,19 +461,6 @@ def require_map(lung: Lung, objective: str) -> None:
             expected=f"a cost map among the patient's files for --objective {objective}",
             remedy="Choose inverse-clearance or length",
         )
-
-
-def load_organ(
-    patient: Path, cache: Path | None, thick_slices: bool, accept: tuple[str, ...] | None
-) -> Organ:
-    """Return a patient's lung or liver, and show what is being done meanwhile; see `load_lung`."""
-    from anatomy.io.liver import is_liver
-    from lungaccess.problem.patients import load_organ as load
-
-    if not is_liver(patient):
-        return load_lung(patient, cache, thick_slices, accept)
-    with progress(f"reading {patient}"):
-        return load(patient, accept=accept)
 
 
 def load_lung(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 from anatomy.base.files import write_text
 from anatomy.base.records import frozen_value
@@ -45,28 +44,13 @@ RESULTS = (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *PICTURES, "no_plan.*", "plan-
 """All files that `plan` may write, and the page beside them."""
 
 
-class Display(AbstractContextManager[Any], Protocol):
-    """What a search is shown on."""
-
-    def update(self, description: str, elapsed_s: float, iteration: int, best_cost: float | None) -> None:
-        """Show the state of the search."""
-
-    def better(self, elapsed_s: float, value: str) -> None:
-        """Show that a better plan was found, and what it states of the goal."""
-
-    def interrupted(self) -> None:
-        """Show that the user ended the search."""
-
-
 class CostHistory:
     """Collects how plans become better while a search runs; its clock is that of the planner."""
 
-    def __init__(self, display: Display, goal: Goal) -> None:
+    def __init__(self, display: SearchDisplay, goal: Goal) -> None:
         from lungaccess.showing.report import CostPoint
 
-        self._point, self._goal = CostPoint, goal
-        self._display = display
-        self._iteration = 0
+        self._point, self._goal, self._display, self._iteration = CostPoint, goal, display, 0
         self._best: float | None = None
         self.points: list[CostPoint] = []
 
@@ -111,7 +95,7 @@ class PlanJob:
         return (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *(PICTURES if self.pictures else ()), *page)
 
 
-def run_search(request: Request, job: PlanJob, display: Display) -> tuple[Plan, list[CostPoint]]:
+def run_search(request: Request, job: PlanJob, display: SearchDisplay) -> tuple[Plan, list[CostPoint]]:
     """Search until the budget is spent and return the best plan and the history of its cost.
 
     The first plan is saved as soon as it is found, and the best one at the end, whatever happens after.  An

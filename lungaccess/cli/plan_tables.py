@@ -14,7 +14,6 @@ from rich.text import Text
 
 from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
-from lungaccess.judging.appraisal.headline import Grade
 from stages.needle import Objective
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from lungaccess.plans.plan import Plan
 
 
-GRADE_STYLES = {Grade.GOOD: "green", Grade.FAIR: "yellow", Grade.UNKNOWN: "yellow", Grade.POOR: "red"}
+GRADE_STYLES = {"good": "green", "fair": "yellow", "unknown": "yellow", "poor": "red"}
 MARKS = {True: Text("ok", "green"), False: Text("refused", "bold red"), None: Text("not checked", "yellow")}
 
 
@@ -120,7 +119,7 @@ def show_findings(appraisal: Appraisal) -> None:
 
 def show_headline(headline: Headline) -> None:
     """Print the headline in a panel whose colour, mark and title follow the worse of its two parts."""
-    style = GRADE_STYLES[headline.grade]
+    style = GRADE_STYLES[headline.grade.key]
     parts = [(headline.grade.mark, f"bold {style}"), (f" {headline.text}", "bold")]
     parts += [(f"\n{each}", "dim") for each in headline.details]
     title = Text(headline.verdict, f"bold {style}")
@@ -173,7 +172,6 @@ def check_tables(report: CheckReport) -> list[Table]:
 
 
 def _findings_table(stage: str, findings: list[Finding]) -> Table:
-    """Return what was found of one stage: values, limits and the distances between the two."""
     made = terminal.bare_table(f"Independent check: {stage}")
     made.add_column("")
     made.add_column("what", no_wrap=True)

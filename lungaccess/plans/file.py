@@ -30,6 +30,7 @@ and one share of strain for the whole shaft of the needle."""
 LINES = "lungaccess-plan-1"
 """The format whose plans state a line for the scope."""
 
+WRITTEN = "a plan.json as `lungaccess plan` writes it"
 ARRAY_TYPES = (np.ndarray, NDArray)
 """What `anatomy.base.typed` is made of: numpy resolves its name of arrays before 2.5, and keeps it since."""
 
@@ -58,23 +59,17 @@ def from_json(cls: type[P], text: str) -> P:
     try:
         content = json.loads(text, object_pairs_hook=_unique, parse_constant=_not_finite)
     except DAMAGE as error:
-        raise PlanFileError(
-            f"The plan is not JSON ({reason(error)})", expected="a plan.json as `lungaccess plan` writes it"
-        ) from error
+        raise PlanFileError(f"The plan is not JSON ({reason(error)})", expected=WRITTEN) from error
     if not isinstance(content, dict):
-        raise PlanFileError(
-            "The plan is not a JSON object", expected="a plan.json as `lungaccess plan` writes it"
-        )
+        raise PlanFileError("The plan is not a JSON object", expected=WRITTEN)
     _require_schema(content.get("schema"))
     stated = content.pop("digest", None)
     try:
         plan = _decode(cls, _in_schema(content), "plan")
         found = digest(plan) if content["schema"] == SCHEMA else _digest(content)
     except DAMAGE as error:
-        raise PlanFileError(
-            f"The plan holds values that no plan has ({reason(error)})",
-            expected="a plan.json as `lungaccess plan` writes it",
-        ) from error
+        found = f"The plan holds values that no plan has ({reason(error)})"
+        raise PlanFileError(found, expected=WRITTEN) from error
     if stated != found:
         raise PlanFileError(
             "The plan does not match its own digest: it was edited or damaged", expected=str(stated)
@@ -146,9 +141,7 @@ def load(cls: type[P], path: str | os.PathLike[str]) -> P:
             remedy="Check the name; `lungaccess plan` writes plan.json into its folder",
         ) from error
     except UnicodeDecodeError as error:
-        raise PlanFileError(
-            f"The plan {os.fspath(path)} is not text", expected="a plan.json as `lungaccess plan` writes it"
-        ) from error
+        raise PlanFileError(f"The plan {os.fspath(path)} is not text", expected=WRITTEN) from error
     return from_json(cls, text)
 
 

@@ -113,7 +113,6 @@ class Plan(Record):
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
-
         heading = f"Plan for {self.patient_name}, {self.system.name}"
         return plan_html(
             heading, self.figures(), self.shown_curves(), self.tube.exit.point_lps, self.target_lps
@@ -324,39 +323,21 @@ class Plan(Record):
         return plan_file.digest(self)
 
     def to_json(self) -> str:
-        """Return the plan as JSON text, with its digest; `from_json` restores it without loss.
-
-        Raises:
-            PlanFileError: If a number is not finite.
-        """
+        """Return the plan as JSON text, with its digest; PlanFileError if a number is not finite."""
         return plan_file.to_json(self)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Return the plan that `to_json` wrote.
-
-        Raises:
-            PlanFileError: If the text is no JSON, of another schema, incomplete, or not what its digest was
-                made from.
-        """
+        """Return the plan that `to_json` wrote; PlanFileError if it is no intact JSON of its schema."""
         return plan_file.from_json(cls, text)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the plan to `path`, all or nothing.
-
-        Raises:
-            FileError: If the file cannot be written.
-            PlanFileError: If a number is not finite.
-        """
+        """Write the plan to `path`, all or nothing; FileError if that fails, other errors as `to_json`."""
         plan_file.save(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a plan from `path`.
-
-        Raises:
-            PlanFileError: If there is no such file or it is not an intact plan.
-        """
+        """Read a plan from `path`; PlanFileError if there is no such file or it is not an intact plan."""
         return plan_file.load(cls, path)
 
 
@@ -384,12 +365,7 @@ def plan_html(
     exit_lps: Float,
     target_lps: Float,
 ) -> str:
-    """Return a plan as HTML.
-
-    Args:
-        rows (iterable of (str, str)): Names and values of the table.
-        exit_lps, target_lps ((3,) float64, LPS mm): Where rings are drawn.
-    """
+    """Return a plan as HTML: a table of names and values, and drawings with rings at exit and target."""
     drawings = [_drawing(view, curves, exit_lps, target_lps) for view in (CORONAL, AXIAL)]
     return side_by_side(table(rows, heading), *drawings)
 

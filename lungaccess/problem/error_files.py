@@ -22,9 +22,8 @@ _FILES = PresetFiles(
 )
 
 
-def error_preset_names() -> tuple[str, ...]:
-    """Return the names of the error models that ship with the package, sorted."""
-    return _FILES.names
+error_preset_names = _FILES.names
+"""Returns the names of the error models that ship with the package, sorted."""
 
 
 @functools.cache
@@ -38,9 +37,6 @@ def load_errors(name_or_path: str | os.PathLike[str] = DEFAULT_ERRORS) -> ErrorM
     A table that a file leaves out is that of the preset that its key `like` names, of `breath-hold` without
     that key.  The model is called what the file says in `name`, else as the file is.
 
-    Args:
-        name_or_path: Name of a preset (see `error_preset_names`), or path of a file that ends in ``.toml``.
-
     What may be stated, and the errors, are those of `lungaccess.problem.system.load_system`.
 
     Examples:
@@ -48,7 +44,7 @@ def load_errors(name_or_path: str | os.PathLike[str] = DEFAULT_ERRORS) -> ErrorM
         1.3
     """
     given = os.fspath(name_or_path)
-    if given in _FILES.names:
+    if given in _FILES.names():
         return _preset(given)
     stated = _FILES.read(name_or_path)
     like = stated.pop(LIKE, DEFAULT_ERRORS)

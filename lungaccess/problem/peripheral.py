@@ -18,12 +18,8 @@ DRAWS_A_POINT = 100_000
 def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
     """Draw targets 5 to 25 mm from the pleura and at least 3 mm clear of airway, vessels and pleura.
 
-    Args:
-        per_lung: How many on each side of the carina.
-        seed: The same seed and number give the same points.
-
     Returns:
-        (2 per_lung, 3) float64, LPS mm: Those of the patient's left lung first.
+        (2 per_lung, 3) float64, LPS mm: Those of the patient's left lung first; the same for the same seed.
 
     Raises:
         TargetError: If one side has no such target.

@@ -28,9 +28,8 @@ class PresetFiles:
     remedy: str
     expected: str = "UTF-8 text in TOML syntax"
 
-    @property
     def names(self) -> tuple[str, ...]:
-        """Names of the presets, sorted in each folder."""
+        """Return the names of the presets, sorted in each folder."""
         return tuple(name for folder in self.folders for name in self.names_in(folder))
 
     @staticmethod
@@ -48,7 +47,7 @@ class PresetFiles:
         for folder in self.folders:
             if name in self.names_in(folder):
                 return (_ROOM / folder / f"{name}.toml").read_text(encoding="utf-8")
-        names = self.names
+        names = self.names()
         raise SettingsError(
             f"There is no {self.what} called {name!r}",
             expected=f"a preset ({', '.join(names)}) or the path of a .toml file",
@@ -63,6 +62,6 @@ class PresetFiles:
             FileError: If the file cannot be read.
         """
         given = os.fspath(name_or_path)
-        if given in self.names or (isinstance(name_or_path, str) and not given.endswith(".toml")):
+        if given in self.names() or (isinstance(name_or_path, str) and not given.endswith(".toml")):
             return tomllib.loads(self.text(given))
         return read_toml(given, expected=self.expected, remedy=self.remedy)

@@ -55,12 +55,7 @@ def least_invasive_first(systems: Iterable[System]) -> tuple[System, ...]:
 def presets_by_invasiveness(
     *, fissures_allowed: bool | None = None, tool: Tool | None = None
 ) -> tuple[System, ...]:
-    """Return the systems that ship with the package, the least invasive first.
-
-    Args:
-        fissures_allowed: Whether fissures may be crossed, instead of what each system says.
-        tool: What is done at the target; with one, those without a needle are left out.
-    """
+    """Return the systems that ship, the least invasive first; with a tool, those that have a needle."""
     systems = (load_system(name, fissures_allowed=fissures_allowed) for name in preset_names())
     able = (each for each in systems if tool is None or each.needle is not None)
     return least_invasive_first(with_tool(each, tool) for each in able)

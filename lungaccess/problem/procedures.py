@@ -130,9 +130,8 @@ class Procedure:
         return not (self.scope.measured or self.tubes.measured or self.needle.closed_loop)
 
 
-def procedure_names() -> tuple[str, ...]:
-    """Return the names of the procedures that ship with the package, sorted."""
-    return _FILES.names
+procedure_names = _FILES.names
+"""Returns the names of the procedures that ship with the package, sorted."""
 
 
 def load_procedure(name_or_path: str | os.PathLike[str] = DEFAULT_PROCEDURE) -> Procedure:
@@ -142,6 +141,6 @@ def load_procedure(name_or_path: str | os.PathLike[str] = DEFAULT_PROCEDURE) -> 
     """
     given = os.fspath(name_or_path)
     stated = _FILES.read(name_or_path)
-    if given in _FILES.names:
+    if given in _FILES.names():
         return parse(Procedure, stated, given)
     return parse(Procedure, {"name": os.path.basename(given), **stated}, given, remedy=_FILES.remedy)

@@ -203,7 +203,6 @@ class Request:
         self._require_systems()
 
     def _require_bound(self) -> None:
-        """Refuse a gap where no bound can be known."""
         if self.gap is None or self.goal.objective is not None:
             return
         raise SettingsError(

@@ -189,39 +189,16 @@ class System:
         return self.needle
 
 
-def preset_names() -> tuple[str, ...]:
-    """Return the names of the systems that ship with the package, sorted."""
-    return _FILES.names_in(_PRESETS)
-
-
-def needle_preset_names() -> tuple[str, ...]:
-    """Return the names of the systems that ship for the needle stage alone, sorted.
-
-    They are published needles; scope and tubes are only as large as these need.
-    """
-    return _FILES.names_in(_NEEDLES)
-
-
-def tube_preset_names() -> tuple[str, ...]:
-    """Return the names of the systems that ship with tubes turned one against the other, sorted.
-
-    They are not tried where the system is chosen among the presets: their atlas takes minutes.
-    """
-    return _FILES.names_in(_TUBES)
-
-
-def shipped_names() -> tuple[str, ...]:
-    """Return the names of all systems that ship with the package."""
-    return _FILES.names
-
-
-def preset_text(name: str) -> str:
-    """Return the TOML text of a preset, with its comments.
-
-    Raises:
-        SettingsError: If there is no such preset.
-    """
-    return _FILES.text(name)
+preset_names = functools.partial(_FILES.names_in, _PRESETS)
+"""Returns the names of the systems that ship with the package, sorted."""
+needle_preset_names = functools.partial(_FILES.names_in, _NEEDLES)
+"""Returns those for the needle stage alone: published needles; scope and tubes are as large as these need."""
+tube_preset_names = functools.partial(_FILES.names_in, _TUBES)
+"""Returns those with tubes turned one against the other; no choice tries them: their atlas takes minutes."""
+shipped_names = _FILES.names
+"""Returns the names of all of them."""
+preset_text = _FILES.text
+"""Returns the TOML text of a preset, with its comments; SettingsError if there is none so called."""
 
 
 def load_system(name_or_path: str | os.PathLike[str], *, fissures_allowed: bool | None = None) -> System:

@@ -114,9 +114,8 @@ class Tool:
         return np.asarray(found - [0.0, 0.0, self.beyond_mm])
 
 
-def tool_names() -> tuple[str, ...]:
-    """Return the names of the tools that ship with the package, sorted."""
-    return _FILES.names
+tool_names = _FILES.names
+"""Returns the names of the tools that ship with the package, sorted."""
 
 
 def load_tool(name_or_path: str | os.PathLike[str]) -> Tool:

@@ -364,7 +364,6 @@ def _rows(
 def _posing(
     path: Path, rules: Rules, device: System, output: PatientOptions
 ) -> tuple[Pose, Organ | PatientImages | LiverImages]:
-    """Return what makes environments of a patient by the rules, and the patient."""
     from lungaccess.running.benchmark.runs import posed_by_unc, posed_in_lung
 
     if rules == "ours":

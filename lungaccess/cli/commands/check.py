@@ -91,7 +91,6 @@ def check(
 def _check_curve(
     plan: Path, patient: Path, text: str, out: Path | None, output: PatientOptions, *, everything: bool
 ) -> ExitCode:
-    """Check a plan with an edited curve, and save it if it is accepted."""
     from anatomy.io.markups import parse_reference, read_named_curve
     from lungaccess.cli.plan_tables import check_tables, show_headline
     from lungaccess.judging.appraisal import Headline
@@ -181,7 +180,6 @@ def window(
 
 
 def _in_place(needle: CarriedNeedle) -> Table:
-    """Return what the breath does to the needle in place."""
     rows = [
         ("its end to the moving target", f"{needle.end_miss_mm:.1f} mm"),
         ("shift of its begin from the tubes", f"{needle.shift_at_tubes_mm:.1f} mm"),

@@ -57,7 +57,6 @@ def presets(*, show: str | None = None, output: OutputOptions = OutputOptions())
 
 
 def _preset_table(systems: Mapping[str, System]) -> Table:
-    """Return one line a preset: the sizes that matter, and what it is."""
     rows = [
         (
             name,
@@ -176,7 +175,6 @@ def _tubes_rows(answer: TubeAnswer) -> list[terminal.Row]:
 
 
 def _marked(text: str, exceeds: bool) -> str:
-    """Return a value with a mark if it exceeds its limit."""
     return f"{text}  EXCEEDS" if exceeds else text
 
 
@@ -387,7 +385,6 @@ def design(
 
 
 def _show(title: str, found: DesignFound) -> None:
-    """Print the first device and the front, and how many others were tried or refused."""
     devices = found.record()["devices"]
     first = found.counted[0].system.name
     numbers = {each.system.name: f"{n}" for n, each in enumerate(found.front, start=1)}

@@ -124,7 +124,6 @@ def _decided(
     followed: _Followed,
     output: PatientOptions,
 ) -> ExitCode:
-    """Show what the policy of a procedure says about measured poses."""
     from lungaccess.planning.procedure import Measurements, Policy, ProcedureRecord
     from lungaccess.plans.plan import Plan
 
@@ -155,7 +154,6 @@ def _decided(
 
 
 def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[Float, Plan | None]:
-    """Return the pose as measured, and the plan that it is of if it is one of a plan."""
     given = scope if tube is None else tube
     if given is None or (scope is not None and tube is not None):
         raise SettingsError(
@@ -314,7 +312,6 @@ def needle(
 
 
 def _needle_tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
-    """Return what a needle planner found: the outcome, and the path arc by arc."""
     from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.planning.one_stage import obstruction_rows
     from lungaccess.plans.costs import costs_in_words

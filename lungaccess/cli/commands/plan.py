@@ -89,7 +89,6 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
 
 
 def _first_reachable_nodule(lung: Lung, job: PlanJob) -> ExitCode:
-    """Plan to the nodules in their order until one can be reached."""
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import stated_target
 
@@ -179,9 +178,7 @@ def explain_and_report(
 ) -> dict[str, Any]:
     """Explain a `NoPlan`, write and show what was learned, and return it as plain values.
 
-    Args:
-        cost: By which plans of other systems are searched.
-        time_s: Processor time for the explanation; the default of `explain_no_plan` if None.
+    Plans of other systems are searched by `cost`; the time is that of `explain_no_plan` if None.
     """
     from lungaccess.judging.explanation import explanation_record, save_explanation
 
@@ -333,7 +330,6 @@ def alternatives(
 
 
 def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal]) -> None:
-    """Print the headline of the plan that succeeds most often, then one row a plan."""
     from lungaccess.cli.plan_tables import show_headline
 
     best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
@@ -361,7 +357,6 @@ def _success(appraisal: Appraisal) -> float:
 def _records(
     found: tuple[Alternative, ...], appraisals: list[Appraisal], out: Path, has_map: bool
 ) -> list[dict[str, object]]:
-    """Return each plan's file, appraisal and criteria as plain values."""
     from lungaccess.plans.costs import known_costs
 
     return [
@@ -378,7 +373,6 @@ def _records(
 
 
 def _row(number: int, each: Alternative, appraisal: Appraisal, has_map: bool) -> tuple[str, ...]:
-
     success = appraisal.headline.success
     return (
         f"{number:02d}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from anatomy.base.words import of_hundred, percent, range_of_hundred
@@ -106,7 +106,6 @@ def risk(
 
 def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]:
     """Return a report and tolerances as plain values."""
-
     return _estimate_record(report) | {
         "reaches": report.reaches.to_mapping(),
         "forbidden": list(report.forbidden),
@@ -146,10 +145,7 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
 
 def resting_record(rows: Sequence[RestingRow]) -> dict[str, object]:
     """Return what the shaft at rest on the wall does to a plan, as plain values."""
-    found = [
-        {"name": each.name, "value": each.value, "unit": each.unit, "limit": each.limit} for each in rows
-    ]
-    return {"resting_scope": found}
+    return {"resting_scope": [asdict(each) for each in rows]}
 
 
 def _resting_table(rows: Sequence[RestingRow]) -> Table:
@@ -179,7 +175,6 @@ def _outcome_table(report: RiskReport) -> Table:
 
 
 def _goal_words(report: RiskReport | ProcedureReport) -> str:
-    """Return what the goal is, and where it came from."""
     goal = report.tissue or f"goal {report.radius_mm:.2f} mm"
     return f"{goal}: {report.radius_origin}"
 

@@ -94,11 +94,8 @@ def completed_plan(
         follow_the_leader_error_mm=motions.follow_the_leader_error_mm,
         shape=motions.shape,
     )
-    pieces = [
-        shapes.Piece(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
-        for arc in motions.arcs
-    ]
-    curve = shapes.integrate(motions.lps_from_tube_tip, shapes.cut_at(pieces, needle.exit_exemption_mm))
+    pieces = shapes.cut_at(shapes.needle_pieces(motions.arcs), needle.exit_exemption_mm)
+    curve = shapes.integrate(motions.lps_from_tube_tip, pieces)
     draft = Plan(
         software_version=software_version(),
         patient_name=lung.name,
@@ -123,7 +120,9 @@ def completed_plan(
         iterations=0,
         timing={},
     )
-    return _with_costs(_with_exit(draft, environment), environment, curve)
+    whole = _with_exit(draft, environment)
+    costs = recomputed_costs(whole, environment, curve)
+    return replace(whole, costs={name: cost.value for name, cost in costs.items()})
 
 
 def _scope(motions: Motions, environment: Environment, system: System) -> ScopeInsertion:
@@ -183,8 +182,3 @@ def _needle(motions: Motions, curve: shapes.Curve) -> NeedlePath:
         max_angle_from_start_rad=angle,
         accumulated_turn_rad=turned,
     )
-
-
-def _with_costs(plan: Plan, environment: Environment, curve: shapes.Curve) -> Plan:
-    found = recomputed_costs(plan, environment, curve)
-    return replace(plan, costs={name: cost.value for name, cost in found.items()})

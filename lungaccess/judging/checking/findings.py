@@ -142,17 +142,15 @@ class Findings:
         self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
     ) -> bool:
         """Record a value that must not be below `limit` by more than `tolerance`."""
-        return self._number(
-            name, value >= limit - tolerance, value, limit, "at least", tolerance, unit, detail
-        )
+        kept = value >= limit - tolerance
+        return self._bounded("at least", kept, name, value, limit, unit, detail, tolerance)
 
     def at_most(
         self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
     ) -> bool:
         """Record a value that must not be above `limit` by more than `tolerance`."""
-        return self._number(
-            name, value <= limit + tolerance, value, limit, "at most", tolerance, unit, detail
-        )
+        kept = value <= limit + tolerance
+        return self._bounded("at most", kept, name, value, limit, unit, detail, tolerance)
 
     def agrees(self, name: str, stated: ArrayLike, found: ArrayLike, largest: float, unit: str) -> bool:
         """Record the largest difference between a stated and a recomputed value (or array)."""
@@ -161,27 +159,21 @@ class Findings:
         detail = f"stated {float(a):.6g}, recomputed {float(b):.6g}" if a.shape == b.shape == () else ""
         return self.at_most(name, gap, largest, unit, detail or "largest difference of stated and recomputed")
 
-    def _number(
+    def _bounded(
         self,
-        name: str,
+        side: Side,
         ok: bool,
+        name: str,
         value: float,
         limit: float,
-        side: Side,
-        tolerance: float,
         unit: str,
         detail: str,
+        spare: float,
     ) -> bool:
         made = Finding(
-            name=name,
-            ok=bool(ok),
-            value=float(value),
-            limit=float(limit),
-            side=side,
-            tolerance=tolerance,
-            unit=unit,
-            detail=detail,
-        )
+            name=name, ok=bool(ok), value=float(value), limit=float(limit), side=side, tolerance=spare,
+            unit=unit, detail=detail,
+        )  # fmt: skip
         self._all.append(made)
         return bool(ok)
 

@@ -32,11 +32,14 @@ def check_record(
     plan: Plan, lung: "Lung", found: Findings, system: System | None, target_lps: Float | None
 ) -> bool:
     """Record all that needs no geometry; return whether geometry can be looked at."""
-    usable = _check_numbers(plan, found)
-    if not usable:
+    bad = [name for name, size in _sizes(plan, "plan") if not math.isfinite(size)]
+    if not found.true("record.finite", not bad, ", ".join(bad)):
         return False
     _check_integrity(plan, found)
-    _check_patient(plan, lung, found)
+    found.true("patient.name", plan.patient_name == lung.name, f"{plan.patient_name} against {lung.name}")
+    found.true("patient.key", plan.lung_key == lung.key, f"{plan.lung_key} against {lung.key}")
+    found.true("patient.sources", dict(plan.sources) == dict(lung.sources), "hashes of the image files")
+    found.true("patient.breath_hold", plan.breath_hold == lung.breath_hold, str(plan.breath_hold))
     _check_system(plan, found, system)
     _check_required(plan, found)
     _check_fissures(plan, lung, found)
@@ -74,11 +77,6 @@ def _sizes(value: object, where: str) -> Iterator[tuple[str, float]]:
         yield where, abs(float(value))
 
 
-def _check_numbers(plan: Plan, found: Findings) -> bool:
-    bad = [name for name, size in _sizes(plan, "plan") if not math.isfinite(size)]
-    return found.true("record.finite", not bad, ", ".join(bad))
-
-
 def _check_integrity(plan: Plan, found: Findings) -> None:
     found.true("record.schema", plan.schema == SCHEMA, plan.schema)
     found.true("record.version", bool(plan.software_version.strip()), plan.software_version)
@@ -88,13 +86,6 @@ def _check_integrity(plan: Plan, found: Findings) -> None:
         found.true("record.round_trip", True, "the plan as text is the same plan")
     except LungaccessError as error:
         found.true("record.round_trip", False, str(error))
-
-
-def _check_patient(plan: Plan, lung: "Lung", found: Findings) -> None:
-    found.true("patient.name", plan.patient_name == lung.name, f"{plan.patient_name} against {lung.name}")
-    found.true("patient.key", plan.lung_key == lung.key, f"{plan.lung_key} against {lung.key}")
-    found.true("patient.sources", dict(plan.sources) == dict(lung.sources), "hashes of the image files")
-    found.true("patient.breath_hold", plan.breath_hold == lung.breath_hold, str(plan.breath_hold))
 
 
 def _check_system(plan: Plan, found: Findings, system: System | None) -> None:

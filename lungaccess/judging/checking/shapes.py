@@ -1,12 +1,13 @@
 """Own kinematics of the check: poses re-integrated with matrix exponentials, shapes by quadrature."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
+from lungaccess.plans.parts import NeedleArc
 from lungaccess.plans.plan import Plan
 
 TINY_MM = 1e-9
@@ -147,6 +148,13 @@ def tube_pieces(plan: Plan) -> list[Piece]:
             pieces.append(Piece(length_mm=length, roll_rad=direction - turned, curvature_per_mm=curvature))
             turned = direction
     return pieces
+
+
+def needle_pieces(arcs: Iterable[NeedleArc]) -> list[Piece]:
+    """Return the arcs of a needle as pieces."""
+    return [
+        Piece(length_mm=a.length_mm, roll_rad=a.roll_rad, curvature_per_mm=a.curvature_per_mm) for a in arcs
+    ]
 
 
 def tube_tip(plan: Plan, curve: Curve) -> Float:

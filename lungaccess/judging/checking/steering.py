@@ -24,7 +24,7 @@ from lungaccess.judging.checking.findings import (
     check_same_pose,
 )
 from lungaccess.judging.checking.outcome import check_costs, check_target, check_tool, forbidden_bits
-from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
+from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate, needle_pieces
 from lungaccess.judging.checking.space import Select, airway_except, branch_of, has, labels_at
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
@@ -52,32 +52,26 @@ def check_needle(
     check_same_pose("needle.start", needle.lps_from_start, plan.tube.lps_from_tip, found)
     if tube_end is not None:
         check_same_pose("needle.start.integrated", needle.lps_from_start, tube_end, found)
-    pieces = [
-        Piece(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
-        for arc in needle.arcs
-    ]
+    pieces = needle_pieces(needle.arcs)
     curve = integrate(needle.lps_from_start, cut_at(pieces, plan.exemption.needle_length_mm))
-    if not _check_motion(needle, device, pieces, curve, found):
-        return
-    found.agrees("needle.end", needle.end_lps, curve.points[-1], POSITION_TOLERANCE_MM, "mm")
-    check_target(plan, lung, curve.points[-1], found)
-    check_tool(plan, lung, curve.end, found)
-    _check_exemption(plan, device, found)
-    _check_containment(plan, lung, curve, found)
-    _check_clearance(plan, device, environment, curve, found)
-    check_costs(plan, environment, curve, found)
-
-
-def _check_motion(
-    needle: NeedlePath, device: Needle, pieces: Sequence[Piece], curve: Curve, found: Findings
-) -> bool:
-    """Curvature, length and both turning limits; tell whether the needle is as short as the device's."""
     length = float(sum(arc.length_mm for arc in needle.arcs))
     found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
     turned, angle = turning(curve)
     found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
     found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
-    return check_limits(pieces, device, curve, found)
+    if not check_limits(pieces, device, curve, found):
+        return
+    found.agrees("needle.end", needle.end_lps, curve.points[-1], POSITION_TOLERANCE_MM, "mm")
+    check_target(plan, lung, curve.points[-1], found)
+    check_tool(plan, lung, curve.end, found)
+    # The exit of the tubes settles branch and point of the exemption.
+    exempt, limit = plan.exemption.needle_length_mm, device.exit_exemption_mm
+    detail = "needle that may be near the pierced wall"
+    found.at_most("exemption.length", exempt, limit, "mm", detail, LENGTH_TOLERANCE_MM)
+    found.at_least("exemption.length.sign", exempt, 0.0, "mm")
+    _check_containment(plan, lung, curve, found)
+    _check_clearance(plan, device, environment, curve, found)
+    check_costs(plan, environment, curve, found)
 
 
 def turning(curve: Curve) -> tuple[float, float]:
@@ -105,14 +99,6 @@ def check_limits(pieces: Sequence[Piece], device: Needle, curve: Curve, found: F
     return found.at_most(
         "needle.length.limit", length, device.max_length_mm, "mm", detail, LENGTH_TOLERANCE_MM
     )
-
-
-def _check_exemption(plan: Plan, device: Needle, found: Findings) -> None:
-    """The exemption is not longer than the device's; the exit of the tubes settles its branch and point."""
-    exempt = plan.exemption.needle_length_mm
-    limit, detail = device.exit_exemption_mm, "needle that may be near the pierced wall"
-    found.at_most("exemption.length", exempt, limit, "mm", detail, LENGTH_TOLERANCE_MM)
-    found.at_least("exemption.length.sign", exempt, 0.0, "mm")
 
 
 def _check_containment(plan: Plan, lung: "Lung", curve: Curve, found: Findings) -> None:

@@ -20,7 +20,7 @@ from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.deployment import OUT_OF_LUMEN_MM, RIM_POINTS, WALL_ZONE_MM
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.outcome import forbidden_bits
-from lungaccess.judging.checking.shapes import Curve, Piece, cut_at, integrate
+from lungaccess.judging.checking.shapes import Curve, cut_at, integrate
 from lungaccess.judging.checking.space import Select, airway_except, has, labels_at, not_lumen
 from lungaccess.plans.plan import Plan
 
@@ -150,11 +150,7 @@ class _Devices:
         self.tube: Curve = integrate(plan.scope.lps_from_scope_tip, pieces)
         self.needle: Curve | None = None
         if plan.needle is not None:
-            arcs = [
-                Piece(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
-                for arc in plan.needle.arcs
-            ]
-            cut = cut_at(arcs, plan.exemption.needle_length_mm)
+            cut = cut_at(shapes.needle_pieces(plan.needle.arcs), plan.exemption.needle_length_mm)
             self.needle = integrate(plan.needle.lps_from_start, cut)
 
     @property

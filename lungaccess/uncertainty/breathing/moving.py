@@ -12,9 +12,8 @@ from anatomy.lung import Lung
 from anatomy.motion.motion import Motion
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingWindow
-from lungaccess.uncertainty.breathing.devices import device_points
 from lungaccess.uncertainty.breathing.kernels.rigid import Rigid, turned
-from lungaccess.uncertainty.breathing.window import carrier, require_motion
+from lungaccess.uncertainty.breathing.window import carrier, device_points, require_motion
 
 
 @frozen_record

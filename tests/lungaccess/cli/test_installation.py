@@ -46,13 +46,13 @@ def test_the_doctor_misses_nothing_that_this_platform_does_not_need(monkeypatch:
         "no-such-c>=1; python_version >= '3.9' and (sys_platform != 'another' or extra == 'view')",
     ]  # fmt: skip
     monkeypatch.setattr(installation.metadata, "requires", lambda _name: lines)
-    found = {each.name: each.version for each in installation._libraries()}
+    found = {each["name"]: each["version"] for each in installation._libraries()}
     assert list(found) == ["numpy", "no-such-c"] and found["numpy"] and found["no-such-c"] is None
 
 
 def test_the_doctor_complains(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any) -> None:
-    missing = installation.Library(name="numba", required=">=0.60", version=None)
-    monkeypatch.setattr(installation, "_libraries", lambda: (missing,))
+    missing = {"name": "numba", "required": ">=0.60", "version": None}
+    monkeypatch.setattr(installation, "_libraries", lambda: [missing])
     monkeypatch.setenv("LUNGACCESS_DATA", str(tmp_path / "nowhere"))
     (tmp_path / "file").write_text("")
     assert cli.main(["doctor", "--cache", str(tmp_path / "file" / "cache")]) == 1
@@ -68,16 +68,16 @@ def test_kernels_are_warm_where_there_is_code_of_their_present_sources(
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(sources, "kernel_modules", lambda **_more: ("a", "b"))
     monkeypatch.setattr(sources.Sources, "stamp", lambda _self, name: 64 * texts[name])
-    place = Path(installation.kernel_cache().folders[-1])
-    assert tmp_path in place.parents and installation.kernel_cache().state == "cold"
+    place = Path(installation.kernel_cache()["folders"][-1])
+    assert tmp_path in place.parents and installation.examine()["kernel_state"] == "cold"
     for name, stamp, state in (("a", "1", "partly warm"), ("b", "3", "partly warm"), ("b", "2", "warm")):
         code = place / f"{name}-{12 * stamp}" / "f-123.code"
         code.parent.mkdir(parents=True)
         code.write_bytes(b"12345")
-        assert installation.kernel_cache().state == state
+        assert installation.examine()["kernel_state"] == state
     texts["a"] = "4"
-    assert installation.kernel_cache().state == "partly warm", "code of other sources does not count"
-    assert installation.kernel_cache().size_bytes == 15
+    assert installation.examine()["kernel_state"] == "partly warm", "code of other sources does not count"
+    assert installation.kernel_cache()["size_bytes"] == 15
 
 
 @cache

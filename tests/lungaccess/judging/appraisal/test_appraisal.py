@@ -157,7 +157,7 @@ def test_nothing_is_green_unless_it_is_accepted_and_likely(
     draws = count + more + 1
     report = None if checked is None else make_check(checked)
     headline = Headline.of(report, make_risk(count, draws) if estimated else None)
-    good = GRADE_STYLES[headline.grade] == "green"
+    good = GRADE_STYLES[headline.grade.key] == "green"
     assert good == ("grade-good" in words.headline(headline)) == ("✓" in words.headline(headline))
     assert good == (headline.grade.colour == Grade.GOOD.colour)
     if good:
@@ -165,7 +165,7 @@ def test_nothing_is_green_unless_it_is_accepted_and_likely(
     if headline.grade == Grade.FAIR:
         assert checked and estimated and count / draws >= FAIR_FROM
     if headline.geometry == Geometry.REFUSED:
-        assert GRADE_STYLES[headline.grade] == "red"
+        assert GRADE_STYLES[headline.grade.key] == "red"
     json.dumps(headline.to_mapping(), allow_nan=False)
 
 

@@ -171,6 +171,9 @@ def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
     """
     from anatomy.lung import Lung
 
+    starts = zip(lung.start_names, (pose[:3, 3] for pose in lung.starts), strict=False)
+    targets = zip(lung.target_names, lung.targets_lps, strict=False)
+    places = [(name, ", ".join(f"{c:.1f}" for c in point)) for name, point in (*starts, *targets)]
     made = [
         terminal.table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
@@ -178,7 +181,7 @@ def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
         checks_table(lung),
         *(_tree_tables(lung, details) if isinstance(lung, Lung) else ()),
         *(_motion_tables(lung) if isinstance(lung, Lung) else ()),
-        terminal.table("Starts and targets", ("name", "LPS, mm"), _place_rows(lung)),
+        terminal.table("Starts and targets", ("name", "LPS, mm"), places),
         terminal.table(
             "Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]
         ),
@@ -257,12 +260,6 @@ def _motion_tables(lung: Lung) -> list[Table]:
         *((MOTION_WORDS.get(name, name), f"{value:.2f}") for name, value in motion.figures.items()),
     ]
     return [terminal.table("Breathing", ("", ""), rows)]
-
-
-def _place_rows(lung: Organ) -> list[terminal.Row]:
-    starts = zip(lung.start_names, (pose[:3, 3] for pose in lung.starts), strict=False)
-    targets = zip(lung.target_names, lung.targets_lps, strict=False)
-    return [(name, ", ".join(f"{c:.1f}" for c in point)) for name, point in (*starts, *targets)]
 
 
 def _patient_rows(lung: Organ) -> list[terminal.Row]:

@@ -111,11 +111,7 @@ def _run(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code; no user error ever shows a traceback.
-
-    Args:
-        arguments: The words after the name of the program; those of this process if None.
-    """
+    """Run one command, of this process if no words are given, and return its exit code, never a traceback."""
     words = [_with_home(word) for word in (sys.argv[1:] if arguments is None else arguments)]
     terminal.prepare_surroundings()
     try:
@@ -177,7 +173,9 @@ def _answer(words: list[str]) -> int:
         return _explain(usage_error(error), as_json)
     except LungaccessError as error:
         error.expected = error.expected or "input that this command can use"
-        error.remedy = error.remedy or _see_help(" ".join(_command_in(words)))
+        named = [word for word in words if not word.startswith("-")][:2]
+        command = next((text for n in (2, 1) if (text := " ".join(named[:n])) in EXAMPLES), "")
+        error.remedy = error.remedy or _see_help(command)
         return _explain(error, as_json)
     except BrokenPipeError:
         raise
@@ -280,12 +278,6 @@ def usage_error(error: CycloptsError) -> UsageError:
     return UsageError(
         _one_line(_GUESS.sub("", found)), expected=_one_line(expected), remedy=_one_line(remedy)
     )
-
-
-def _command_in(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the words that name the command, such as study and run; none if they name none."""
-    named = [word for word in words if not word.startswith("-")][:2]
-    return next((tuple(named[:n]) for n in (2, 1) if " ".join(named[:n]) in EXAMPLES), ())
 
 
 def _see_help(command: str) -> str:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from anatomy.lung import Lung
     from anatomy.organ import Organ
     from lungaccess.planning.coupled.atlas import Atlas
+    from lungaccess.plans.plan import Plan
     from lungaccess.problem.errors import ErrorModel
     from lungaccess.problem.procedures import Procedure
     from lungaccess.problem.system import System
@@ -125,6 +126,14 @@ class PatientOptions(CacheOptions):
         """Return a patient's lung; see `load_lung`."""
         return load_lung(patient, self.cache, thick_slices, self.accept)
 
+    def load_plan(self, plan: Path, patient: Path) -> tuple[Plan, Lung]:
+        """Return a plan and the lung that it was made for; PlanFileError if it was made for another."""
+        from lungaccess.plans.plan import Plan
+
+        stored, lung = Plan.load(plan), self.load(patient)
+        stored.require_lung(lung)
+        return stored, lung
+
     def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> Organ:
         """Return a patient's lung or a liver of Med-RAD, and show what is being done; see `load_lung`."""
         from anatomy.io.liver import is_liver
@@ -153,12 +162,7 @@ class TargetOptions:
     nodule: Annotated[Whole | None, Parameter(metavar="[INT]")] = None
 
     def stated(self) -> StatedTarget:
-        """Return what the user states, before any patient is read.
-
-        Raises:
-            FrameError: If a point states no frame.
-            TargetError: If there is not exactly one of point and nodule.
-        """
+        """Return what the user states, before any patient is read; errors as of `stated_target`."""
         from lungaccess.problem.target import stated_target
 
         return stated_target(self.target, self.nodule)
@@ -183,11 +187,7 @@ class PlaceOptions:
     scope_tip_within: NotNegative = 1.5
 
     def stated(self) -> StatedPlace | None:
-        """Return the place that the user states, None for none; errors as `TargetOptions`.
-
-        Raises:
-            SettingsError: If both are stated.
-        """
+        """Return the place that the user states, None for none; SettingsError if both are stated."""
         if self.exit is not None and self.scope_tip is not None:
             raise SettingsError(
                 "--exit and --scope-tip are both stated",
@@ -226,11 +226,7 @@ class SystemOptions:
     allow_fissures: bool | None = None
 
     def load(self) -> System:
-        """Return the system, with its rule about fissures replaced if the user states one.
-
-        Raises:
-            SettingsError: If it is to be chosen, or cannot be read.
-        """
+        """Return the system, its rule about fissures replaced if stated; SettingsError if it is "auto"."""
         from lungaccess.problem.system import load_system
 
         if self.system == AUTO:
@@ -385,11 +381,7 @@ class SearchOptions(BudgetOptions):
         procedure: Procedure | None = None,
         place: StatedPlace | None = None,
     ) -> Asked:
-        """Return all of a request but patient and target, after what can be looked at without them.
-
-        Raises:
-            SettingsError: If there is no such goal or method, or a value is wrong.
-        """
+        """Return all of a request but patient and target; SettingsError if anything in it is wrong."""
         from anatomy.machine_code.ahead import usable_cores
         from lungaccess.planning.searches import planners, unknown_method
 
@@ -422,11 +414,7 @@ class Asked:
 
 
 def stated_phases(text: str | None) -> tuple[float, float] | None:
-    """Return first and last phase of a text such as 0.0:0.3; None without one.
-
-    Raises:
-        SettingsError: If it is not two phases from 0 to 1 in order.
-    """
+    """Return first and last phase of a text such as 0.0:0.3; None without one; else SettingsError."""
     if text is None:
         return None
     first, _colon, last = text.partition(":")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,13 +95,10 @@ class PlanJob:
 
 
 def run_search(request: Request, job: PlanJob, display: SearchDisplay) -> tuple[Plan, list[CostPoint]]:
-    """Search until the budget is spent and return the best plan and the history of its cost.
+    """Search until the budget is spent; return the best plan and the history of its cost, or raise NoPlan.
 
     The first plan is saved as soon as it is found, and the best one at the end, whatever happens after.  An
     interruption from the keyboard ends the search early; the best plan so far is kept.
-
-    Raises:
-        lungaccess.plans.no_plan.NoPlan: If no plan was found.
     """
     from lungaccess.judging import answer
     from lungaccess.planning import atlas_event
@@ -137,13 +133,10 @@ def run_search(request: Request, job: PlanJob, display: SearchDisplay) -> tuple[
 
 
 def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
-    """Search, appraise, show headline, limits and plan, draw it, and return the exit code.
+    """Search, appraise, show headline, limits and plan, draw it, return the exit code; NoPlan without a plan.
 
     What is known is saved and shown before anything slower begins: the first plan, then the best one with its
     check and its chance of success, then the pictures.
-
-    Raises:
-        lungaccess.plans.no_plan.NoPlan: If no plan was found.
     """
     request = job.asked.request(lung, job.target.resolve(lung))
     goal, limits = request.goal, request.limits
@@ -151,6 +144,7 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     best, history = run_search(request, job, display)
     # After the search: the first plan does not wait for these.
     from lungaccess.judging.appraisal import appraise, plan_record
+    from lungaccess.showing.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
     from lungaccess.uncertainty.breathing.window import with_window
 
     found = best if best.window is not None else with_window(best, lung)
@@ -173,7 +167,12 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
         if job.guide is not None:
             terminal.console.print(job.guide)
         show_plan(found, lung, appraisal, advice)
-    write_history(found, history, lung, appraisal, job, goal)
+    cost_over_time_csv(history, job.out / HISTORY_FILE)
+    if job.pictures:
+        with progress("drawing the plan"):
+            overview_png(found, lung, job.out / "overview.png", appraisal)
+            tree_png(lung, job.out / "tree.png")
+            cost_over_time_png(history, job.out / "cost_over_time.png", goal)
     if job.guide is not None:
         from lungaccess.showing.report.html import PageOptions, plan_page
 
@@ -198,20 +197,17 @@ def advised(
     """Return what would lift the chance of a plan, with the presets whose atlases the cache holds."""
     from lungaccess.judging.advice import advise
     from lungaccess.judging.appraisal import appraise
+    from lungaccess.planning.coupled import atlas_is_kept, open_atlas
     from lungaccess.problem.preset_order import presets_by_invasiveness
+
+    def kept_atlas(system: System) -> Atlas | None:
+        return open_atlas(lung, system, cache=cache) if atlas_is_kept(lung, system, cache=cache) else None
 
     known = appraisal or appraise(plan, lung, errors=errors, procedure=procedure)
     return advise(
-        plan, lung, known, errors=errors, procedure=procedure, atlas_of=partial(kept_atlas, lung, cache),
+        plan, lung, known, errors=errors, procedure=procedure, atlas_of=kept_atlas,
         systems=presets_by_invasiveness(tool=plan.system.tool),
     )  # fmt: skip
-
-
-def kept_atlas(lung: Lung, cache: Path | None, system: System) -> Atlas | None:
-    """Return the atlas of a system if the cache holds it."""
-    from lungaccess.planning.coupled import atlas_is_kept, open_atlas
-
-    return open_atlas(lung, system, cache=cache) if atlas_is_kept(lung, system, cache=cache) else None
 
 
 def system_of(plan: Plan, systems: Sequence[System]) -> System:
@@ -232,17 +228,3 @@ def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal, advice: Sequence[Adv
         terminal.say(" ".join(plan.system_choice))
     plan_tables.show_advice(advice, appraisal)
     plan_tables.show_headline(appraisal.headline)
-
-
-def write_history(
-    found: Plan, history: list[CostPoint], lung: Lung, appraisal: Appraisal, job: PlanJob, goal: Goal
-) -> None:
-    """Write how the cost fell, and the pictures if they are wanted."""
-    from lungaccess.showing.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
-
-    cost_over_time_csv(history, job.out / HISTORY_FILE)
-    if job.pictures:
-        with progress("drawing the plan"):
-            overview_png(found, lung, job.out / "overview.png", appraisal)
-            tree_png(lung, job.out / "tree.png")
-            cost_over_time_png(history, job.out / "cost_over_time.png", goal)

@@ -24,12 +24,7 @@ from lungaccess.problem.target import Target
 
 @frozen_record
 class Attempt:
-    """What became of one system that was tried.
-
-    Args:
-        plan: The first plan found, whether or not the check accepts it.
-        report: What the independent check says of that plan.
-    """
+    """What became of one system that was tried: the first plan found, and what the check says of it."""
 
     system: System
     plan: Plan | None = None
@@ -144,9 +139,6 @@ def plan(
 
     Raises:
         NoPlan, SettingsError, TargetError: See `answer` and `lungaccess.problem.request.Request`.
-
-    Examples:
-        >>> plans = la.plan(lung, "lung-default", target, goal="length", iterations=50)  # doctest: +SKIP
     """
     request = Request.of(lung, system, target, **asked)
     atlas_of = None if atlas is None else lambda _system: atlas
@@ -167,12 +159,7 @@ def alternatives(
 ) -> tuple[Alternative, ...]:
     """Return a diverse plan set, the best plan first, with its Pareto front.
 
-    Args:
-        system, atlas, counterfactuals, on_progress, asked: As of `plan`.
-        count, separation_mm: See `lungaccess.planning.diverse_plans.alternatives`.
-
-    Raises:
-        NoPlan, SettingsError, TargetError: As `plan`.
+    Parameters and errors are those of `plan` and of `lungaccess.planning.diverse_plans.alternatives`.
     """
     request = Request.of(lung, system, target, **asked)
     return answer_with_several(

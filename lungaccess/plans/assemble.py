@@ -36,11 +36,7 @@ SAMPLE_MM = 0.05
 
 
 def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mapping[str, float]) -> Plan:
-    """Return the plan of a candidate.
-
-    Raises:
-        AnatomyError: If the motion of the scope is not proved, which no candidate of a search may be.
-    """
+    """Return the plan of a candidate; AnatomyError if its scope's motion is not proved, as it has to be."""
     system, lung = task.system, task.lung
     frame, deployment, needle = candidate.tip.lps_from_scope_tip, candidate.deployment, system.needle
     path, of_needle = with_tool_in_place(system, candidate.path), {}

@@ -62,7 +62,12 @@ def from_json(cls: type[P], text: str) -> P:
         raise PlanFileError(f"The plan is not JSON ({reason(error)})", expected=WRITTEN) from error
     if not isinstance(content, dict):
         raise PlanFileError("The plan is not a JSON object", expected=WRITTEN)
-    _require_schema(content.get("schema"))
+    schema = content.get("schema")
+    if schema not in (SCHEMA, SHAPELESS):
+        why = ", in which the scope has a line but no motion: it does not say how the scope gets there"
+        raise PlanFileError(
+            f"The plan has the schema {schema!r}{why if schema == LINES else ''}", expected=SCHEMA
+        )
     stated = content.pop("digest", None)
     try:
         plan = _decode(cls, _in_schema(content), "plan")
@@ -75,15 +80,6 @@ def from_json(cls: type[P], text: str) -> P:
             "The plan does not match its own digest: it was edited or damaged", expected=str(stated)
         )
     return typing.cast(P, plan)
-
-
-def _require_schema(schema: object) -> None:
-    if schema in (SCHEMA, SHAPELESS):
-        return
-    found = f"The plan has the schema {schema!r}"
-    if schema == LINES:
-        found += ", in which the scope has a line but no motion: it does not say how the scope gets there"
-    raise PlanFileError(found, expected=SCHEMA)
 
 
 def _in_schema(content: dict[str, Any]) -> dict[str, Any]:

@@ -26,7 +26,9 @@ def scope_insertion(
         min_lumen_margin_mm: Smallest lumen depth of the body's axis over the whole motion, minus the radius
             of the scope.
     """
-    branches = _branches_to(tree, int(tree.branch_of_point[tree_point]))
+    branches = [int(tree.branch_of_point[tree_point])]
+    while (parent := int(tree.branch_parent[branches[0]])) >= 0:
+        branches.insert(0, parent)
     length = motion.length_mm
     return ScopeInsertion(
         lps_from_entry=motion.lps_from_entry,
@@ -78,13 +80,6 @@ def with_simplest_motion(plan: Plan, lung: Lung) -> Plan:
 def shown_motion(plan: Plan) -> ScopeMotion:
     """Return the motion of a plan's bronchoscope with so many states that a film of them is smooth."""
     return scope_motion(plan).between(SHOWN_STEP_MM, SHOWN_TURN_RAD)
-
-
-def _branches_to(tree: AirwayTree, branch: int) -> list[int]:
-    branches = [branch]
-    while (parent := int(tree.branch_parent[branches[0]])) >= 0:
-        branches.insert(0, parent)
-    return branches
 
 
 def _passes_mm(motion: ScopeMotion, point_lps: Float) -> float:

@@ -182,11 +182,7 @@ class Exemption(Record):
 
 @frozen_record
 class Pass(Record):
-    """A further pass of the needle from where the scope stands: what differs from the first.
-
-    Args:
-        tube, needle, exemption, clearance_mm, costs, end_lps: As those of a plan and of its aim.
-    """
+    """A further pass of the needle from where the scope stands: what differs from the first, as of a plan."""
 
     tube: TubeDeployment
     needle: NeedlePath

@@ -1,7 +1,7 @@
 """The plan of all three stages: what each device does, why it is allowed, and where it came from."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
 from itertools import pairwise, takewhile
@@ -113,10 +113,20 @@ class Plan(Record):
 
     def _repr_html_(self) -> str:
         """Return the plan as HTML: its figures, and drawings of its devices from the front and the feet."""
-        heading = f"Plan for {self.patient_name}, {self.system.name}"
-        return plan_html(
-            heading, self.figures(), self.shown_curves(), self.tube.exit.point_lps, self.target_lps
-        )
+        drawings = [self._drawing(view) for view in (CORONAL, AXIAL)]
+        figures = table(self.figures(), f"Plan for {self.patient_name}, {self.system.name}")
+        return side_by_side(figures, *drawings)
+
+    def _drawing(self, view: str) -> str:
+        drawing = Drawing(view)
+        for curve in self.shown_curves():
+            red, green, blue = (round(255 * c) for c in curve.colour)
+            # A thinner device is drawn this wide, so that it can be seen.
+            width_mm = max(2.0 * float(curve.radius_mm.max()), 1.5)
+            drawing.line(curve.points_lps, f"#{red:02x}{green:02x}{blue:02x}", width_mm)
+        drawing.mark(self.tube.exit.point_lps, EXIT_COLOUR)
+        drawing.mark(self.target_lps, TARGET_COLOUR)
+        return drawing.svg()
 
     @property
     def end_lps(self) -> Float:
@@ -356,27 +366,3 @@ def redirection_mm(before: Plan, after: Plan) -> tuple[float, float]:
 
 TARGET_COLOUR, EXIT_COLOUR = "#2ca02c", "#d62728"
 """The colours of target and exit in 3D Slicer's scene and in the drawings."""
-
-
-def plan_html(
-    heading: str,
-    rows: Iterable[tuple[str, str]],
-    curves: Sequence[DeviceCurve],
-    exit_lps: Float,
-    target_lps: Float,
-) -> str:
-    """Return a plan as HTML: a table of names and values, and drawings with rings at exit and target."""
-    drawings = [_drawing(view, curves, exit_lps, target_lps) for view in (CORONAL, AXIAL)]
-    return side_by_side(table(rows, heading), *drawings)
-
-
-def _drawing(view: str, curves: Sequence[DeviceCurve], exit_lps: Float, target_lps: Float) -> str:
-    drawing = Drawing(view)
-    for curve in curves:
-        red, green, blue = (round(255 * c) for c in curve.colour)
-        # A thinner device is drawn this wide, so that it can be seen.
-        width_mm = max(2.0 * float(curve.radius_mm.max()), 1.5)
-        drawing.line(curve.points_lps, f"#{red:02x}{green:02x}{blue:02x}", width_mm)
-    drawing.mark(exit_lps, EXIT_COLOUR)
-    drawing.mark(target_lps, TARGET_COLOUR)
-    return drawing.svg()

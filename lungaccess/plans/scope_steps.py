@@ -82,7 +82,14 @@ class ScopeStep:
         """What hands do."""
         if self.advance_mm > 0.0:
             return f"advance {_number(self.advance_mm)} mm, until {_number(self.inserted_mm)} mm are inserted"
-        return " and evenly with it ".join(words for words in (self._twist_words, self._bend_words) if words)
+        said = []
+        if self.twist_deg != 0.0:
+            turn = f"turn the scope {_number(abs(self.twist_deg))}° {_way(self.twist_deg)}"
+            said.append(f"{turn} (seen from behind), to {twist_words(self.to_twist_deg)}")
+        if self.to_bend_deg != self.from_bend_deg:
+            bends = bend_words(self.from_bend_deg), bend_words(self.to_bend_deg)
+            said.append("bring the tip from {} to {}".format(*bends))
+        return " and evenly with it ".join(said)
 
     @property
     def tolerance_words(self) -> str:
@@ -91,21 +98,6 @@ class ScopeStep:
         twist = _tolerance(self.twist_tolerance_deg, UNLIMITED_DEG, "°")
         bend = _tolerance(self.bend_tolerance_deg, UNLIMITED_DEG, "°")
         return f"There is room for an error of {mm}, {twist} of twist or {bend} of bend"
-
-    @property
-    def _twist_words(self) -> str:
-        if self.twist_deg == 0.0:
-            return ""
-        return (
-            f"turn the scope {_number(abs(self.twist_deg))}° {_way(self.twist_deg)} (seen from behind), to "
-            f"{twist_words(self.to_twist_deg)}"
-        )
-
-    @property
-    def _bend_words(self) -> str:
-        if self.to_bend_deg == self.from_bend_deg:
-            return ""
-        return f"bring the tip from {bend_words(self.from_bend_deg)} to {bend_words(self.to_bend_deg)}"
 
     def as_json(self) -> dict[str, object]:
         """Return the step as plain values, with its sentence."""
@@ -164,12 +156,7 @@ def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
     allowed = prover_of(lung, plan.system.scope).tolerances(motion)
     eyes = lps_from_camera(plan.system, motion.tips)
     places = lung.tree.route(int(lung.tree.branch_start[plan.scope.branches[-1] + 1]) - 1)
-
-    def goes_on(state: int) -> str:
-        """Say where in the picture of a state the airway goes on."""
-        return _goes_on(lung, places, eyes[state])
-
-    return steps_of(motion, lung.tree, allowed, goes_on)
+    return steps_of(motion, lung.tree, allowed, lambda state: _goes_on(lung, places, eyes[state]))
 
 
 def steps_note(plan: Plan, lung: Lung) -> str:

@@ -90,10 +90,7 @@ def goal_radius(lung: Lung, target_lps: Float, radius_mm: float | None = None) -
     """Return the radius of the goal about a target in mm, and its origin in words.
 
     It is the given one, or that of the ball as large as the target's nodule, or 5 mm, of a nodule of 10 mm,
-    where the target lies in none of the mask.
-
-    Raises:
-        SettingsError: If a given radius is not above 0 and finite.
+    where the target lies in none of the mask.  SettingsError is raised if a given one is no length.
     """
     if radius_mm is not None:
         if not 0.0 < radius_mm < math.inf:

@@ -9,14 +9,7 @@ if TYPE_CHECKING:
     from lungaccess.problem.peripheral import peripheral_targets
     from lungaccess.problem.preset_order import presets_by_invasiveness
     from lungaccess.problem.system import System, load_system, preset_names, shipped_names
-    from lungaccess.problem.target import (
-        Place,
-        Target,
-        describe_place,
-        nodule_target,
-        point_target,
-        resolve_target,
-    )
-    from lungaccess.problem.task import Task, fissures_are_obstacles
+    from lungaccess.problem.target import Place, Target, describe_place, point_target, resolve_target
+    from lungaccess.problem.task import fissures_are_obstacles
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -146,9 +146,6 @@ class PositionError(_Term):
             attempt; they add up.
         bias_mm: Mean of the error, added to both parts: as many numbers as `AXES` says, none for no bias.
         source: Where the sizes come from; what nobody has published begins with "assumption".
-
-    Raises:
-        SettingsError: If a size is not finite, negative or absurd, or the distribution unknown.
     """
 
     unit: ClassVar[str] = "mm"
@@ -406,11 +403,7 @@ def _listed(term: Term) -> str:
 
 
 def with_known(errors: ErrorModel, kind: str, size: float) -> ErrorModel:
-    """Return an error model in which one kind of error has another size, wherever the scope stands.
-
-    Raises:
-        SettingsError: If there is no such kind, or the size is absurd.
-    """
+    """Return a model in which a kind of error has another size everywhere; else SettingsError."""
     if kind not in UNITS:
         raise SettingsError(
             f"There is no kind of error {kind!r}",

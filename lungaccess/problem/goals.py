@@ -70,11 +70,7 @@ class Goal:
         return None if self.objective is None else plan.costs.get(str(self.objective))
 
     def computed(self, plan: Any, lung: Any) -> float:
-        """Return the value of its function of a plan.
-
-        Raises:
-            SettingsError: If the function fails, or its value is no finite number.
-        """
+        """Return the value of its function of a plan; SettingsError if that fails or is no finite number."""
         try:
             value = float(self.of(plan, lung)) if self.of is not None else math.nan
         except Exception as error:

@@ -50,11 +50,7 @@ def nodules_of(organ: Organ) -> tuple[Nodule, ...]:
 
 
 def find_nodule(organ: Organ, number: int) -> Nodule:
-    """Return the nodule with a number; the largest for 0.
-
-    Raises:
-        TargetError: If there is none.
-    """
+    """Return the nodule with a number, the largest for 0; TargetError if there is none."""
     found = nodules_of(organ)
     if not found:
         raise TargetError(

@@ -16,13 +16,9 @@ DRAWS_A_POINT = 100_000
 
 
 def peripheral_targets(lung: Lung, per_lung: int, seed: int) -> Float:
-    """Draw targets 5 to 25 mm from the pleura and at least 3 mm clear of airway, vessels and pleura.
+    """Draw targets `(2 per_lung, 3)` LPS mm, 5 to 25 mm from the pleura and at least 3 mm clear of all else.
 
-    Returns:
-        (2 per_lung, 3) float64, LPS mm: Those of the patient's left lung first; the same for the same seed.
-
-    Raises:
-        TargetError: If one side has no such target.
+    Those of the patient's left lung come first.  TargetError is raised if one side has none.
     """
     rng = np.random.default_rng(seed)
     points = [_peripheral_point(lung, rng, side) for side in (1.0, -1.0) for _ in range(per_lung)]

@@ -39,11 +39,7 @@ class PresetFiles:
         return tuple(sorted(each.name[:-5] for each in entries if each.name.endswith(".toml")))
 
     def text(self, name: str) -> str:
-        """Return the TOML text of a preset, with its comments.
-
-        Raises:
-            SettingsError: If there is no such preset.
-        """
+        """Return the TOML text of a preset, with its comments; SettingsError if there is no such preset."""
         for folder in self.folders:
             if name in self.names_in(folder):
                 return (_ROOM / folder / f"{name}.toml").read_text(encoding="utf-8")
@@ -55,12 +51,7 @@ class PresetFiles:
         )
 
     def read(self, name_or_path: str | os.PathLike[str]) -> dict[str, Any]:
-        """Return the values of a preset, or of a file whose name ends in ``.toml``.
-
-        Raises:
-            SettingsError: If there is no such preset, or the file is not TOML.
-            FileError: If the file cannot be read.
-        """
+        """Return the values of a preset or a ``.toml`` file; SettingsError or FileError if there is none."""
         given = os.fspath(name_or_path)
         if given in self.names() or (isinstance(name_or_path, str) and not given.endswith(".toml")):
             return tomllib.loads(self.text(given))

@@ -108,9 +108,6 @@ class Procedure:
     Args:
         least_margin_share: Share of the margins that a path from a measured pose has to keep where none keeps
             them whole; margins allow for errors that are known by then.
-
-    Raises:
-        SettingsError: If a value is not finite or outside its range.
     """
 
     name: Annotated[str, text("what the procedure is called where its results are shown")] = "stated"

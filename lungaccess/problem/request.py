@@ -66,13 +66,7 @@ class Limits:
 
 @frozen_record
 class StatedPlace:
-    """A point that a plan has to go through.
-
-    Args:
-        kind: "exit", where the tubes leave the lumen, or "scope tip".
-        lps_mm: (3,) float64.
-        within_mm: How far from it the plan's may be.
-    """
+    """A point (3,) that a plan passes so near: "exit", where the tubes leave the lumen, or "scope tip"."""
 
     kind: Literal["exit", "scope tip"]
     lps_mm: Float
@@ -142,15 +136,13 @@ class Request:
         first_plan_s: float | None = None,
         **others: Any,
     ) -> Request:
-        """Return the request that plain values state.
+        """Return the request that plain values state; others are fields of `Request`.
 
         Args:
             system (System, str, or sequence of them): Devices, the name of a preset, the path of a file, or
                 "auto" for all presets.
-            goal: See `goal_of`.
             fissures_allowed: Whether fissures may be crossed, instead of what the systems say.
             least_clearance_mm: Every axis in tissue keeps at least this distance from every obstacle.
-            **others: Fields of `Request`.
         """
         return cls(
             lung=lung, target=target, goal=goal_of(goal, lung),
@@ -199,19 +191,12 @@ class Request:
                 "another pass helps",
                 remedy="Add --tool core, and leave out --goal",
             )
-        self._require_bound()
-        self._require_systems()
-
-    def _require_bound(self) -> None:
-        if self.gap is None or self.goal.objective is not None:
-            return
-        raise SettingsError(
-            f"A gap is asked for with the goal {self.goal.name}: no bound of the best possible is known",
-            expected="a gap with a cost",
-            remedy="Leave out the gap, or choose a cost such as inverse-clearance",
-        )
-
-    def _require_systems(self) -> None:
+        if self.gap is not None and self.goal.objective is None:
+            raise SettingsError(
+                f"A gap is asked for with the goal {self.goal.name}: no bound of the best possible is known",
+                expected="a gap with a cost",
+                remedy="Leave out the gap, or choose a cost such as inverse-clearance",
+            )
         if len({system.name for system in self.systems}) < len(self.systems):
             raise SettingsError("Two systems have the same name", expected="a name of its own for each")
         if len(self.systems) > 1 and self.needle_planner in OMPL_PLANNERS:
@@ -238,11 +223,7 @@ class Request:
 
     @property
     def task(self) -> Task:
-        """What a search by cost is asked with the first system.
-
-        Raises:
-            TargetError: If the target lies outside the lung or inside an obstacle.
-        """
+        """What a search by cost is asked with the first system; TargetError if the target is not free."""
         from lungaccess.problem.task import Task, objective_of
 
         named = self.goal.name if self.counts else WINDOW.name if self.is_for_window else self.method
@@ -258,11 +239,7 @@ class Request:
 
 
 def register_goal(goal: Goal) -> Goal:
-    """Make a goal known by its name in this process, and return it; a package does so by an entry point.
-
-    Raises:
-        SettingsError: If the name is that of another goal or of a cost.
-    """
+    """Make a goal known by its name, as packages do by entry points; SettingsError if the name is taken."""
     taken = {SUCCESS.name, WINDOW.name, *(name for term in TERMS for name in (term.key, term.option))}
     if goal.name in taken or not goal.name.isidentifier():
         raise SettingsError(
@@ -324,11 +301,7 @@ def systems_of(
 
 
 def with_least_clearance(system: System, least_clearance_mm: float) -> System:
-    """Return a system whose margins keep every axis in tissue so far from obstacles, under a name of its own.
-
-    Raises:
-        SettingsError: If the distance is negative, not finite or absurd.
-    """
+    """Return a system of another name whose margins keep so far from obstacles, or a SettingsError."""
     thinnest = system.track_radius_mm if system.needle is None else system.needle.radius_mm
     more = least_clearance_mm - thinnest - system.margins.total_mm
     if not 0.0 <= least_clearance_mm < math.inf:

@@ -172,14 +172,7 @@ class System:
         return f"{self.needle.diameter_mm:g}", f"{self.needle.min_radius_of_curvature_mm:.0f}"
 
     def require_needle(self, use: str) -> Needle:
-        """Return the needle.
-
-        Args:
-            use: What needs it, in words that begin a sentence.
-
-        Raises:
-            SettingsError: If the system has none.
-        """
+        """Return the needle; SettingsError without one, which begins with what needs it."""
         if self.needle is None:
             raise SettingsError(
                 f"{use} needs a needle, and the system {self.name!r} has none",
@@ -271,11 +264,7 @@ def _preset(name: str, fissures_allowed: bool | None) -> System | None:
 
 
 def require_own_name(system: System, where: str = "The system") -> None:
-    """Refuse a system that bears the name of a preset and is not that preset.
-
-    Raises:
-        SettingsError: If it differs from the preset of its name.
-    """
+    """Refuse, by a SettingsError, a system that bears the name of a preset and is not that preset."""
     preset = preset_named(system.name)
     if preset is None or preset == system:
         return

@@ -96,11 +96,7 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
 
 
 def named_target(lung: Organ, name: str) -> Float:
-    """Return the point `(3,)` LPS mm of a target that came with the patient, by its name or number.
-
-    Raises:
-        TargetError: If there is none of this name.
-    """
+    """Return the point `(3,)` LPS mm of the patient's target of a name or number; TargetError without one."""
     names = [known.lower() for known in lung.target_names]
     if name.lower() in names:
         return lung.targets_lps[names.index(name.lower())]
@@ -131,11 +127,7 @@ def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = No
 
 
 def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target:
-    """Return a target at a point `(3,)` LPS mm.
-
-    Raises:
-        TargetError: If the point is not finite, outside the lung or inside an obstacle.
-    """
+    """Return a target at a point `(3,)` LPS mm; TargetError unless it is finite and in free lung."""
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():
         raise TargetError(
@@ -148,11 +140,7 @@ def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target
 
 
 def nodule_target(lung: Organ, number: int) -> Target:
-    """Return a target in a nodule, by its number as of `lungaccess.problem.nodules`; 0 is the largest one.
-
-    Raises:
-        TargetError: If there is no such nodule or none of it can be entered.
-    """
+    """Return a target in a nodule, by number, 0 for the largest; TargetError if none of it can be entered."""
     nodule = find_nodule(lung, number)
     centres = lung.grid.lps(nodule.voxels)
     clearance = lung.obstacle_field(with_fissures=True).lower_bound_mm(centres)
@@ -245,11 +233,7 @@ class Place:
 
 
 def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
-    """Return what is at a point `(3,)` LPS mm.
-
-    Raises:
-        TargetError: If the point is not three finite numbers.
-    """
+    """Return what is at a point `(3,)` LPS mm; TargetError if it is not three finite numbers."""
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():
         raise TargetError(

@@ -34,11 +34,7 @@ class Task:
 
 
 def objective_of(lung: Organ, stated: str | Objective = DEFAULT) -> Objective:
-    """Return what is to be made small in a lung; the default without a cost map is clearance alone.
-
-    Raises:
-        SettingsError: If there is no such objective; see `stages.needle.objective.Objective.of`.
-    """
+    """Return what is to be made small in a lung, clearance alone without a map; errors of `Objective.of`."""
     weighed = Objective.of(stated)
     return weighed.without_map if stated == DEFAULT and lung.cost is None else weighed
 

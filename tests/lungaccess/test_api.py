@@ -31,7 +31,6 @@ FACADES = (
     "lungaccess.planning",
     "lungaccess.planning.coupled",
     "lungaccess.planning.one_stage",
-    "lungaccess.plans",
     "lungaccess.problem",
     "lungaccess.planning.procedure",
     "lungaccess.planning.reachability",

@@ -35,11 +35,7 @@ synthetic = App(
 
 
 def names_of(text: str | None) -> tuple[str, ...]:
-    """Return the names in a text that are separated by commas; none if there is no text.
-
-    Raises:
-        SettingsError: If a name is empty.
-    """
+    """Return the names in a text that commas separate; none without a text; SettingsError if one is empty."""
     if text is None:
         return ()
     names = tuple(name.strip() for name in text.split(","))

@@ -148,15 +148,13 @@ def window(
     from dataclasses import asdict, replace
 
     from lungaccess.plans.file import plain
-    from lungaccess.plans.plan import Plan
     from lungaccess.uncertainty.breathing.moving import carried_needle
     from lungaccess.uncertainty.breathing.window import breathing_window
 
     for file, suffix in ((out, ".json"), (picture, ".png")):
         if file is not None:
             require_suffix(file, suffix)
-    stored = Plan.load(plan)
-    lung = output.load(patient)
+    stored, lung = output.load_plan(plan, patient)
     found = breathing_window(stored, lung, tolerance_mm=tolerance)
     in_place = carried_needle(stored, lung, found) if tissue_carries_needle else None
     if out is not None:

@@ -59,7 +59,6 @@ def export(
         )
     from lungaccess.cli.plan_tables import show_headline
     from lungaccess.judging.appraisal import appraise
-    from lungaccess.plans.plan import Plan
     from lungaccess.showing.live import plan_trajectory, write_trajectory
     from lungaccess.showing.model_files import export_models
     from lungaccess.showing.slicer import export_slicer
@@ -67,9 +66,7 @@ def export(
     for folder in (slicer, trajectory, models, dicom):
         if folder is not None:
             claim_folder(folder, ("*",), force=force)
-    stored = Plan.load(plan)
-    lung = output.load(patient)
-    stored.require_lung(lung)
+    stored, lung = output.load_plan(plan, patient)
     written: dict[Path, tuple[str, ...]] = {}
     with progress("checking the plan") as shown:
         appraisal = appraise(stored, lung)
@@ -255,11 +252,7 @@ def template(
 
 
 def template_text(kind: Kind) -> str:
-    """Return the example of a file.
-
-    Raises:
-        SettingsError: If files of the kind are not written by hand.
-    """
+    """Return the example of a file; SettingsError if files of the kind are not written by hand."""
     if kind not in FILES:
         raise SettingsError(
             f"There is no example of a {kind}",
@@ -270,11 +263,7 @@ def template_text(kind: Kind) -> str:
 
 
 def schema_text(kind: Kind) -> str:
-    """Return the JSON Schema of the files of a kind.
-
-    Raises:
-        SettingsError: If its files have no keys.
-    """
+    """Return the JSON Schema of the files of a kind; SettingsError if its files have no keys."""
     from lungaccess.plans.schema import schema_of
 
     if kind not in SCHEMAS:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lungaccess.planning.procedure import ProcedureReport
-    from lungaccess.uncertainty.risk import RareShare, RestingRow, RiskReport, Tolerance
+    from lungaccess.uncertainty.risk import RestingRow, RiskReport, Tolerance
     from stages.needle import StartRegion
 
 
@@ -48,7 +48,6 @@ def risk(
     from lungaccess.judging.appraisal import Headline
     from lungaccess.planning.procedure import simulate_procedure
     from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
-    from lungaccess.plans.plan import Plan
     from lungaccess.problem.procedures import Procedure
     from lungaccess.problem.system import with_tool
     from lungaccess.problem.tools import load_tool
@@ -57,10 +56,9 @@ def risk(
     from stages.scope import WallContact
 
     model, followed = errors.load(), errors.given_procedure() or Procedure()
-    stored = Plan.load(plan)
-    stored = replace(stored, system=with_tool(stored.system, None if tool is None else load_tool(tool)))
-    lung = output.load(patient)
-    stored.require_lung(lung)
+    tool_given = None if tool is None else load_tool(tool)
+    stored, lung = output.load_plan(plan, patient)
+    stored = replace(stored, system=with_tool(stored.system, tool_given))
     with progress("bringing the scope to rest on the wall"):
         wall = model.wall or WallContact()
         rested = resting_rows(resting_tip(stored, lung, wall), wall)
@@ -164,11 +162,12 @@ def _outcome_table(report: RiskReport) -> Table:
     for name, share in report.touches.items():
         words = name if name.startswith("stays") else f"touches {name}"
         words = words if name in report.forbidden else f"{words} (allowed)"
-        rows.append(
-            _rare_row(words, report.rare[name])
-            if name in report.rare
-            else share_row(words, share, fails=True)
-        )
+        if name in report.rare:
+            rare = report.rare[name]
+            said = f"{range_of_hundred(rare.interval)}, as {rare.effective_samples:.0f} events"
+            rows.append((f"{words} (weighted)", of_hundred(rare.value, up=True), said))
+        else:
+            rows.append(share_row(words, share, fails=True))
     rows += [(f"{percent(share)} end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()]
     title = f"{report.samples} deviated plans, errors of '{report.model.label}'; {_goal_words(report)}"
     return terminal.table(title, ("", "%", "95 % interval"), rows)
@@ -177,15 +176,6 @@ def _outcome_table(report: RiskReport) -> Table:
 def _goal_words(report: RiskReport | ProcedureReport) -> str:
     goal = report.tissue or f"goal {report.radius_mm:.2f} mm"
     return f"{goal}: {report.radius_origin}"
-
-
-def _rare_row(name: str, rare: RareShare) -> terminal.Row:
-    """Return name, per cent and interval of a probability estimated with weights, and how exact it is."""
-    return (
-        f"{name} (weighted)",
-        of_hundred(rare.value, up=True),
-        f"{range_of_hundred(rare.interval)}, as {rare.effective_samples:.0f} events",
-    )
 
 
 def _sensitivity_table(report: RiskReport) -> Table:
@@ -328,11 +318,9 @@ def start_region(
         seed: Seed of the search.
     """
     from lungaccess.planning.one_stage import safe_scope_region
-    from lungaccess.plans.plan import Plan
     from lungaccess.uncertainty.risk import safe_start_region
 
-    stored = Plan.load(plan)
-    lung = output.load(patient)
+    stored, lung = output.load_plan(plan, patient)
     with progress("trying start poses"):
         region = safe_start_region(
             stored, lung, radius_mm=radius, offset_mm=distance, tilt_deg=tilt, poses=poses,
@@ -349,7 +337,9 @@ def start_region(
         terminal.say(f"{region.words}.")
         if of_scope is not None:
             terminal.say(f"{of_scope.words}.")
-        terminal.show([_proved_table(region), _tried_table(region), _counts_table(region)])
+        found = [(words, str(count)) for words, count in region.tried.counts.items()]
+        counts = terminal.table(f"{region.tried.kinds.size} starts were tried", ("found", "starts"), found)
+        terminal.show([_proved_table(region), _tried_table(region), counts])
     return ExitCode.OK
 
 
@@ -383,8 +373,3 @@ def _tried_table(region: StartRegion) -> Table:
         for far, row in zip(tried.offset_mm * steps, shares.tolist(), strict=True)
     ]
     return terminal.table("Tried: % of the starts with a clear path, ring by ring", headings, rows)
-
-
-def _counts_table(region: StartRegion) -> Table:
-    rows = [(words, str(count)) for words, count in region.tried.counts.items()]
-    return terminal.table(f"{region.tried.kinds.size} starts were tried", ("found", "starts"), rows)

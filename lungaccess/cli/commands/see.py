@@ -53,16 +53,14 @@ def report(
     """
     from lungaccess.cli.plan_search import advised
     from lungaccess.judging.appraisal import appraise
-    from lungaccess.plans.plan import Plan
     from lungaccess.showing.report.html import PageOptions, bronchoscopy_webp, plan_page
 
     page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)
     keep_earlier(page)
-    stored, model, followed = Plan.load(plan), errors.given(), errors.given_procedure()
-    lung = output.load(patient)
-    stored.require_lung(lung)
+    model, followed = errors.given(), errors.given_procedure()
+    stored, lung = output.load_plan(plan, patient)
     image = shown_ct(ct, patient)
     with progress("making the page"):
         appraisal = appraise(
@@ -196,12 +194,9 @@ def view(
 def steps(plan: PlanFile, patient: PatientOfPlan, *, output: PatientOptions = PatientOptions()) -> ExitCode:
     """Print step by step how the bronchoscope of a plan moves; with --json also every state, for motors."""
     from lungaccess.cli.plan_tables import steps_table
-    from lungaccess.plans.plan import Plan
     from lungaccess.plans.scope_steps import motion_record
 
-    stored = Plan.load(plan)
-    lung = output.load(patient)
-    stored.require_lung(lung)
+    stored, lung = output.load_plan(plan, patient)
     if output.json:
         terminal.show_json(motion_record(stored, lung))
     else:

@@ -165,11 +165,6 @@ def appraise(
     Args:
         system, target_lps: What was asked for; see `lungaccess.judging.checking.check`.
         each_kind: Whether success under errors of one kind only is estimated, too.
-
-    Examples:
-        >>> appraisal = la.appraise(plan, lung)  # doctest: +SKIP
-        >>> print(appraisal.headline.text)  # doctest: +SKIP
-        Estimated to succeed in 24 of 100 procedures (95 % interval 22 to 27); fails most because it ...
     """
     appraiser = Appraiser(lung, errors, procedure=procedure, draws=draws, seed=seed)
     return appraiser.appraise(plan, system, target_lps=target_lps, each_kind=each_kind)

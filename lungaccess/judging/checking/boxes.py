@@ -157,11 +157,7 @@ def on_surface(body: Labels) -> Bool:
 
 
 class Boxes:
-    """One structure of a lung as solid boxes.
-
-    Args:
-        reach_mm: What lies farther counts as this far.
-    """
+    """One structure of a lung as solid boxes; what lies farther than `reach_mm` counts as this far."""
 
     def __init__(self, tiles: Tiles, select: Select, reach_mm: float) -> None:
         self._tiles = tiles
@@ -289,10 +285,7 @@ def _to_bounding_box(cluster: Cluster, local: Float) -> Float:
 
 
 class Environment:
-    """A lung, its structures as solid boxes, and the points of its airway tree.
-
-    The arrays of the lung must not change while this is used.
-    """
+    """A lung, which must not change, its structures as solid boxes, and the points of its airway tree."""
 
     def __init__(self, lung: "Lung") -> None:
         self.lung = lung

@@ -25,11 +25,7 @@ if TYPE_CHECKING:
 
 
 class Checker:
-    """Checks many plans of one lung: what follows from the lung alone is computed once.
-
-    Args:
-        lung: The patient that the plans are for; its arrays must not change while the checker is used.
-    """
+    """Checks many plans of one lung, whose arrays must not change: what follows from it is computed once."""
 
     def __init__(self, lung: "Lung") -> None:
         self._environment = Environment(lung)

@@ -28,7 +28,7 @@ from lungaccess.judging.checking.findings import (
 )
 from lungaccess.judging.checking.scope import motion_of
 from lungaccess.judging.checking.shapes import Curve, distance_to_polyline, radius_at
-from lungaccess.judging.checking.space import Select, airway_except, branch_of, has, labels_at
+from lungaccess.judging.checking.space import airway_except, branch_of, has, labels_at
 from lungaccess.judging.checking.wall_exit import Exit, check_exit, check_wall_run
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
@@ -75,13 +75,9 @@ def _strains(tube: Tube, behind_mm: Float, bent: Float, inserted_mm: float) -> I
         passed = bent[behind_mm >= at - inserted_mm - STEP_MM]
         most = float(passed.max(initial=0.0))
         for end in (max(at - STEP_MM, 0.0), at):
-            rest, factor = _bend_at_rest(tube, end), slots_at(tube.slotted_segments, end)[1]
+            rest = max(k for begin, stop, k in bent_at_rest(tube) if begin <= end <= stop)
+            factor = slots_at(tube.slotted_segments, end)[1]
             yield 0.5 * tube.outer_diameter_mm * factor * (most + rest)
-
-
-def _bend_at_rest(tube: Tube, from_tip_mm: float) -> float:
-    """Return the precurvature at a place of a tube, 1/mm."""
-    return max(k for begin, end, k in bent_at_rest(tube) if begin <= from_tip_mm <= end)
 
 
 def bent_at_rest(tube: Tube) -> list[tuple[float, float, float]]:
@@ -152,7 +148,9 @@ _PROTRUSION = {"middle": "tube.protrusion.middle", "inner": "tube.protrusion"}
 def check_deployment(plan: Plan, environment: Environment, found: Findings) -> Float | None:
     """Record everything about the tubes; return their re-integrated tip `(4, 4)` if they can be followed."""
     tube, lung = plan.tube, environment.lung
-    if not (check_rigid("tube.tip", tube.lps_from_tip, found) and _is_pose(plan.scope.lps_from_scope_tip)):
+    axes = plan.scope.lps_from_scope_tip[:3, :3]
+    rigid = check_rigid("tube.tip", tube.lps_from_tip, found)
+    if not (rigid and np.abs(axes.T @ axes - np.eye(3)).max() < 1e-3):
         return None
     pieces = shapes.tube_pieces(plan)
     curve = shapes.integrate(plan.scope.lps_from_scope_tip, pieces)
@@ -173,10 +171,6 @@ def check_deployment(plan: Plan, environment: Environment, found: Findings) -> F
         _check_clearance(plan, environment, curve, way_out, beside_mm, found)
         check_wall_run(plan, environment, curve, way_out, found)
     return tip
-
-
-def _is_pose(pose: Float) -> bool:
-    return bool(np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < 1e-3)
 
 
 def _check_lengths(plan: Plan, found: Findings) -> None:
@@ -249,7 +243,13 @@ def _check_clearance(
     contact = _first_contact(environment.lung, curve, way_out, plan)
     margin = plan.system.margins.total_mm + beside_mm
     needed = shapes.radius_at(plan, curve.arc_mm[:-1] + ROUNDING_MM) + margin + curve.sagitta_mm
-    cases = obstacles_of(way_out.branch, contact, way_out.frame)
+    # In the lumen, up to the exit, other branches are only open space.
+    cases = [
+        ("vessel", has(structures.VESSEL), contact),
+        ("outside", has(structures.OUTSIDE), contact),
+        ("fissure", has(structures.FISSURE), contact),
+        ("airway", airway_except(way_out.branch), way_out.frame),
+    ]
     for name, select, first in structures_known(cases, "tube", environment.lung, found):
         boxes = environment.boxes(select, REACH_MM)
         points = curve.points[first:]
@@ -260,19 +260,6 @@ def _check_clearance(
         most = PathDistances(boxes, curve.points[way_out.frame :]).least_mm()
         diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
         check_stated_clearance(plan, "tube", name, (least, most), diagonal, found)
-
-
-def obstacles_of(branch: int, contact: int, way_out: int) -> list[tuple[str, Select, int]]:
-    """Return each structure, how to select it, and the first frame that must be clear of it.
-
-    In the lumen, up to the exit, other branches are only open space.
-    """
-    return [
-        ("vessel", has(structures.VESSEL), contact),
-        ("outside", has(structures.OUTSIDE), contact),
-        ("fissure", has(structures.FISSURE), contact),
-        ("airway", airway_except(branch), way_out),
-    ]
 
 
 SHAPE_TOLERANCE_MM = 1e-3

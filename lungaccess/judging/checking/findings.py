@@ -94,9 +94,15 @@ class CheckReport:
     findings: tuple[Finding, ...]
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows."""
+        """Return what a notebook shows; accepted geometry is not green, as it says nothing of success."""
         rows, refused = ([each.cells() for each in some] for some in (self.findings, self.refusals))
-        return report_html(rows, refused, accepted=self.accepted)
+        verdict = "accepts the plan" if self.accepted else f"REFUSES the plan ({len(refused)} findings)"
+        colour = "inherit" if self.accepted else "#c00000"
+        everything = f"<details><summary>{len(rows)} findings</summary>{_table(rows)}</details>"
+        return (
+            f'<div style="color:{colour}">{title(f"The independent check {verdict}")}</div>'
+            f"{_table(refused) if refused else ''}{everything}"
+        )
 
     @property
     def refusals(self) -> tuple[Finding, ...]:
@@ -181,20 +187,6 @@ class Findings:
         """Return what was collected; nothing collected is not accepted."""
         accepted = any(each.ok for each in self._all) and all(each.ok is not False for each in self._all)
         return CheckReport(accepted=accepted, findings=tuple(self._all))
-
-
-def report_html(findings: Sequence[Row], refused: Sequence[Row], *, accepted: bool) -> str:
-    """Return the verdict and the findings as HTML; only a refusal has a colour.
-
-    Accepted geometry says nothing of the chance of success, so it is not shown in green.
-    """
-    verdict = "accepts the plan" if accepted else f"REFUSES the plan ({len(refused)} findings)"
-    colour = "inherit" if accepted else "#c00000"
-    everything = f"<details><summary>{len(findings)} findings</summary>{_table(findings)}</details>"
-    return (
-        f'<div style="color:{colour}">{title(f"The independent check {verdict}")}</div>'
-        f"{_table(refused) if refused else ''}{everything}"
-    )
 
 
 def _table(rows: Sequence[Row]) -> str:

@@ -35,7 +35,14 @@ def check_record(
     bad = [name for name, size in _sizes(plan, "plan") if not math.isfinite(size)]
     if not found.true("record.finite", not bad, ", ".join(bad)):
         return False
-    _check_integrity(plan, found)
+    found.true("record.schema", plan.schema == SCHEMA, plan.schema)
+    found.true("record.version", bool(plan.software_version.strip()), plan.software_version)
+    try:
+        # Reading compares the digest of what was read with that of what was written.
+        Plan.from_json(plan.to_json())
+        found.true("record.round_trip", True, "the plan as text is the same plan")
+    except LungaccessError as error:
+        found.true("record.round_trip", False, str(error))
     found.true("patient.name", plan.patient_name == lung.name, f"{plan.patient_name} against {lung.name}")
     found.true("patient.key", plan.lung_key == lung.key, f"{plan.lung_key} against {lung.key}")
     found.true("patient.sources", dict(plan.sources) == dict(lung.sources), "hashes of the image files")
@@ -75,17 +82,6 @@ def _sizes(value: object, where: str) -> Iterator[tuple[str, float]]:
         yield where, float(np.abs(value).max(initial=0.0))
     elif isinstance(value, float | int | np.generic):
         yield where, abs(float(value))
-
-
-def _check_integrity(plan: Plan, found: Findings) -> None:
-    found.true("record.schema", plan.schema == SCHEMA, plan.schema)
-    found.true("record.version", bool(plan.software_version.strip()), plan.software_version)
-    try:
-        # Reading compares the digest of what was read with that of what was written.
-        Plan.from_json(plan.to_json())
-        found.true("record.round_trip", True, "the plan as text is the same plan")
-    except LungaccessError as error:
-        found.true("record.round_trip", False, str(error))
 
 
 def _check_system(plan: Plan, found: Findings, system: System | None) -> None:

@@ -77,11 +77,7 @@ def window_of(lung: "Lung", low: Int, high: Int) -> Labels:
 
 @frozen_record
 class Region:
-    """The part of a lung around some points, OUTSIDE beyond the lung's grid.
-
-    Args:
-        labels: (ni, nj, nk) uint16.
-    """
+    """The part of a lung around some points, labels `(ni, nj, nk)`, OUTSIDE beyond the lung's grid."""
 
     grid: Grid
     labels: Labels

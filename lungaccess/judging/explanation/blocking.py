@@ -131,7 +131,9 @@ def look_along(arcs: DirectArcs) -> tuple[tuple[Blocking, ...], BlockedArc | Non
 
     At most `MOST_ARCS` arcs are looked along, evenly chosen from all with the target in their workspace.
     """
-    chosen = _evenly(arcs.in_workspace)
+    chosen = arcs.in_workspace
+    if len(chosen) > MOST_ARCS:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, MOST_ARCS).astype(np.int64)]
     if not len(chosen):
         return (), None
     entries, environment = arcs.atlas.deployments, arcs.evaluator.environment
@@ -219,13 +221,6 @@ def region_of(lung: Lung, point: Float) -> str:
     """Return the lobe that holds a point (3,) LPS mm, or the side of the carina where lobes are not known."""
     side = "left lung" if point[0] > lung.tree.carina_lps[0] else "right lung"
     return lung.lobe_at(point) or side
-
-
-def _evenly(entries: Int) -> Int:
-    """Return at most MOST_ARCS of the entries, evenly spaced in their order."""
-    if len(entries) <= MOST_ARCS:
-        return entries
-    return entries[np.linspace(0, len(entries) - 1, MOST_ARCS).astype(np.int64)]
 
 
 def _first(found: Float) -> Float:

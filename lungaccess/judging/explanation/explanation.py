@@ -45,7 +45,6 @@ class Explanation:
     What is None or empty was looked for and not found, or was not tried: `parts` tells which.
 
     Args:
-        with_fissures: Whether fissures are obstacles.
         starts: Where needles can start, and why each start fails.
         blocking: What stops the direct arcs, most first.
         blocked_arc: The arc to the target that violates least, of those within the needle's limits.
@@ -54,10 +53,8 @@ class Explanation:
         changes: Changes of one device parameter that reach the target, the smallest first.
         through_fissures: Whether a single arc reaches the target if fissures may be crossed; None if they may
             be or there are none.
-        shares: How much of the surroundings is reached.
         chances: How many of the simulated procedures succeed with each of `plans`, by the names of their
             files, under the default errors.
-        verdict: Whether the target is proved unreachable.
         ultrasound: What radial ultrasound is expected to show of the nodule, in words.
         parts: What was done and what was not, in the order of doing.
         time_s: Seconds of processor time that it took, without getting kernels.

@@ -72,9 +72,7 @@ class Surroundings:
 
         Points on spheres around the target are tried, the smaller sphere first; from the first that is
         reached the distance is halved towards the target.  A nearer point may exist between those tried.
-
-        Args:
-            alive: Called before each point; it raises to end the search.
+        `alive` is called before each point, and raises to end the search.
         """
         target = self._task.target.lps_mm
         before = 0.0

@@ -11,11 +11,9 @@ from anatomy.base.typed import Float
 from anatomy.base.words import of_hundred, percent, point_in_words
 from anatomy.io.frames import LPS_FROM_RAS
 from lungaccess.judging.answering import Attempt
-from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, Structure
+from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Structure
 from lungaccess.judging.explanation.explanation import Change, Explanation
-from lungaccess.judging.explanation.neighbours import ReachedShare
 from lungaccess.plans.version import made_by
-from lungaccess.uncertainty.risk import Share
 
 Row = tuple[str, ...]
 
@@ -143,11 +141,7 @@ FILE = "no_plan.json"
 
 
 def save_explanation(explanation: Explanation, folder: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Write `no_plan.json` and the plans to a folder that exists, and return the names of the files.
-
-    Raises:
-        FileError: If a file cannot be written.
-    """
+    """Write `no_plan.json` and the plans to a folder, and return their names; FileError if that fails."""
     for name, plan in explanation.plans.items():
         plan.save(Path(folder) / name)
     write_json(Path(folder) / FILE, explanation_record(explanation))
@@ -171,7 +165,15 @@ def explanation_record(explanation: Explanation) -> Record:
         "reasons": dict(e.failure.reasons),
         "attempts": dict(e.failure.attempts),
         "starts": None if e.starts is None else dict(e.starts.counts),
-        "blocking": [_blocking(each) for each in e.blocking],
+        "blocking": [
+            {
+                **_structure(each.place),
+                "arcs": each.arcs,
+                "arcs_at_place": each.arcs_at_place,
+                "of_arcs": each.of,
+            }
+            for each in e.blocking
+        ],
         "nearest_miss": {
             "path_to_the_target": None
             if e.blocked_arc is None
@@ -185,12 +187,23 @@ def explanation_record(explanation: Explanation) -> Record:
         ],
         "changes": [_change(e, each) for each in e.changes],
         "through_fissures": e.through_fissures,
-        "reached_shares": [_share(each) for each in e.shares],
+        "reached_shares": [
+            {
+                "region": each.region,
+                "reached": each.share.count,
+                "of": each.share.samples,
+                "interval": list(each.share.interval),
+            }
+            for each in e.shares
+        ],
         "proved_unreachable": None if e.verdict is None else e.verdict.proved,
         "radial_ultrasound": e.ultrasound or None,
         "proof_rests_on": "" if e.verdict is None else e.verdict.rests_on,
         "parts": [{"part": part.name, "outcome": part.outcome, "why": part.why} for part in e.parts],
-        "chances_under_default_errors": {name: _chance(share) for name, share in e.chances.items()},
+        "chances_under_default_errors": {
+            name: {"succeeds": share.value, "interval": list(share.interval), "procedures": share.samples}
+            for name, share in e.chances.items()
+        },
         "files": list(e.plans),
         "explain_cpu_s": e.time_s,
     }
@@ -215,15 +228,6 @@ def _numbers(arc: BlockedArc | ArcBeyondLimits) -> Record:
     return {name: value for name, value in vars(arc).items() if isinstance(value, int | float)}
 
 
-def _blocking(blocking: Blocking) -> Record:
-    return {
-        **_structure(blocking.place),
-        "arcs": blocking.arcs,
-        "arcs_at_place": blocking.arcs_at_place,
-        "of_arcs": blocking.of,
-    }
-
-
 def _neighbour(e: Explanation) -> Record | None:
     neighbour = e.neighbour
     if neighbour is None:
@@ -233,10 +237,6 @@ def _neighbour(e: Explanation) -> Record | None:
         "from_target_mm": neighbour.from_target_mm,
         "plan": e.file_of(neighbour.plan),
     }
-
-
-def _chance(share: Share) -> Record:
-    return {"succeeds": share.value, "interval": list(share.interval), "procedures": share.samples}
 
 
 def _attempt(e: Explanation, attempt: Attempt) -> Record:
@@ -257,13 +257,4 @@ def _change(e: Explanation, change: Change) -> Record:
         "needed_mm": change.change.needed,
         "accepted": change.accepted,
         "plan": e.file_of(change.change.plan),
-    }
-
-
-def _share(share: ReachedShare) -> Record:
-    return {
-        "region": share.region,
-        "reached": share.share.count,
-        "of": share.share.samples,
-        "interval": list(share.share.interval),
     }

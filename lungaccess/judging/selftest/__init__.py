@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.judging.selftest.run import KINDS, Failure, Kind, Outcome, self_test
+    from lungaccess.judging.selftest.run import KINDS, Failure, Outcome, self_test
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -113,15 +113,10 @@ class Outcome:
 def self_test(
     kinds: Sequence[str] = (), *, progress: Callable[[str], None] = lambda _kind: None
 ) -> tuple[Outcome, ...]:
-    """Compute proofs of every kind on drawn cases, compiled and in plain Python, and compare with the truth.
+    """Compute proofs of the named kinds, or all, compiled and in plain Python, and compare with the truth.
 
-    Where NUMBA_DISABLE_JIT is set nothing is compiled, and the truth alone is compared.
-
-    Args:
-        kinds: Names of `KINDS`; all of them if empty.
-
-    Raises:
-        SettingsError: If there is no such kind.
+    Where NUMBA_DISABLE_JIT is set nothing is compiled, and the truth alone is compared.  SettingsError is
+    raised if there is no such kind.
     """
     import numba
 
@@ -221,13 +216,6 @@ def _short(answers: Any) -> str:
     return answers if isinstance(answers, str) else f"{len(answers)} numbers"
 
 
-def _print_answers(names: list[str]) -> None:
-    """Print as JSON, by kind and seed, the numbers or an error in words."""
-    end_with_parent()
-    found = {name: {str(seed): _plain_answer(name, seed) for seed in KINDS[name].seeds} for name in names}
-    json.dump(found, sys.stdout)
-
-
 def _plain_answer(name: str, seed: int) -> Any:
     try:
         return KINDS[name].case(seed).answers.tolist()
@@ -236,4 +224,8 @@ def _plain_answer(name: str, seed: int) -> Any:
 
 
 if __name__ == "__main__":
-    _print_answers(sys.argv[1:])
+    end_with_parent()
+    json.dump(
+        {name: {str(seed): _plain_answer(name, seed) for seed in KINDS[name].seeds} for name in sys.argv[1:]},
+        sys.stdout,
+    )

@@ -33,11 +33,7 @@ class Moving:
 
     @classmethod
     def of(cls, plan: Plan, lung: Lung) -> Self:
-        """Return what moves with the breathing of the patient of a plan.
-
-        Raises:
-            AnatomyError: If the patient has no motion.
-        """
+        """Return what moves with the breathing of the patient of a plan; AnatomyError without a motion."""
         motion = require_motion(lung)
         side = motion.side_of(plan.target_lps)
         rigid = carrier(motion, plan.scope.lps_from_scope_tip[:3, 3], side)

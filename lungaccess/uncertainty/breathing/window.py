@@ -60,7 +60,9 @@ def device_points(plan: Plan) -> DevicePoints:
     pieces = tube_pieces(tube)
     length, way_out = float(pieces[:, 0].sum()), tube.exit.arc_length_mm
     hole_mm = float(tube_radii(tube, system.tubes, np.array([way_out]))[0])
-    zone = exit_zone_mm(hole_mm, tube.exit.wall_angle_rad)
+    # Length of tube that is spent on piercing the wall, which the presets pierce at 10 degrees or more, and
+    # how far along the tube, either way of the exit, a hole is that shifts sideways by its limit.
+    zone = 1.0 + hole_mm / math.sin(max(tube.exit.wall_angle_rad, math.radians(10.0)))
     at_exit = (way_out - zone, way_out, way_out + zone)
     edges = _edges([*at_exit, length, *tube.insertions_mm(system.tubes)], length)
     extra = system.margins.total_mm + tube.clearance_loss_mm
@@ -91,13 +93,6 @@ def device_points(plan: Plan) -> DevicePoints:
         hole_lps=np.array(tube.exit.point_lps, dtype=np.float64),
         hole_mm=hole_mm,
     )
-
-
-def exit_zone_mm(hole_mm: float, wall_angle_rad: float) -> float:
-    """Return how far along the tube, either way of the exit, a hole is that shifts sideways by its limit."""
-    # The least angle at which the tubes of the presets may pierce a wall.
-    # Length of tube that is spent on piercing the wall.
-    return 1.0 + hole_mm / math.sin(max(wall_angle_rad, math.radians(10.0)))
 
 
 def _edges(lengths: list[float], most: float) -> list[float]:

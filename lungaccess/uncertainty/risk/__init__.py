@@ -13,10 +13,9 @@ if TYPE_CHECKING:
         assess,
         rare_touch,
     )
-    from lungaccess.uncertainty.risk.assessor import STRUCTURES, Outcomes, RiskAssessor
+    from lungaccess.uncertainty.risk.assessor import STRUCTURES, RiskAssessor
     from lungaccess.uncertainty.risk.deviations import Deviations
-    from lungaccess.uncertainty.risk.draws import Draws
-    from lungaccess.uncertainty.risk.rare import RareShare, rare_share
+    from lungaccess.uncertainty.risk.rare import rare_share
     from lungaccess.uncertainty.risk.resting import RestingRow, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.start_region import proved_body, safe_start_region, tried_body
     from lungaccess.uncertainty.risk.statistics import Share

@@ -216,11 +216,7 @@ def assess(
 def rare_touch(
     assessor: RiskAssessor, model: ErrorModel, structure: str, samples: int = DEFAULT_SAMPLES, seed: int = 0
 ) -> RareShare:
-    """Return how likely a structure is touched, a name of `STRUCTURES`, by importance sampling.
-
-    Raises:
-        SettingsError: If there are no samples.
-    """
+    """Return how likely one of `STRUCTURES` is touched, by importance sampling; errors of `assess`."""
     flag = assessor.structures[structure]
     luck = Luck(lambda count: assessor.draws(count, seed), model)
     happens = luck.event(lambda draws: (assessor.outcomes(draws.deviations(model)).touched & flag) != 0)

@@ -69,11 +69,7 @@ class Deviations:
 
 
 def no_deviations(count: int, n_arcs: int, n_twisted: int = 0) -> dict[str, Float]:
-    """Return the fields of `Deviations` for `count` sets without any error.
-
-    Args:
-        n_twisted: Number of tubes if they are not planar, else 0.
-    """
+    """Return the fields of `Deviations` for so many sets without error; `n_twisted` tubes are not planar."""
     return {
         "scope_mm": np.zeros((count, 3)),
         "tilt_rad": np.zeros((count, 2)),
@@ -179,12 +175,7 @@ def in_rows(deviations: Deviations) -> Float:
 def tubes_alone(
     tubes: ConcentricTubes, lps_from_scope_tip: Float, choice: tuple[float, float, float]
 ) -> Devices:
-    """Return planar tubes without a needle as kernels take them.
-
-    Args:
-        choice ((float, float, float)): Rotation in rad and insertions of outer and inner tube in mm; nothing
-            is swept sideways.
-    """
+    """Return planar tubes without needle or sweep as kernels take them: rotation in rad, insertions in mm."""
     turned, outer, inner = choice
     tube = Deployed(turned, 0.0 if tubes.outer is None else outer, inner, 0.0)
     # A copy, which can be written, as of a plan's frame: for one kind of array kernels are compiled once.

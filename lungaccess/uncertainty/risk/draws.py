@@ -29,11 +29,9 @@ class Draws:
 
     Args:
         count, n_arcs: N and A of `Deviations`.
-        seed: The same seed gives the same numbers.
         n_twisted: See `no_deviations`.
         stretch: By how much of the patient's motion by breathing the target moves farther than the scope's
             tip, where the patient's own motion is not known.
-        motion: The patient's own.
         attempt: Number of the attempt on the same N patients: what is drawn for each attempt has other
             numbers.
         further: Of each pass after the first the number of its arcs, and the pass whose numbers it has by the

@@ -64,7 +64,6 @@ def rare_share(happens: Callable[[Float], Bool], dimensions: int, samples: int, 
     Args:
         happens: Takes `(N, dimensions)` float64 and tells in which rows it happens, `(N,)`.
         samples: Draws from the mixture, and as many to look for centres with each of `SPREADS`.
-        seed: The same seed gives the same estimate.
     """
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, 2])))
     centres = _centres(happens, dimensions, samples, rng)

@@ -72,8 +72,6 @@ def find_tolerances(
     out: it is an error of the target in one direction.
 
     Args:
-        plan, lung, radius_mm: See `RiskAssessor`.
-        model: States the sizes to compare with.
         probability: Probability of success that is asked for, above 0 and below 1.
         samples, seed: Draws for each size.
 

@@ -13,7 +13,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Array, Float, Int32, Mask, UInt16
 from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
 from anatomy.grid import Grid, Volume
-from anatomy.lobes import FISSURES_UNKNOWN
+from anatomy.lobes import FISSURES_UNKNOWN, UNKNOWN
 from anatomy.lung import Lung
 from anatomy.mask_findings import mask_findings
 from anatomy.morphology import bounds, window
@@ -111,6 +111,7 @@ def build_lung(
         nodule_labels=_cut_volume(images.nodule_labels, box, "nodule_labels", keep),
         cost=_cut_volume(images.cost, box, "cost", keep),
         lobes=_cut_volume(images.lobes, box, "lobes", keep),
+        fissure_band=_cut_volume(images.fissure_band, box, "fissure_band", keep),
         motion=motion,
         starts=images.starts,
         targets_lps=images.targets_lps,
@@ -158,7 +159,11 @@ def _labels(
     labels[_septum(sides, lung & ~airway, warnings)] |= structures.OUTSIDE
     labels[vessels] |= structures.VESSEL
     if images.fissures is not None:
-        fissures = box.cut(images.fissures.array) & ~airway
+        fissures = box.cut(images.fissures.array)
+        if images.fissure_band is not None:
+            band = box.cut(images.fissure_band.array)
+            fissures |= (band > 0) & (band < UNKNOWN)
+        fissures &= ~airway
         labels[fissures] |= structures.FISSURE
     _label_airway(labels, airway, lumen, tree, box.grid)
     empty = np.zeros((0, 3))

@@ -20,6 +20,12 @@ LOBES: Mapping[int, str] = MappingProxyType(
 
 FISSURES_UNKNOWN = "no fissure mask, so that nobody knows whether a fissure is crossed"
 """Check, plan and report say this where a patient has no mask of the fissures."""
+FISSURES_UNKNOWN_HERE = "lung of which nobody knows where its fissures are is passed"
+"""Check, plan and report say this of a plan in a lung whose lobes are not known."""
+BORDER, SEEN, LEAST_CHANCE, UNKNOWN = 1, 2, 3, 99
+"""Values of an image of fissures: a border between lobes where no fissure is seen, and one where it is; from
+`LEAST_CHANCE` to 49, around a border, the chance in percent that a place lies beyond the fissure, in another
+lobe; and `UNKNOWN`, where nobody knows of fissures."""
 GAP_VOXELS = 2
 """Masks of two lobes may leave so many voxels between them to neither: a fissure as drawn by hand."""
 

@@ -9,7 +9,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.fields import DistanceField
 from anatomy.grid import Volume
-from anatomy.lobes import LOBES
+from anatomy.lobes import LEAST_CHANCE, LOBES, UNKNOWN
 from anatomy.morphology import components, voxels_in
 from anatomy.motion.motion import Motion
 from anatomy.organ import Organ
@@ -30,12 +30,14 @@ class Lung(Organ):
     Args:
         lumen_depth: Distance from a point in the lumen to the nearest voxel that is not lumen; 0 outside.
         lobes: uint8 numbers of `anatomy.lobes.LOBES` on `grid`, if the patient came with lobes.
+        fissure_band: uint8 values of `anatomy.lobes.UNKNOWN` on `grid`, if the patient came with them.
         motion: How it breathes, if that is known.
     """
 
     lumen_depth: DistanceField
     tree: AirwayTree
     lobes: Volume | None = None
+    fissure_band: Volume | None = None
     motion: Motion | None = None
 
     def _repr_html_(self) -> str:
@@ -94,6 +96,31 @@ class Lung(Organ):
         """
         apex, base = self._apex_and_base[int(point_lps[0] > self.tree.carina_lps[0])]
         return float(np.clip((apex - point_lps[2]) / max(apex - base, 1e-9), 0.0, 1.0))
+
+    def fissure_chance(self, points_lps: Float) -> float | None:
+        """Return the chance that a path through points `(N, 3)` LPS mm, in order, crosses a fissure.
+
+        How far the fissure lies from its border is one number for all of a band that the path is in, so that
+        the chance is that of its places that differ most; of several visits to bands it is at most their sum.
+        The 2.5 % beyond each side of a band count as none.
+
+        Returns:
+            None where the path goes through lung of which no band is known.
+        """
+        if self.fissure_band is None or self.lobes is None:
+            return None
+        value = self.fissure_band.at(points_lps, 0).astype(np.int64)
+        lobe = self.lobes.at(points_lps, 0)
+        if (value == UNKNOWN).any():
+            return None
+        beyond, total = np.where((value > 0) & (value < LEAST_CHANCE), 50, value) / 100.0, 0.0
+        edges = np.flatnonzero(np.diff(value > 0, prepend=False, append=False))
+        for first, last in zip(edges[::2], edges[1::2], strict=True):
+            part = slice(max(first - 1, 0), last + 1)
+            own = next((each for each in lobe[part] if each), 0)
+            visited = np.where((lobe[part] == own) | (lobe[part] == 0), beyond[part], 1.0 - beyond[part])
+            total += float(np.ptp(visited))
+        return min(total, 1.0)
 
     def lobe_at(self, point_lps: Float) -> str:
         """Return the name of the lobe that holds a point `(3,)` LPS mm or is near it; "" if not known."""

@@ -26,6 +26,7 @@ class PatientImages:
         lumen, vessels, lung: Bool masks: the airway lumen, the union of arteries and veins, both lungs
             filled.
         wall, fissures, nodules: Bool masks; None when the patient has none.
+        fissure_band: uint8 values of `anatomy.lobes.UNKNOWN`: where a fissure may lie, and with what chance.
         lobes: uint8 numbers of `anatomy.lobes.LOBES`; 0 is no lobe.
         nodule_labels: uint16 numbers of the nodules by the patient's files, if these tell more than one
             apart; else 0.
@@ -56,6 +57,7 @@ class PatientImages:
     wall: Volume | None = None
     fissures: Volume | None = None
     nodules: Volume | None = None
+    fissure_band: Volume | None = None
     lobes: Volume | None = None
     nodule_labels: Volume | None = None
     cost: Volume | None = None
@@ -78,7 +80,7 @@ class PatientImages:
                 if mask.array.dtype != np.bool_:
                     found = f"The mask {role} has the type {mask.array.dtype}"
                     raise AnatomyError(found, expected="bool voxels")
-        for name in ("lobes", "nodule_labels"):
+        for name in ("lobes", "fissure_band", "nodule_labels"):
             numbers = getattr(self, name)
             if numbers is not None:
                 self.grid.require_same(numbers.grid, f"the {name.replace('_', ' ')}")

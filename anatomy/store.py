@@ -26,7 +26,7 @@ from anatomy.patient import PatientImages
 from anatomy.plausibility import require_plausible, with_accepted
 
 META = LUNG_FILE
-LAYOUT = 3
+LAYOUT = 4
 """Raise it when the files of a stored lung change, and the lung itself does not."""
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Mask, UInt8
 from anatomy.grid import Grid, Volume
+from anatomy.io.mask_values import require_label_values
 from anatomy.io.masks import MaskSet, place
 from anatomy.io.voxels import from_stored
-from anatomy.lobes import LOBES, fissures_between, grown_into, main_pieces
+from anatomy.lobes import LOBES, UNKNOWN, fissures_between, grown_into, main_pieces
 from anatomy.morphology import bounds, grown_by_one, window
 from anatomy.patient import PatientImages
 
@@ -193,4 +194,24 @@ def require_cost(volume: Volume, grid: Grid) -> Volume:
     array = from_stored(volume.array)
     if not grid.is_close(volume.grid):
         array = place(array, volume.grid, grid, fill=np.inf).array
+    return Volume(grid=grid, array=array)
+
+
+def require_band(volume: Volume, grid: Grid) -> Volume:
+    """Return an image of fissures as uint8 on the grid of the masks; see `anatomy.lobes.UNKNOWN`.
+
+    Raises:
+        AnatomyError: If a value is none of such an image.
+    """
+    require_label_values(volume.array, "The image of the fissures' band")
+    least, most = int(volume.array.min()), int(volume.array.max())
+    if least < 0 or not (most < 50 or most == UNKNOWN):
+        raise AnatomyError(
+            f"The image of the fissures' band holds values from {least} to {most}",
+            expected=f"1 and 2 for a border, 3 to 49 for a chance in percent, {UNKNOWN} for not known",
+            remedy="Name the fissures.nii.gz of `segment`, or leave fissure_band out",
+        )
+    array = volume.array.astype(np.uint8)
+    if not grid.is_close(volume.grid):
+        array = place(array, volume.grid, grid).array
     return Volume(grid=grid, array=array)

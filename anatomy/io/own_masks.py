@@ -13,7 +13,7 @@ from anatomy.base.errors import AnatomyError, FileError, SettingsError
 from anatomy.base.files import read_toml, sha256
 from anatomy.base.settings import parse, quantity, settings
 from anatomy.base.words import did_you_mean
-from anatomy.io.assembly import assemble, require_cost
+from anatomy.io.assembly import assemble, require_band, require_cost
 from anatomy.io.frames import Frame, parse_point
 from anatomy.io.images import image_stem, image_suffix, read_volume
 from anatomy.io.mask_values import file_and_label, parse_labels
@@ -46,6 +46,9 @@ class PatientFile:
     )
     wall: Annotated[_Files, _key("Airway wall")] = ()
     fissures: Annotated[_Files, _key("Fissures between lobes")] = ()
+    fissure_band: Annotated[
+        str, _key("Where fissures may lie, an obstacle: 3 to 49 % chance of lying beyond, 99 unknown")
+    ] = ""
     nodule: Annotated[_Files, _key("Nodules")] = ()
     cost: Annotated[str, _key("Cost map with values in [0, 1] or infinity")] = ""
     name: Annotated[str, _key("How reports call the patient")] = ""
@@ -106,17 +109,17 @@ def load_own_masks(description: Path) -> PatientImages:
     targets = tuple(parse_point(point) for point in keys.targets)
     masks = read_masks(list(_sources(keys, folder)), frame)
     hashes = {description.name: sha256(description)}
-    cost = None
-    if keys.cost:
-        cost_path = _named_file(folder, keys.cost)
-        cost = require_cost(read_volume(cost_path, frame=frame), masks.grid)
-        hashes[keys.cost] = sha256(cost_path)
+    maps = {}
+    for key, fitted in {"cost": require_cost, "fissure_band": require_band}.items():
+        if name := getattr(keys, key):
+            maps[key] = fitted(read_volume(path := _named_file(folder, name), frame=frame), masks.grid)
+            hashes[name] = sha256(path)
     images = assemble(
         masks,
         name=keys.name or folder.resolve().name,
         kind="masks",
         where=folder,
-        cost=cost,
+        **maps,
         targets_lps=targets,
         breath_hold=keys.breath_hold or None,
         vessel_border_mm=keys.vessel_border_mm,

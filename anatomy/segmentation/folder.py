@@ -29,7 +29,8 @@ IMAGES = ("lungs", "airway", "airway_wall", "nodule", "vessels", "all_vessels", 
 NOTES = {
     "cost": COST_MAP_NOTE,
     "lobes": ", ".join(f"{number} {name}" for number, name in LOBES.items()).replace(" lobe", ""),
-    "fissures": "1 border of lobes without a fissure to be seen, 2 fissure seen",
+    "fissures": "1 border of lobes without a fissure to be seen, 2 fissure seen, 3 to 49 chance in percent "
+    "of lying beyond it, 99 unknown",
 }
 """The headers of images that are no masks say this."""
 

@@ -1,4 +1,4 @@
-"""Which lobe each bronchus supplies: the parting of the tree whose regions meet at the fissures."""
+"""Which lobe each bronchus supplies: the parting of the tree that fits fissures and names of bronchi."""
 
 import itertools
 from collections.abc import Mapping
@@ -22,6 +22,9 @@ USUAL_SHARES: Mapping[int, tuple[float, float]] = MappingProxyType(
 """Mean share of each lobe in its lung, and twice the spread of the healthy, as lobes shrink and swell."""
 WEIGHT_OF_SHARES = 0.05
 """One spread off the usual share weighs as much as a fissure over a twentieth of the lung's cross-section."""
+WEIGHT_OF_NAMES = 0.5
+"""A parting that puts all of a lung into the lobes after which its bronchi are named is worth as much as a
+fissure over half of the lung's cross-section: names decide where no fissure is seen."""
 LEAST_SHARE = 0.03
 """No lobe is smaller, unless it has collapsed."""
 TRUNK_SHARE = 0.9
@@ -43,6 +46,7 @@ class Regions:
             regions, and their number.
         below ((B, B) bool): Whether the second branch descends from the first, or is it.
         used ((B,) bool): Branches that have a region.
+        named ((B,) int64): The lobe of each branch by the name of its bronchus, 0 where that is not sure.
     """
 
     volume: Float
@@ -51,6 +55,7 @@ class Regions:
     faces: Float
     below: Bool
     used: Bool
+    named: Int
 
     @property
     def support(self) -> Float:
@@ -68,7 +73,7 @@ def lobes_of_branches(regions: Regions, lobes: tuple[int, ...]) -> Int:
 
     Every way to cut the tree into as many parts as there are lobes is tried; then twigs move to another part
     where that is better, because a lobe can have several bronchi.  Good is a parting whose parts meet where
-    fissures are seen, and have about usual shares of the lung.
+    fissures are seen, have about usual shares of the lung, and hold the bronchi that are named after them.
 
     Args:
         lobes: Numbers of `anatomy.lobes.LOBES` in this lung.
@@ -84,6 +89,7 @@ def lobes_of_branches(regions: Regions, lobes: tuple[int, ...]) -> Int:
         _named(regions, _parted(regions, cuts), lobes)
         for cuts in itertools.combinations(large, len(lobes) - 1)
     ]
+    partings.append(np.where(regions.used & np.isin(regions.named, lobes), regions.named, 0))
     partings.sort(key=lambda lobe: -_value(regions, lobe, lobes))
     settled = [_settled(regions, lobe, lobes) for lobe in partings[:STARTS]]
     return max(
@@ -147,6 +153,8 @@ def _value(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> float:
     for part, number in zip(parts, lobes, strict=True):
         usual, spread = USUAL_SHARES[number]
         value -= WEIGHT_OF_SHARES * ((regions.volume[part].sum() / whole - usual) / spread) ** 2
+    agrees = np.where(regions.named == lobe, 1.0, -1.0) * ((lobe > 0) & (regions.named > 0))
+    value += WEIGHT_OF_NAMES * float(agrees @ regions.volume) / whole
     # Most lobes have one bronchus: each further one must be worth as much as a fissure over a fiftieth.
     return value - 0.02 * (_bronchi(regions, lobe) - len(lobes))
 

@@ -15,7 +15,7 @@ from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION, description_text
-from anatomy.lobes import LOBES
+from anatomy.lobes import BORDER, LOBES, SEEN
 from anatomy.plausibility import require_known_checks
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
@@ -105,18 +105,17 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
     folder.save(provenance=_provenance(request, steps, warnings), ct_source=_ct_source(request))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
-    sides = [side for side in (parts.left, parts.right) if side.any()]
-    known = all(np.count_nonzero(parts.lobes[side]) > 0.5 * np.count_nonzero(side) for side in sides)
     # A given mask says itself which vessels are obstacles, and of its border nothing is known.
     large_mm = 0.0 if "vessels" in steps.given_names else request.large_radius_mm
-    lobes = np.unique(parts.lobes[parts.lobes > 0]).tolist() if known else []
-    has_fissures = bool(parts.fissures.any()) and (known or "fissures" in steps.from_elsewhere)
+    lobes = np.unique(parts.lobes[parts.lobes > 0]).tolist()
+    fissures = [str(value) for value in (BORDER, SEEN) if (parts.fissures == value).any()]
     keys = {
         "name": request.name,
         **MADE_MASKS,
-        "fissures": "fissures.nii.gz" if has_fissures else "",
+        "fissures": f"fissures.nii.gz#{','.join(fissures)}" if fissures else "",
+        "fissure_band": "fissures.nii.gz" if fissures and lobes else "",
         "lobes": {LOBES[number]: f"lobes.nii.gz#{number}" for number in lobes},
-        "warnings": folder.facts("lobes").get("warnings", ()) if known else (),
+        "warnings": tuple(folder.facts("lobes").get("warnings", ())),
         "nodule": "nodule.nii.gz" if parts.nodule.any() else "",
         "targets": () if target is None else ["lps:{:.3f},{:.3f},{:.3f}".format(*target)],
         "thick_slices_mm": thick_mm,

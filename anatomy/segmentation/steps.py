@@ -298,13 +298,14 @@ class Steps:
         key = self._key("lobes", sources=names, of=made_of, ct=self._ct_digest, by_hand=by_hand)
 
         def compute() -> tuple[Images, dict[str, Any]]:
-            from anatomy.segmentation.lobes import BORDER, SEEN, confirmed_lobes, lobes_given, segment_lobes
+            from anatomy.lobes import BORDER, SEEN
+            from anatomy.segmentation.lobes import confirmed_lobes, lobes_given, segment_lobes
 
             given = {name: self._source(name).astype(np.uint8) for name in names if name in self._sources}
             if "fissures" in given and given["fissures"].max() == BORDER:
                 given["fissures"] = given["fissures"] * np.uint8(SEEN)
             if "lobes" in given and ("fissures" in given or by_hand):
-                return lobes_given(given["lobes"], given.get("fissures")), {}
+                return lobes_given(given["lobes"], given.get("fissures"), lungs), {}
             self._tell("lobes and fissures")
             parts = (self._ct, lungs, _airways(airway), vessels["all_vessels"])
             if "lobes" in given:

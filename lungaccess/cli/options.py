@@ -14,7 +14,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
 from anatomy.base.records import frozen_value
 from anatomy.plausibility import require_known_checks
-from lungaccess.cli.numbers import Count, NotNegative, Processes, Seconds, Seed, Whole
+from lungaccess.cli.numbers import Count, NotNegative, Probability, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from lungaccess.problem.goals import SUCCESS, WINDOW
 from lungaccess.problem.request import ATLAS, AUTO, Request, StatedPlace, goal_of, require_phases
@@ -347,6 +347,8 @@ class SearchOptions(BudgetOptions):
             that a package adds.
         passes: So many times at most the tool goes into the nodule; planned together.
         least_clearance: Every axis in tissue keeps at least so many mm from every obstacle, if not more.
+        fissure_chance: The band in which a fissure may lie is no obstacle, and the chance of crossing the
+            fissure is at most this, such as 0.2.
         method: Search for plans. atlas: over all that scope and tubes can do; kuntz2015: Algorithm 1 of Kuntz
             et al. 2015; reference: the same as printed, with collisions of surface meshes, slow; each of the
             two also -without-rejection; or one that a package adds.
@@ -363,6 +365,7 @@ class SearchOptions(BudgetOptions):
     passes: Count = 1
     phases: PhasesText = None
     least_clearance: NotNegative = 0.0
+    fissure_chance: Probability | None = None
     method: str = ATLAS
     needle_planner: PlannerName | None = None
     processes: Processes | None = None
@@ -393,6 +396,7 @@ class SearchOptions(BudgetOptions):
             fields={
                 "goal": self.goal, "passes": self.passes, "phases": stated_phases(self.phases),
                 "least_clearance_mm": self.least_clearance, "method": self.method,
+                "max_fissure_chance": self.fissure_chance,
                 "needle_planner": self.needle_planner or "", "processes": processes, "gap": self.gap,
                 "seed": self.seed, "iterations": self.iterations, "time_s": self.time_s,
                 "cpu_s": self.cpu_budget, "errors": errors, "procedure": procedure, "place": place,

@@ -25,9 +25,12 @@ TIP_WITHIN_MM = 1.5
 
 
 def holds(request: Request, plan: Plan) -> bool:
-    """Tell whether a plan keeps the stated place, and is proved in the phases that are asked for."""
+    """Tell whether a plan keeps the place, the chance of a fissure and the phases that are asked for."""
     place = request.place
     if place is not None and float(np.linalg.norm(place_of(plan, place) - place.lps_mm)) > place.within_mm:
+        return False
+    most = plan.system.max_fissure_chance
+    if most is not None and (plan.fissure_chance is None or plan.fissure_chance > most):
         return False
     return request.phases is None or (plan.window is not None and plan.window.holds_all(request.phases))
 
@@ -191,6 +194,12 @@ def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None
 def no_plan_beside(request: Request) -> NoPlan:
     """Return why there is no plan where all that were found miss a constraint."""
     place = request.place
+    if place is None and request.phases is None:
+        return NoPlan(
+            "Every plan that was found crosses a fissure with more chance than is allowed",
+            reasons={"fissure: every plan found crosses it with more chance": 1},
+            advice="Allow a greater --fissure-chance",
+        )
     if place is None:
         return NoPlan(
             "Every plan that was found leaves the phases of the breath that are asked for",

@@ -10,7 +10,13 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
 from anatomy.structures import BITS
-from lungaccess.plans.candidate import Candidate, parts_in_tissue, wall_in_path_mm, with_tool_in_place
+from lungaccess.plans.candidate import (
+    Candidate,
+    fissure_chance,
+    parts_in_tissue,
+    wall_in_path_mm,
+    with_tool_in_place,
+)
 from lungaccess.plans.costs import path_costs
 from lungaccess.plans.insertion import scope_insertion
 from lungaccess.plans.parts import (
@@ -65,6 +71,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         ),
         required_clearance_mm=required_clearance_mm(system),
         clearance_mm={"tube": tube_clearance_mm(task, frame, deployment)} | of_needle,
+        fissure_chance=fissure_chance(system, lung, frame, deployment, path),
         costs=stated_costs(task, frame, deployment, path),
         method=task.method,
         needle_planner=task.needle_planner,
@@ -94,7 +101,10 @@ def with_devices(task: Task, candidate: Candidate, model: Plan) -> Plan:
     exemption = replace(model.exemption, branch=deployment.branch, exit_point_lps=tube.exit.point_lps)
     scope = replace(model.scope, lps_from_scope_tip=frame)
     aim = aim_of_tool(task.system, path)
-    return replace(model, scope=scope, tube=tube, needle=needle, exemption=exemption, aim=aim)
+    chance = fissure_chance(task.system, task.lung, frame, deployment, path)
+    return replace(
+        model, scope=scope, tube=tube, needle=needle, exemption=exemption, aim=aim, fissure_chance=chance
+    )
 
 
 def required_clearance_mm(system: System) -> dict[str, float]:

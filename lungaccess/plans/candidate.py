@@ -13,6 +13,9 @@ from stages.needle import LENGTH, ArcPath, InTissue
 from stages.scope import Bronchoscope, ScopeTip, TipRow, in_tip_region, prover_of
 from stages.tube import Deployment, pieces_of_arcs
 
+BAND_STEP_MM = 0.05
+"""Spacing of the places at which the band of a fissure is looked up: its voxels differ in chance."""
+
 
 @frozen_record
 class Candidate:
@@ -53,6 +56,16 @@ def parts_in_tissue(
     if system.needle is not None:
         parts.append(InTissue(path, system.needle.diameter_mm))
     return parts
+
+
+def fissure_chance(
+    system: System, lung: Lung, lps_from_scope_tip: Float, deployment: Deployment, path: ArcPath
+) -> float | None:
+    """Return the chance that the axes of a candidate cross a fissure; None where that is not known."""
+    if lung.fissure_band is None:
+        return None
+    parts = [path] if system.needle is None else [tubes_in_tissue(lps_from_scope_tip, deployment), path]
+    return lung.fissure_chance(np.concatenate([part.sample(BAND_STEP_MM)[0] for part in parts]))
 
 
 def _tubes_beyond(lps_from_scope_tip: Float, deployment: Deployment, begin_mm: float) -> ArcPath:

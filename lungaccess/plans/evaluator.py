@@ -12,6 +12,7 @@ from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.plans.candidate import (
     Candidate,
     TipRows,
+    fissure_chance,
     parts_in_tissue,
     tubes_in_tissue,
     wall_in_path_mm,
@@ -64,6 +65,8 @@ BLOCKERS = ((VESSEL, "a vessel"), (OUTSIDE, "the pleura"), (FISSURE, "a fissure"
 
 TOO_LITTLE = "too little of the nodule in the tool"
 """The reason that stops a path whose tool is at the target and holds less of the nodule than it has to."""
+TOO_LIKELY = "a fissure: crossed with more chance than is allowed"
+"""The reason that stops what crosses a fissure with too much chance, or enters lung where none is known."""
 TIP_OFF_MM = 1e-6
 """So far from the target may the tip of the tubes be by rounding where there is no needle."""
 
@@ -130,6 +133,13 @@ class CandidateEvaluator:
         """Tell whether a path is proved, and no tube enters an infinite cost that the objective weighs."""
         if not self.proves(deployment, path):
             return False
+        most = self.task.system.max_fissure_chance
+        if most is not None:
+            aimed = with_tool_in_place(self.task.system, path)
+            chance = fissure_chance(self.task.system, self.task.lung, lps_from_scope_tip, deployment, aimed)
+            if chance is None or chance > most:
+                self.blocked[TOO_LIKELY] += 1
+                return False
         weighs_tubes = self.task.lung.cost is not None and self.objective.tissue > 0.0
         return not weighs_tubes or math.isfinite(self.cost_from(lps_from_scope_tip, deployment, path))
 

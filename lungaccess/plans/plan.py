@@ -14,6 +14,7 @@ from anatomy.base.records import LEFT_OUT_IF_EMPTY, frozen_record
 from anatomy.base.typed import Float
 from anatomy.base.words import percent, plural
 from anatomy.display import AXIAL, CORONAL, Drawing, side_by_side, table
+from anatomy.lobes import LEAST_CHANCE
 from anatomy.poses import poses_on_pieces
 from lungaccess.plans import file as plan_file
 from lungaccess.plans.chance import Chance
@@ -66,6 +67,8 @@ class Plan(Record):
         system_choice: Where the system was chosen among several: in sentences, which were tried, why each
             failed, and why this one was chosen; see `lungaccess.judging.answering`.  Empty otherwise.
         timing: Seconds; the only values that differ between two equal runs.
+        fissure_chance: Chance that tubes or needle cross a fissure, from the band it lies in; None where none
+             is known.
         chance: Of success, counted on draws that no search saw: for a plan that was searched by it, and of
             studies that count it; None for any other.
         window: The phases of the breath in which it is proved clear and on target; None where no motion was
@@ -104,6 +107,7 @@ class Plan(Record):
     kernels: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
     needle_planner: str = field(default="", metadata={LEFT_OUT_IF_EMPTY: True})
     system_choice: tuple[str, ...] = field(default=(), metadata={LEFT_OUT_IF_EMPTY: True})
+    fissure_chance: float | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     chance: Chance | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     window: BreathingWindow | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     aim: BreathingAim | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
@@ -223,6 +227,14 @@ class Plan(Record):
         )
 
     @property
+    def fissure_words(self) -> str:
+        """The chance of crossing a fissure in words; "" where none is known."""
+        chance = self.fissure_chance
+        if chance is None:
+            return ""
+        return "under 3 %" if chance < 0.01 * LEAST_CHANCE else percent(chance, up=True)
+
+    @property
     def tissue_mm(self) -> float:
         """Length of tubes and needle beyond the lumen that the tubes leave."""
         needle_mm = 0.0 if self.needle is None else self.needle.length_mm
@@ -261,6 +273,8 @@ class Plan(Record):
             words = ", ".join(f"{name} {value:.2f}" for name, value in distances.items())
             least = f"{self.least_required_clearance_mm(device):.2f}"
             rows.append((f"{device}: least distance, mm", f"{words}; needs {least}"))
+        if self.fissure_chance is not None:
+            rows.append(("chance of crossing a fissure", self.fissure_words))
         costs = ", ".join(f"{name} {value:.4g}" for name, value in self.costs.items() if value)
         return [
             *rows,

@@ -129,6 +129,7 @@ class Request:
         goal: str | Goal | Objective | PlanFunction = SUCCESS,
         fissures_allowed: bool | None = None,
         least_clearance_mm: float = 0.0,
+        max_fissure_chance: float | None = None,
         phases: Sequence[float] | None = None,
         iterations: int | None = None,
         time_s: float | None = None,
@@ -143,10 +144,11 @@ class Request:
                 "auto" for all presets.
             fissures_allowed: Whether fissures may be crossed, instead of what the systems say.
             least_clearance_mm: Every axis in tissue keeps at least this distance from every obstacle.
+            max_fissure_chance: Fissures may be crossed where the chance to do so is at most this.
         """
         return cls(
             lung=lung, target=target, goal=goal_of(goal, lung),
-            systems=systems_of(system, fissures_allowed, least_clearance_mm),
+            systems=systems_of(system, fissures_allowed, least_clearance_mm, max_fissure_chance),
             phases=None if phases is None else require_phases(*phases),
             limits=Limits(iterations=iterations, time_s=time_s, cpu_s=cpu_s, first_plan_s=first_plan_s),
             **others,
@@ -174,6 +176,12 @@ class Request:
                 f"How {self.lung.name} breathes is not known, and a window of the breath is asked for",
                 expected="a patient with a motion: [motion] in its patient.toml",
                 remedy="Leave phases and window out, or state a motion; see docs/how_to/breathing.md",
+            )
+        if self.lung.fissure_band is None and any(each.max_fissure_chance for each in self.systems):
+            raise AnatomyError(
+                f"Where the fissures of {self.lung.name} may lie is not known, and a chance is asked for",
+                expected="a patient with fissure_band in its patient.toml, as `segment` writes it",
+                remedy="Leave out the chance, or segment the CT again",
             )
         tools = [system.tool.name for system in self.systems if system.tool is not None]
         if self.is_for_window and tools:
@@ -285,10 +293,11 @@ def systems_of(
     stated: System | str | Sequence[System | str],
     fissures_allowed: bool | None = None,
     least_clearance_mm: float = 0.0,
+    max_fissure_chance: float | None = None,
 ) -> tuple[System, ...]:
     """Return the systems that are stated, the least invasive first; see `Request.of`."""
     from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
-    from lungaccess.problem.system import System, load_system, with_fissure_rule
+    from lungaccess.problem.system import System, load_system, with_fissure_chance, with_fissure_rule
 
     if stated == AUTO:
         found = presets_by_invasiveness(fissures_allowed=fissures_allowed)
@@ -296,6 +305,7 @@ def systems_of(
         several = [stated] if isinstance(stated, System | str) else list(stated)
         loaded = [load_system(each) if isinstance(each, str) else each for each in several]
         found = tuple(with_fissure_rule(each, fissures_allowed) for each in loaded)
+    found = tuple(with_fissure_chance(each, max_fissure_chance) for each in found)
     kept = tuple(with_least_clearance(each, least_clearance_mm) for each in found)
     return kept if len(kept) == 1 else least_invasive_first(kept)
 

@@ -12,7 +12,7 @@ from pydantic import Field
 from anatomy.base.checksums import canonical_sha256
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
-from anatomy.base.settings import impossible, parse, settings, switch, text, to_mapping
+from anatomy.base.settings import impossible, parse, quantity, settings, switch, text, to_mapping
 from anatomy.margins import Margins
 from lungaccess.problem.preset_files import PresetFiles
 from lungaccess.problem.tools import Tool, load_tool
@@ -43,6 +43,8 @@ class System:
         needle_preloaded: Whether the needle's tip stays at that of the inner tube while the tubes are
             deployed.  Then it bends with them, and `tubes` know its shaft; else its stiffness is neglected.
         fissures_allowed: Whether tubes and needle may cross a fissure, which pierces the pleura twice.
+        max_fissure_chance: With what chance tubes and needle may cross a fissure of which a band is known;
+            None for any chance.
         tool: What is done at the target, on the needle.  With one a procedure succeeds if enough of the
             nodule is in it, and without one if the last tip ends near the target.
 
@@ -65,9 +67,14 @@ class System:
         ),
     ] = field(default=False, metadata={LEFT_OUT_IF_EMPTY: True})
     fissures_allowed: Annotated[bool, switch("whether a fissure may be crossed")] = False
+    max_fissure_chance: Annotated[
+        float | None, quantity("greatest chance of crossing a fissure in its band", above=0.0, at_most=1.0)
+    ] = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
     tool: Tool | None = field(default=None, metadata={LEFT_OUT_IF_EMPTY: True})
 
     def __post_init__(self) -> None:
+        if self.max_fissure_chance is not None and not self.fissures_allowed:
+            raise impossible("max_fissure_chance", self.max_fissure_chance, "none: no fissure is allowed")
         outer, channel = self.tubes.outermost.outer_diameter_mm, self.scope.channel_diameter_mm
         name = self.tubes.named[0][0]
         if outer >= channel:
@@ -222,6 +229,18 @@ def with_fissure_rule(system: System, fissures_allowed: bool | None) -> System:
         return system
     name = system.name + FISSURE_RULES[fissures_allowed]
     return replace(system, name=name, fissures_allowed=fissures_allowed)
+
+
+def with_fissure_chance(system: System, chance: float | None) -> System:
+    """Return a system that may cross a fissure with so much chance, and says so in its name; itself for None.
+
+    Raises:
+        SettingsError: If the chance is not above 0 and at most 1.
+    """
+    if chance is None:
+        return system
+    name = f"{system.name} (crosses a fissure with a chance of at most {chance:g})"
+    return replace(system, name=name, fissures_allowed=True, max_fissure_chance=chance)
 
 
 def with_tool(system: System, tool: Tool | None) -> System:

@@ -4,7 +4,6 @@ from enum import IntEnum, StrEnum
 
 from anatomy.base.records import frozen_value
 from anatomy.base.words import of_hundred, plural, range_of_hundred
-from anatomy.lobes import FISSURES_UNKNOWN
 from lungaccess.judging.checking import CheckReport
 from lungaccess.judging.checking.needle_load import FINDING as NEEDLE_LOAD
 from lungaccess.planning.procedure.report import NO_PATH
@@ -95,7 +94,8 @@ class Headline:
         refusals: Findings of the check that are not ok.
         estimate: The estimate of success, or what the plan states of one; None if there is none, as for a
             refused plan.
-        fissures_unknown: Whether fissures must not be crossed, and the patient has no mask of them.
+        fissures_unknown: Why fissures are not checked; empty if they are, or may be crossed.
+        fissure_chance: With what chance a fissure is crossed, as far as that is known.
         needle_load: What the needle does to the tubes that aim it, where the plan does not count it; empty
             where nothing.
         without_measuring: How often the plan succeeds in open loop, where the estimate is of a procedure that
@@ -107,7 +107,8 @@ class Headline:
     geometry: Geometry
     refusals: int = 0
     estimate: Estimate | None = None
-    fissures_unknown: bool = False
+    fissures_unknown: str = ""
+    fissure_chance: float | None = None
     needle_load: str = ""
     without_measuring: Share | None = None
     has_aim: bool = False
@@ -121,12 +122,14 @@ class Headline:
             return cls(geometry=Geometry.UNCHECKED, estimate=estimate)
         geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
         unchecked = {each.name: each.detail for each in report.unchecked}
+        chances = {each.name: each.value for each in report.findings}
         has_aim = any(each.name == "window.of_aim" for each in report.findings)
         return cls(
             geometry=geometry,
             refusals=len(report.refusals),
             estimate=estimate,
-            fissures_unknown="patient.fissures" in unchecked,
+            fissures_unknown=unchecked.get("patient.fissures", ""),
+            fissure_chance=chances.get("fissure.chance"),
             needle_load=unchecked.get(NEEDLE_LOAD, ""),
             without_measuring=without_measuring,
             has_aim=has_aim,
@@ -212,7 +215,9 @@ class Headline:
     @property
     def geometry_words(self) -> str:
         """What is known of the geometry, and what is not checked."""
-        missing = f", fissures not checked: {FISSURES_UNKNOWN}" if self.fissures_unknown else ""
+        missing = f", fissures not checked: {self.fissures_unknown}" if self.fissures_unknown else ""
+        if self.fissure_chance:
+            missing += f", fissure crossed in {of_hundred(self.fissure_chance, up=True)} of 100"
         load = f", needle's load not counted: {self.needle_load}" if self.needle_load else ""
         return f"geometry {self.geometry}{missing}{load}"
 
@@ -287,7 +292,8 @@ class Headline:
             "grade": self.grade.key,
             "verdict": self.verdict,
             "geometry": str(self.geometry),
-            "fissures_unknown": self.fissures_unknown,
+            "fissures_unknown": bool(self.fissures_unknown),
+            "fissure_chance": self.fissure_chance,
             "needle_load": self.needle_load or None,
             "success": None if self.success is None else self.success.to_mapping(),
             "without_measuring": None if open_loop is None else open_loop.to_mapping(),

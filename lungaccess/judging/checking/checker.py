@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from anatomy.lobes import FISSURES_UNKNOWN_HERE
+from lungaccess.judging.checking import shapes
 from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.completion import Motions, completed_plan
 from lungaccess.judging.checking.deployment import check_deployment
@@ -55,6 +57,7 @@ class Checker:
                 check_tubes_at_target(plan, self._environment, tube_tip, found)
             else:
                 check_needle(plan, needle, device, self._environment, tube_tip, found)
+            check_fissure_chance(plan, self._environment.lung, found)
             check_window(plan, self._environment, found)
             check_functions(plan, self._environment.lung, found)
         return found.report()
@@ -89,6 +92,30 @@ def check(
         target_lps ((3,) array_like): The target that was asked for, LPS mm; the plan's must be the same.
     """
     return Checker(lung).check(plan, system, target_lps=target_lps)
+
+
+def check_fissure_chance(plan: Plan, lung: "Lung", found: Findings) -> None:
+    """Recompute the chance of crossing a fissure along the axes, and compare it with what is allowed."""
+    name, stated, most = "fissure.chance", plan.fissure_chance, plan.system.max_fissure_chance
+    if lung.fissure_band is None:
+        found.true(f"{name}.known", stated is None and most is None, "no band of a fissure is known")
+        return
+    tubes = shapes.integrate(plan.scope.lps_from_scope_tip, shapes.tube_pieces(plan))
+    points = [shapes.beyond(tubes, plan.tube.exit.arc_length_mm).points]
+    if plan.needle is not None:
+        points.append(shapes.integrate(plan.needle.lps_from_start, shapes.needle_pieces(plan.needle.arcs)).points)
+    chance = lung.fissure_chance(np.concatenate(points))
+    if chance is None:
+        found.true(f"{name}.known", stated is None and most is None, FISSURES_UNKNOWN_HERE)
+        found.unchecked("patient.fissures", FISSURES_UNKNOWN_HERE)
+        return
+    if found.true(f"{name}.known", stated is not None, "a band of the fissures is known"):
+        # Places that differ by a part of a step may lie in voxels of other chances.
+        found.at_most(f"{name}.stated", chance, stated or 0.0, "", "recomputed against stated", 0.03)
+    if most is not None:
+        found.at_most(name, chance, most, "", "chance that tubes or needle cross a fissure", 0.03)
+    else:
+        found.measured(name, chance, "", "chance that tubes or needle cross a fissure")
 
 
 def check_functions(plan: Plan, lung: "Lung", found: Findings) -> None:

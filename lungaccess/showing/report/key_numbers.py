@@ -48,6 +48,8 @@ def _general_rows(plan: Plan, lung: Lung) -> list[Row]:
 
 
 def _fissures(plan: Plan) -> str:
+    if plan.fissure_chance is not None:
+        return f"crossed with a chance of {plan.fissure_words}"
     if plan.fissures_are_obstacles:
         return "are obstacles"
     return "may be crossed" if plan.system.fissures_allowed else "not checked: no mask"

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from anatomy.grid import Grid
-from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
+from anatomy.lobes import (
+    LEAST_CHANCE,
+    LEFT_LOWER,
+    LEFT_UPPER,
+    RIGHT_LOWER,
+    RIGHT_MIDDLE,
+    RIGHT_UPPER,
+    SEEN,
+    UNKNOWN,
+)
 from anatomy.segmentation.fissures import Cubic, fissureness
 from anatomy.segmentation.kernels.flooding import diffuse, flood
 from anatomy.segmentation.lobar_bronchi import Regions, lobes_of_branches
-from anatomy.segmentation.lobes import SEEN, lobes_given
+from anatomy.segmentation.lobes import BAND_GROWTH, BAND_MM, BAND_UNSEEN_MM, WIDEST_SHARE, _bands, lobes_given
 
 SHAPE = (40, 50, 60)
 
@@ -75,7 +88,12 @@ def test_shares_fall_evenly_between_two_fixed_ends() -> None:
     assert share[1, 1, 1:12] == pytest.approx(np.linspace(1.0, 0.0, 11), abs=1e-4)
 
 
-def regions(volume: list[float], places: list[list[float]], fissures: list[tuple[int, int]]) -> Regions:
+def regions(
+    volume: list[float],
+    places: list[list[float]],
+    fissures: list[tuple[int, int]],
+    named: tuple[int, ...] = (0,) * 7,
+) -> Regions:
     """Regions of a main bronchus 0 that divides into 1 and 2; 3 and 4 are branches of 1, 5 and 6 of 2."""
     parent = [-1, 0, 0, 1, 1, 2, 2]
     below = np.eye(7, dtype=bool)
@@ -92,6 +110,7 @@ def regions(volume: list[float], places: list[list[float]], fissures: list[tuple
         volume=size, moment=size[:, None] * np.array(places), likelihood=likelihood, faces=faces,
         below=below,
         used=used,
+        named=np.array(named),
     )  # fmt: skip
 
 
@@ -132,10 +151,52 @@ def test_too_few_bronchi_give_no_lobes() -> None:
     assert not lobes_of_branches(one, (LEFT_UPPER, LEFT_LOWER)).any()
 
 
-def test_corrected_lobes_have_fissures_between_them() -> None:
+def test_names_of_bronchi_decide_where_no_fissure_is_seen_and_give_way_to_one_that_is() -> None:
+    """Usual shares and one bronchus a lobe put branch 5 into the lower lobe, its name into the upper one."""
+    named = (0, 0, 0, LEFT_UPPER, LEFT_UPPER, LEFT_UPPER, LEFT_LOWER)
+    lobes = (LEFT_UPPER, LEFT_LOWER)
+    unnamed = lobes_of_branches(regions(VOLUME, PLACES, []), lobes)
+    found = lobes_of_branches(regions(VOLUME, PLACES, [], named), lobes)
+    assert unnamed[5] == LEFT_LOWER and found[3:].tolist() == list(named[3:])
+    seen = lobes_of_branches(regions(VOLUME, PLACES, [(4, 5)], named), lobes)
+    assert seen[3:].tolist() == [LEFT_UPPER, LEFT_UPPER, LEFT_LOWER, LEFT_LOWER]
+
+
+def lungs_of(lobes: np.ndarray, right: np.ndarray) -> Any:
+    return SimpleNamespace(left=~right, right=right, mask=np.ones(lobes.shape, dtype=bool))
+
+
+def test_corrected_lobes_have_fissures_between_them_and_a_lung_without_lobes_has_none_known() -> None:
     lobes = np.zeros((4, 4, 4), dtype=np.uint8)
     lobes[:2], lobes[2:] = LEFT_UPPER, LEFT_LOWER
-    made = lobes_given(lobes, None)
+    made = lobes_given(lobes, None, lungs_of(lobes, np.zeros(lobes.shape, dtype=bool)))
     assert (made["fissures"][1:3] == SEEN).all() and not made["fissures"][[0, 3]].any()
     own = np.ones_like(lobes)
-    assert lobes_given(lobes, own)["fissures"] is own
+    assert lobes_given(lobes, own, lungs_of(lobes, lobes > 9))["fissures"] is own
+    right = np.zeros(lobes.shape, dtype=bool)
+    right[:, :2] = True
+    half = lobes_given(np.where(right, np.uint8(0), lobes), None, lungs_of(lobes, right))["fissures"]
+    assert (half[right] == UNKNOWN).all() and (half[1:3, 2:] == SEEN).all() and not half[0, 2:].any()
+
+
+def test_a_band_is_wider_where_its_fissure_is_not_seen_and_has_the_chances_of_a_normal_error() -> None:
+    lobes = np.full((120, 30, 120), LEFT_LOWER, dtype=np.uint8)
+    lobes[60:] = LEFT_UPPER
+    near = np.zeros(lobes.shape, dtype=bool)
+    near[58:62, :, :20] = True
+    widest_mm = WIDEST_SHARE * lobes.size ** (1 / 3)
+    for share, more_mm in ((1.0, 0.0), (0.5, 0.5 * BAND_UNSEEN_MM)):
+        found = _bands(lobes, near, {"left oblique fissure": share})
+        heights = [int(np.count_nonzero(found[:, 15, i])) for i in (5, 20, 23, 110)]
+        widths_mm = [
+            BAND_MM + more_mm,
+            BAND_MM + BAND_GROWTH + more_mm,
+            BAND_MM + 2.0 * BAND_GROWTH + more_mm,
+        ]
+        # Voxels count whose middles lie in the band, those of each side for themselves.
+        assert heights == [2 * int(np.floor(width + 0.5)) for width in (*widths_mm, widest_mm)]
+    for away in (0, 4, 9):
+        beyond = round(100.0 * NormalDist().cdf(-1.96 * (away + 0.5) / widest_mm))
+        assert found[60 + away, 15, 110] == found[59 - away, 15, 110] == beyond
+    assert found.max() < 50 and found[found > 0].min() >= LEAST_CHANCE
+    assert not _bands(np.full((9, 9, 9), LEFT_LOWER, dtype=np.uint8), near[:9, :9, :9], {}).any()

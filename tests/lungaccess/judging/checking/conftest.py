@@ -89,6 +89,7 @@ def toy_lung() -> Any:
         tree=tree,
         cost=None,
         has_fissures=True,
+        fissure_band=None,
         nodules=None,
         breath_hold="inspiration",
         motion=None,

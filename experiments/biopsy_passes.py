@@ -1,18 +1,18 @@
 """Several passes planned together, by size of the nodule and tool, and counted by brute force.
 
     python -m experiments.biopsy_passes [--quick] [--results FOLDER] [--procedure open-loop] [--tools core]
-        [--places 1] [--lungs 3 Patient1] [--sizes 8] [--picture FILE]
+        [--errors breath-hold] [--nodules 60] [--lungs 8 Patient1] [--sizes 8]
 
 Nodules are drawn at peripheral targets: balls, and lumps whose radius varies by a quarter.  Of each, one pass
 at the centre, three passes at the same point, and three planned together are counted by the same draws, which
-no search saw, under `breath-hold`.  In open loop, draws of another seed are counted voxel by voxel, too.
+no search saw.  In open loop, draws of another seed are counted voxel by voxel in every third nodule.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.phantom import make_phantom
 from experiments.support.anatomies import anatomy
-from experiments.support.results import Result, setting_of, small_png, study_parser, write_result
+from experiments.support.results import Result, setting_of, study_parser, write_result
 from lungaccess.judging.checking import check
 from lungaccess.planning.one_system import run
 from lungaccess.planning.success.estimate import estimate_success
@@ -36,7 +36,11 @@ from lungaccess.problem.request import Request
 from lungaccess.problem.system import with_tool
 from lungaccess.problem.tools import load_tool
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
+from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.statistics import share_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SIZES_MM = (6.0, 8.0, 12.0, 20.0, 30.0)
 SYSTEM, PASSES, SEED = "ultrathin", 3, 5
@@ -64,9 +68,11 @@ def with_nodule(lung: Lung, centre: Float, diameter_mm: float, rng: np.random.Ge
     return replace(lung, nodules=Volume(grid=grid, array=inside))
 
 
-def brute(plan: Plan, lung: Lung, draws: int, seed: int) -> Bool:
+def brute(plan: Plan, lung: Lung, model: la.ErrorModel, draws: int, seed: int) -> Bool:
     """Return which draws succeed `(N,)`, by the voxels in which points of the tool's axis lie."""
-    tool, model = plan.system.tool, load_errors()
+    tool, nodules, model = plan.system.tool, lung.nodules, model_for(model, plan, lung)
+    if tool is None or nodules is None:
+        raise ValueError("Voxels of a nodule are counted in a tool: the plan has none, or the lung has none")
     whole = RiskAssessor(plan, lung)
     errors = whole.draws(draws, seed).deviations(model)
     total, clear = np.zeros(draws), np.ones(draws, dtype=bool)
@@ -78,129 +84,176 @@ def brute(plan: Plan, lung: Lung, draws: int, seed: int) -> Bool:
         for part in np.array_split(np.arange(draws), max(1, draws // 2000)):
             ends = outcomes.ends[part] if len(outcomes.ends) else outcomes.ends
             points = ends[:, None, :3] + along[:, None] * ends[:, None, 3:6] - own.target_mm[part, None]
-            inside = lung.nodules.at(points.reshape(-1, 3), False).reshape(len(part), -1)
+            inside = nodules.at(points.reshape(-1, 3), False).reshape(len(part), -1)
             total[part] += STEP_MM * inside.sum(axis=1)
     return clear & (total >= tool.least - 0.5 * STEP_MM)
 
 
-def planned(lung: Lung, atlas: la.Atlas, centre: Float, tool: str, procedure: str, passes: int) -> Plan:
-    """Return the plan for success with so many passes at most."""
-    request = Request.of(
-        lung, with_tool(la.load_system(SYSTEM), load_tool(tool)), la.point_target(lung, centre),
-        passes=passes, procedure=load_procedure(procedure), iterations=0, seed=SEED,
-    )  # fmt: skip
-    return list(run(request, atlas=atlas, counterfactuals=False))[-1]
-
-
-def cases(names: Sequence[str], places: int) -> Iterator[tuple[str, Lung, la.Atlas, Float]]:
-    """Yield lungs with peripheral places; a name is the seed of a phantom, or a patient of the data."""
+def lungs_of(names: Sequence[str]) -> Iterator[tuple[str, Lung]]:
+    """Yield lungs with their names: a name is the seed of a phantom, or a patient of the data."""
     for name in names:
-        made = make_phantom(seed=int(name), size="small") if name.isdigit() else None
-        lung = anatomy(name) if made is None else build_lung(made.images)
-        atlas = la.build_atlas(lung, la.load_system(SYSTEM))
-        drawn = (
-            each for each in la.peripheral_targets(lung, 10 * places, SEED) if reached(lung, atlas, each)
+        yield (
+            (f"phantom {name}", build_lung(make_phantom(seed=int(name), size="small").images))
+            if name.isdigit()
+            else (name, anatomy(name))
         )
-        for number, centre in enumerate(islice(drawn, places)):
-            yield f"{name}, place {number}", lung, atlas, centre
 
 
-def reached(lung: Lung, atlas: la.Atlas, centre: Float) -> bool:
-    """Tell whether a plan of the core needle to the middle of a nodule of 12 mm is found."""
-    try:
-        planned(with_nodule(lung, centre, 12.0, None), atlas, centre, "core", "open-loop", 1)
-    except (NoPlan, LungaccessError):
-        return False
-    return True
+def cases(
+    names: Sequence[str], nodules: int, sizes: Sequence[float]
+) -> Iterator[tuple[str, float, Lung, la.Atlas]]:
+    """Yield nodules drawn at peripheral places, lung by lung in turn: name, size, lung with it, and atlas."""
+    there = [(name, lung, la.build_atlas(lung, la.load_system(SYSTEM))) for name, lung in lungs_of(names)]
+    places = [la.peripheral_targets(lung, nodules, SEED) for _name, lung, _atlas in there]
+    for number in range(nodules):
+        size, solid = sizes[number % len(sizes)], number // len(sizes) % 2 == 0
+        for (name, lung, atlas), centres in zip(there, places, strict=True):
+            rng = None if solid else np.random.default_rng(number)
+            case = f"{name}, {size:g} mm {'ball' if solid else 'lump'} {number + 1}"
+            yield case, size, with_nodule(lung, centres[number], size, rng), atlas
 
 
 def main() -> None:
-    """Run the study and store its result."""
+    """Run the study and store its result, anew after every nodule."""
     parser = study_parser(__doc__)
     parser.add_argument("--procedure", default="open-loop")
+    parser.add_argument("--errors", nargs="+", default=["breath-hold", "expiratory-free"])
     parser.add_argument("--tools", nargs="+", default=["core"])
-    parser.add_argument("--places", type=int, default=1)
-    parser.add_argument("--lungs", nargs="+", default=["3", "21", "8"])
+    parser.add_argument("--nodules", type=int, default=60, help="nodules a lung (default: %(default)s)")
+    parser.add_argument("--lungs", nargs="+", default=["8", "11", "14", "Patient1"])
     parser.add_argument("--sizes", type=float, nargs="+", default=SIZES_MM)
-    parser.add_argument("--picture", default="")
     options = parser.parse_args()
-    name = f"biopsy_passes_{options.procedure}"
+    nodules = 5 if options.quick else options.nodules
+    lungs = options.lungs[: 1 if options.quick else None]
     result = Result(
-        name=name, title=f"Passes planned together, {options.procedure}", setting=setting_of(options),
-        seeds=[SEED], conditions={"errors": "breath-hold", "system": SYSTEM},
+        name=f"biopsy_passes_{options.procedure}", title=f"Passes planned together, {options.procedure}",
+        setting=setting_of(options), seeds=[SEED],
+        conditions={"system": SYSTEM, "lungs": ", ".join(lungs), "nodules": "drawn at peripheral places"},
     )  # fmt: skip
-    samples = DRAWS if options.procedure == "open-loop" else 1000
-    shares: dict[tuple[str, float], list[list[float]]] = {}
-    within = []
-    for where, lung, atlas, centre in cases(options.lungs[: 1 if options.quick else None], options.places):
-        for tool in options.tools:
-            for number, size in enumerate(options.sizes):
-                rng = np.random.default_rng(number) if number % 2 else None
-                drawn = with_nodule(lung, centre, size, rng)
-                case = f"{where}, {size:g} mm {'lump' if number % 2 else 'ball'}, {tool}"
-                try:
-                    one = planned(drawn, atlas, centre, tool, options.procedure, 1)
-                    several = planned(drawn, atlas, centre, tool, options.procedure, PASSES)
-                except (NoPlan, LungaccessError) as reason:
-                    print(case, "no plan", str(reason)[:80], flush=True)
-                    continue
-                plans = (one, one.with_further([one] * (PASSES - 1)), several)
-                accepted = all(check(each, drawn).accepted for each in plans)
-                counted = [
-                    estimate_success(
-                        each, drawn, errors=load_errors(), procedure=load_procedure(options.procedure),
-                        samples=samples, seed=SEED + 99,
-                    ).succeeds
-                    for each in plans
-                ]  # fmt: skip
-                shares.setdefault((tool, size), []).append([each.value for each in counted])
-                truth = ""
-                if options.procedure == "open-loop" and load_tool(tool).unit == "mm":
-                    for each, share in zip(plans, counted, strict=True):
-                        low, high = share.interval
-                        counts = share_of(brute(each, drawn, BRUTE_DRAWS, SEED + 7))
-                        within.append(low <= counts.value <= high)
-                        truth += f" {counts.value:.3f} in {low:.3f}-{high:.3f}"
-                words = " ".join(f"{each.value:.3f}" for each in counted)
-                print(
-                    case, len(several.passes), "accepted" if accepted else "REFUSED", words, truth, flush=True
+    counted = Counted(options.procedure, with_brute=options.procedure == "open-loop")
+    for number, (case, size, lung, atlas) in enumerate(cases(lungs, nodules, options.sizes)):
+        for errors in options.errors:
+            for tool in options.tools:
+                counted.add(
+                    f"{case}, {tool}, {errors}", (errors, tool, size), lung, atlas, brutally=number % 3 == 0
                 )
-                note = f"one {counted[0].value:.3f}, three at one point {counted[1].value:.3f}"
-                result.add(f"{case}: chance of three together", counted[2].value, note=note)
-    every = np.array([each for rows in shares.values() for each in rows])
-    gains = 100.0 * (every[:, 2:] - every[:, :2])
+        counted.fill(result)
+        write_result(result, options.results)
+
+
+class Counted:
+    """What was counted so far: chances by errors, tool and size.
+
+    Each nodule has three numbers: how often one pass, three at its point and three planned together succeed.
+    In open loop it has two more: how often the first two touch nothing forbidden, which is the most that they
+    can succeed.
+    """
+
+    def __init__(self, procedure: str, *, with_brute: bool) -> None:
+        self.procedure, self._with_brute = load_procedure(procedure), with_brute
+        self.samples = DRAWS if self.procedure.is_open_loop else 1000
+        self.shares: dict[tuple[str, str, float], list[list[float]]] = {}
+        self.within: list[bool] = []
+        self.accepted: list[bool] = []
+        self.none = 0
+
+    def add(
+        self, case: str, key: tuple[str, str, float], lung: Lung, atlas: la.Atlas, *, brutally: bool
+    ) -> None:
+        """Plan for a nodule, and count."""
+        model, tool = load_errors(key[0]), load_tool(key[1])
+        target = la.resolve_target(lung, nodule=1)
+        found = []
+        try:
+            for passes in (1, PASSES):
+                request = Request.of(
+                    lung, with_tool(la.load_system(SYSTEM), tool), target, passes=passes, errors=model,
+                    procedure=self.procedure, iterations=0, seed=SEED,
+                )  # fmt: skip
+                found.append(list(run(request, atlas=atlas, counterfactuals=False))[-1])
+        except (NoPlan, LungaccessError) as reason:
+            self.none += 1
+            print(case, "no plan:", str(reason)[:80], flush=True)
+            return
+        one, several = found
+        plans = (one, one.with_further([one] * (PASSES - 1)), several)
+        self.accepted.append(check(several, lung).accepted)
+        estimates = [
+            estimate_success(
+                each, lung, errors=model, procedure=self.procedure, samples=self.samples, seed=SEED + 99
+            )
+            for each in plans
+        ]
+        shares = [each.succeeds.value for each in estimates]
+        shares += (
+            [touches_nothing(each, lung, model) for each in plans[:2]] if self.procedure.is_open_loop else []
+        )
+        self.shares.setdefault(key, []).append(shares)
+        truth = ""
+        if brutally and self._with_brute and tool.unit == "mm":
+            low, high = estimates[-1].succeeds.interval
+            counts = share_of(brute(several, lung, model, BRUTE_DRAWS, SEED + 7))
+            self.within.append(low <= counts.value <= high)
+            truth = f"brute {counts.value:.4f} in {low:.4f} to {high:.4f}"
+        words = " ".join(f"{each:.3f}" for each in shares)
+        print(case, len(several.passes), words, truth, "" if self.accepted[-1] else "REFUSED", flush=True)
+
+    def fill(self, result: Result) -> None:
+        """Fill the table and the figure of a result."""
+        result.rows = []
+        for errors in sorted({key[0] for key in self.shares}):
+            own = {key: np.array(rows) for key, rows in self.shares.items() if key[0] == errors}
+            _add_gains(result, errors, np.concatenate(list(own.values())))
+            for (_errors, tool, size), rows in sorted(own.items()):
+                mean = 100.0 * rows.mean(axis=0)
+                note = f"one {mean[0]:.1f}, three at one point {mean[1]:.1f}; {len(rows)} nodules"
+                quantity = f"{errors}, {tool}, {size:g} mm: three together"
+                result.add(quantity, float(mean[2]), unit="%", note=note)
+        result.add("nodules without a plan", float(self.none))
+        refused = len(self.accepted) - sum(self.accepted)
+        result.add("plans refused by the check", float(refused), note=f"of {len(self.accepted)}")
+        if self.within:
+            note = f"{sum(self.within)} of {len(self.within)} plans, {BRUTE_DRAWS:,} draws"
+            share = 100.0 * float(np.mean(self.within))
+            result.add("brute force within the interval", share, unit="%", note=note)
+        result.figure = self.figure() if self.shares else None
+
+    def figure(self) -> Figure:
+        """Return the mean chance by size, of one pass and of several, for each tool and errors."""
+        from matplotlib.figure import Figure
+
+        panels = sorted({key[:2] for key in self.shares})
+        figure = Figure(figsize=(4.0 * len(panels), 3.4), layout="constrained")
+        every = np.atleast_1d(figure.subplots(1, len(panels), sharey=True))
+        for axes, panel in zip(every, panels, strict=True):
+            sizes = sorted(key[2] for key in self.shares if key[:2] == panel)
+            means = 100.0 * np.array([np.mean(self.shares[(*panel, size)], axis=0)[:3] for size in sizes])
+            styles = (("o:", "one pass"), ("s--", "three at one point"), ("D-", "three together"))
+            for mean, (style, label) in zip(means.T, styles, strict=True):
+                axes.plot(sizes, mean, style, label=label)
+            axes.set(title=", ".join(panel), xlabel="size of the nodule, mm", ylim=(0.0, 100.0))
+        every[0].set_ylabel("enough tissue, of 100")
+        every[0].legend(frameon=False)
+        return figure
+
+
+def _add_gains(result: Result, errors: str, every: Float) -> None:
+    """Add how much three passes together gain, and how much there is to gain."""
     for column, other in enumerate(("one pass", "three at one point")):
-        gain = gains[:, column]
-        note = f"least {gain.min():.1f}, {len(gain)} nodules"
-        result.add(f"points gained on {other}, mean", float(gain.mean()), note=note)
-        print(other, gain.mean(), gain.min(), flush=True)
-    if within:
-        result.add("brute force within the interval", float(np.mean(within)), note=f"{len(within)} plans")
-        print("within", np.mean(within), len(within))
-    if options.picture:
-        draw(shares, options.picture)
-    print(write_result(result, options.results))
+        gain = 100.0 * (every[:, 2] - every[:, column])
+        note = f"least {gain.min():.1f}, most {gain.max():.1f}, {len(gain)} nodules"
+        result.add(f"{errors}: points gained on {other}, mean", float(gain.mean()), note=note)
+    if every.shape[1] > 3:
+        left = 100.0 * (every[:, 3] - every[:, 1])
+        note = "how often one pass touches nothing, less how often three at one point succeed"
+        result.add(f"{errors}: points left above three at one point, mean", float(left.mean()), note=note)
 
 
-def draw(shares: dict[tuple[str, float], list[list[float]]], path: str) -> None:
-    """Draw the mean chance by size, of one pass and of several, for each tool."""
-    from pathlib import Path
-
-    from matplotlib.figure import Figure
-
-    tools = sorted({tool for tool, _size in shares})
-    figure = Figure(figsize=(4.0 * len(tools), 3.4), layout="constrained")
-    for axes, tool in zip(np.atleast_1d(figure.subplots(1, len(tools), sharey=True)), tools, strict=True):
-        sizes = sorted(size for own, size in shares if own == tool)
-        means = 100.0 * np.array([np.mean(shares[tool, size], axis=0) for size in sizes])
-        for mean, style, label in zip(
-            means.T, ("o:", "s--", "D-"), ("one pass", "three at one point", "three together"), strict=True
-        ):
-            axes.plot(sizes, mean, style, label=label)
-        axes.set(title=tool, xlabel="size of the nodule, mm", ylim=(0.0, 100.0))
-    np.atleast_1d(figure.axes)[0].set_ylabel("enough tissue, of 100")
-    np.atleast_1d(figure.axes)[0].legend(frameon=False)
-    Path(path).write_bytes(small_png(figure))
+def touches_nothing(plan: Plan, lung: Lung, model: la.ErrorModel) -> float:
+    """Return how often a plan touches nothing forbidden as it stands."""
+    assessor = RiskAssessor(plan, lung)
+    found = assessor.outcomes(assessor.draws(5000, SEED + 99).deviations(model))
+    return float(assessor.touches_nothing(found.touched).mean())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """What stands in the way of a needle, in words and as plain values."""
 
 import math
+from functools import cache
 from typing import Any
 
 from anatomy.base.words import point_in_words
@@ -41,10 +42,16 @@ def reason_in_words(found: Obstruction) -> str:
     )
 
 
+@cache
+def _bundled_radii_mm() -> dict[str, float]:
+    """Return the least radius of curvature of the needle of each system that ships, by its name."""
+    systems = [load_system(name) for name in (*preset_names(), *needle_preset_names())]
+    return {each.name: each.needle.min_radius_of_curvature_mm for each in systems if each.needle is not None}
+
+
 def _needle_with(radius_mm: float) -> str:
     """Name the system with the gentlest needle that turns within a radius; "" if none that ships does."""
-    systems = [load_system(name) for name in (*preset_names(), *needle_preset_names())]
-    radii = {each.name: each.needle.min_radius_of_curvature_mm for each in systems if each.needle is not None}
+    radii = _bundled_radii_mm()
     name = max((each for each in radii if radii[each] <= radius_mm), key=lambda each: radii[each], default="")
     return f", which --system {name} has ({radii[name]:g} mm)" if name else ""
 

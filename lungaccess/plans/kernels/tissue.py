@@ -56,23 +56,6 @@ def miss_of(wanted, shift, end):
 
 
 @borrowing_kernel
-def _nodule_holds(wanted, shift, x, y, z):
-    """Tell whether a point is tissue of the nodule that counts."""
-    ni, nj, nk = wanted.tissue.shape
-    if ni == 0:
-        target = wanted.target
-        dx, dy, dz = x - target[0] - shift[0], y - target[1] - shift[1], z - target[2] - shift[2]
-        return wanted.inner_mm <= math.sqrt(dx * dx + dy * dy + dz * dz) <= wanted.outer_mm
-    g, x, y, z = wanted.geometry, x - shift[0], y - shift[1], z - shift[2]
-    u = g[0, 0] * x + g[0, 1] * y + g[0, 2] * z + g[0, 3]
-    v = g[1, 0] * x + g[1, 1] * y + g[1, 2] * z + g[1, 3]
-    w = g[2, 0] * x + g[2, 1] * y + g[2, 2] * z + g[2, 3]
-    if not (0.0 <= u < ni and 0.0 <= v < nj and 0.0 <= w < nk):
-        return False
-    return wanted.tissue[int(u), int(v), int(w)] != 0
-
-
-@borrowing_kernel
 def _covered(wanted, shift, end):
     """Return how many points of the nodule are in the tool."""
     x, y, z, tx, ty, tz, _nx, _ny, _nz = end
@@ -89,17 +72,43 @@ def _covered(wanted, shift, end):
 
 
 @borrowing_kernel
+def _seen(geometry, has_voxels, x, y, z, w):
+    """Return a direction (w 0) or a point (w 1) in voxels of the nodule, or in mm where it is a ball."""
+    if not has_voxels:
+        return x, y, z
+    g = geometry
+    return (
+        g[0, 0] * x + g[0, 1] * y + g[0, 2] * z + g[0, 3] * w,
+        g[1, 0] * x + g[1, 1] * y + g[1, 2] * z + g[1, 3] * w,
+        g[2, 0] * x + g[2, 1] * y + g[2, 2] * z + g[2, 3] * w,
+    )
+
+
+@borrowing_kernel
 def tissue_taken(wanted, shift, end):
     """Return how much of the nodule is in the tool, in the unit of `least`."""
     if wanted.covered.shape[0] != 0:
         return _covered(wanted, shift, end) * wanted.weight
     x, y, z, tx, ty, tz, nx, ny, nz = end
+    ni, nj, nk = wanted.tissue.shape
+    target, points, has_voxels, found = wanted.target, wanted.points, ni != 0, 0
+    # The frame of the tool is laid into the nodule once, not each of its points.
+    x, y, z = x - shift[0], y - shift[1], z - shift[2]
+    if not has_voxels:
+        x, y, z = x - target[0], y - target[1], z - target[2]
     bx, by, bz = ty * nz - tz * ny, tz * nx - tx * nz, tx * ny - ty * nx
-    found = 0
-    for k in range(wanted.points.shape[0]):
-        a, b, c = wanted.points[k, 0], wanted.points[k, 1], wanted.points[k, 2]
-        px, py, pz = a * nx + b * bx + c * tx, a * ny + b * by + c * ty, a * nz + b * bz + c * tz
-        found += _nodule_holds(wanted, shift, x + px, y + py, z + pz)
+    x, y, z = _seen(wanted.geometry, has_voxels, x, y, z, 1.0)
+    tx, ty, tz = _seen(wanted.geometry, has_voxels, tx, ty, tz, 0.0)
+    nx, ny, nz = _seen(wanted.geometry, has_voxels, nx, ny, nz, 0.0)
+    bx, by, bz = _seen(wanted.geometry, has_voxels, bx, by, bz, 0.0)
+    for k in range(points.shape[0]):
+        a, b, c = points[k, 0], points[k, 1], points[k, 2]
+        u, v, w = x + a * nx + b * bx + c * tx, y + a * ny + b * by + c * ty, z + a * nz + b * bz + c * tz
+        if has_voxels:
+            inside = 0.0 <= u < ni and 0.0 <= v < nj and 0.0 <= w < nk
+            found += inside and wanted.tissue[int(u), int(v), int(w)] != 0
+        else:
+            found += wanted.inner_mm <= math.sqrt(u * u + v * v + w * w) <= wanted.outer_mm
     return found * wanted.weight
 
 

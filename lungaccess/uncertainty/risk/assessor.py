@@ -1,6 +1,5 @@
 """A plan in its lung, ready to be deviated from: what becomes of many deviated plans, compiled."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,14 +15,14 @@ from anatomy.motion.source import share_of_motion
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.plans.kernels.tissue import Wanted
 from lungaccess.plans.plan import Plan
-from lungaccess.plans.tissue import goal_radius, wanted_in, wanted_of
+from lungaccess.plans.tissue import goal_radius, wanted_of
 from lungaccess.problem.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.breathing import PatientMotion
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, Deviations, judging, no_deviations
 from lungaccess.uncertainty.risk.draws import Draws
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import Devices
-from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_successes, follow_chains
+from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_taken, follow_chains, keep_clear
 from lungaccess.uncertainty.risk.statistics import Share, share_of
 from stages.needle import Obstacles
 
@@ -57,7 +56,7 @@ class Outcomes:
     ends: Float
 
 
-def taken_together(taken: Sequence[Float], wanted: Wanted) -> Float:
+def taken_together(taken: Sequence[Float] | Float, wanted: Wanted) -> Float:
     """Return how much several passes take together, `(N,)`: of a share of the nodule, what the best takes.
 
     What two zones cover together is not known from their shares: the best of them is the least it can be.
@@ -71,10 +70,12 @@ def drawn_anew(plan: Plan) -> tuple[Mapping[str, int], ...]:
     The scope stands, registration stays wrong and the breath goes on as it does: only errors of the needle
     are drawn in every pass, and those of the tubes where they have been moved.
     """
-    return tuple(
-        dict.fromkeys(OF_NEEDLE, number) | dict.fromkeys(("tube_rotation", "tube_insertion"), tubes)
-        for number, tubes in enumerate(plan.same_tubes)
-    )
+    return tuple(numbers_of_pass(number, tubes) for number, tubes in enumerate(plan.same_tubes))
+
+
+def numbers_of_pass(number: int, tubes: int) -> dict[str, int]:
+    """Return by kinds of error the pass whose numbers a pass has whose tubes were moved for another."""
+    return dict.fromkeys(OF_NEEDLE, number) | dict.fromkeys(("tube_rotation", "tube_insertion"), tubes)
 
 
 class RiskAssessor:
@@ -149,8 +150,7 @@ class RiskAssessor:
 
     def outcomes(self, deviations: Deviations) -> Outcomes:
         """Follow deviated plans through all three stages, and all passes."""
-        further = deviations.further or [_fitted(each.n_arcs, deviations) for each in self._others]
-        passes = zip(self._others, further, strict=True)
+        passes = zip(self._others, self._further(deviations), strict=True)
         every = [self._of_first(deviations), *(each.outcomes(own) for each, own in passes)]
         return Outcomes(
             touched=np.bitwise_or.reduce([each.touched for each in every]),
@@ -168,7 +168,14 @@ class RiskAssessor:
 
         def find(part: slice) -> None:
             find_outcomes(
-                *inputs, self.wanted, part.start, touched[part], miss_mm[part], taken[part], ends[part]
+                *inputs,
+                self._obstacles,
+                self.wanted,
+                part.start,
+                touched[part],
+                miss_mm[part],
+                taken[part],
+                ends[part],
             )
 
         _in_threads(find, count)
@@ -188,8 +195,8 @@ class RiskAssessor:
         return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken, ends=ends)
 
     def _inputs(self, deviations: Deviations) -> tuple[Any, ...]:
-        """Return what both kernels take first; see `find_successes`."""
-        return (*self._deviated.kernel_inputs(deviations), self._obstacles, self._judging)
+        """Return what all kernels take first; see `find_taken`."""
+        return (*self._deviated.kernel_inputs(deviations), self._judging)
 
     def succeeded(self, outcomes: Outcomes) -> Bool:
         """Tell which `(N,)` take enough, leave the airway and touch nothing forbidden."""
@@ -204,16 +211,35 @@ class RiskAssessor:
 
         Those that miss the goal are not followed, and the others only up to the first forbidden touch.
         """
-        if self._others:
-            return self.succeeded(self.outcomes(deviations))
-        done = np.zeros(deviations.count, dtype=bool)
-        inputs = self._inputs(deviations)
+        inputs = [self._inputs(deviations)]
+        inputs += [one._inputs(own) for one, own in zip(self._others, self._further(deviations), strict=True)]
+        taken, done = np.zeros((len(inputs), deviations.count)), np.zeros(deviations.count, dtype=bool)
 
         def find(part: slice) -> None:
-            find_successes(*inputs, self.wanted, self._forbidden_flags, part.start, done[part])
+            for own, found in zip(inputs, taken, strict=True):
+                find_taken(*own, self.wanted, part.start, found[part])
+            done[part] = taken_together(taken[:, part], self.wanted) >= self.wanted.least
+            for own in inputs:
+                keep_clear(*own, self._obstacles, self._forbidden_flags, part.start, done[part])
 
         _in_threads(find, deviations.count)
         return done
+
+    def taken_and_clear(self, deviations: Deviations) -> tuple[Float, Bool]:
+        """Return how much the first pass takes `(N,)`, and where it touches nothing forbidden `(N,)`."""
+        inputs, count = self._inputs(deviations), deviations.count
+        taken, clear = np.zeros(count), np.ones(count, dtype=bool)
+
+        def find(part: slice) -> None:
+            find_taken(*inputs, self.wanted, part.start, taken[part])
+            keep_clear(*inputs, self._obstacles, self._forbidden_flags, part.start, clear[part])
+
+        _in_threads(find, count)
+        return taken, clear
+
+    def _further(self, deviations: Deviations) -> Sequence[Deviations]:
+        """Return the deviations of the passes after the first."""
+        return deviations.further or [_fitted(each.n_arcs, deviations) for each in self._others]
 
     def clear(self, devices: Devices, errors: Float, least_depth_mm: float) -> Bool:
         """Tell which `(N,)` of deviated devices touch nothing forbidden, wherever they end.
@@ -223,12 +249,9 @@ class RiskAssessor:
             errors ((N, E) float64): See `in_rows`.
             least_depth_mm: See `Judging`.
         """
-        done, which = np.zeros(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
+        done, which = np.ones(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
         judged = self._judging._replace(least_depth_mm=least_depth_mm)
-        anywhere = wanted_in(self.wanted.target, None, math.inf)
-        find_successes(
-            devices, errors, which, self._obstacles, judged, anywhere, self._forbidden_flags, 0, done
-        )
+        keep_clear(devices, errors, which, judged, self._obstacles, self._forbidden_flags, 0, done)
         return done
 
     def success(self, draws: Draws, model: ErrorModel) -> Share:

@@ -72,37 +72,52 @@ def _touched(obstacles, judging, start, pieces, n_tube, enough, border_mm):
 
 
 @kernel(nogil=True)
-def find_successes(devices, errors, which, obstacles, judging, wanted, forbidden, first, done):
-    """Tell which deviated plans end with enough of the nodule in the tool and touch nothing forbidden.
+def find_taken(devices, errors, which, judging, wanted, first, taken):
+    """Note how much of the nodule is in the tool of deviated plans, whatever they touch.
 
     Args:
         devices: Devices.
         errors ((M, E) float64): See `chain`.
         which ((M,) int64): The shape of each draw, see `Devices`.
-        obstacles (Obstacles): All structures, see `deviation.follow`.
         judging: Judging.
         wanted (Wanted): See `lungaccess.plans.kernels.tissue`.
-        forbidden (int): Flags of what must not be touched.
-        first (int): Number of the first deviated plan; as many are judged as there is room in `done`.
+        first (int): Number of the first deviated plan; as many are followed as there is room in `taken`.
+        taken: (N,) float64.
+    """
+    start, pieces = np.zeros(N_START), np.zeros((devices.n_tube + devices.needle.shape[0], N_PIECE))
+    for m in range(taken.shape[0]):
+        _set_start(devices, judging, errors, first + m, start)
+        _set_pieces(devices, errors, which, first + m, pieces)
+        taken[m] = tissue_taken(wanted, _shift(errors, first + m), find_end(start, pieces))
+
+
+@kernel(nogil=True)
+def keep_clear(devices, errors, which, judging, obstacles, forbidden, first, done):
+    """Keep of deviated plans that are done those that touch nothing forbidden.
+
+    Args:
+        obstacles (Obstacles): All structures, see `deviation.follow`.
+        forbidden (int): Flags of what must not be touched; the first one ends the search for more.
         done: (N,) bool.
+
+    The others are those of `find_taken`.
     """
     start, pieces = np.zeros(N_START), np.zeros((devices.n_tube + devices.needle.shape[0], N_PIECE))
     for m in range(done.shape[0]):
-        _set_start(devices, judging, errors, first + m, start)
-        _set_pieces(devices, errors, which, first + m, pieces)
-        done[m] = tissue_taken(wanted, _shift(errors, first + m), find_end(start, pieces)) >= wanted.least
         if done[m]:
+            _set_start(devices, judging, errors, first + m, start)
+            _set_pieces(devices, errors, which, first + m, pieces)
             border_mm = errors[first + m, BORDER]
             touched = _touched(obstacles, judging, start, pieces, devices.n_tube, forbidden, border_mm)
             done[m] = touched & forbidden == 0
 
 
 @kernel(nogil=True)
-def find_outcomes(devices, errors, which, obstacles, judging, wanted, first, touched, miss_mm, taken, ends):
+def find_outcomes(devices, errors, which, judging, obstacles, wanted, first, touched, miss_mm, taken, ends):
     """Note all that deviated plans touch, `(N,)` flags, how far the middle of the tool misses the
     target, `(N,)` mm, what they take, and where they end, `(N, 9)`.
 
-    The parameters are those of `find_successes`.
+    The parameters are those of `find_taken` and `keep_clear`.
     """
     start, pieces = np.zeros(N_START), np.zeros((devices.n_tube + devices.needle.shape[0], N_PIECE))
     for m in range(touched.shape[0]):

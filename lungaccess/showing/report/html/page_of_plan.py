@@ -184,14 +184,17 @@ def page_data(
 ) -> dict[str, Any]:
     """Return what the scripts of the page draw, as plain JSON values."""
     near = np.concatenate([device_points(each) for each in plans])
+    passes = len(plans[0].passes)
+    names = [tables.shown_name(n, passes) for n in range(len(plans))]
     return {
         "page": "plan",
         "patient": lung.name,
         "structures": structure_meshes(lung) + ([] if region is None else start_meshes(region)),
         "plans": [
-            {**packed_plan(each, lung, tables.plan_name(n, len(plans[0].passes))), **appraisal.to_mapping()}
-            for n, (each, appraisal) in enumerate(zip(plans, appraisals, strict=True))
+            {**packed_plan(each, lung, name), "label": label, **appraisal.to_mapping()}
+            for each, (name, label), appraisal in zip(plans, names, appraisals, strict=True)
         ],
+        "passes": passes,
         **page_image(lung, near, options.ct),
         "cost_over_time": cost_history(options.cost_over_time),
         "made_small": made_small(plans[0]),
@@ -224,8 +227,9 @@ def summary(plan: Plan, lung: Lung) -> str:
     """Return system, scope, tubes and target of a plan in words; its lengths are among the numbers."""
     x, y, z = (float(c) for c in plan.target_lps)
     place = target_words(lung, plan.target_lps)
+    passes = f"{len(plan.passes)} passes, of which the first is told; " if plan.further else ""
     facts = (
-        f"{plan.system.name}; scope to generation {plan.scope.generation}; {plan.insertions}; target"
+        f"{plan.system.name}; {passes}scope to generation {plan.scope.generation}; {plan.insertions}; target"
         f"{f': {place},' if place else ''} at LPS {x:.1f}, {y:.1f}, {z:.1f} mm{_aim_words(plan)}"
     )
     # Why this system, if it was chosen among several: the last sentence of its choice.

@@ -150,7 +150,15 @@ def plan_name(number: int, passes: int) -> str:
     """Return the name of a plan by its place on the page: the one that was given, and its further passes."""
     if 0 < number < passes:
         return f"Pass {number + 1} alone"
-    return "The plan" if number == 0 else f"Alternative {number - passes + 1}"
+    whole = "The plan" if passes == 1 else f"All {passes} passes of the plan"
+    return whole if number == 0 else f"Alternative {number - passes + 1}"
+
+
+def shown_name(number: int, passes: int) -> tuple[str, str]:
+    """Return the name and the short label of what is drawn of a plan: one pass, where it has several."""
+    if number < passes and passes > 1:
+        return f"Pass {number + 1}", str(number + 1)
+    return plan_name(number, passes), f"{'' if passes == 1 else 'A'}{number - passes + 1}"
 
 
 def key_section(plan: Plan, lung: Lung) -> str:

@@ -51,7 +51,7 @@ class PlanPage extends DevicePage {
       this.phase = this.breath.masksPhase;
     }
     this.motions = await Promise.all(this.data.plans.map((plan) => Motion.of(plan)));
-    this.shownPlans = this.motions.map((_, n) => n === 0);
+    this.shownPlans = this.motions.map((_, n) => n < this.data.passes);
     this.followed = 0;
     this.listSwitches();
     this.connectControls();
@@ -98,8 +98,8 @@ class PlanPage extends DevicePage {
     if (shown.length < 2) return [];
     return shown.map((n, k) => {
       const end = this.stateOf(n, 1), line = end.needle.length > 1 ? end.needle : end.inner;
-      const at = Math.round((line.length - 1) * (0.25 + (0.6 * k) / shown.length));
-      return { text: String(n), point: line[at], colour: planStyle(n).colour };
+      const at = Math.round((line.length - 1) * (0.2 + (0.75 * k) / (shown.length - 1)));
+      return { text: this.data.plans[n].label, point: line[at], colour: planStyle(n).colour };
     });
   }
 
@@ -117,7 +117,7 @@ class PlanPage extends DevicePage {
     this.listStructures();
     this.data.plans.forEach((plan, n) => {
       const name = `${plan.name}${plan.accepted ? "" : " (refused)"}`;
-      addSwitch(byId("plans"), { key: `plan-${n}`, name, colour: swatchOf(planStyle(n)), shown: n === 0 }, (on) => {
+      addSwitch(byId("plans"), { key: `plan-${n}`, name, colour: swatchOf(planStyle(n)), shown: n < this.data.passes }, (on) => {
         this.shownPlans[n] = on;
         this.redraw();
       });

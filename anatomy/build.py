@@ -4,13 +4,14 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
-from anatomy.base.typed import Array, Float, Int32, Mask, UInt16
+from anatomy.base.typed import Array, Float, Int, Int32, Mask, UInt16
 from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import FISSURES_UNKNOWN, UNKNOWN
@@ -31,10 +32,50 @@ PAD_VOXELS = 2
 """One voxel around the lungs must be outside of them, and the fields look one farther."""
 
 
+SINGLE_FIELDS = ("airway", "vessel", "pleura", "fissure")
+"""The clearance fields that are made of a structure; the others are made of these."""
+
+
 def lung_key(sources: Mapping[str, str]) -> str:
     """Return the key of the lung made from input files with these hashes."""
     text = json.dumps({"format": FORMAT, "sources": dict(sorted(sources.items()))})
     return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+class Reused:
+    """What was made last, and from which arrays: it is made again only where one of these has changed.
+
+    So a patient of which a person corrects a mask is built anew within a second or two, and is the very
+    lung that is built without what was made before.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[str, tuple[tuple[Array | None, ...], Any]] = {}
+
+    @classmethod
+    def of(cls, images: PatientImages, lung: Lung) -> "Reused":
+        """Return what was made when a lung was built from images."""
+        reused = cls()
+        reused._kept["tree"] = (images.lumen.array,), lung.tree
+        reused._kept["lumen_depth"] = (images.lumen.array,), lung.lumen_depth
+        for name in SINGLE_FIELDS:
+            if name in lung.fields:
+                solid = (lung.labels & structures.FIELD_BITS[name]) != 0
+                reused._kept[name] = (solid, lung.grid.spacing_mm), lung.fields[name].corners
+        return reused
+
+    def get(self, name: str, sources: tuple[Array | None, ...], make: Callable[[], Any]) -> Any:
+        """Return what was made of the same sources, or make and keep it."""
+        known = self._kept.get(name)
+        if known is None or not all(map(_are_same, known[0], sources)):
+            self._kept[name] = known = sources, make()
+        return known[1]
+
+
+def _are_same(one: Array | None, other: Array | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return one is other or np.array_equal(one, other)
 
 
 class WorkingBox:
@@ -63,6 +104,7 @@ def build_lung(
     key: str | None = None,
     keep: Keep | None = None,
     progress: Progress | None = None,
+    reused: Reused | None = None,
 ) -> Lung:
     """Make the `Lung` of a patient.
 
@@ -71,6 +113,7 @@ def build_lung(
         keep: Takes the name, as of `plain_values`, and values of each large array as soon as it is made and
             returns the array to use, for instance the same values mapped from a file.
         progress: Told each step as it begins.
+        reused: What was made for images that differ little; it is kept for the next ones.
 
     Raises:
         AnatomyError: If lung or airway are empty, or the airway has no trachea.
@@ -78,15 +121,17 @@ def build_lung(
     from anatomy.tree import tree_from_mask
 
     keep, tell = keep or (lambda _name, array: array), progress or (lambda _step: None)
+    reused = reused or Reused()
     warnings = list(images.warnings)
     if images.fissures is None:
         warnings.append(f"Fissures are not checked: {FISSURES_UNKNOWN}.")
     _require_tissue(images)
     tell("airway tree")
-    tree = tree_from_mask(images.lumen)
+    lumen = images.lumen
+    tree: AirwayTree = reused.get("tree", (lumen.array,), lambda: tree_from_mask(lumen))
     tell("labels")
     box = WorkingBox(images.lung.array | images.lumen.array, images.grid)
-    labels, lungs_lps = _labels(images, box, tree, warnings)
+    labels, lungs_lps = _labels(images, box, tree, warnings, reused)
     labels = keep("labels", labels)
     tell("plausibility of the masks")
     findings = with_accepted(mask_findings(images, tree, lungs_lps), images.accepted)
@@ -104,8 +149,10 @@ def build_lung(
         key=key or lung_key(images.sources),
         grid=box.grid,
         labels=labels,
-        fields=clearance_fields(labels, box.grid, fissures=images.fissures is not None, keep=keep, tell=tell),
-        lumen_depth=_lumen_depth(images.lumen, keep),
+        fields=clearance_fields(
+            labels, box.grid, fissures=images.fissures is not None, keep=keep, tell=tell, reused=reused
+        ),
+        lumen_depth=_lumen_depth(lumen, keep, reused),
         tree=tree,
         nodules=_cut_volume(images.nodules, box, "nodules", keep),
         nodule_labels=_cut_volume(images.nodule_labels, box, "nodule_labels", keep),
@@ -136,7 +183,7 @@ def _require_tissue(images: PatientImages) -> None:
 
 
 def _labels(
-    images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: list[str]
+    images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: list[str], reused: Reused
 ) -> tuple[UInt16, tuple[Float, Float]]:
     """Set the bits of every structure and the branch of airway voxels; also return points of both lungs."""
     lumen = box.cut(images.lumen.array)
@@ -155,8 +202,11 @@ def _labels(
     labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
     labels[~inside] = structures.OUTSIDE
     structures.close_border(labels)
-    sides = coarse_sides(lung & ~airway, box.grid)
-    labels[_septum(sides, lung & ~airway, warnings)] |= structures.OUTSIDE
+    tissue = lung & ~airway
+    sides: tuple[Int32, tuple[int, ...]] | None = reused.get(
+        "sides", (tissue,), lambda: coarse_sides(tissue, box.grid)
+    )
+    labels[_septum(sides, tissue, warnings)] |= structures.OUTSIDE
     labels[vessels] |= structures.VESSEL
     if images.fissures is not None:
         fissures = box.cut(images.fissures.array)
@@ -165,7 +215,12 @@ def _labels(
             fissures |= (band > 0) & (band < UNKNOWN)
         fissures &= ~airway
         labels[fissures] |= structures.FISSURE
-    _label_airway(labels, airway, lumen, tree, box.grid)
+    at, codes = reused.get(
+        "branches",
+        (airway, lumen, box.grid.lps_from_ijk),
+        lambda: _airway_codes(airway, lumen, tree, box.grid),
+    )
+    labels[at] |= codes
     empty = np.zeros((0, 3))
     return labels, (empty, empty) if sides is None else points_of_sides(*sides, box.grid)
 
@@ -184,9 +239,11 @@ def _septum(sides: tuple[Int32, tuple[int, ...]] | None, tissue: Mask, warnings:
     return border
 
 
-def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> None:
-    """Set AIRWAY, LUMEN and, of the branches nearest by their centreline, the one nearest by its surface."""
+def _airway_codes(airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> tuple[tuple[Int, ...], UInt16]:
+    """Return where airways are and what labels say there: AIRWAY, LUMEN and the branch.
 
+    It is of the branches nearest by their centreline the one nearest by its surface.
+    """
     if tree.n_branches > structures.MAX_BRANCHES:
         raise AnatomyError(
             f"The airway tree has {tree.n_branches} branches",
@@ -201,9 +258,8 @@ def _label_airway(labels: UInt16, airway: Mask, lumen: Mask, tree: AirwayTree, g
     nearest = np.argmin(distance - tree.radius_mm[index], axis=1)
     branch = tree.branch_of_point[index[np.arange(len(voxels)), nearest]]
     at = tuple(voxels.T)
-    code = structures.AIRWAY | ((branch + 1) << structures.BRANCH_SHIFT)
-    labels[at] |= code.astype(np.uint16)
-    labels[lumen] |= structures.LUMEN
+    code = structures.AIRWAY | ((branch + 1) << structures.BRANCH_SHIFT) | structures.LUMEN * lumen[at]
+    return at, code.astype(np.uint16)
 
 
 def clearance_fields(
@@ -213,49 +269,60 @@ def clearance_fields(
     fissures: bool = False,
     keep: Keep = lambda _name, array: array,
     tell: Progress = lambda _step: None,
+    reused: Reused | None = None,
 ) -> dict[str, DistanceField]:
     """Return the fields of the clearance to each structure and to all of them, by name.
 
     Args:
         labels ((ni, nj, nk) uint16): See `anatomy.structures`.
         fissures: Whether fissures are known, so that there are fields of them.
-        keep, tell: As `keep` and `progress` of `build_lung`.
+        keep, tell, reused: As `keep`, `progress` and `reused` of `build_lung`.
     """
     geometry = corner_geometry(grid)
     return {
         name: DistanceField(name=name, corners=keep(f"fields.{name}.corners", corners), geometry=geometry)
-        for name, corners in _field_arrays(labels, grid, fissures, tell)
+        for name, corners in _field_arrays(labels, grid, fissures, tell, reused or Reused())
     }
 
 
 def _field_arrays(
-    labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress
+    labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress, reused: Reused
 ) -> Iterator[tuple[str, UInt16]]:
     """Yield the clearance fields one after the other; the unions are minima of the parts."""
     shape = tuple(n + 1 for n in grid.shape)
     union: UInt16 = np.full(shape, MAX_STORED, dtype=np.uint16, order="F")
-    for name in ("airway", "vessel", "pleura"):
+
+    def corners_of(name: str) -> UInt16:
         tell(f"clearance to {name}")
-        corners = distance_corners((labels & structures.FIELD_BITS[name]) != 0, grid.spacing_mm)
+        solid = (labels & structures.FIELD_BITS[name]) != 0
+        return np.asarray(
+            reused.get(name, (solid, grid.spacing_mm), lambda: distance_corners(solid, grid.spacing_mm))
+        )
+
+    for name in SINGLE_FIELDS[:3]:
+        corners = corners_of(name)
         np.minimum(union, corners, out=union)
         yield name, corners
     yield "obstacle", union
     if has_fissures:
-        tell("clearance to fissure")
-        corners = distance_corners((labels & structures.FISSURE) != 0, grid.spacing_mm)
+        corners = corners_of("fissure")
         yield "fissure", corners
         yield "obstacle_fissure", np.minimum(union, corners)
 
 
-def _lumen_depth(lumen: Volume, keep: Keep) -> DistanceField:
+def _lumen_depth(lumen: Volume, keep: Keep, reused: Reused) -> DistanceField:
     """Make the field of the depth inside the lumen, on the lumen's own box."""
+    field: DistanceField = reused.get("lumen_depth", (lumen.array,), lambda: _depth_of(lumen))
+    stored = keep("lumen_depth.corners", field.corners)
+    return DistanceField(name=field.name, corners=stored, geometry=field.geometry)
+
+
+def _depth_of(lumen: Volume) -> DistanceField:
     low, high = bounds(lumen.array)
     grid = lumen.grid.crop(low - 1, high + 1)
     solid = np.ones(grid.shape, dtype=bool, order="F")
     solid[1:-1, 1:-1, 1:-1] = ~lumen.array[window(low, high)]
-    field = distance_field("lumen_depth", solid, grid)
-    stored = keep("lumen_depth.corners", field.corners)
-    return DistanceField(name=field.name, corners=stored, geometry=field.geometry)
+    return distance_field("lumen_depth", solid, grid)
 
 
 def _cut_volume(volume: Volume | None, box: WorkingBox, name: str, keep: Keep) -> Volume | None:

@@ -18,7 +18,7 @@ from anatomy.base.files import DAMAGE
 from anatomy.base.records import plain_values, record_from
 from anatomy.base.typed import Array
 from anatomy.base.unfinished import clear_place, filled_folder
-from anatomy.build import FORMAT, build_lung, lung_key
+from anatomy.build import FORMAT, Reused, build_lung, lung_key
 from anatomy.grid import read_only
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
@@ -37,6 +37,7 @@ def open_lung(
     cache: Path | None = None,
     progress: Callable[[str], None] | None = None,
     accept: Collection[str] | None = None,
+    reused: Reused | None = None,
 ) -> Lung:
     """Return the lung made from inputs with these hashes, from the cache or newly built.
 
@@ -49,12 +50,13 @@ def open_lung(
         progress: Told each step as it begins.
         accept (collection of str): Names of the checks whose failure is accepted; others are refused.  None
             refuses nothing.
+        reused: See `anatomy.build.build_lung`.
 
     Raises:
         AnatomyError: If a check of the masks fails that is not accepted.
         FileError: If the cache cannot be written.
     """
-    lung = _stored_or_built(sources, read, cache, progress)
+    lung = _stored_or_built(sources, read, cache, progress, reused)
     findings = with_accepted(lung.findings, accept or ())
     if accept is not None:
         require_plausible(findings, accept)
@@ -69,6 +71,7 @@ def _stored_or_built(
     read: Callable[[], PatientImages],
     cache: Path | None,
     progress: Callable[[str], None] | None,
+    reused: Reused | None,
 ) -> Lung:
     key = lung_key(sources)
     folder = (cache or default_cache()) / folder_name(key)
@@ -79,7 +82,7 @@ def _stored_or_built(
     most_bytes = cache_limit_bytes()
     if progress:
         progress("reading images")
-    lung = _build_into(folder, key, read(), progress)
+    lung = _build_into(folder, key, read(), progress, reused)
     make_room(folder.parent, most_bytes, {"anatomy": stored_format()}, keep=(folder,))
     return lung
 
@@ -95,7 +98,11 @@ def folder_name(key: str) -> str:
 
 
 def _build_into(
-    folder: Path, key: str, images: PatientImages, progress: Callable[[str], None] | None
+    folder: Path,
+    key: str,
+    images: PatientImages,
+    progress: Callable[[str], None] | None,
+    reused: Reused | None,
 ) -> Lung:
     """Build a lung with its arrays in a new folder that gets its name when it is complete."""
     with _new_folder(folder) as work:
@@ -105,7 +112,7 @@ def _build_into(
             return _mapped(work, name)
 
         # Nothing stays mapped: Windows renames no folder in which a file is open.
-        _save_rest(build_lung(images, key=key, keep=keep, progress=progress), work)
+        _save_rest(build_lung(images, key=key, keep=keep, progress=progress, reused=reused), work)
     lung = _load(folder)
     if lung is None and not folder.exists():
         return build_lung(images, key=key)  # Another process made room; this lung is in memory alone.

@@ -9,6 +9,7 @@ from typing import Any
 
 from anatomy.base.errors import FileError
 from anatomy.base.files import DAMAGE, read_text, require_file, sha256
+from anatomy.io.corrections import corrections_file
 from anatomy.io.images import image_suffix
 from anatomy.io.own_masks import DESCRIPTION
 
@@ -42,6 +43,8 @@ def input_hashes(path: str | Path) -> dict[str, str]:
 
 def _hashes(folder: Path, files: set[Path]) -> dict[str, str]:
     files |= {data for file in files for data in _detached_data(file)}
+    if (painted := corrections_file(folder)).is_file():
+        files.add(painted)
     return {Path(os.path.relpath(file, folder)).as_posix(): sha256(file) for file in sorted(files)}
 
 

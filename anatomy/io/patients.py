@@ -7,6 +7,7 @@ from typing import NoReturn
 
 from anatomy.base.errors import FileError
 from anatomy.io.assembly import describe_yourself
+from anatomy.io.corrections import corrected
 from anatomy.io.ct_cases import cases_in, require_no_ct_case
 from anatomy.io.dicom_seg import is_dicom
 from anatomy.io.images import image_suffix, images_in, read_volume
@@ -45,12 +46,14 @@ def load_patient(path: str | Path) -> PatientImages:
         anatomy.base.errors.FileError: There is no patient at nowhere. ...
     """
     path = Path(path)
-    if path.is_file():
-        return _load_file(path)
-    if not path.is_dir():
+    if not path.exists():
         raise FileError(
             f"There is no patient at {path}", expected="an existing folder or file", remedy="Check the path"
         )
+    return corrected(_load_file(path) if path.is_file() else _load_folder(path), path)
+
+
+def _load_folder(path: Path) -> PatientImages:
     description = path / DESCRIPTION
     motion = motion_alone(description) if description.is_file() else None
     if description.is_file() and motion is None:

@@ -14,6 +14,7 @@ from anatomy.base.errors import AnatomyError, FileError, GridMismatchError
 from anatomy.base.files import atomic_write, read_json, require_writable_folder, sha256, write_text
 from anatomy.base.typed import Array
 from anatomy.grid import Grid, Volume
+from anatomy.io.corrections import FOLDER, corrections_file
 from anatomy.io.images import SUFFIXES, read_volume, write_volume
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.io.voxels import COST_MAP_NOTE
@@ -23,7 +24,6 @@ from anatomy.segmentation.canonical import canonical
 STATE = "segmentation.json"
 FORMAT = 1
 _MADE_SUFFIX = ".nii.gz"
-CORRECTIONS = "corrections"
 IMAGES = ("lungs", "airway", "airway_wall", "nodule", "vessels", "all_vessels", "lobes", "fissures")
 """A person may correct these."""
 NOTES = {
@@ -87,11 +87,11 @@ class SegmentationFolder:
         Raises:
             AnatomyError: If there are two of them.
         """
-        paths = [self.path / CORRECTIONS / f"{name}{suffix}" for suffix in SUFFIXES]
+        paths = [self.path / FOLDER / f"{name}{suffix}" for suffix in SUFFIXES]
         found = [path for path in paths if path.is_file()]
         if len(found) > 1:
             raise AnatomyError(
-                f"{self.path / CORRECTIONS} holds {' and '.join(path.name for path in found)}",
+                f"{self.path / FOLDER} holds {' and '.join(path.name for path in found)}",
                 expected=f"one correction of the {name.replace('_', ' ')}",
                 remedy="Remove the one that is not meant",
             )
@@ -129,8 +129,8 @@ class SegmentationFolder:
                 if not path.is_file():
                     continue
                 if suffix != _MADE_SUFFIX or sha256(path) not in self._entry(name).get("written", ()):
-                    require_writable_folder(self.path / CORRECTIONS)
-                    os.replace(path, self.path / CORRECTIONS / path.name)
+                    require_writable_folder(self.path / FOLDER)
+                    os.replace(path, self.path / FOLDER / path.name)
 
     def read(self, path: Path) -> Volume:
         """Read an image and put it on the grid of the CT."""
@@ -165,9 +165,14 @@ class SegmentationFolder:
         """Keep what a step found beside its images."""
         self._record.setdefault("facts", {})[step] = dict(facts)
 
+    def remember(self, **others: Any) -> None:
+        """Put further entries into the record, which is written with the next image."""
+        self._record |= others
+
     def save(self, **others: Any) -> None:
         """Write the record, with further entries if given."""
-        self._record = json.loads(json.dumps(self._record | others))
+        self.remember(**others)
+        self._record = json.loads(json.dumps(self._record))
         sealed = self._record | {"checksum": values_checksum(self._record)}
         write_text(self.path / STATE, json.dumps(sealed, indent=1) + "\n")
 
@@ -183,6 +188,7 @@ class SegmentationFolder:
         if before in (None, ct_digest):
             return
         corrected = [name for name in IMAGES if self.correction(name)]
+        corrected += ["what was painted"] if corrections_file(self.path).is_file() else []
         if corrected:
             raise AnatomyError(
                 f"{self.path} holds images of another CT that were corrected: {', '.join(corrected)}",

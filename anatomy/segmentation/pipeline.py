@@ -97,13 +97,14 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     digest = digest_of_ct(request.ct)
     inputs = [Path(name) for name in (*request.given.hashes(), *request.sources)]
     folder = SegmentationFolder(request.out, grid, digest, inputs=inputs, force=request.force)
+    folder.remember(ct_source=_ct_source(request))  # Early: a run that is refused goes on in this folder.
     description = Description(folder, DESCRIPTION)
     steps = Steps(request, folder, description, digest, tell)
     parts = steps.run()
     if parts.nodule.any() and target is None:
         target = centre_of(parts.nodule, parts.ct.grid)
     warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
-    folder.save(provenance=_provenance(request, steps, warnings), ct_source=_ct_source(request))
+    folder.save(provenance=_provenance(request, steps, warnings))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
     # A given mask says itself which vessels are obstacles, and of its border nothing is known.
     large_mm = 0.0 if "vessels" in steps.given_names else request.large_radius_mm

@@ -62,6 +62,17 @@ def _image_target(name: str, header: Callable[[bytes], int] | None, compressed: 
     return Target(file=name, make=_image(name, compressed), read=read, header_bytes=header)
 
 
+def _corrections_target() -> Target:
+    """Return what a person painted, whose values say what a voxel is."""
+
+    def read(folder: Path) -> Volume:
+        from anatomy.io.corrections import read_corrections
+
+        return read_corrections(folder / "painted.nii.gz")
+
+    return Target(file="painted.nii.gz", make=_image("painted.nii.gz", True), read=read)
+
+
 def _field_target(name: str, header: Callable[[bytes], int] | None) -> Target:
     """Return a displacement field; what is read of it is one number for each vector."""
 
@@ -275,6 +286,7 @@ def targets() -> dict[str, Target]:
         "peer": Target("peer.json", _peer, _read_peer),
         "nifti": _image_target("a.nii", lambda content: 352),
         "nifti-gzip": _image_target("a.nii.gz", None, compressed=True),
+        "corrections": _corrections_target(),
         "nrrd": _image_target("a.nrrd", _after(b"\n\n")),
         "nrrd-gzip": _image_target("a.nrrd", _after(b"\n\n"), compressed=True),
         "metaimage": _image_target("a.mha", _after(b"LOCAL\n")),

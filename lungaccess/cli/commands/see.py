@@ -133,7 +133,8 @@ def view(
             image file or a folder of DICOM, which is segmented first. Without one the page lets you choose.
         system: System that is shown first: name of a preset, or path of a TOML file.
         series: UID of the DICOM series of a CT, where the folder holds several.
-        out: Patient folder for a CT; NAME-patient here if not given. It is taken up again.
+        out: Patient folder for a CT; if not given, NAME-patient here, or NAME-patient-2 where that holds
+            another patient. It is taken up again.
         port: Port of this machine; a free one if not given.
         browser: Whether the page is opened in the browser.
         thick_slices: Explore masks from slices of more than 3 mm, which lack small structures.
@@ -156,7 +157,7 @@ def view(
         ) from error
     first = load_system(system)
     if patient is not None and is_ct(patient):
-        made = out or patient_folder(patient)
+        made = out or patient_folder(patient, series)
         terminal.console.quiet |= output.json  # Only the address is printed then.
         segment(patient, out=made, series=series, thick_slices=thick_slices, accept=output.accept)
         held.close()  # The explorer writes into the folder, too, when a nodule is added.

@@ -105,7 +105,7 @@ def opened(question: OpenQuestion, source: PatientSource, folder: Path, turn: Tu
         thick = "--thick-slices" in error.remedy and not question.thick_slices
         if not (names or thick):
             raise
-        drawn = patient_folder(path) / REFUSED_PICTURE
+        drawn = patient_folder(path, question.series or None) / REFUSED_PICTURE
         yield Part(
             {
                 "answer": "refused", "found": error.found, "expected": error.expected,
@@ -129,8 +129,8 @@ def _segmented(path: Path, question: OpenQuestion, folder: Path, turn: Turn) -> 
     turn.send(_progress("reading the CT", 0.0))
     volume, sources = read_ct(path, series)
     request = SegmentationRequest(
-        ct=volume, out=patient_folder(path).resolve(), sources=sources, ct_path=path, ct_series=series,
-        thick_slices=question.thick_slices, accept=question.accept,
+        ct=volume, out=patient_folder(path, series).resolve(), sources=sources, ct_path=path,
+        ct_series=series, thick_slices=question.thick_slices, accept=question.accept,
     )  # fmt: skip
     made = _made(request, turn)
     yield Part(

@@ -1,6 +1,7 @@
 """A CT segmented with all that is written about it: masks, quality, and pictures also of what was refused."""
 
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,8 +78,28 @@ def segment_with_pictures(
     return made
 
 
-def patient_folder(ct: Path) -> Path:
-    """Return the folder in which the patient of a CT is made where none is named: NAME-patient, here."""
+def patient_folder(ct: Path, series: str | None = None) -> Path:
+    """Return the folder in which the patient of a CT is made where none is named: NAME-patient, here.
+
+    A folder that holds another patient, such as the one of a CT of the same name or of another series, is
+    left alone: then it is NAME-patient-2, and so on.
+
+    Raises:
+        FileError: If the record of a segmentation is damaged.
+    """
     from anatomy.io.images import image_stem
 
-    return Path(f"{image_stem(ct) if ct.is_file() else ct.resolve().name}-patient")
+    name = f"{image_stem(ct) if ct.is_file() else ct.resolve().name}-patient"
+    folders = (Path(f"{name}-{number}" if number > 1 else name) for number in count(1))
+    return next(each for each in folders if _may_hold(each, ct.resolve(), series))
+
+
+def _may_hold(folder: Path, ct: Path, series: str | None) -> bool:
+    """Tell whether a folder was segmented from a CT, or has nothing of another patient."""
+    from anatomy.io.own_masks import DESCRIPTION
+    from anatomy.segmentation.folder import STATE, segmented_ct
+
+    if not (folder / STATE).is_file():
+        return not (folder / DESCRIPTION).exists()
+    source = segmented_ct(folder)
+    return source is not None and (source["path"].resolve(), source["series"]) == (ct, series)

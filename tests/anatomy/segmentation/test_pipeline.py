@@ -17,10 +17,11 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError, FileError, GridMismatchError, SettingsError
 from anatomy.grid import Grid, Volume
 from anatomy.io import load_patient, read_volume
+from anatomy.io.corrections import FOLDER
 from anatomy.io.images import write_volume
 from anatomy.lobes import BORDER, LEFT_LOWER, LEFT_UPPER, LOBES, RIGHT_LOWER, SEEN, UNKNOWN
 from anatomy.phantom import LABELS, Phantom
-from anatomy.segmentation.folder import CORRECTIONS, STATE, SegmentationFolder, digest_of
+from anatomy.segmentation.folder import STATE, SegmentationFolder, digest_of
 from anatomy.segmentation.parts import RefusedError
 from anatomy.segmentation.pipeline import Segmentation, read_ct, segment
 from anatomy.segmentation.request import Given, SegmentationRequest
@@ -210,7 +211,7 @@ def test_taking_a_correction_back_restores_what_was_made(
 ) -> None:
     write_volume(copy / "airway.nii.gz", Volume(grid=made.grid, array=_cut_airway(made)))
     _again(patient, made, copy)
-    (copy / CORRECTIONS / "airway.nii.gz").unlink()
+    (copy / FOLDER / "airway.nii.gz").unlink()
     restored = _again(patient, made, copy)
     assert restored.corrected == ()
     assert _voxels(copy) == _voxels(made.folder)

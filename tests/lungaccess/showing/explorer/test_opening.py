@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import math
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,15 +11,17 @@ import aiohttp
 import numpy as np
 import pytest
 
+from anatomy.base.files import write_text
 from anatomy.grid import Grid, Volume
 from anatomy.lung import Lung
 from anatomy.phantom import Phantom
 from lungaccess.problem.nodules import nodules_of
 from lungaccess.showing.explorer import Explorer, PatientSource
 from lungaccess.showing.explorer.opening import nodule_near
+from lungaccess.showing.report.segmented import patient_folder
 from tests.anatomy.io.series import write_series
 from tests.lungaccess.showing.explorer.client import Client, opened, with_client
-from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served
+from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served, explored, press
 from tests.lungaccess.showing.report import browser
 
 
@@ -149,19 +151,6 @@ def empty(here: Path) -> Iterator[tuple[Served, Page]]:
         served.stop()
 
 
-def press(page: Page, words: str) -> None:
-    """Press the button with these words."""
-    found = "[...document.querySelectorAll('button')].find((each) => each.textContent.includes(arguments[0]))"
-    page.run(f"{found}.click()", words)
-
-
-def explored(page: Page) -> None:
-    """Wait until another page than the one before has the patient."""
-    script = "return !window.before && Boolean(window.lungaccessExplorer && window.lungaccessExplorer.ready)"
-    while not page.run(script):
-        time.sleep(0.1)
-
-
 @pytest.mark.browser
 @pytest.mark.slow
 @pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there")
@@ -194,3 +183,32 @@ def test_from_an_empty_page_to_a_checked_plan(
     assert page.messages() == []
     hosts = {url.split("/")[2] for url in page.requests() if url.startswith(("http", "ws"))}
     assert hosts == {f"127.0.0.1:{served.address.port}"}, "nothing is asked of anything else"
+
+
+def test_two_ct_of_one_name_have_a_folder_each(here: Path) -> None:
+    """A CT, or a series of it, never takes up the patient of another one; its own it does."""
+    from anatomy.io.own_masks import DESCRIPTION
+    from anatomy.segmentation.folder import STATE
+
+    def made(folder: Path, ct: Path, series: str | None) -> None:
+        folder.mkdir()
+        write_text(
+            folder / STATE,
+            json.dumps({"format": 1, "ct": "x", "ct_source": {"path": str(ct), "series": series}}),
+        )
+        (folder / DESCRIPTION).touch()
+
+    one, other = (here / name / "ct.nii.gz" for name in ("one", "other"))
+    for each in (one, other):
+        each.parent.mkdir()
+        each.touch()
+    assert patient_folder(one) == Path("ct-patient")
+    made(Path("ct-patient"), one, None)
+    assert patient_folder(one) == Path("ct-patient")
+    assert patient_folder(other) == Path("ct-patient-2")
+    made(Path("ct-patient-2"), one, "1.2.3")
+    assert patient_folder(one, "1.2.3") == Path("ct-patient-2")
+    assert patient_folder(other) == Path("ct-patient-3")
+    Path("ct-patient-3").mkdir()
+    (Path("ct-patient-3") / DESCRIPTION).touch()
+    assert patient_folder(other) == Path("ct-patient-4"), "masks that nobody knows to be its own"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
+import time
 from typing import Any
 
 from lungaccess.showing.explorer import Address, Explorer, PatientSource
@@ -96,3 +97,16 @@ class Page(browser.Browser):
         self.run("document.getElementById('target-text').value = arguments[0]", text)
         self.run("document.getElementById('target-form').requestSubmit()")
         return self.wait(f"s.asked.target === {json.dumps(text)} && s.exits && s.exits.complete && {PLANNED}")
+
+
+def press(page: Page, words: str) -> None:
+    """Press the button with these words."""
+    found = "[...document.querySelectorAll('button')].find((each) => each.textContent.includes(arguments[0]))"
+    page.run(f"{found}.click()", words)
+
+
+def explored(page: Page) -> None:
+    """Wait until another page than the one before has the patient."""
+    script = "return !window.before && Boolean(window.lungaccessExplorer && window.lungaccessExplorer.ready)"
+    while not page.run(script):
+        time.sleep(0.1)

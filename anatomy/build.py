@@ -35,6 +35,9 @@ PAD_VOXELS = 2
 SINGLE_FIELDS = ("airway", "vessel", "pleura", "fissure")
 """The clearance fields that are made of a structure; the others are made of these."""
 
+CUT = ("nodules", "nodule_labels", "cost", "lobes")
+"""The images that a lung holds as they were read, cut to its box."""
+
 
 def lung_key(sources: Mapping[str, str]) -> str:
     """Return the key of the lung made from input files with these hashes."""
@@ -58,6 +61,10 @@ class Reused:
         reused = cls()
         reused._kept["tree"] = (images.lumen.array,), lung.tree
         reused._kept["lumen_depth"] = (images.lumen.array,), lung.lumen_depth
+        for name in CUT:
+            volume, cut = getattr(images, name), getattr(lung, name)
+            if cut is not None:
+                reused._kept[name] = (volume.array, lung.grid.lps_from_ijk), cut.array
         for name in SINGLE_FIELDS:
             if name in lung.fields:
                 solid = (lung.labels & structures.FIELD_BITS[name]) != 0
@@ -154,11 +161,11 @@ def build_lung(
         ),
         lumen_depth=_lumen_depth(lumen, keep, reused),
         tree=tree,
-        nodules=_cut_volume(images.nodules, box, "nodules", keep),
-        nodule_labels=_cut_volume(images.nodule_labels, box, "nodule_labels", keep),
-        cost=_cut_volume(images.cost, box, "cost", keep),
-        lobes=_cut_volume(images.lobes, box, "lobes", keep),
-        fissure_band=_cut_volume(images.fissure_band, box, "fissure_band", keep),
+        nodules=_cut_volume(images, "nodules", box, keep, reused),
+        nodule_labels=_cut_volume(images, "nodule_labels", box, keep, reused),
+        cost=_cut_volume(images, "cost", box, keep, reused),
+        lobes=_cut_volume(images, "lobes", box, keep, reused),
+        fissure_band=_cut_volume(images, "fissure_band", box, keep, reused),
         motion=motion,
         starts=images.starts,
         targets_lps=images.targets_lps,
@@ -325,7 +332,12 @@ def _depth_of(lumen: Volume) -> DistanceField:
     return distance_field("lumen_depth", solid, grid)
 
 
-def _cut_volume(volume: Volume | None, box: WorkingBox, name: str, keep: Keep) -> Volume | None:
-    return (
-        None if volume is None else Volume(grid=box.grid, array=keep(f"{name}.array", box.cut(volume.array)))
-    )
+def _cut_volume(
+    images: PatientImages, name: str, box: WorkingBox, keep: Keep, reused: Reused
+) -> Volume | None:
+    volume: Volume | None = getattr(images, name)
+    if volume is None:
+        return None
+    array = volume.array
+    cut = reused.get(name, (array, box.grid.lps_from_ijk), lambda: box.cut(array))
+    return Volume(grid=box.grid, array=keep(f"{name}.array", cut))

@@ -56,14 +56,16 @@ def with_corrections(images: PatientImages, corrections: Volume) -> PatientImage
     made: dict[str, Any] = {
         role: _with_part(getattr(images, role), box, mask, images.grid)
         for role, mask in after.items()
-        if getattr(images, role) is not None or mask.any()
+        if not np.array_equal(mask, before[role])
     }
     if images.nodule_labels is not None:
         made["nodule_labels"] = _labelled(images.nodule_labels, box, after["nodules"], values == NODULE)
     if images.cost is not None:
         cost = images.cost.array[box].copy()
-        cost[changed & np.isinf(cost) & ~after["vessels"] & ~after["lumen"]] = CLOSED_COST
-        made["cost"] = _with_part(images.cost, box, cost, images.grid)
+        opened = changed & np.isinf(cost) & ~after["vessels"] & ~after["lumen"]
+        if opened.any():
+            cost[opened] = CLOSED_COST
+            made["cost"] = _with_part(images.cost, box, cost, images.grid)
     return replace(
         images, **made, warnings=(*images.warnings, *_warnings(images.grid, before, after), *UNUSED[:unused])
     )

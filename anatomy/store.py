@@ -106,13 +106,19 @@ def _build_into(
 ) -> Lung:
     """Build a lung with its arrays in a new folder that gets its name when it is complete."""
     with _new_folder(folder) as work:
+        linked: dict[str, list[int]] = {}
 
         def keep(name: str, array: Array) -> Array:
-            np.save(work / f"{name}.npy", array)
+            file = work / f"{name}.npy"
+            state = _linked(array, file)
+            if state is not None:
+                linked[file.name] = state
+                return array
+            np.save(file, array)
             return _mapped(work, name)
 
         # Nothing stays mapped: Windows renames no folder in which a file is open.
-        _save_rest(build_lung(images, key=key, keep=keep, progress=progress, reused=reused), work)
+        _save_rest(build_lung(images, key=key, keep=keep, progress=progress, reused=reused), work, linked)
     lung = _load(folder)
     if lung is None and not folder.exists():
         return build_lung(images, key=key)  # Another process made room; this lung is in memory alone.
@@ -123,6 +129,28 @@ def _build_into(
             expected="files as lungaccess wrote them",
         )
     return lung
+
+
+def _linked(array: Array, file: Path) -> list[int] | None:
+    """Link a file to that of a stored array, and return its state; None where the array has to be written.
+
+    A lung that differs little from a stored one so takes little room.  Where the other one is removed, this
+    one counts as damaged, and is made anew.
+    """
+    mapped: Any = array
+    while mapped is not None and not isinstance(mapped, np.memmap):
+        mapped = getattr(mapped, "base", None)
+    if mapped is None or mapped.filename is None or mapped.shape != array.shape:
+        return None
+    source = Path(mapped.filename)
+    try:
+        state = json.loads((source.parent / META).read_text(encoding="utf-8"))["files"][source.name]
+        if source.stem == file.stem and are_unchanged(source.parent, {source.name: state}):
+            file.symlink_to(source.resolve())
+            return list(state)
+    except (*DAMAGE, KeyError):
+        pass
+    return None
 
 
 @contextlib.contextmanager
@@ -165,14 +193,15 @@ def _publish(work: Path, folder: Path) -> None:
             raise
 
 
-def _save_rest(lung: Lung, folder: Path) -> None:
-    """Write everything but the large arrays; the description last."""
+def _save_rest(lung: Lung, folder: Path, linked: dict[str, list[int]]) -> None:
+    """Write everything but the large arrays; the description last, with the states of linked files."""
     arrays: dict[str, Any] = {}
     described = plain_values(lung, "", arrays)
     small = {name: array for name, array in arrays.items() if not (folder / f"{name}.npy").exists()}
     np.savez(folder / "arrays.npz", **small)
     meta = {"format": stored_format(), "name": lung.name, "key": lung.key, "lung": described}
-    meta["files"] = file_states(folder, sorted(path.name for path in folder.iterdir()))
+    written = sorted(path.name for path in folder.iterdir() if path.name not in linked)
+    meta["files"] = file_states(folder, written) | linked
     meta = json.loads(json.dumps(meta))
     meta["checksum"] = values_checksum(meta)
     (folder / META).write_text(json.dumps(meta, indent=1), encoding="utf-8")

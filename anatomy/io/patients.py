@@ -23,13 +23,14 @@ AIR_HU = -500.0
 """A CT of the chest holds voxels of less density; masks and label maps hold none below 0."""
 
 
-def load_patient(path: str | Path) -> PatientImages:
+def load_patient(path: str | Path, *, as_made: bool = False) -> PatientImages:
     """Read a patient's lungs from disk.
 
     Args:
         path: A folder with a `patient.toml`, a lung of Med-RAD, a folder with output of TotalSegmentator,
             beside which a `patient.toml` may name the motion alone; or a `.toml` file, or a label map of
             TotalSegmentator with the lobes beside it.
+        as_made: Without what a person corrected by hand.
 
     Raises:
         AnatomyError: If a mask is missing, empty, or holds NaN.
@@ -50,7 +51,8 @@ def load_patient(path: str | Path) -> PatientImages:
         raise FileError(
             f"There is no patient at {path}", expected="an existing folder or file", remedy="Check the path"
         )
-    return corrected(_load_file(path) if path.is_file() else _load_folder(path), path)
+    images = _load_file(path) if path.is_file() else _load_folder(path)
+    return images if as_made else corrected(images, path)
 
 
 def _load_folder(path: Path) -> PatientImages:

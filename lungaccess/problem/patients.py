@@ -3,10 +3,15 @@
 import os
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from anatomy.lung import Lung
 from anatomy.organ import Organ
 from anatomy.plausibility import require_known_checks
+
+if TYPE_CHECKING:
+    from anatomy.build import Reused
+    from anatomy.patient import PatientImages
 
 
 def load_patient(
@@ -41,6 +46,31 @@ def load_patient(
         progress=progress,
         accept=accept,
     )
+
+
+def renewed_patient(
+    path: Path,
+    images: "PatientImages",
+    reused: "Reused",
+    *,
+    cache: Path | None = None,
+    accept: Collection[str] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Lung:
+    """Return the `Lung` of a patient whose images are at hand, made anew where they have changed.
+
+    Args:
+        images: What `anatomy.io.load_patient` reads at `path`.
+        reused: See `anatomy.build.build_lung`.
+
+    Raises:
+        LungaccessError: As `load_patient`.
+    """
+    from anatomy.io.inputs import input_hashes
+    from anatomy.store import open_lung
+
+    hashes = input_hashes(path)
+    return open_lung(hashes, lambda: images, cache=cache, accept=accept, progress=progress, reused=reused)
 
 
 def load_organ(

@@ -26,6 +26,7 @@ from lungaccess.problem.request import Request, goal_of
 from lungaccess.showing.explorer import questions as ask
 from lungaccess.showing.explorer.changed_system import ChosenPlace, plan_command, system_of
 from lungaccess.showing.explorer.opening import looked, opened, outlined, with_nodule
+from lungaccess.showing.explorer.painting import Painting
 from lungaccess.showing.explorer.patient import image_parts, patient_ct, patient_facts, scene_parts, target_of
 from lungaccess.showing.explorer.questions import WhatIf
 from lungaccess.showing.explorer.worker import Asked, KeptPlan, Part, PatientSource, Turn
@@ -50,6 +51,7 @@ class Answers:
         self._lung: Lung | None = None
         self._atlases: OrderedDict[tuple[Any, ...], Atlas] = OrderedDict()
         self._appraiser: Any = None
+        self._painting: Painting | None = None
         self._reached: dict[tuple[Any, ...], Int] = {}
 
     def parts(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
@@ -105,6 +107,38 @@ class Answers:
             return
         shown, size = outlined(self.lung, self._ct(), point)
         yield Part({"answer": "outline", **size, **image_parts(shown, self._source, question.point)})
+
+    def _paint(self, asked: Asked, turn: Turn) -> Iterator[Part]:
+        """Correct the masks, then make lung and atlas anew here, so that the other processes find both."""
+        question: ask.PaintQuestion = asked.question
+
+        def tell(what: str) -> None:
+            turn.send(Part({"answer": "progress", "what": what, "share": None}))
+
+        if self._painting is None:
+            tell("reading the masks")
+            self._painting = Painting.of(self._source, self.lung)
+        around = question.points[-1] if question.points else tuple(self.lung.tree.carina_lps.tolist())
+        size_ml = self._painting.draw(question, self._ct)
+        lung = self._painting.renewed(tell)
+        self.renew(self._source, lung)
+        # Before the atlas, in which a later stroke may take the place of this one.
+        turn.send(
+            Part(
+                {"answer": "painted", "size_ml": size_ml, **image_parts(lung, self._source, around)},
+                source=self._source,
+                renewed=True,
+            )  # fmt: skip
+        )
+        self._atlas(self._system(question.what_if), turn)
+        yield from ()
+
+    def renew(self, source: PatientSource, lung: Lung | None = None) -> None:
+        """Take the patient again, of which a person corrected the masks."""
+        self._source, self._lung = source, lung
+        self._atlases.clear()
+        self._reached.clear()
+        self._appraiser = None
 
     def _ct(self) -> Volume:
         """Return the CT of the patient."""

@@ -21,7 +21,8 @@ NAMES = (CLICKS, PLANS, REACH, ANSWERS)
 def _work(connection: Connection, source: PatientSource, folder: Path) -> None:
     """Run in a process of its own."""
     end_with_parent()
-    Worker(connection, Answers(source, folder).parts).run()
+    answers = Answers(source, folder)
+    Worker(connection, answers.parts, answers.renew).run()
 
 
 class Process:
@@ -48,12 +49,18 @@ class Process:
         self._open[asked.page, asked.question.id] = None
         self._send(asked)
 
+    def renew(self, source: PatientSource) -> None:
+        """Have the process take the patient again, of which a person corrected the masks."""
+        self._source = source
+        if self._connection is not None:
+            self._send(source)
+
     def end(self, ended: Ended) -> None:
         """Say that an answer is no longer wanted."""
         if self._process is not None:
             self._send(ended)
 
-    def _send(self, what: Asked | Ended) -> None:
+    def _send(self, what: Asked | Ended | PatientSource) -> None:
         with self._lock:
             connection = self._connection or self._start()
             # Where the process has ended, the thread that reads notices it, and tells what was not answered.

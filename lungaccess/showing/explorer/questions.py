@@ -100,6 +100,29 @@ class OutlineQuestion(_Question):
 
 
 @settings
+class PaintQuestion(_Question):
+    """Correct the masks by hand: the answer is what the patient is from now on, at once for all questions.
+
+    Args:
+        tool: See `anatomy.strokes.Stroke`; `undo` takes the last stroke back.
+        points: Along the stroke.
+        radius_mm: Of the brush; of a fill how far it may reach.
+        normal: Normal of the slice in which alone brush and fill act.
+        level_hu: By how much a filled voxel may differ from the first point.
+        what_if: The system whose atlas is made anew with the lung.
+    """
+
+    tool: Literal["paint", "erase", "fill", "cut", "join", "undo"]
+    structure: Literal["airway", "vessel", "fissure", "nodule"] = "vessel"
+    points: Annotated[tuple[Point, ...], Len(0, 400)] = ()
+    radius_mm: Annotated[float, quantity("radius of the brush", at_least=0.2, at_most=30.0)] = 2.0
+    normal: Point | None = None
+    level_hu: Annotated[float, quantity("difference in HU", at_least=1.0, at_most=2000.0)] = 150.0
+    what_if: WhatIf = WhatIf()
+    worker: ClassVar[str] = ANSWERS
+
+
+@settings
 class PatientQuestion(_Question):
     """The patient, the systems and their limits."""
 
@@ -217,6 +240,7 @@ QUESTIONS: Mapping[str, type[_Question]] = {
     "look": LookQuestion,
     "open": OpenQuestion,
     "outline": OutlineQuestion,
+    "paint": PaintQuestion,
     "patient": PatientQuestion,
     "scene": SceneQuestion,
     "image": ImageQuestion,

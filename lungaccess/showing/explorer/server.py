@@ -22,7 +22,7 @@ from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
 from lungaccess.showing.explorer.messages import error_message, frame
 from lungaccess.showing.explorer.processes import NAMES, Process
-from lungaccess.showing.explorer.questions import CANCEL, MOST_CHARACTERS, number_of, read_message
+from lungaccess.showing.explorer.questions import ANSWERS, CANCEL, MOST_CHARACTERS, number_of, read_message
 from lungaccess.showing.explorer.worker import Asked, Ended, Given, KeptPlan, PatientSource
 from lungaccess.showing.report.html.document import filled, scene_figure, slice_controls
 
@@ -184,9 +184,21 @@ class Explorer:
     def _explore(self, source: PatientSource, asking: Page) -> None:
         """Explore another patient; pages that show the one before are closed, and cannot ask of this one."""
         self._source = source
+        self._close_others(asking)
         ended, self._processes = self._processes, self._new_processes()
         for process in ended.values():
             threading.Thread(target=process.stop, daemon=True).start()
+
+    def _renew(self, source: PatientSource, asking: Page) -> None:
+        """Explore the patient as a person corrected it: the process that answers has done so already."""
+        self._source = source
+        self._close_others(asking)
+        asking.plans.clear()
+        for name, process in self._processes.items():
+            if name != ANSWERS:
+                process.renew(source)
+
+    def _close_others(self, asking: Page) -> None:
         for page in self._pages.values():
             if page is not asking:
                 page.closing = asyncio.create_task(page.socket.close(code=1012, message=b"another patient"))
@@ -325,7 +337,7 @@ class Explorer:
         if given.plan is not None:
             page.keep(given.plan)
         if given.source is not None:
-            self._explore(given.source, page)
+            (self._renew if given.renewed else self._explore)(given.source, page)
         if given.last:
             page.asked.pop(given.number, None)
         page.waiting_bytes += len(given.sent)
@@ -349,7 +361,7 @@ class Explorer:
                     await page.socket.send_str(given.sent)
                 else:
                     await page.socket.send_bytes(given.sent)
-                if given.source is not None:
+                if given.source is not None and not given.renewed:
                     await page.socket.close(code=1012, message=b"another patient")
             page.waiting_bytes -= len(given.sent)
 

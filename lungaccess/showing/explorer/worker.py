@@ -88,6 +88,7 @@ class Given:
         plan: A plan that the page may ask about.
         file: A file that the page may fetch.
         source: The patient that is explored from now on.
+        renewed: Whether that is the same patient, of which a person corrected the masks.
     """
 
     page: str
@@ -97,6 +98,7 @@ class Given:
     plan: KeptPlan | None = None
     file: Path | None = None
     source: PatientSource | None = None
+    renewed: bool = False
 
 
 @frozen_value
@@ -122,9 +124,10 @@ class Part:
         plan: KeptPlan | None = None,
         file: Path | None = None,
         source: PatientSource | None = None,
+        renewed: bool = False,
     ) -> None:
         self.message, self.arrays, self.plan, self.file = message, arrays, plan, file
-        self.source = source
+        self.source, self.renewed = source, renewed
 
 
 class Turn:
@@ -161,10 +164,13 @@ class Worker:
     Args:
         connection: To the process of the server.
         answering: See `Answering`.
+        renew: Takes the patient again, of which a person corrected the masks in another process.
     """
 
-    def __init__(self, connection: Connection, answering: Answering) -> None:
-        self._connection, self._answering = connection, answering
+    def __init__(
+        self, connection: Connection, answering: Answering, renew: Callable[[PatientSource], None]
+    ) -> None:
+        self._connection, self._answering, self._renew = connection, answering, renew
         self._running: dict[Key, tuple[Asked, Iterator[Part | None]]] = {}
         self._now: list[Key] = []
         self._lock = threading.RLock()
@@ -183,6 +189,11 @@ class Worker:
         while self._connection.poll(None if wait else 0):
             wait = False
             received = self._connection.recv()
+            if isinstance(received, PatientSource):
+                for key in list(self._running):
+                    self._end(key)
+                self._renew(received)
+                continue
             if isinstance(received, Asked):
                 self._end(received.key)
                 self._running[received.key] = received, self._answering(received, Turn(self, received))
@@ -269,6 +280,7 @@ class Worker:
                 plan=part.plan,
                 file=part.file,
                 source=part.source,
+                renewed=part.renewed,
             )
         )
 

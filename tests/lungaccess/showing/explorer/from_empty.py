@@ -22,6 +22,14 @@ from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served, exp
 DECIDED = f"({PLANNED}) || s.failure !== null || !document.getElementById('no-plan').hidden"
 
 
+def settled(page: Page, condition: str) -> dict[str, Any]:
+    """Wait until a condition of the state `s` holds, however slow the machine is, and return the state."""
+    script = f"const s = window.lungaccessReport.state(); return Boolean({condition})"
+    while not page.run(script):
+        time.sleep(0.1)
+    return page.state()
+
+
 class Walk:
     """One way through the page: each step is timed, and its picture kept.
 
@@ -57,7 +65,7 @@ class Walk:
 def accepted(page: Page, accept: bool) -> dict[str, Any]:
     """Wait for masks; a question on the way is answered and printed, as is what is not answered."""
     while True:
-        state = page.wait("!s.busy")
+        state = settled(page, "!s.busy")
         question = state["question"]
         if "Go on all the same" in question and accept:
             print("   question:", question)
@@ -84,7 +92,7 @@ def walk(ct: Path, nodule: list[float], out: Path, served: Served, page: Page, a
     print("   page:", state["problem"] or state["question"])
     if state["problem"]:
         return
-    page.wait("document.getElementById('picture').naturalWidth > 0")
+    settled(page, "document.getElementById('picture').naturalWidth > 0")
 
     def exploring() -> None:
         press(page, "The masks are right")
@@ -92,16 +100,17 @@ def walk(ct: Path, nodule: list[float], out: Path, served: Served, page: Page, a
 
     on.step("explored", exploring)
     page.run("window.lungaccessExplorer.moveTo(arguments[0])", nodule)
-    on.step("cross moved", lambda: page.wait("s.place !== null"))
+    on.step("cross moved", lambda: settled(page, "s.place !== null"))
     if page.run("return document.getElementById('outline').hidden"):
         page.click("cross-target")
     else:
 
         def outlined() -> None:
             page.click("outline")
-            page.wait(
+            settled(
+                page,
                 "document.getElementById('outline').textContent.startsWith('Add this nodule')"
-                " || !document.getElementById('target-error').hidden"
+                " || !document.getElementById('target-error').hidden",
             )
 
         on.step("outlined", outlined)
@@ -116,7 +125,7 @@ def walk(ct: Path, nodule: list[float], out: Path, served: Served, page: Page, a
                 explored(page)
 
             on.step("added", added)
-    on.step("planned", lambda: page.wait(DECIDED))
+    on.step("planned", lambda: settled(page, DECIDED))
     print("   page:", page.text("headline-text"), page.text("no-plan-why"))
     print("   state:", json.dumps({key: page.state()[key] for key in ("failure", "target_lps")}))
 

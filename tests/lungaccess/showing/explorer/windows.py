@@ -99,13 +99,13 @@ class Page(browser.Browser):
         return self.wait(f"s.asked.target === {json.dumps(text)} && s.exits && s.exits.complete && {PLANNED}")
 
 
-def press(page: Page, words: str) -> None:
+def press(page: browser.Browser, words: str) -> None:
     """Press the button with these words."""
     found = "[...document.querySelectorAll('button')].find((each) => each.textContent.includes(arguments[0]))"
     page.run(f"{found}.click()", words)
 
 
-def explored(page: Page) -> None:
+def explored(page: browser.Browser) -> None:
     """Wait until another page than the one before has the patient."""
     script = "return !window.before && Boolean(window.lungaccessExplorer && window.lungaccessExplorer.ready)"
     while not page.run(script):

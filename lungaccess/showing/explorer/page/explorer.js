@@ -15,6 +15,7 @@ import { Asker } from "./asker.js";
 import { Compared } from "./compare.js";
 import { Connection } from "./connection.js";
 import { connectHelp, connectKeys } from "./keys.js";
+import { connectPainting } from "./paint.js";
 import { Panes } from "./panes.js";
 import { PlanPanel } from "./plan_panel.js";
 import { connectPointer } from "./pointer.js";
@@ -84,14 +85,18 @@ class ExplorerPage extends DevicePage {
     byId("status").textContent = words;
   }
 
-  takePatient(facts) {
+  takeFacts(facts) {
     this.facts = facts;
-    byId("patient").textContent = facts.patient;
-    document.title = `${facts.patient} - lungaccess`;
-    this.data = { ...this.data, patient: facts.patient, page: "explorer" };
     byId("warnings").replaceChildren(...facts.warnings.map((words) => made("li", {}, words)));
     byId("nodule").replaceChildren(new Option(facts.targets.length ? "choose" : "none", ""), ...facts.targets.map(({ text, lobe }) =>
       new Option(lobe ? `${text}, ${lobe}` : text, text)));
+  }
+
+  takePatient(facts) {
+    this.takeFacts(facts);
+    byId("patient").textContent = facts.patient;
+    document.title = `${facts.patient} - lungaccess`;
+    this.data = { ...this.data, patient: facts.patient, page: "explorer" };
     for (const kind of ["direct arc", "unreachable"]) {
       document.documentElement.style.setProperty(`--${kind.replace(" ", "-")}`, facts.reach_colours[kind]);
     }
@@ -128,6 +133,7 @@ class ExplorerPage extends DevicePage {
     const isOpen = await this.openScene();
     this.panes = new Panes(this.redraw);
     this.linkSlices({ placed: () => this.describe(), picked: (place) => this.chooseTarget(lpsText(place)) });
+    connectPainting(this);
     this.views.lookAt(this.start);
     this.setTheme(document.documentElement.dataset.theme);
     if (isOpen) {
@@ -423,7 +429,16 @@ class ExplorerPage extends DevicePage {
     const of = this.motion ? deviceLines(this.motion.plan, this.motion.at(this.player.position)) : [];
     const others = this.compared.shown.flatMap(({ motion, number }) => otherLines(motion.plan, motion.end, number));
     const planes = Object.fromEntries(Object.entries(STANDARD).filter(([name]) => this.panes.isShown(name)));
-    this.views.draw(planes, { lines: [...others, ...of], target: this.targetLps }, isCoarse);
+    this.views.draw(planes, { lines: [...others, ...of, ...(this.stroke ? [this.stroke] : [])], target: this.targetLps }, isCoarse);
+  }
+
+  // Take the patient again, of which the masks were corrected: what was known of it holds no longer.
+  async renew() {
+    await this.asker.asked("patient", {}, (facts) => this.takeFacts(facts));
+    this.plans.clear();
+    this.plan = this.motion = this.search.systemKey = null;
+    this.compared.rows = [];
+    this.follow();
   }
 
   // What a test may read.

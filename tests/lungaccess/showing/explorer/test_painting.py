@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from lungaccess.showing.explorer import Explorer, PatientSource
 from lungaccess.showing.report.html.volumes import find_ct
 from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.showing.explorer.client import Client, opened, with_client
+from tests.lungaccess.showing.explorer.windows import PLANNED, Page, Served
+from tests.lungaccess.showing.report import browser
 
 
 @pytest.fixture
@@ -152,3 +155,35 @@ def test_cut_and_join_mend_an_airway(painted: PatientSource) -> None:
         assert lung_of(painted).label_at(behind) & LUMEN
 
     with_client(painted, talk)
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there")
+def test_a_stroke_in_a_slice_becomes_another_plan(painted: PatientSource, tmp_path: Path) -> None:
+    served = Served(painted)
+    try:
+        with Page(1440, 900) as page:
+            page.open(served.address.url)
+            first = page.target(TARGET)["plan"]
+            page.run("document.getElementById('mend').open = true")
+            exit_lps = np.array(first["exit_lps"])
+            between = 0.5 * (exit_lps + np.array(page.state()["target_lps"]))
+            page.run("window.lungaccessExplorer.moveTo(arguments[0])", between.tolist())
+            page.frame()
+            canvas = "document.getElementById('slice-axial')"
+            width, height = page.run(f"return [{canvas}.clientWidth, {canvas}.clientHeight]")
+            page.pointer("mousePressed", "slice-axial", width / 2 - 4, height / 2)
+            page.pointer("mouseMoved", "slice-axial", width / 2 + 4, height / 2)
+            page.screenshot(tmp_path / "stroke.png")
+            page.pointer("mouseReleased", "slice-axial", width / 2 + 4, height / 2)
+            page.wait("document.getElementById('mend-words').textContent.includes('changed')")
+            second = page.wait(f"{PLANNED} && s.plan.digest !== {json.dumps(first['digest'])}")
+            page.screenshot(tmp_path / "mended.png")
+            assert page.state()["place"] is not None
+            assert second["plan"]["digest"] != first["digest"]
+            page.click("mend-undo")
+            page.wait(f"{PLANNED} && s.plan.digest === {json.dumps(first['digest'])}")
+            assert page.messages() == []
+    finally:
+        served.stop()

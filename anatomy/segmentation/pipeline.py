@@ -69,7 +69,11 @@ def memory_estimate_gib(grid: Grid, voxel_mm: float = VOXEL_MM) -> float:
     return (float(np.prod(grid.shape)) * BYTES_PER_CT_VOXEL + voxels * BYTES_PER_VOXEL) / 2**30
 
 
-def segment(request: SegmentationRequest, progress: Progress | None = None) -> Segmentation:
+def segment(
+    request: SegmentationRequest,
+    progress: Progress | None = None,
+    begun: Callable[[Parts], None] | None = None,
+) -> Segmentation:
     """Segment a CT and write a patient folder that `anatomy.io.load_patient` reads.
 
     Steps whose inputs, settings and results are unchanged since the last run are not repeated; images that
@@ -77,6 +81,7 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
 
     Args:
         progress: Told each step as it begins.
+        begun: See `anatomy.segmentation.steps.Steps`.
 
     Raises:
         AnatomyError: If the CT cannot be segmented, what was found cannot be a patient's lungs and airways,
@@ -99,7 +104,7 @@ def segment(request: SegmentationRequest, progress: Progress | None = None) -> S
     folder = SegmentationFolder(request.out, grid, digest, inputs=inputs, force=request.force)
     folder.remember(ct_source=_ct_source(request))  # Early: a run that is refused goes on in this folder.
     description = Description(folder, DESCRIPTION)
-    steps = Steps(request, folder, description, digest, tell)
+    steps = Steps(request, folder, description, digest, tell, begun)
     parts = steps.run()
     if parts.nodule.any() and target is None:
         target = centre_of(parts.nodule, parts.ct.grid)

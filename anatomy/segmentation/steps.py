@@ -47,7 +47,11 @@ _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 
 
 class Steps:
-    """Runs lungs, airway, nodule, vessels, lobes and cost map in this order; tells each step as it begins."""
+    """Runs lungs, airway, nodule, vessels, lobes and cost map in this order; tells each step as it begins.
+
+    Args:
+        begun: Is given lungs and airway when they were made, before the longer steps.
+    """
 
     def __init__(
         self,
@@ -56,7 +60,9 @@ class Steps:
         description: Description,
         ct_digest: str,
         progress: Progress,
+        begun: Callable[[Parts], None] | None = None,
     ) -> None:
+        self._begun = begun
         self._request, self._folder, self._description = request, folder, description
         self._ct_digest, self._tell = ct_digest, progress
         self._work_in(Box.whole(request.ct.grid, request.voxel_mm))
@@ -99,6 +105,8 @@ class Steps:
         airway = self._airway(lungs)
         tree = self._tree_of(airway["airway"])
         self._require_plausible(lungs, airway, tree)
+        if self._begun is not None and self.recomputed:
+            self._begun(Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree))
         nodule = self._nodule(lungs)
         if nodule.any():
             volume_ml = float(np.count_nonzero(nodule)) * self.grid.voxel_volume_mm3 / 1000.0

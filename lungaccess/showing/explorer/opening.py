@@ -132,9 +132,10 @@ def _segmented(path: Path, question: OpenQuestion, folder: Path, turn: Turn) -> 
         ct=volume, out=patient_folder(path, series).resolve(), sources=sources, ct_path=path,
         ct_series=series, thick_slices=question.thick_slices, accept=question.accept,
     )  # fmt: skip
-    made = _made(request, turn)
+    made = _made(request, turn, folder)
+    warnings = [_words_of_page(each) for each in made.warnings]
     yield Part(
-        {"answer": "segmented", "folder": str(request.out), "warnings": list(made.warnings)},
+        {"answer": "segmented", "folder": str(request.out), "warnings": warnings},
         file=_copied(request.out / PICTURE, folder),
     )
 
@@ -240,7 +241,7 @@ def with_nodule(point_lps: Float, source: PatientSource, turn: Turn) -> Part:
         accept=tuple(made["accepted"]), seed_lps=None if seed is None else np.array(seed),
         voxel_mm=made["voxel_mm"], given=Given(nodules=(*made["nodules"], point)),
     )  # fmt: skip
-    _made(request, turn)
+    _made(request, turn, None)
     part = _exploring(folder, source, turn)
     number = nodule_near(load_patient(folder, cache=source.cache, accept=source.accept), point_lps)
     if number is None:
@@ -293,8 +294,21 @@ def _progress(what: str, share: float | None) -> Part:
     return Part({"answer": "progress", "what": what, "share": share})
 
 
-def _made(request: SegmentationRequest, turn: Turn) -> Segmented:
-    """Segment, alone in the folder, and tell the page each step; it ends when the page is gone."""
+def _words_of_page(warning: str) -> str:
+    """Return a warning as the page has its remedy: options of a command are none of a person's there."""
+    place = re.sub(r"add --nodule (\S+?)\.$", r"put the cross to \1 and outline it.", warning)
+    return place.replace("in segmentation.png", "in the pictures below")
+
+
+def _made(request: SegmentationRequest, turn: Turn, folder: Path | None) -> Segmented:
+    """Segment, alone in the folder, and tell the page each step; it ends when the page is gone.
+
+    Lungs and airway are shown as soon as they are made, if pictures have a folder.
+    """
+
+    def begun(picture: Path) -> None:
+        step = {"answer": "begun", "words": "Lungs and airway are made; vessels, lobes and fissures follow."}
+        turn.send(Part(step, file=None if folder is None else _copied(picture, folder)))
 
     def tell(step: str, share: float | None) -> None:
         turn.check()
@@ -303,7 +317,7 @@ def _made(request: SegmentationRequest, turn: Turn) -> Segmented:
     mark = require_writable_folder(request.out) / MARK
     mark.mkdir(exist_ok=True)
     with sole_writer(request.out, mark):
-        return segment_with_pictures(request, tell)
+        return segment_with_pictures(request, tell, begun=None if folder is None else begun)
 
 
 def _copied(picture: Path, folder: Path) -> Path | None:

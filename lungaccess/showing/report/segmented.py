@@ -11,6 +11,7 @@ from anatomy.base.records import frozen_record
 from anatomy.segmentation.request import SegmentationRequest
 
 if TYPE_CHECKING:
+    from anatomy.segmentation.parts import Parts
     from anatomy.segmentation.pipeline import Segmentation
     from anatomy.segmentation.scan_warnings import Quality
 
@@ -23,7 +24,7 @@ STEP_SHARES = {
     "pictures": 0.95,
 }
 """Share of the work that is done when a step begins, as measured on a CT of 512 x 512 x 275 voxels."""
-PICTURE, REFUSED_PICTURE = "segmentation.png", "refused.png"
+PICTURE, REFUSED_PICTURE, BEGUN_PICTURE = "segmentation.png", "refused.png", "begun.png"
 """Names of the pictures in the folder of the patient."""
 
 
@@ -42,13 +43,19 @@ class Segmented:
 
 
 def segment_with_pictures(
-    request: SegmentationRequest, tell: Callable[[str, float | None], None], *, pictures: bool = True
+    request: SegmentationRequest,
+    tell: Callable[[str, float | None], None],
+    *,
+    pictures: bool = True,
+    begun: Callable[[Path], None] | None = None,
 ) -> Segmented:
     """Segment a CT, and write quality.json and the pictures beside the masks.
 
     Args:
         tell: Told each step as it begins, and the share of the work that is done then, None if not known.
         pictures: Whether pictures are drawn, also of a CT that is refused.
+        begun: Is given a picture of lungs and airway as soon as they are made, so that a person need not wait
+            for the longer steps where they are wrong.
 
     Raises:
         LungaccessError: As `anatomy.segmentation.pipeline.segment`.
@@ -63,12 +70,19 @@ def segment_with_pictures(
 
             segmentation_png(request.ct, parts, request.out / name)
 
+    def draw_begun(parts: "Parts") -> None:
+        draw(parts, BEGUN_PICTURE)
+        if begun is not None:
+            begun(request.out / BEGUN_PICTURE)
+
+    shown = draw_begun if pictures and begun is not None else None
     try:
-        result = segment(request, lambda step: tell(step, STEP_SHARES.get(step)))
+        result = segment(request, lambda step: tell(step, STEP_SHARES.get(step)), shown)
     except AnatomyError as error:
         draw(error.parts if isinstance(error, RefusedError) else None, REFUSED_PICTURE)
         raise
-    (request.out / REFUSED_PICTURE).unlink(missing_ok=True)
+    for name in (REFUSED_PICTURE, BEGUN_PICTURE):
+        (request.out / name).unlink(missing_ok=True)
     quality = quality_of(result.parts)
     if pictures:
         tell("pictures", STEP_SHARES["pictures"])

@@ -39,7 +39,7 @@ function decide(words, choices) {
   byId("words").replaceChildren(...words.filter(Boolean).map((each) => made("li", {}, each)));
   byId("choices").replaceChildren(...choices);
   byId("question").hidden = false;
-  say("Your decision is needed.");
+  if (choices.length) say("Your decision is needed.");
 }
 
 function open(path, values = {}) {
@@ -49,6 +49,7 @@ function open(path, values = {}) {
     const { answer, accept, thick_slices: thick } = part;
     if (answer === "link") byId("picture").src = part.address;
     if (answer === "link") byId("picture").hidden = false;
+    if (answer === "begun") decide([part.words], []);
     if (answer === "opened") location.assign("/");
     if (answer === "segmented") decide([`The masks are in ${part.folder}: look at them.`, ...part.warnings], [
       button("The masks are right: explore", "Explore", () => open(part.folder, { thick_slices: Boolean(values.thick_slices) }))]);

@@ -31,7 +31,7 @@ DEFAULT_STOP_MM = 2.0
 
 @frozen_record
 class Deployments:
-    """Accepted deployments, E of them, and counts of the refused.
+    """Accepted deployments, E of them, from S scope poses, and counts of the refused.
 
     Args:
         site ((E,) int64): Index of the scope pose.
@@ -43,8 +43,8 @@ class Deployments:
             its angle to the wall there.
         wall_run_mm ((E,) float64): Length of body in the wall of the pierced branch, beyond the exit.
         positions, tangents ((E, 3) float64): Tip of the inner tube, LPS mm.
-        candidates: Deployments looked at.
-        refused: Counts by reason.
+        looked_at ((S,) int64): How many were looked at from each scope pose.
+        refused_at ((S, N_REASONS) int64): How many of them were refused, by reason.
     """
 
     site: Int
@@ -58,8 +58,19 @@ class Deployments:
     wall_run_mm: Float
     positions: Float
     tangents: Float
-    candidates: int
-    refused: dict[str, int]
+    looked_at: Int
+    refused_at: Int
+
+    @property
+    def candidates(self) -> int:
+        """Number of deployments looked at."""
+        return int(self.looked_at.sum())
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """How many were refused, by reason."""
+        counts = self.refused_at.sum(axis=0)
+        return {why: int(counts[code]) for code, why in REASONS.items() if counts[code]}
 
     @property
     def count(self) -> int:
@@ -68,16 +79,32 @@ class Deployments:
 
     def only(self, chosen: Int) -> "Deployments":
         """Return some of them, by their numbers `(N,)`."""
-        arrays: dict[str, Any] = {
-            f.name: read_only(getattr(self, f.name)[chosen])
-            for f in fields(self)
-            if isinstance(getattr(self, f.name), np.ndarray)
-        }
+        arrays: dict[str, Any] = {name: read_only(getattr(self, name)[chosen]) for name in _OF_EACH}
         return replace(self, **arrays)
+
+    def with_sites(self, sites: Int, others: "Deployments") -> "Deployments":
+        """Return these, but from some scope poses, by their numbers `(N,)`, those of another enumeration."""
+        kept = np.flatnonzero(~np.isin(self.site, sites))
+        site = np.concatenate([self.site[kept], sites[others.site]])
+        order = np.argsort(site, kind="stable")
+        arrays: dict[str, Any] = {
+            name: read_only(np.concatenate([getattr(self, name)[kept], getattr(others, name)])[order])
+            for name in _OF_EACH
+        }
+        arrays["site"] = read_only(site[order])
+        for name in _OF_SITES:
+            counts = getattr(self, name).copy()
+            counts[sites] = getattr(others, name)
+            arrays[name] = read_only(counts)
+        return Deployments(**arrays)
 
     def choice(self, entry: int) -> tuple[float, int]:
         """Return rotation and shape of one, as `DeploymentValidator.choose` takes them."""
         return float(self.rotation_rad[entry]), int(self.shape[entry])
+
+
+_OF_SITES = ("looked_at", "refused_at")
+_OF_EACH = tuple(each.name for each in fields(Deployments) if each.name not in _OF_SITES)
 
 
 def enumerate_deployments(
@@ -172,7 +199,8 @@ class SiteEnumerator:
         self._environment = tube_environment(lung, with_fissures=with_fissures)
         self._constants = tube_constants(tubes, margins)
         empty = np.zeros((0, placing.PLACED_COLUMNS)), np.zeros(0, dtype=np.int64)
-        self.none = self._as_deployments(np.eye(4), *empty, np.zeros(kernels.N_REASONS, dtype=np.int64), 0)
+        refused = np.zeros((0, kernels.N_REASONS), dtype=np.int64)
+        self.none = self._as_deployments(np.eye(4), *empty, refused, np.zeros(0, dtype=np.int64))
 
     def deployments(
         self, tip: Float, worthwhile: Callable[[Float, Float], Bool] | None = None
@@ -201,8 +229,8 @@ class SiteEnumerator:
             more, of_more = placed(further)
             rows, turn_of = np.concatenate([rows, more]), np.concatenate([turn_of, of_more])
             turns = np.concatenate([turns, further])
-        candidates = int(np.count_nonzero(wanted[turns]))
-        return self._as_deployments(frame, rows, turn_of, refused, candidates)
+        looked_at = np.array([np.count_nonzero(wanted[turns])], dtype=np.int64)
+        return self._as_deployments(frame, rows, turn_of, refused[None], looked_at)
 
     def _of_use(self, frame: Float, worthwhile: Callable[[Float, Float], Bool]) -> Bool:
         """Return which shapes `(T, S)` are of use, from few enough rotations: those between come last."""
@@ -223,7 +251,7 @@ class SiteEnumerator:
         return np.flatnonzero((accepted != np.roll(accepted, -1, axis=0)).any(axis=1))
 
     def _as_deployments(
-        self, frame: Float, rows: Float, turn_of: Int, refused: Int, candidates: int
+        self, frame: Float, rows: Float, turn_of: Int, refused: Int, looked_at: Int
     ) -> Deployments:
         shape = rows[:, placing.PLACED_SHAPE].astype(np.int64)
         lps = frame @ self._turns[turn_of] @ self._shapes.scope_from_tip[shape]
@@ -239,8 +267,8 @@ class SiteEnumerator:
             wall_run_mm=read_only(rows[:, placing.PLACED_RUN].copy()),
             positions=read_only(lps[:, :3, 3].copy()),
             tangents=read_only(lps[:, :3, 2].copy()),
-            candidates=candidates,
-            refused={REASONS[code]: int(refused[code]) for code in REASONS if refused[code]},
+            looked_at=read_only(looked_at),
+            refused_at=read_only(refused),
         )
 
 
@@ -262,15 +290,11 @@ def join_deployments(one: Deployments, other: Deployments, first_site: int) -> D
 def _joined(parts: list[Deployments], first_site: Int) -> Deployments:
     """Return the deployments of several enumerations, whose sites are counted from `first_site` (P,)."""
     arrays: dict[str, Any] = {
-        f.name: read_only(np.concatenate([getattr(part, f.name) for part in parts]))
-        for f in fields(Deployments)
-        if isinstance(getattr(parts[0], f.name), np.ndarray)
+        name: read_only(np.concatenate([getattr(part, name) for part in parts]))
+        for name in (*_OF_EACH, *_OF_SITES)
     }
     arrays["site"] = read_only(arrays["site"] + np.repeat(first_site, [part.count for part in parts]))
-    refused: dict[str, int] = {}
-    for why in dict.fromkeys(why for part in parts for why in part.refused):
-        refused[why] = sum(part.refused.get(why, 0) for part in parts)
-    return Deployments(**arrays, candidates=sum(part.candidates for part in parts), refused=refused)
+    return Deployments(**arrays)
 
 
 def exit_points(tubes: ConcentricTubes, scope_tips: Float, deployments: Deployments, chosen: Int) -> Float:

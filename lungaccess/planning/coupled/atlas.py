@@ -11,10 +11,12 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.settings import to_mapping
-from anatomy.base.typed import Float, Int
+from anatomy.base.typed import Bool, Float, Int
 from anatomy.kept_records import kept_record, record_path
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
+from anatomy.morphology import bounds
+from anatomy.structures import FISSURE, VESSEL
 from lungaccess.problem.channel import bends_with_tubes_rad
 from lungaccess.problem.system import System
 from lungaccess.problem.task import fissures_are_obstacles
@@ -102,36 +104,46 @@ def build_atlas(
     stop_spacing_mm: float = DEFAULT_STOP_MM,
     site_spacing_mm: float = TIP_SPACING_MM,
     progress: Callable[[float], None] | None = None,
+    before: Atlas | None = None,
 ) -> Atlas:
     """Find the motions of the scope, enumerate rotations and insertions at their tips, and keep what is safe.
 
     Rotations are spaced evenly, with further ones where tube or exit is near a limit; `site_spacing_mm` is
-    the spacing of scope tips along the airway.
+    the spacing of scope tips along the airway.  `before` is an atlas with the same
+    settings in the same patient, of which a person has corrected the masks since: what lies beyond the reach
+    of the change is taken from it.
     """
     began = time.perf_counter()
     with_fissures = fissures_are_obstacles(lung, system)
-    motions = motions_of(lung, system, site_spacing_mm)
+    same = before is not None and _has_same_airway(before, lung, system)
+    motions = before.motions if before is not None and same else motions_of(lung, system, site_spacing_mm)
     straight = int((~motions.turned).sum())
-    share = straight / max(motions.count, 1)
+    anew: Int = np.arange(motions.count)
+    if before is not None and same:
+        anew = np.flatnonzero(_within_reach_of_change(before, lung, motions))
+    first = int(np.count_nonzero(anew < straight))
+    share = first / max(len(anew), 1)
     tell = progress or (lambda _share: None)
 
-    def enumerated(poses: Float, rotations: int, spacing_mm: float, begin: float, end: float) -> Deployments:
+    def enumerated(sites: Int, rotations: int, spacing_mm: float, begin: float, end: float) -> Deployments:
         return enumerate_deployments(
             lung,
             system.tubes,
             system.margins,
-            poses,
+            motions.tips[sites],
             with_fissures=with_fissures,
             rotations=rotations,
             stop_spacing_mm=spacing_mm,
             progress=lambda done: tell(begin + done * (end - begin)),
         )
 
-    found = enumerated(motions.tips[:straight], rotations, stop_spacing_mm, 0.0, share)
-    if straight < motions.count:
+    found = enumerated(anew[:first], rotations, stop_spacing_mm, 0.0, share)
+    if first < len(anew):
         # Tips turned aside look in so many directions that each of them needs fewer rotations and stops.
         coarse = max(1, rotations // TURNED_COARSER), stop_spacing_mm * TURNED_COARSER
-        found = join_deployments(found, enumerated(motions.tips[straight:], *coarse, share, 1.0), straight)
+        found = join_deployments(found, enumerated(anew[first:], *coarse, share, 1.0), first)
+    if before is not None and same:
+        found = before.deployments.with_sites(anew, found)
     return Atlas(
         lung=lung,
         system=system,
@@ -143,7 +155,7 @@ def build_atlas(
     )
 
 
-FORMAT = 11
+FORMAT = 12
 """Raise it when the enumeration changes: stored atlases of another format are made anew."""
 
 
@@ -173,6 +185,7 @@ def open_atlas(
     site_spacing_mm: float = TIP_SPACING_MM,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[float], None] | None = None,
+    before: Atlas | None = None,
 ) -> Atlas:
     """Return the atlas from the cache, or make and keep it.
 
@@ -191,6 +204,7 @@ def open_atlas(
             stop_spacing_mm=stop_spacing_mm,
             site_spacing_mm=site_spacing_mm,
             progress=progress,
+            before=before,
         )
         return _StoredAtlas(**{each.name: getattr(made, each.name) for each in fields(_StoredAtlas)})
 
@@ -243,3 +257,37 @@ def _depends_on(
         "stop_mm": stop_spacing_mm,
         "site_mm": site_spacing_mm,
     }
+
+
+def _has_same_airway(before: Atlas, lung: Lung, system: System) -> bool:
+    """Tell whether airways and pleura are those of an atlas that was made for the same devices."""
+    old, made = before.lung, before.system
+    settings = (made.scope, made.tubes, made.margins) == (system.scope, system.tubes, system.margins)
+    fits = settings and before.with_fissures == fissures_are_obstacles(lung, system)
+    fits = fits and old.grid.shape == lung.grid.shape
+    if not (fits and np.array_equal(old.grid.lps_from_ijk, lung.grid.lps_from_ijk)):
+        return False
+    airway = ~np.uint16(VESSEL | FISSURE)
+    depths = old.lumen_depth, lung.lumen_depth
+    return (
+        np.array_equal(old.labels & airway, lung.labels & airway)
+        and np.array_equal(depths[0].corners, depths[1].corners)
+        and np.array_equal(depths[0].geometry, depths[1].geometry)
+    )
+
+
+def _within_reach_of_change(before: Atlas, lung: Lung, motions: ScopeMotions) -> Bool:
+    """Return from which scope tips `(S,)` tubes come to places where labels or clearance have changed."""
+    fields = (each.obstacle_field(with_fissures=before.with_fissures).corners for each in (before.lung, lung))
+    boxes = [bounds(np.not_equal(*fields)), bounds(before.lung.labels != lung.labels)]
+    boxes = [(low, high) for low, high in boxes if (low < high).all()]
+    if not boxes:
+        return np.zeros(motions.count, dtype=np.bool_)
+    low = np.min([each for each, _ in boxes], axis=0)
+    high = np.max([each for _, each in boxes], axis=0)
+    tips = lung.grid.ijk(motions.tips[:, :3])
+    spacing = lung.grid.spacing_mm
+    # Beyond a tube no more than the corners of the voxel around a point are looked at.
+    reach_mm = longest_mm(before.system.tubes) + 2.0 * float(np.linalg.norm(spacing))
+    away = np.maximum(np.maximum(low - 0.5 - tips, tips - high + 0.5), 0.0) * spacing
+    return np.asarray(np.linalg.norm(away, axis=1) <= reach_mm)

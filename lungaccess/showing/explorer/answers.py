@@ -50,6 +50,7 @@ class Answers:
         self._own = {system.name: system for _path, system in source.own}
         self._lung: Lung | None = None
         self._atlases: OrderedDict[tuple[Any, ...], Atlas] = OrderedDict()
+        self._before = self._atlases
         self._appraiser: Any = None
         self._painting: Painting | None = None
         self._reached: dict[tuple[Any, ...], Int] = {}
@@ -87,7 +88,9 @@ class Answers:
                 turn.send(Part({"answer": "progress", "what": "deployment atlas", "share": round(share, 4)}))
 
         if key not in self._atlases:
-            self._atlases[key] = open_atlas(self.lung, system, cache=self._source.cache, progress=progress)
+            self._atlases[key] = open_atlas(
+                self.lung, system, cache=self._source.cache, progress=progress, before=self._before.get(key)
+            )
         self._atlases.move_to_end(key)
         # In memory; others come from the cache within a second.
         while len(self._atlases) > 3:
@@ -118,6 +121,8 @@ class Answers:
         if self._painting is None:
             tell("reading the masks")
             self._painting = Painting.of(self._source, self.lung)
+        system = self._system(question.what_if)
+        self._atlas(system, turn)
         around = question.points[-1] if question.points else tuple(self.lung.tree.carina_lps.tolist())
         size_ml = self._painting.draw(question, self._ct)
         lung = self._painting.renewed(tell)
@@ -130,13 +135,13 @@ class Answers:
                 renewed=True,
             )  # fmt: skip
         )
-        self._atlas(self._system(question.what_if), turn)
+        self._atlas(system, turn)
         yield from ()
 
     def renew(self, source: PatientSource, lung: Lung | None = None) -> None:
         """Take the patient again, of which a person corrected the masks."""
         self._source, self._lung = source, lung
-        self._atlases.clear()
+        self._before, self._atlases = self._atlases, OrderedDict()
         self._reached.clear()
         self._appraiser = None
 

@@ -30,7 +30,9 @@ CLOSED_COST = np.float32(1.0)
 """The cost of passing tissue that was taken for an obstacle: the highest that there is."""
 
 
-def with_corrections(images: PatientImages, corrections: Volume) -> PatientImages:
+def with_corrections(
+    images: PatientImages, corrections: Volume, sources: Mapping[str, str] | None = None
+) -> PatientImages:
     """Return a patient as a person corrected it, with a warning that says how much.
 
     Erased lumen takes the wall nearest to it along.  What is left of the airway is closed by a wall of one
@@ -38,10 +40,12 @@ def with_corrections(images: PatientImages, corrections: Volume) -> PatientImage
 
     Args:
         corrections: uint8, see `PAINTED`; its voxels may cover another box than those of the patient.
+        sources: SHA-256 of further files, those of the corrections.
     """
     found = _placed(corrections, images.grid)
+    sources = {**images.sources, **(sources or {})}
     if found is None:
-        return images
+        return replace(images, sources=sources)
     box, values = found
     changed = values != AS_MADE
     before = {role: _part(images, role, box) for role in (*ROLES.values(), "wall")}
@@ -66,9 +70,8 @@ def with_corrections(images: PatientImages, corrections: Volume) -> PatientImage
         if opened.any():
             cost[opened] = CLOSED_COST
             made["cost"] = _with_part(images.cost, box, cost, images.grid)
-    return replace(
-        images, **made, warnings=(*images.warnings, *_warnings(images.grid, before, after), *UNUSED[:unused])
-    )
+    warnings = (*images.warnings, *_warnings(images.grid, before, after), *UNUSED[:unused])
+    return replace(images, **made, warnings=warnings, sources=sources)
 
 
 def _placed(corrections: Volume, grid: Grid) -> tuple[Window, Array] | None:

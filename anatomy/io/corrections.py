@@ -1,6 +1,5 @@
 """The file in which the corrections of a person are kept with a patient."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +32,7 @@ def corrected(images: PatientImages, path: Path) -> PatientImages:
     file = corrections_file(path)
     if not file.is_file():
         return images
-    sources = {**images.sources, f"{FOLDER}/{PAINTED_FILE}": sha256(file)}
-    return replace(with_corrections(images, read_corrections(file)), sources=sources)
+    return with_corrections(images, read_corrections(file), {f"{FOLDER}/{PAINTED_FILE}": sha256(file)})
 
 
 def read_corrections(file: Path) -> Volume:

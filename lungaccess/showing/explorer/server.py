@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import hmac
 import logging
+import re
 import secrets
 import shutil
 import signal
@@ -18,7 +19,8 @@ from typing import Any
 from aiohttp import WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.errors import FileError, LungaccessError, SettingsError
+from anatomy.base.files import atomic_write
 from anatomy.base.records import frozen_value
 from lungaccess.showing.explorer.messages import error_message, frame
 from lungaccess.showing.explorer.processes import NAMES, Process
@@ -29,6 +31,8 @@ from lungaccess.showing.report.html.document import filled, scene_figure, slice_
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24
 MOST_FILES = 20
+DROPPED, DROPPED_BYTES = re.compile(r"[\w(][\w .()+-]{0,199}"), 1 << 20
+"""Names that a dropped file and its folder may have, and how much of a file is in memory at a time."""
 MOST_WAITING_BYTES = 1 << 27
 """Answers that wait for a page which does not read; it is closed when they become more."""
 REQUEST_S = 5.0
@@ -135,6 +139,7 @@ class Explorer:
         app.router.add_get("/open", self._index)
         app.router.add_get("/socket", self._socket)
         app.router.add_get("/download/{ticket}/{name}", self._download)
+        app.router.add_put("/drop/{folder}/{name}", self._drop)
         app.router.add_get("/{folder}/{name}", self._asset)
         self._runner = web.AppRunner(
             app, access_log=None, handle_signals=False, shutdown_timeout=1.0, logger=LOG
@@ -281,6 +286,21 @@ class Explorer:
         if file is None or not file.is_file() or file.name != request.match_info["name"]:
             raise web.HTTPNotFound
         return web.FileResponse(file, headers={"Content-Disposition": f'attachment; filename="{file.name}"'})
+
+    async def _drop(self, request: web.Request) -> web.StreamResponse:
+        """Copy a file that was dropped on the page beside the patients: a browser tells nobody its path."""
+        names = request.match_info["folder"], request.match_info["name"]
+        if not all(DROPPED.fullmatch(name) for name in names):
+            raise web.HTTPBadRequest
+        file = Path("dropped", *names).resolve()
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_write(file) as temporary, open(temporary, "wb") as stream:
+                async for part in request.content.iter_chunked(DROPPED_BYTES):
+                    await asyncio.to_thread(stream.write, part)
+        except (OSError, FileError):
+            raise web.HTTPInsufficientStorage from None
+        return web.Response(text=str(file))
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if "Origin" not in request.headers:

@@ -64,6 +64,40 @@ function open(path, values = {}) {
   });
 }
 
+// Return the files of dropped folders, and of folders in them.
+async function filesOf(entry) {
+  if (entry.isFile) return [await new Promise((done, failed) => entry.file(done, failed))];
+  const reader = entry.createReader(), found = [];
+  for (let some = null; !some || some.length;) {
+    some = await new Promise((done, failed) => reader.readEntries(done, failed));
+    for (const each of some) found.push(...await filesOf(each));
+  }
+  return found;
+}
+
+// Open what is dropped: it is copied first, as a browser tells nobody where it lies.
+async function drop(event) {
+  event.preventDefault();
+  if (busy) return;
+  const entry = event.dataTransfer.items[0] && event.dataTransfer.items[0].webkitGetAsEntry();
+  if (!entry) return;
+  busy = true;
+  const files = await filesOf(entry), plain = (name) => name.replace(/[^\w.()+-]/g, "-").replace(/^[^\w(]/, "x").slice(-150);
+  const folder = `${plain(entry.name)}-${Date.now().toString(36)}`;
+  let path = "";
+  for (const [n, file] of files.entries()) {
+    say(`Copying file ${n + 1} of ${files.length}`);
+    const answer = await fetch(`/drop/${folder}/${entry.isFile ? plain(file.name) : `${n}-${plain(file.name)}`}`, { method: "PUT", body: file });
+    if (!answer.ok) {
+      busy = false;
+      return say(`${file.name} cannot be copied: is there room in the folder in which lungaccess was started?`);
+    }
+    path = await answer.text();
+  }
+  return open(entry.isFile ? path : path.replace(/[\\/][^\\/]*$/, ""));
+}
+
+for (const kind of ["dragover", "drop"]) document.addEventListener(kind, (event) => (kind === "drop" ? drop(event) : event.preventDefault()));
 byId("place").addEventListener("submit", (event) => {
   event.preventDefault();
   look(byId("path").value);

@@ -10,6 +10,7 @@ from pathlib import Path
 import aiohttp
 import numpy as np
 import pytest
+import yarl
 
 from anatomy.base.files import write_text
 from anatomy.grid import Grid, Volume
@@ -212,3 +213,41 @@ def test_two_ct_of_one_name_have_a_folder_each(here: Path) -> None:
     Path("ct-patient-3").mkdir()
     (Path("ct-patient-3") / DESCRIPTION).touch()
     assert patient_folder(other) == Path("ct-patient-4"), "masks that nobody knows to be its own"
+
+
+def test_a_dropped_file_is_copied_beside_the_patients_and_nowhere_else(here: Path) -> None:
+    async def talk(_client: Client, explorer: Explorer) -> None:
+        address = explorer.address
+        assert address is not None
+        cookies = {address.cookie: address.token}
+        async with aiohttp.ClientSession(cookies=cookies) as session, aiohttp.ClientSession() as stranger:
+
+            async def put(name: str, by: aiohttp.ClientSession = session) -> tuple[int, str]:
+                place = yarl.URL(f"{address.origin}/drop/{name}", encoded=True)
+                async with by.put(place, data=b"x" * 3_000_000) as answer:
+                    return answer.status, await answer.text()
+
+            status, path = await put("head-1/1-IM%201.dcm")
+            assert (status, Path(path)) == (200, here / "dropped" / "head-1" / "1-IM 1.dcm")
+            assert Path(path).stat().st_size == 3_000_000
+            for name in ("a/..%2Fb", "..%2F..%2Fx/y", ".ssh/x", "a/.bashrc", "a%5Cb/c", "x" * 201 + "/y"):
+                assert (await put(name))[0] in (400, 404), name
+            assert (await put("a/b", stranger))[0] == 403
+        assert [each.name for each in (here / "dropped").rglob("*")] == ["head-1", "1-IM 1.dcm"]
+
+    with_client(source(here), talk)
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "all there")
+def test_a_folder_that_is_dropped_is_opened(scanned: Path, empty: tuple[Served, Page]) -> None:
+    _served, page = empty
+    data = {"items": [], "files": [str(scanned)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        page.command("Input.dispatchDragEvent", {"type": kind, "x": 300, "y": 300, "data": data})
+    page.wait("s.question.includes('Proposed')")
+    (copied,) = (scanned.parent / "dropped").iterdir()
+    assert copied.name.startswith("disc-")
+    assert len(list(copied.iterdir())) == len(list(scanned.rglob("*.dcm")))
+    assert page.messages() == []

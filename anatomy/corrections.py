@@ -9,7 +9,7 @@ import numpy as np
 
 from anatomy.base.typed import Array, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.io.placement import box_in, place
+from anatomy.io.masks import box_in, place
 from anatomy.morphology import Window, bounds, grown_by_one, window
 from anatomy.patient import PatientImages
 

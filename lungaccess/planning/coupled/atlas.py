@@ -11,7 +11,7 @@ import numpy as np
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.settings import to_mapping
-from anatomy.base.typed import Bool, Float, Int
+from anatomy.base.typed import Bool, Int
 from anatomy.kept_records import kept_record, record_path
 from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest

@@ -15,7 +15,7 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
-from lungaccess.planning.coupled.search.variation import varied
+from lungaccess.planning.coupled.search.window_search import varied
 from lungaccess.planning.procedure import Policy
 from lungaccess.planning.procedure.simulation import passes_simulated
 from lungaccess.planning.success.ratings import ChanceRating

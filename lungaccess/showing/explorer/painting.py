@@ -12,8 +12,8 @@ from anatomy.build import Reused
 from anatomy.corrections import PAINTED, ROLES, TISSUE
 from anatomy.grid import Volume
 from anatomy.io.corrections import corrected, corrections_file, read_corrections, write_corrections
+from anatomy.io.masks import place
 from anatomy.io.patients import load_patient
-from anatomy.io.placement import place
 from anatomy.lung import Lung
 from anatomy.morphology import Window
 from anatomy.patient import PatientImages

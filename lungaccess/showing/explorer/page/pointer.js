@@ -19,15 +19,17 @@ export function connectPointer(page) {
   };
   const nearestExit = (at) => leastOf([...page.exits.places.keys()], (n) => near(page.exits.places[n], at));
 
-  // Return what can be dragged at a place: the chosen exit, or the tip of the scope.
+  // Return what can be dragged at a place: the chosen exit or the tip of the scope, whichever is nearer.
   const handleAt = (at) => {
     if (!scene.view) return null;
     const { exits, tips, plan, state: { asked } } = page;
-    const tip = tips && (tips.place(asked.tip) || (plan && plan.scope_tip_lps));
-    if (tip && near(tip, at) <= HANDLE_PX) return "tip";
     const chosen = exits ? exits.numberOf(asked.exit) : -1;
-    const exit = chosen >= 0 ? exits.places[chosen] : plan && exits && exits.count ? plan.exit_lps : null;
-    return exit && near(exit, at) <= HANDLE_PX ? "exit" : null;
+    const places = {
+      exit: chosen >= 0 ? exits.places[chosen] : plan && exits && exits.count ? plan.exit_lps : null,
+      tip: tips && (tips.place(asked.tip) || (plan && plan.scope_tip_lps)),
+    };
+    const away = (kind) => (places[kind] ? near(places[kind], at) : Infinity), kind = leastOf(Object.keys(places), away);
+    return away(kind) <= HANDLE_PX ? kind : null;
   };
 
   const dragTo = (at) => {

@@ -60,8 +60,11 @@ def test_a_click_in_3d_chooses_an_exit_and_a_drag_moves_it(page: Page) -> None:
     if state["exits"]["count"] < 2:
         pytest.skip("this target has one place of exit")
     first, second = page.run(
+        # The exit that is farthest from the first one in the picture: others nearby have the same plan.
         "const { exits, scene } = window.lungaccessExplorer;"
-        "return [0, exits.count - 1].map((n) => scene.project(exits.places[n]))"
+        "const seen = exits.places.map((each) => scene.project(each));"
+        "const away = ([x, y]) => Math.hypot(x - seen[0][0], y - seen[0][1]);"
+        "return [seen[0], seen.reduce((a, b) => (away(b) > away(a) ? b : a))]"
     )
     page.press_at("scene", *first)
     chosen = page.wait(f"s.asked.exit !== null && s.exits && {PLANNED}")

@@ -61,8 +61,10 @@ def test_everything_breathes_together(
 ) -> None:
     """Devices and target go where Python has them, inside and outside the window; all pictures change."""
     plan, canvases = breathing_plans[0], ("scene", "slice-axial", "slice-across", "inside")
-    page.run("window.lungaccessReport.set(1); window.lungaccessReport.breathe(1)")
-    page.rest()
+    # Twice: the browser smooths the letters of a canvas in another way the first time it draws them.
+    for phase in (0.5, 1.0):
+        page.run("window.lungaccessReport.set(1); window.lungaccessReport.breathe(arguments[0])", phase)
+        page.rest()
     moving, before = Moving.of(plan, breathing_lung), [page.run(PICTURE, 1, name) for name in canvases]
     for phase, said in ((0.0, "✗ not proved"), (0.35, "✗ not proved"), (0.8, "✓ proved")):
         page.run("window.lungaccessReport.set(1); window.lungaccessReport.breathe(arguments[0])", phase)
@@ -97,9 +99,16 @@ def test_the_lumen_breathes_in_the_slices(
     masks = moving.pulled_back(places, 0.0)
     assert len(places) > 50
     assert np.linalg.norm(masks - places, axis=1).min() > 0.3
-    index = np.rint(breathing_lung.grid.ijk(masks)).astype(int)
-    assert ((breathing_lung.labels[tuple(index.T)] & structures.LUMEN) != 0).mean() > 0.9
+    # The voxels of the page are coarser: of the pixels in the phase of the masks 91 % are lumen.
+    assert share_of_lumen(breathing_lung, masks) > 0.85
+    assert share_of_lumen(breathing_lung, places) < 0.75
     page.run("window.lungaccessReport.breathe(1)")
+
+
+def share_of_lumen(lung: Lung, places: np.ndarray) -> float:
+    """Return which share of places lies in voxels of the lumen."""
+    index = np.rint(lung.grid.ijk(places)).astype(int)
+    return float(((lung.labels[tuple(index.T)] & structures.LUMEN) != 0).mean())
 
 
 def test_the_breath_plays_and_is_held(page: browser.Browser) -> None:

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         bend_direction,
         blocker_on_path,
         direct_path,
+        pose_at,
         violation,
     )
     from stages.needle.planner_choice import has_ompl, require_planner
@@ -62,7 +63,6 @@ if TYPE_CHECKING:
         StartIndex,
     )
     from stages.needle.replanning.insertion import Belief, Commands, TrueNeedle, Unknown, steer, tilt
-    from stages.needle.replanning.reaiming import pose_at
     from stages.needle.replanning.replanner import (
         DEFAULT_SETTINGS,
         ITERATIONS,

@@ -13,7 +13,7 @@ from stages.needle.kernels import obstruction as kernels
 from stages.needle.kernels.connections import seen_from
 from stages.needle.kernels.goal_ball import workspace_length
 from stages.needle.kernels.proof import Limits, exact_gap
-from stages.needle.path import Query
+from stages.needle.path import Query, pose_at
 
 SAME_SHARE = 1e-6
 """A radius is found to this share of itself, and limits may be exceeded by it through rounding."""
@@ -82,20 +82,16 @@ def easiest_obstruction(environment: NeedleEnvironment, query: Query) -> Obstruc
     found = np.zeros(kernels.FOUND_SIZE)
     # Paths that are tried for the easiest one: some milliseconds.
     label, tried = kernels.easiest_trial(
-        environment.obstacles, environment.limits, _pose(query), query.inserted_mm, query.branch, query.goal,
-        256, np.zeros(1, dtype=np.uint64), np.zeros(kernels.FOUND_SIZE), found,
+        environment.obstacles, environment.limits, pose_at(query.lps_from_start), query.inserted_mm,
+        query.branch, query.goal, 256, np.zeros(1, dtype=np.uint64), np.zeros(kernels.FOUND_SIZE), found,
     )  # fmt: skip
     if not tried or not label or found[kernels.DISTANCE] >= found[kernels.NEEDED]:
         return None
     return _with_obstacle(environment, _found("path", False, label, found, query))
 
 
-def _pose(query: Query) -> tuple[float, ...]:
-    return tuple(query.lps_from_start[:3, [3, 2]].T.ravel().tolist())
-
-
 def _seen(query: Query) -> tuple[float, float]:
-    rho, h = seen_from(_pose(query), query.goal)
+    rho, h = seen_from(pose_at(query.lps_from_start), query.goal)
     return float(rho), float(h)
 
 
@@ -129,21 +125,15 @@ def _found(place: str, proved: bool, label: int, found: Float, query: Query) -> 
     )
 
 
-def _left(limits: Limits, query: Query) -> Limits:
-    """Return the limits less what is behind the start.
-
-    The angle counts from the reference: where that is another direction, nothing is taken from the angle.
-    """
-    return limits._replace(
-        max_length_mm=limits.max_length_mm - query.inserted_mm,
-        max_turn_rad=limits.max_turn_rad - query.turned_rad,
-        max_angle_rad=limits.max_angle_rad if query.reference is None else math.pi,
-    )
-
-
 def _reach(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     """Tell whether the target lies outside the workspace, and which limit keeps it there."""
-    limits = _left(environment.limits, query)
+    # The limits less what is behind the start.  The angle counts from the reference: where that is another
+    # direction, nothing is taken from the angle.
+    limits = environment.limits._replace(
+        max_length_mm=environment.limits.max_length_mm - query.inserted_mm,
+        max_turn_rad=environment.limits.max_turn_rad - query.turned_rad,
+        max_angle_rad=environment.limits.max_angle_rad if query.reference is None else math.pi,
+    )
     rho, h = _seen(query)
     far = math.hypot(rho, h)
     tolerance = environment.goal_tolerance_mm
@@ -212,8 +202,8 @@ def _start(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     longest = math.hypot(rho, h) - environment.goal_tolerance_mm
     found = np.zeros(kernels.FOUND_SIZE)
     label = kernels.blocked_start(
-        environment.obstacles, environment.limits, _pose(query), query.inserted_mm, longest, query.branch,
-        found,
+        environment.obstacles, environment.limits, pose_at(query.lps_from_start), query.inserted_mm, longest,
+        query.branch, found,
     )  # fmt: skip
     return _found("start", True, label, found, query) if label else None
 

@@ -51,8 +51,7 @@ class Query:
     @property
     def goal(self) -> tuple[float, float, float]:
         """The target as the kernels take it."""
-        x, y, z = self.target.tolist()
-        return x, y, z
+        return as_point(self.target)
 
     def __post_init__(self) -> None:
         frame = np.array(self.lps_from_start, dtype=np.float64)
@@ -173,14 +172,23 @@ def arc_transform(length_mm: float, roll_rad: float, curvature_per_mm: float) ->
     return np.asarray(roll @ arc)
 
 
+def as_point(values: ArrayLike) -> tuple[float, float, float]:
+    """Return three coordinates as the kernels take them."""
+    x, y, z = np.asarray(values).tolist()
+    return x, y, z
+
+
+def pose_at(frame: Float) -> tuple[float, ...]:
+    """Return position and direction of a tip frame as the kernels take them."""
+    return *as_point(frame[:3, 3]), *as_point(frame[:3, 2])
+
+
 def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
     """Return the single arc from a pose to a point [Kuntz2015, `steer`].
 
     The caller checks curvature and length against the needle's limits.
     """
-    pose = tuple(float(v) for v in (*lps_from_start[:3, 3], *lps_from_start[:3, 2]))
-    point = tuple(float(v) for v in np.asarray(target))
-    length, (curvature, *normal), _turn = arc_kernels.arc_to_point(pose, point)
+    length, (curvature, *normal), _turn = arc_kernels.arc_to_point(pose_at(lps_from_start), as_point(target))
     return ArcPath(
         lps_from_start=lps_from_start,
         arcs=np.array([[length, frames.roll_towards(lps_from_start, normal), curvature]]),
@@ -225,8 +233,7 @@ def blocker_on_path(
 def kernel_arcs(path: ArcPath) -> Iterator[tuple[tuple[float, ...], tuple[float, ...], float]]:
     """Yield each arc as the kernels take it: `pose`, `bend` and length."""
     for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
-        pose = tuple(float(v) for v in (*frame[:3, 3], *frame[:3, 2]))
-        yield pose, (float(curvature), *(float(v) for v in bend_direction(frame, roll))), float(length)
+        yield pose_at(frame), (float(curvature), *as_point(bend_direction(frame, roll))), float(length)
 
 
 def violation(

@@ -93,7 +93,11 @@ def try_around(
     offsets = spacing * np.linalg.norm(lattice, axis=1)
     lattice, offsets = lattice[offsets <= offset_mm], offsets[offsets <= offset_mm]
     positions = frame[:3, 3] + spacing * lattice @ frame[:3, :3].T
-    tilts, around = _directions(len(positions), directions, tilt_rad)
+    # Each place covers the cone evenly.
+    place = np.arange(len(positions))[:, None]
+    rank = np.arange(directions) + (TURNS[0] * (place + 0.5)) % 1.0
+    tilts = np.arccos(1.0 - rank / directions * (1.0 - math.cos(tilt_rad)))
+    around = GOLDEN_RAD * np.arange(directions) + 2.0 * math.pi * TURNS[1] * place
     local = np.stack([np.sin(tilts) * np.cos(around), np.sin(tilts) * np.sin(around), np.cos(tilts)], axis=-1)
     tangents = local @ frame[:3, :3].T
     kinds = tried(np.repeat(positions, directions, axis=0), tangents.reshape(-1, 3))
@@ -136,14 +140,6 @@ def try_poses(
         RANDOM_SHARE, seed, np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, dtype=np.int64), kinds,
     )  # fmt: skip
     return kinds
-
-
-def _directions(places: int, count: int, tilt_rad: float) -> tuple[Float, Float]:
-    """Return tilts and angles about the axis `(places, count)`: each place covers the cone evenly."""
-    place = np.arange(places)[:, None]
-    rank = np.arange(count) + (TURNS[0] * (place + 0.5)) % 1.0
-    tilts = np.arccos(1.0 - rank / count * (1.0 - math.cos(tilt_rad)))
-    return tilts, GOLDEN_RAD * np.arange(count) + 2.0 * math.pi * TURNS[1] * place
 
 
 def _vias_around(path: ArcPath) -> Float:

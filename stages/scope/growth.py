@@ -229,7 +229,9 @@ class Growth:
             )
         begins = np.append(0, np.cumsum([len(rows) for rows in self._rows]))
         used = sorted({layer for layers in self._layers.values() for layer, _ in layers})
-        some = [begins[layer] + _spread(len(self._rows[layer])) for layer in used]
+        ends = [len(self._rows[layer]) - 1 for layer in used]
+        spread = [np.unique(np.linspace(0, end, TURNED_A_LAYER).astype(np.int64)) for end in ends]
+        some = [begins[layer] + members for layer, members in zip(used, spread, strict=True)]
         return StateTree(
             states=np.concatenate(self._rows),
             parent=np.concatenate(self._parents),
@@ -237,11 +239,6 @@ class Growth:
             advance_mm=np.repeat(self._advance, [len(rows) for rows in self._rows]),
             turned_from=np.concatenate(some),
         )
-
-
-def _spread(count: int) -> Int:
-    """Return at most TURNED_A_LAYER of the numbers below a count, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, TURNED_A_LAYER).astype(np.int64))
 
 
 def rings(sizes: tuple[float, ...], spokes: int) -> Float:

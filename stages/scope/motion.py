@@ -110,3 +110,8 @@ class ScopeMotion:
         cut = np.sign(bend) * np.floor(np.abs(bend) * scale + 1e-6) / scale
         angles = np.radians(np.stack([np.round(twist, decimals), cut], axis=1))
         return replace(self, states=np.column_stack([np.round(advance, decimals), angles]))
+
+
+def frame_columns(frame: Float) -> Float:
+    """Return a frame as kernels take it, `(12,)`: the columns +x, +y, +z, and the point."""
+    return np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])

@@ -20,8 +20,8 @@ from stages.scope.device import SHORTEST_MM, Bronchoscope
 from stages.scope.kernels.body import MOST_TWIST_RAD, Walls, motion_room
 from stages.scope.kernels.growth import Device
 from stages.scope.kernels.turning import shifted_tips, step_tolerances
-from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
-from stages.scope.simplifying import Simplifier, frame_columns
+from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion, frame_columns
+from stages.scope.simplifying import Simplifier
 
 PROOF_STEP_MM = 0.1
 """Longest step of the proof along the body; at most half of it is lost, far less than a voxel."""

@@ -23,7 +23,7 @@ from anatomy.structures import LUMEN
 from stages.scope.device import Bronchoscope, laid_pieces
 from stages.scope.kernels import resting as kernel
 from stages.scope.kernels.resting import Lumen
-from stages.scope.motion import BEND, TWIST, ScopeMotion
+from stages.scope.motion import BEND, TWIST, ScopeMotion, frame_columns
 
 SECTION_STEP_MM = 1.0
 """Length of the arcs of the bending section, at most, which is bent more tightly."""
@@ -127,7 +127,7 @@ class RestingShaft:
             as_advanced: Leave the advance as planned; by default the hand advances more or less until the tip
                 has the planned depth, which cameras and trackers show.
         """
-        planned, entry = motion.lps_from_tip, _row(motion.lps_from_entry)
+        planned, entry = motion.lps_from_tip, frame_columns(motion.lps_from_entry)
         shaft, curvature = self._shaft(motion, chosen)
         farther = 0.0
         if start is not None:
@@ -155,7 +155,10 @@ class RestingShaft:
             if abs(beyond) < 0.02 and still:
                 break
             if chosen.friction:
-                pull = _friction(laid, force, chosen)
+                # Against the way in which the shaft slid, in N.
+                ahead, pressed = laid[1:, 6:9], np.linalg.norm(force, axis=1, keepdims=True)
+                way = np.cos(chosen.slid_rad) * pressed * ahead
+                pull = -chosen.friction * (way + np.sin(chosen.slid_rad) * np.cross(force, ahead))
             if not as_advanced:
                 slope = 1.0
                 if before is not None and abs(farther - before[0]) > 1e-6:
@@ -164,8 +167,11 @@ class RestingShaft:
                 farther -= min(max(beyond / slope, -FARTHER_MM), FARTHER_MM)
         else:
             settled = False
+        twist = float(motion.states[-1, TWIST])
+        sideways = np.cos(twist) * laid[-1, :3] + np.sin(twist) * laid[-1, 3:6]
         return RestingShape(
-            lps_from_scope_tip=_tip(laid[-1], float(motion.states[-1, TWIST])),
+            # The frame of the channel is the Bishop frame rolled by the twist.
+            lps_from_scope_tip=frames.pose(laid[-1, 9:], laid[-1, 6:9], sideways),
             frames=read_only(laid),
             lengths_mm=read_only(shaft.length),
             curvature=read_only(curvature),
@@ -217,7 +223,8 @@ class RestingShaft:
         behind = motion.length_mm - section
         # Length of the arcs of the shaft, at most: the wall is looked at where they end.
         parts = [(behind, 2.0), (section - head, SECTION_STEP_MM), (head, SECTION_STEP_MM)]
-        arcs = [_equal(length, step) for length, step in parts]
+        counts = [int(np.ceil(length / step - 1e-9)) for length, step in parts]
+        arcs = [np.full(n, size / max(n, 1)) for n, (size, _step) in zip(counts, parts, strict=True)]
         length = np.concatenate(arcs)
         laid = _laid(motion, length)
         stiffness = np.full(len(length), chosen.stiffer * self._scope.bending_stiffness_n_mm2)
@@ -244,12 +251,6 @@ def _drawn_back(shaft: kernel.Shaft, farther_mm: float) -> kernel.Shaft:
     return shaft._replace(wall=np.where(behind, 0.0, shaft.wall))
 
 
-def _equal(length_mm: float, step_mm: float) -> Float:
-    """Return equal lengths, at most a step each, that make up a length; none for none."""
-    count = int(np.ceil(length_mm / step_mm - 1e-9))
-    return np.full(count, length_mm / max(count, 1))
-
-
 def _laid(motion: ScopeMotion, length: Float) -> Float:
     """Return the mean curvature `(N, 2)` of the laid body along arcs of some lengths."""
     pieces = laid_pieces(motion.states, motion.bending_length_mm)
@@ -260,24 +261,6 @@ def _laid(motion: ScopeMotion, length: Float) -> Float:
     at = np.append(0.0, np.cumsum(length))
     along = np.column_stack([np.interp(at, ends, total[:, axis]) for axis in range(2)])
     return np.asarray(np.diff(along, axis=0) / length[:, None])
-
-
-def _friction(laid: Float, force: Float, chosen: Circumstances) -> Float:
-    """Return the friction on the ends of all arcs `(N, 3)` in N, against the way in which the shaft slid."""
-    ahead, pressed = laid[1:, 6:9], np.linalg.norm(force, axis=1, keepdims=True)
-    way = np.cos(chosen.slid_rad) * pressed * ahead + np.sin(chosen.slid_rad) * np.cross(force, ahead)
-    return np.asarray(-chosen.friction * way)
-
-
-def _row(frame: Float) -> Float:
-    """Return a pose as a row of kernels: the columns +x, +y, +z, and the point."""
-    return np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
-
-
-def _tip(row: Float, twist_rad: float) -> Float:
-    """Return the frame of the working channel at the end of a body: its Bishop frame, rolled by the twist."""
-    sideways = np.cos(twist_rad) * row[:3] + np.sin(twist_rad) * row[3:6]
-    return frames.pose(row[9:], row[6:9], sideways)
 
 
 _LUMENS: WeakKeyDictionary[Lung, Lumen] = WeakKeyDictionary()

@@ -11,7 +11,7 @@ from stages.scope.device import SHORTEST_MM
 from stages.scope.kernels import simplifying as kernel
 from stages.scope.kernels.body import MOST_TWIST_RAD, Walls
 from stages.scope.kernels.growth import Device
-from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion
+from stages.scope.motion import ADVANCE, BEND, TWIST, ScopeMotion, frame_columns
 
 LADDER = ((3, 2), (4, 3), (6, 4), (8, 5), (11, 7), (15, 10), (20, 14))
 """Legs and twists that are tried at once, the simplest first."""
@@ -324,8 +324,3 @@ class Simplifier:
                 advance += step
                 rows.append((advance, twist, bend))
         return np.array(rows)
-
-
-def frame_columns(frame: Float) -> Float:
-    """Return a frame as kernels take it, `(12,)`."""
-    return np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])

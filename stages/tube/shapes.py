@@ -177,9 +177,14 @@ def tube_shapes(
         )
     limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
     mechanics = TubeMechanics(tubes, needle=needle)
-    stops = _stops(mechanics, limits, grid)
+    longest = min(limits.max_extension_mm, float(mechanics.lengths_mm[0]))
+    stops = np.linspace(0.0, longest, _n_stops(longest, grid) + 1)
     states, parents = _states(mechanics, stops)
-    rotations = _rotations(mechanics.tubes, grid)
+    # Of the rear ends; 0 for straight tubes and the first bent one.
+    turns = 2.0 * math.pi / grid.rotations * np.arange(grid.rotations)
+    bent = [number for number, tube in enumerate(mechanics.tubes) if tube.bends]
+    free = [turns if number in bent[1:] else turns[:1] for number in range(mechanics.count)]
+    rotations = np.array(list(itertools.product(*free)))
     strained = strained_radii(mechanics.tubes, float(stops[-1]))
 
     def with_rotations(base: Float) -> tuple[Float, Int, Float, Float]:
@@ -242,12 +247,6 @@ def _free_rotations(tubes: Sequence[Tube]) -> int:
     return max(sum(bool(tube.bends) for tube in tubes) - 1, 0)
 
 
-def _stops(mechanics: TubeMechanics, limits: ShapeLimits, grid: ShapeGrid) -> Float:
-    """Return the insertions of any tube, from 0 on."""
-    longest = min(limits.max_extension_mm, float(mechanics.lengths_mm[0]))
-    return np.linspace(0.0, longest, _n_stops(longest, grid) + 1)
-
-
 def _n_stops(longest_mm: float, grid: ShapeGrid) -> int:
     """Return the number of stops up to the longest insertion."""
     return max(round(longest_mm / grid.stop_mm), 1)
@@ -272,14 +271,6 @@ def _states(mechanics: TubeMechanics, stops: Float) -> tuple[Int, Int]:
         of[state] = len(states)
         states.append(state)
     return np.array(states, dtype=np.int64), np.array(parents, dtype=np.int64)
-
-
-def _rotations(tubes: Sequence[Tube], grid: ShapeGrid) -> Float:
-    """Return the rotations of the rear ends `(R, n)`; 0 for straight tubes and the first bent one."""
-    turns = 2.0 * math.pi / grid.rotations * np.arange(grid.rotations)
-    bent = [number for number, tube in enumerate(tubes) if tube.bends]
-    free = [turns if number in bent[1:] else turns[:1] for number in range(len(tubes))]
-    return np.array(list(itertools.product(*free)))
 
 
 def _follow(

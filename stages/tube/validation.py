@@ -129,7 +129,8 @@ class DeploymentValidator:
             rotation_rad: Of all tubes together about +z of the scope tip, counted from its +x.
             shape: Its own limits (extension, sweep, strain, snaps) are kept by all members of `TubeShapes`.
         """
-        base, normal = _start(lps_from_scope_tip, rotation_rad)
+        base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
+        normal = np.asarray(frames.bending_directions(lps_from_scope_tip, rotation_rad)[0])
         reason = kernels.validate_arcs(
             self._environment, self._constants, base, normal, shape.arcs, shape.required_beside_mm,
             self._trace, self._tip,
@@ -149,9 +150,3 @@ class DeploymentValidator:
             lateral_sweep_mm=shape.lateral_sweep_mm,
             shape=shape,
         )
-
-
-def _start(lps_from_scope_tip: Float, rotation_rad: float) -> tuple[Float, Float]:
-    """Return the pose `(6,)` of the scope tip, and the direction `(3,)` to which the tubes are turned."""
-    base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
-    return base, np.asarray(frames.bending_directions(lps_from_scope_tip, rotation_rad)[0])

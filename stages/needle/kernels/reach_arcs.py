@@ -176,16 +176,6 @@ def _improved(obstacles, limits, starts, branches, q, best, chosen, hints):
     return best, chosen
 
 
-@inner_kernel
-def _has_clearance(obstacles, limits, q, bits):
-    """Tell whether the needle's tip keeps the required clearance at a point."""
-    required = limits.required_mm
-    distance, _label = exact_distance(
-        obstacles.labels, obstacles.geometry, q[0], q[1], q[2], bits, _NOBODY, required + 0.1
-    )
-    return distance >= required
-
-
 @kernel(nogil=True)
 def reach_by_arcs(
     obstacles, limits, starts, branches, order, mixed, points, visits, blocks, near, wanted, hints, kinds,
@@ -227,7 +217,11 @@ def reach_by_arcs(
         for n in members:
             q = (points[n, 0], points[n, 1], points[n, 2])
             # At the exit the airway may be nearer, but nothing else.
-            if not _has_clearance(obstacles, limits, q, bits & ~AIRWAY):
+            distance, _label = exact_distance(
+                obstacles.labels, obstacles.geometry, q[0], q[1], q[2], bits & ~AIRWAY, _NOBODY,
+                limits.required_mm + 0.1,
+            )  # fmt: skip
+            if distance < limits.required_mm:
                 kinds[n] = NO_CLEARANCE
                 continue
             kinds[n] = UNREACHED

@@ -17,9 +17,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import proof as index
-from stages.needle.kernels.proof import blocker_on_arc
-from stages.needle.path import LENGTH, ROLL, ArcPath, Query, arc_transform, bend_direction
-from stages.needle.replanning.reaiming import pose_at
+from stages.needle.path import LENGTH, ROLL, ArcPath, Query, arc_transform, blocker_on_path
 from stages.needle.replanning.replanner import Failure, Replan, Replanner
 
 DRIFT_RAD = math.radians(0.1)
@@ -339,22 +337,11 @@ def steer(
             if path is not None:
                 commands = Commands(path, most_per_mm)
                 continue
-            if not _is_clear(environment, commands.rest(belief.frame), needle.inserted_mm, branch):
+            rest = commands.rest(belief.frame)
+            if blocker_on_path(environment, rest, branch, needle.inserted_mm):
                 return tuple(replans), replans[-1].failure
         if needle.inserted_mm >= longest_mm - index.MIN_ARC_MM:
             return tuple(replans), Failure.OUT_OF_LENGTH
         left_mm = min(measure_mm, longest_mm) - needle.inserted_mm
         commands.give(belief, needle, min(step_mm, left_mm))
     return tuple(replans), None
-
-
-def _is_clear(environment: NeedleEnvironment, path: ArcPath, inserted_mm: float, branch: int) -> bool:
-    for frame, (length, roll, curvature) in zip(path.frames(), path.arcs, strict=False):
-        bend = (float(curvature), *(float(v) for v in bend_direction(frame, roll)))
-        pose = pose_at(frame)
-        if blocker_on_arc(
-            environment.obstacles, environment.limits, pose, bend, float(length), inserted_mm, branch
-        ):
-            return False
-        inserted_mm += float(length)
-    return True

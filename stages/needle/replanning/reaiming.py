@@ -15,7 +15,7 @@ from stages.needle.kernels import proof as index
 from stages.needle.kernels import tree
 from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.objective import Objective
-from stages.needle.path import LENGTH, ArcPath, Query, arc_transform, path_from_tree
+from stages.needle.path import LENGTH, ArcPath, Query, arc_transform, as_point, path_from_tree
 from stages.needle.search.base import RestartingRRT, root_of
 
 LEAST_GAIN = 0.1
@@ -103,17 +103,6 @@ def waypoints_ahead(corners: list[Ahead], meetings: list[Ahead]) -> Iterator[Way
         yield [point, *(corner for away, corner in corners if away > meeting)], Source.REJOIN
     for first in range(1, len(corners)):
         yield [point for _away, point in corners[first:]], Source.REST
-
-
-def as_point(values: Float) -> tuple[float, float, float]:
-    """Return three coordinates as the kernels take them."""
-    x, y, z = (float(v) for v in values)
-    return x, y, z
-
-
-def pose_at(frame: Float) -> tuple[float, ...]:
-    """Return position and direction of a tip frame as the kernels take them."""
-    return *as_point(frame[:3, 3]), *as_point(frame[:3, 2])
 
 
 class Attempts:

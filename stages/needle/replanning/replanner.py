@@ -23,16 +23,14 @@ from stages.needle.kernels.cost import ObjectiveArrays
 from stages.needle.kernels.goal_ball import least_length_from
 from stages.needle.kernels.proof import blocker_on_arc
 from stages.needle.objective import SHORTEST, Objective
-from stages.needle.path import CURVATURE, ArcPath, Query, bend_direction
+from stages.needle.path import CURVATURE, ArcPath, Query, as_point, bend_direction, pose_at
 from stages.needle.replanning.reaiming import (
     Attempts,
     Bend,
     Root,
     Source,
     Waypoints,
-    as_point,
     plan_ahead,
-    pose_at,
     root_after,
     waypoints_ahead,
 )

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Generator, Iterator
 from itertools import count
 from operator import attrgetter
-from typing import Protocol, TypeVar
+from typing import TypeVar, Union
 
 import numpy as np
 
@@ -136,9 +136,10 @@ class PortfolioSearch:
         `patience` is how many iterations a search may take at least to find its first path.
         """
         rung = searches
-        for rung, work in successive_halving(
-            searches, attrgetter("cost"), work=FIRST_ITERATIONS, survivors=_half_of_all
-        ):
+        halves = successive_halving(
+            searches, attrgetter("cost"), work=FIRST_ITERATIONS, survivors=lambda size, _finite: size // 2
+        )
+        for rung, work in halves:
             if finder is not None and rung is not searches:
                 for search in rung:
                     yield from _done(search, finder.improve(search, self.cost))
@@ -149,21 +150,9 @@ class PortfolioSearch:
         return rung[0]
 
 
-class _Worker(Protocol):
-    """What takes turns: a search, or work that is done."""
-
-    iterations: int
-
-    @property
-    def path(self) -> ArcPath | None: ...
-
-    @property
-    def cost(self) -> float: ...
-
-    def advance(self, iterations: int) -> bool: ...
-
-
+_Worker = Union[OptimalSearch, "_Done"]
 Turn = tuple[_Worker, int]
+"""What takes turns, a search or work that is done, and for how many iterations."""
 
 
 class _Turns:
@@ -206,11 +195,6 @@ def _done(search: OptimalSearch, work: Iterator[Work]) -> Iterator[Turn]:
     """Do work for a search piece by piece."""
     for iterations, found in work:
         yield _Done(search, found), iterations
-
-
-def _half_of_all(count: int, _finite: int) -> int:
-    """Return how many searches go on: as many as half of them, if so many have a path."""
-    return count // 2
 
 
 def _found_and_refined(search: OptimalSearch, iterations: int, patience: int) -> Iterator[Turn]:

@@ -150,17 +150,11 @@ def evaluate_motions(
     if own is not None:
         row = table[CANDIDATES]
         mine = MotionEvaluation(verdict=VERDICTS[int(row[kernel.VERDICT])], cost=float(row[kernel.COST]))
-        if _beyond_range(environment, own):
+        scope = environment.scope
+        in_range = scope.twist_low <= own.twist_rad <= scope.twist_high
+        if not (in_range and scope.bend_low <= own.bend_rad <= scope.bend_high):
             mine = MotionEvaluation(verdict=VERDICTS[0], cost=math.inf)
     return _candidates(table[:CANDIDATES], float(advance_mm), int(best)), mine
-
-
-def _beyond_range(environment: ScopeEnvironment, own: Motion) -> bool:
-    scope = environment.scope
-    return not (
-        scope.twist_low <= own.twist_rad <= scope.twist_high
-        and scope.bend_low <= own.bend_rad <= scope.bend_high
-    )
 
 
 def _candidates(table: Float, advance_mm: float, best: int) -> Candidates:

@@ -212,6 +212,7 @@ def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
             expected="a picture of rows and columns, true inside the vessels",
             remedy="Draw vessels dark on white, or choose another picture",
         )
+    from scipy import ndimage
     from scipy.spatial import KDTree
     from skimage.morphology import skeletonize
 
@@ -221,7 +222,9 @@ def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
     corner = np.full(3, -pixel_mm)
     grid = Grid.from_spacing(slab.shape, (pixel_mm, pixel_mm, pixel_mm), corner)
     walls = _Walls(slab, grid, SOLID)
-    ij = np.argwhere(skeletonize(_largest(framed)))
+    labels, _count = ndimage.label(framed, np.ones((3, 3), dtype=bool))
+    largest = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+    ij = np.argwhere(skeletonize(largest))
     edges = KDTree(ij).query_pairs(1.5, output_type="ndarray").astype(np.int64)
     if not len(edges):
         raise AnatomyError(
@@ -232,14 +235,6 @@ def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
     middle = np.column_stack((ij, np.ones(len(ij))))
     nodes = _smoothed(grid.lps(middle), edges, walls)
     return _proved(*_refined(nodes, edges), walls)
-
-
-def _largest(picture: Bool) -> Bool:
-    """Keep the largest connected piece of a drawing."""
-    from scipy import ndimage
-
-    labels, _count = ndimage.label(picture, np.ones((3, 3), dtype=bool))
-    return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
 
 
 def _refined(nodes: Float, edges: Int) -> tuple[Float, Int]:

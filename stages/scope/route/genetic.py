@@ -16,7 +16,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.settings import quantity, settings
-from anatomy.base.typed import Bool, Float
+from anatomy.base.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve, interpolate
 from stages.scope.route.proof import RouteLimits
@@ -119,26 +119,20 @@ def cut_segments(
     parts = []
     for low, high in runs:
         own = points[low:high].copy()
-        around = _around(own, centreline)
+        # A segment keeps the nodes of the centreline this near: fits do not move farther.
+        reach = 10.0 + 2.0 * float(centreline.radius_mm.max())
+        nodes = centreline.nodes_mm
+        around = ((nodes >= own.min(axis=0) - reach) & (nodes <= own.max(axis=0) + reach)).all(axis=1)
         parts.append(
             Segment(
                 points_mm=own,
                 begin=low,
                 held=(low > 0, high < len(points)),
-                nodes_mm=centreline.nodes_mm[around],
+                nodes_mm=nodes[around],
                 radius_mm=centreline.radius_mm[around],
             )
         )
     return points, parts
-
-
-def _around(points: Float, centreline: Centreline) -> Bool:
-    """Tell which nodes may be nearest to a point inside the lumen near these points."""
-    # A segment keeps the nodes of the centreline this near: fits do not move farther.
-    margin = 10.0 + 2.0 * float(centreline.radius_mm.max())
-    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
-    nodes = centreline.nodes_mm
-    return np.asarray(((nodes >= low) & (nodes <= high)).all(axis=1))
 
 
 def search_segment(
@@ -156,19 +150,15 @@ def search_segment(
             break
         best = np.argsort(costs, kind="stable")[: settings.parents]
         genes, costs = genes[best], costs[best]
-        children = _children(genes, settings.population - len(genes), settings.mutation_share, rng)
+        # Each gene is taken from one of two parents, and noise is added.
+        size = (settings.population - len(genes), 2)
+        pairs, which = rng.integers(len(genes), size=size), rng.integers(2, size=size)
+        crossed = genes[np.take_along_axis(pairs, which, axis=1), np.arange(2)]
+        children = np.clip(crossed + rng.normal(0.0, settings.mutation_share, size=size), 0.0, 1.0)
         genes = np.vstack((genes, children))
         costs = np.concatenate((costs, [evaluator.cost(gene) for gene in children]))
     winner = int(np.argmin(costs))
     return evaluator.fitted(genes[winner])[0], float(costs[winner])
-
-
-def _children(parents: Float, count: int, mutation_share: float, rng: np.random.Generator) -> Float:
-    """Take each gene from one of two parents, and add noise."""
-    pairs = rng.integers(len(parents), size=(count, 2))
-    which = rng.integers(2, size=(count, 2))
-    crossed = parents[np.take_along_axis(pairs, which, axis=1), np.arange(2)]
-    return np.asarray(np.clip(crossed + rng.normal(0.0, mutation_share, size=crossed.shape), 0.0, 1.0))
 
 
 class _Evaluator:

@@ -79,10 +79,14 @@ class Limit:
 
     def finding(self, value: float) -> Finding:
         """Return what a figure means."""
-        inside = [low <= value <= high for low, high in (self.usual, self.possible)]
+        inside = [least <= value <= most for least, most in (self.usual, self.possible)]
         verdict = FITS if inside[0] else DOUBTFUL if inside[1] else REFUSED
         what = "possible" if verdict == REFUSED else "usual"
-        limits = _range(self.form, self.possible if verdict == REFUSED else self.usual)
+        ends = self.possible if verdict == REFUSED else self.usual
+        low, high = (_written(self.form, end) for end in ends)
+        limits = (
+            f"{low} or more" if ends[1] == MOST else f"up to {high}" if ends[0] == 0 else f"{low} to {high}"
+        )
         return Finding(
             name=self.check,
             found=f"{self.words.format(_written(self.form, value))}; {limits} is {what} ({self.reason})",
@@ -93,13 +97,6 @@ class Limit:
 
 def _written(form: str, value: float) -> str:
     return form.format(value) if form else percent(value)
-
-
-def _range(form: str, limits: tuple[float, float]) -> str:
-    low, high = (_written(form, limit) for limit in limits)
-    if limits[1] == MOST:
-        return f"{low} or more"
-    return f"up to {high}" if limits[0] == 0 else f"{low} to {high}"
 
 
 MOST = float("inf")

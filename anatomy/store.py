@@ -218,21 +218,17 @@ def _load(folder: Path, *, warn: bool = False) -> Lung | None:
         stated = meta.pop("checksum")
         its_own = folder_name(meta["key"]) == folder.name
         if its_own and stated == values_checksum(meta) and are_unchanged(folder, meta["files"]):
-            return _from_meta(folder, meta)
+            with open(folder / "arrays.npz", "rb") as stream, np.load(stream) as small:
+                arrays = {name: read_only(small[name]) for name in small.files}
+            arrays |= {path.stem: _mapped(folder, path.stem) for path in folder.glob("*.npy")}
+            lung: Lung = record_from(Lung, meta["lung"], arrays)
+            object.__setattr__(lung, "folder", folder)
+            return lung
     except (*DAMAGE, LungaccessError):
         pass
     if warn:
         warn_of_damage(folder)
     return None
-
-
-def _from_meta(folder: Path, meta: dict[str, Any]) -> Lung:
-    with open(folder / "arrays.npz", "rb") as stream, np.load(stream) as small:
-        arrays = {name: read_only(small[name]) for name in small.files}
-    arrays |= {path.stem: _mapped(folder, path.stem) for path in folder.glob("*.npy")}
-    lung: Lung = record_from(Lung, meta["lung"], arrays)
-    object.__setattr__(lung, "folder", folder)
-    return lung
 
 
 def _mapped(folder: Path, name: str) -> Array:

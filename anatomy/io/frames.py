@@ -81,7 +81,14 @@ def read_pose(path: str | Path, frame: Frame | None) -> Float:
             expected="a 4x4 pose",
             remedy="Write four lines of four numbers",
         )
-    _require_rigid(matrix, path)
+    rotation = matrix[:3, :3]
+    off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - [0, 0, 0, 1]).max())
+    if not (off <= ORTHONORMAL_TOLERANCE and np.linalg.det(rotation) > 0):
+        raise FrameError(
+            f"{path} does not hold a right-handed rigid pose (off by {off:.2g})",
+            expected="a rotation with determinant +1, and 0 0 0 1 as the last row",
+            remedy="Check that the matrix is neither transposed, scaled nor mirrored",
+        )
     return np.asarray(LPS_FROM[frame] @ matrix)
 
 
@@ -119,15 +126,3 @@ def _numbers(path: str | Path) -> Float:
             remedy="Correct the numbers in the file",
         )
     return values
-
-
-def _require_rigid(matrix: Float, path: str | Path) -> None:
-    rotation = matrix[:3, :3]
-    skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    last_row = np.abs(matrix[3] - [0, 0, 0, 1]).max()
-    if not (max(skew, last_row) <= ORTHONORMAL_TOLERANCE and np.linalg.det(rotation) > 0):
-        raise FrameError(
-            f"{path} does not hold a right-handed rigid pose (off by {max(skew, last_row):.2g})",
-            expected="a rotation with determinant +1, and 0 0 0 1 as the last row",
-            remedy="Check that the matrix is neither transposed, scaled nor mirrored",
-        )

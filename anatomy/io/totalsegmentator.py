@@ -186,7 +186,14 @@ def file_sources(path: Path, *, is_label_map: bool = False) -> tuple[list[MaskSo
     if is_label_map or stem == "lung_vessels" or stem not in ROLES:
         names, statement = _label_names(path, must_have=is_label_map)
         if names or stem not in ROLES:
-            return _named_sources(path, names), statement
+            values_of: dict[tuple[str, int], list[int]] = {}
+            for value, name in names.items():
+                if name in ROLES and value != 0:
+                    values_of.setdefault((ROLES[name], _lobe(name)), []).append(value)
+            return [
+                MaskSource(role=role, path=path, labels=tuple(sorted(values)), lobe=lobe)
+                for (role, lobe), values in values_of.items()
+            ], statement
     return [MaskSource(role=ROLES[stem], path=path, lobe=_lobe(stem))], []
 
 
@@ -204,17 +211,6 @@ def _label_names(path: Path, *, must_have: bool) -> tuple[dict[int, str], list[s
         return {}, []
     table, statement = published_names(stem, values, path)
     return table, [statement]
-
-
-def _named_sources(path: Path, names: Mapping[int, str]) -> list[MaskSource]:
-    values_of: dict[tuple[str, int], list[int]] = {}
-    for value, name in names.items():
-        if name in ROLES and value != 0:
-            values_of.setdefault((ROLES[name], _lobe(name)), []).append(value)
-    return [
-        MaskSource(role=role, path=path, labels=tuple(sorted(values)), lobe=lobe)
-        for (role, lobe), values in values_of.items()
-    ]
 
 
 def _lobe(name: str) -> int:

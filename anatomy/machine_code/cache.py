@@ -99,7 +99,10 @@ class KernelCache(caching._Cache):  # type: ignore[misc]
         try:
             if not folder.is_dir():
                 folder.mkdir(parents=True, exist_ok=True)
-                _forget_old(folder)
+                contents = folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*")
+                with contextlib.suppress(OSError):  # One of them may vanish meanwhile.
+                    for old in sorted(contents, key=lambda each: each.stat().st_mtime)[:-KEPT_CONTENTS]:
+                        shutil.rmtree(old, ignore_errors=True)
             _write(folder / self._file(key), hashlib.sha256(made).digest() + made)
         except OSError as error:
             say_once(
@@ -145,12 +148,3 @@ def _write(path: Path, content: bytes) -> None:
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _forget_old(folder: Path) -> None:
-    """Remove the oldest folders of a module beyond `KEPT_CONTENTS`; one of them may vanish meanwhile."""
-    module = folder.name.rpartition("-")[0]
-    with contextlib.suppress(OSError):
-        others = sorted(folder.parent.glob(f"{module}-*"), key=lambda each: each.stat().st_mtime)
-        for each in others[:-KEPT_CONTENTS]:
-            shutil.rmtree(each, ignore_errors=True)

@@ -328,25 +328,21 @@ def fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
             expected=f"at least {LEAST_PAIRS} in each lung, spread over it",
             remedy="Mark more pairs; check that their coordinates are mm of the masks in the frame stated",
         )
+    halves = np.arange(len(points)) % 2 == 0
     try:
-        return _fitted(points, vectors)
+        errors = [_left_out(points, vectors, halves, smoothing) for smoothing in SMOOTHINGS]
+        means = np.array([error.mean() for error in errors])
+        # The smoothest spline is taken whose prediction is worse than the best by no more than this factor.
+        chosen = int(np.flatnonzero(means <= 1.1 * means.min())[-1])
+        at = _spline(points, vectors, SMOOTHINGS[chosen])
+        residual = np.linalg.norm(at(points) - vectors, axis=1)
+        return Fitted(at=at, residual_mm=residual, left_out_mm=errors[chosen])
     except np.linalg.LinAlgError as error:
         raise AnatomyError(
             f"The landmarks of the {lung} lung determine no field ({error})",
             expected="different points that do not all lie in one plane",
             remedy="Spread the landmarks over the lung, and state each once",
         ) from error
-
-
-def _fitted(points: Float, vectors: Float) -> Fitted:
-    halves = np.arange(len(points)) % 2 == 0
-    errors = [_left_out(points, vectors, halves, smoothing) for smoothing in SMOOTHINGS]
-    means = np.array([error.mean() for error in errors])
-    # The smoothest spline is taken whose prediction is worse than the best by no more than this factor.
-    chosen = int(np.flatnonzero(means <= 1.1 * means.min())[-1])
-    at = _spline(points, vectors, SMOOTHINGS[chosen])
-    residual = np.linalg.norm(at(points) - vectors, axis=1)
-    return Fitted(at=at, residual_mm=residual, left_out_mm=errors[chosen])
 
 
 def _left_out(points: Float, vectors: Float, half: Bool, smoothing: float) -> Float:

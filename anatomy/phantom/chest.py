@@ -137,18 +137,14 @@ class Chest:
 
     def lobe(self, side: Side, x: Array, y: Array, z: Array) -> Array:
         """Return the number of the lobe (1 to 5) that a position in this lung belongs to."""
-        found = self._lobe_before_operation(side, x, y, z)
+        x, y, z = x / self.scale, y / self.scale, z / self.scale
+        if side.sign > 0:
+            found = np.where(z < side.oblique(x, y), np.uint8(LEFT_LOWER), np.uint8(LEFT_UPPER))
+        else:
+            upper = np.where(z < side.horizontal(x, y), np.uint8(RIGHT_MIDDLE), np.uint8(RIGHT_UPPER))
+            found = np.where(z < side.oblique(x, y), np.uint8(RIGHT_LOWER), upper)
         resected, into = self.fills
         return np.where(found == resected, np.uint8(into), found) if resected else found
-
-    def _lobe_before_operation(self, side: Side, x: Array, y: Array, z: Array) -> Array:
-        x, y, z = x / self.scale, y / self.scale, z / self.scale
-        lower = z < side.oblique(x, y)
-        if side.sign > 0:
-            return np.where(lower, np.uint8(LEFT_LOWER), np.uint8(LEFT_UPPER))
-        middle = z < side.horizontal(x, y)
-        upper = np.where(middle, np.uint8(RIGHT_MIDDLE), np.uint8(RIGHT_UPPER))
-        return np.where(lower, np.uint8(RIGHT_LOWER), upper)
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the corners `(3,)`, `(3,)` LPS mm of the imaged box."""

@@ -10,27 +10,9 @@ NODULE_OWNER = -1
 
 @kernel()
 def paint_tree(
-    labels,
-    owner,
-    lumen_cover,
-    outer_cover,
-    origin,
-    spacing,
-    points,
-    inner,
-    outer,
-    branch_start,
-    branch_parent,
-    order,
-    freedom,
-    base,
-    gap,
-    slack,
-    inner_code,
-    outer_code,
-    allowed,
-    keep,
-):
+    labels, owner, lumen_cover, outer_cover, origin, spacing, points, inner, outer, branch_start,
+    branch_parent, order, freedom, base, gap, slack, inner_code, outer_code, allowed, keep,
+):  # fmt: skip
     """Draw the branches of a tree, each only if it fits; mark those drawn in `keep`.
 
     `labels` uint8, `owner` int16 (0 free, `base + branch + 1` of this tree, others taken) and the covers

@@ -154,30 +154,22 @@ def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
     allowed = np.zeros(len(LABELS), dtype=np.bool_)
     allowed[[LABELS[name] for name in ("lung", "fissure", "lumen", "wall", "artery", "vein")]] = True
     keep = np.zeros(len(sprouts.parent), dtype=np.bool_)
-    airway = kind == "airway"
-    paint_tree(
-        canvas.labels,
-        canvas.owner,
-        canvas.lumen_cover,
-        canvas.airway_cover if airway else canvas.solid_cover,
-        canvas.grid.lps_from_ijk[:3, 3].copy(),
-        canvas.spacing_mm,
-        np.vstack(sprouts.points),
-        tree.inner_mm,
-        tree.outer_mm,
+    # Children are thinner than their parents, so parents come first.
+    order = np.argsort(-np.array(sprouts.diameter_mm), kind="stable").astype(np.int64)
+    start, parents = (
         np.concatenate([[0], np.cumsum(sprouts.counts)]),
         np.array(sprouts.parent, dtype=np.int64),
-        # Children are thinner than their parents, so parents come first.
-        np.argsort(-np.array(sprouts.diameter_mm), kind="stable").astype(np.int64),
-        tree.freedom,
-        base,
-        canvas.spacing_mm if airway else -1.0,
-        0.0 if airway else 0.5 * canvas.spacing_mm,
-        LABELS["lumen" if airway else kind],
-        LABELS["wall" if airway else kind],
-        allowed,
-        keep,
     )
+    spacing, origin = canvas.spacing_mm, canvas.grid.lps_from_ijk[:3, 3].copy()
+    if kind == "airway":
+        cover, gap, slack, codes = canvas.airway_cover, spacing, 0.0, (LABELS["lumen"], LABELS["wall"])
+    else:
+        cover, gap, slack, codes = canvas.solid_cover, -1.0, 0.5 * spacing, (LABELS[kind], LABELS[kind])
+    paint_tree(
+        canvas.labels, canvas.owner, canvas.lumen_cover, cover, origin, spacing, np.vstack(sprouts.points),
+        tree.inner_mm, tree.outer_mm, start, parents, order, tree.freedom, base, gap, slack, *codes, allowed,
+        keep,
+    )  # fmt: skip
     return keep
 
 

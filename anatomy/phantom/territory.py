@@ -57,20 +57,6 @@ class Territory:
         return np.asarray(found, dtype=np.float64) - 0.5 * self.spacing_mm
 
 
-def _spread_points(
-    lobes: UInt8, origin: Float, spacing_mm: float, rng: np.random.Generator
-) -> tuple[Float, UInt8]:
-    """Spread points `(N, 3)` LPS mm evenly over the lobes; return them and their lobes `(N,)`."""
-    # Side of the cube that a point stands for: about as large as what a terminal branch of the tree supplies.
-    step = 6.6 / MAP_SPACING_MM
-    axes = [np.arange(0, n - 1, step) for n in lobes.shape]
-    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    lattice += rng.uniform(0, step, lattice.shape)
-    nearest = np.minimum(np.rint(lattice).astype(np.int64), np.array(lobes.shape) - 1)
-    lobe = lobes[tuple(nearest.T)]
-    return origin + spacing_mm * lattice[lobe > 0], lobe[lobe > 0]
-
-
 def make_territory(chest: Chest, rng: np.random.Generator) -> Territory:
     """Map the lobes of a chest at `MAP_SPACING_MM` times its scale and spread points in them.
 
@@ -95,15 +81,21 @@ def make_territory(chest: Chest, rng: np.random.Generator) -> Territory:
             remedy="Use another seed",
         )
     anisotropy = (spacing,) * 3
-    points, lobe_of_point = _spread_points(lobes, low, spacing, rng)
+    # Side of the cube that a point stands for: about as large as what a terminal branch of the tree supplies.
+    step = 6.6 / MAP_SPACING_MM
+    axes = [np.arange(0, n - 1, step) for n in lobes.shape]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    lattice += rng.uniform(0, step, lattice.shape)
+    nearest = np.minimum(np.rint(lattice).astype(np.int64), np.array(lobes.shape) - 1)
+    lobe_there = lobes[tuple(nearest.T)]
     return Territory(
         origin=low,
         spacing_mm=spacing,
         lobes=lobes,
         lobe_depth_mm=edt.edt(lobes, anisotropy=anisotropy),
         pleura_depth_mm=edt.edt(lobes > 0, anisotropy=anisotropy),
-        points_lps=points,
-        lobe_of_point=lobe_of_point,
+        points_lps=low + spacing * lattice[lobe_there > 0],
+        lobe_of_point=lobe_there[lobe_there > 0],
     )
 
 

@@ -96,28 +96,16 @@ def grow(ground: Ground, start: Mask) -> Grown:
     parent = np.zeros(most, dtype=np.int64)
     behind = np.zeros((2, most), dtype=np.int64)
     layer_ends = np.zeros(most, dtype=np.int64)
+    wide, rim = max(WIDE_MM2 / pixel_mm2, 2.0), max(round(RIM_MM / float(np.sqrt(pixel_mm2))), 1)
+    # A piece of fewer layers is too short to tell a leak from a fork.
+    least_layers = 4
+    # The edge of a lumen is where the map is half as deep as inside.
+    skin_share = 0.5
     count, undone = growth.grow_airway(
-        _padded(ground.depth).reshape(-1),
-        smooth.reshape(-1),
-        flat,
-        shape,
-        lumen,
-        count,
-        levels(ground.least_depth),
-        # A piece of fewer layers is too short to tell a leak from a fork.
-        4,
-        FRONT_FACTOR,
-        FRONT_SLACK_MM2 / pixel_mm2,
-        max(WIDE_MM2 / pixel_mm2, 2.0),
-        max(round(RIM_MM / float(np.sqrt(pixel_mm2))), 1),
-        ground.dark_hu,
-        # The edge of a lumen is where the map is half as deep as inside.
-        0.5,
-        queue,
-        parent,
-        behind,
-        layer_ends,
-    )
+        _padded(ground.depth).reshape(-1), smooth.reshape(-1), flat, shape, lumen, count,
+        levels(ground.least_depth), least_layers, FRONT_FACTOR, FRONT_SLACK_MM2 / pixel_mm2, wide, rim,
+        ground.dark_hu, skin_share, queue, parent, behind, layer_ends,
+    )  # fmt: skip
     banned = np.flatnonzero(flat == BANNED)
     flat[flat != LUMEN] = 0
     known = len(seeds)
@@ -220,15 +208,9 @@ def follow_thin_airways(
 
 
 def _false_contrast(
-    hu: Int16,
-    smooth: Int16,
-    state: UInt8,
-    lung: Mask,
-    spacing_mm: Float,
-    bright_hu: float,
-    directions: Float,
-    radii_mm: Float,
-) -> float:
+    hu: Int16, smooth: Int16, state: UInt8, lung: Mask, spacing_mm: Float, bright_hu: float,
+    directions: Float, radii_mm: Float,
+) -> float:  # fmt: skip
     """Return the contrast that hardly any place beside something so bright has; 0 if there are none."""
     distance = np.ceil(FAR_MM / spacing_mm).astype(np.int64)
     stride = max(int(np.count_nonzero(lung)) // (LOOKED_AT * N_PLACES), 1)

@@ -64,7 +64,12 @@ def require_chest_ct(ct: Volume, *, thick_slices: bool = False) -> tuple[str, ..
     """
     _require_numbers(ct.array)
     _require_hounsfield(ct.array)
-    return (*_require_size(ct, thick_slices), *_odd_values(ct.array))
+    greatest = float(ct.array.max())
+    # Metal reaches the 3071 HU of most scanners; more than this is another scale.
+    odd = (
+        (f"The image reaches {greatest:g} HU: metal, or not Hounsfield units.",) if greatest > 5000.0 else ()
+    )
+    return (*_require_size(ct, thick_slices), *odd)
 
 
 def _require_numbers(values: Array) -> None:
@@ -136,14 +141,6 @@ def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
             "are usual."
         )
     return tuple(warnings)
-
-
-def _odd_values(values: Array) -> tuple[str, ...]:
-    greatest = float(values.max())
-    # Metal reaches the 3071 HU of most scanners; more than this is another scale.
-    if greatest <= 5000.0:
-        return ()
-    return (f"The image reaches {greatest:g} HU: metal, or not Hounsfield units.",)
 
 
 @frozen_value

@@ -9,7 +9,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Array, Float, Int32, Mask, UInt8
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
-from anatomy.morphology import bounds, window
+from anatomy.morphology import bounds, distance_mm, window
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.sides import grow_sides
 
@@ -135,7 +135,9 @@ def split_sides(mask: Mask, grid: Grid) -> tuple[Mask, Mask]:
     sides = sides_from_right(tissue, coarse)
     if sides is None:
         return np.zeros_like(mask), mask
-    nearest = _nearest(sides, coarse)
+    # Every coarse voxel has the side that is nearest to it.
+    right, left = (distance_mm(sides != side, coarse.spacing_mm) for side in (RIGHT, LEFT))
+    nearest = np.where(right <= left, RIGHT, LEFT).astype(np.uint8)
     low, high = np.zeros(3, dtype=np.int64), np.asarray(mask.shape)
     fine = coarse.to_ct(nearest, low, high)
     return mask & (fine == LEFT), mask & (fine == RIGHT)
@@ -152,14 +154,3 @@ def sides_from_right(tissue: Mask, coarse: CoarseCt) -> Int32 | None:
     sides = np.zeros(tissue.shape, dtype=np.int32, order="F")
     sides[box] = found if means[0] < means[1] else np.where(found > 0, 3 - found, 0)
     return sides
-
-
-def _nearest(sides: Int32, coarse: CoarseCt) -> Array:
-    """Give every coarse voxel the side that is nearest to it."""
-    import edt
-
-    distance = [
-        edt.edt(np.asfortranarray(sides != side), anisotropy=coarse.spacing_mm, order="F")
-        for side in (RIGHT, LEFT)
-    ]
-    return np.where(distance[0] <= distance[1], RIGHT, LEFT).astype(np.uint8)

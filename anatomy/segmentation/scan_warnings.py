@@ -76,7 +76,15 @@ def noise_hu(ct: Volume, near: Mask) -> float:
     box = window(*bounds(near))
     # Noise is measured in cubes of this side.
     side = np.maximum(2, np.rint(6.0 / ct.grid.spacing_mm)).astype(np.int64)
-    patches = _cubes(ct.array[box], side)
+    values = ct.array[box]
+    counts = np.array(values.shape) // side
+    # The cubes are spread evenly.  A tenth of them lie in soft tissue: the spread of the quietest is then
+    # known to a few per cent.
+    chosen = np.unique(np.linspace(0, counts.prod() - 1, min(int(counts.prod()), 20_000)).astype(np.int64))
+    low = np.stack(np.unravel_index(chosen, tuple(counts)), axis=1) * side
+    inside = np.stack(np.meshgrid(*(np.arange(n) for n in side), indexing="ij"), axis=-1).reshape(-1, 3)
+    at = low[:, None, :] + inside[None]
+    patches = values[at[..., 0], at[..., 1], at[..., 2]].reshape(-1, *side).astype(np.float32)
     middles = patches.mean(axis=(1, 2, 3))
     patches = patches[(middles > TISSUE_HU[0]) & (middles < TISSUE_HU[1])]
     # From fewer no noise is told.
@@ -88,19 +96,6 @@ def noise_hu(ct: Volume, near: Mask) -> float:
     mean_of_five = (inner + beside) / np.float32(5.0)
     left = float(np.quantile(mean_of_five.std(axis=(1, 2, 3)), QUIET_SHARE))
     return max(deviation, float(np.sqrt(5.0)) * left)
-
-
-def _cubes(values: Array, side: Array) -> Array:
-    """Return cubes spread evenly over an image, `(N, *side)` float32."""
-    counts = np.array(values.shape) // side
-    total = int(counts.prod())
-    # A tenth of them lie in soft tissue: the spread of the quietest is then known to a few per cent.
-    chosen = np.unique(np.linspace(0, total - 1, min(total, 20_000)).astype(np.int64))
-    low = np.stack(np.unravel_index(chosen, tuple(counts)), axis=1) * side
-    inside = np.stack(np.meshgrid(*(np.arange(n) for n in side), indexing="ij"), axis=-1).reshape(-1, 3)
-    at = low[:, None, :] + inside[None]
-    found = values[at[..., 0], at[..., 1], at[..., 2]].reshape(-1, *side)
-    return np.asarray(found, dtype=np.float32)
 
 
 LEAST_TRACHEA_MM = 25.0

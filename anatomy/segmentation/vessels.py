@@ -63,6 +63,8 @@ class ScaleSpace:
             GridMismatchError: If the shapes differ.
             AnatomyError: If the lung is empty, or the CT is not of a real type.
         """
+        import edt
+
         if hu.shape != lung.shape or hu.ndim != 3:
             raise GridMismatchError(
                 f"The CT has the shape {hu.shape}, the lung {lung.shape}", expected="two images of one grid"
@@ -78,12 +80,15 @@ class ScaleSpace:
         box = window(*bounds(lung, np.ceil(3.0 * SIGMAS_MM[-1] / spacing).astype(np.int64)))
         kind = np.float32 if hu.dtype.kind == "f" else np.int16
         image = np.maximum(np.asfortranarray(hu[box]).T, LEAST_HU).astype(kind, copy=False)
+        threads = threads or usable_cores()
+        # The end of the image is no surface of the lung.
+        inside, sides = np.array(lung[box], order="F"), tuple(spacing)
+        depth = edt.edt(inside, anisotropy=sides, order="F", black_border=False, parallel=threads).T
+        n_scales = np.zeros(depth.shape, dtype=np.uint8)
+        for limit in DEEPER_THAN_MM:
+            n_scales += depth > limit
         return cls(
-            box=box,
-            spacing_mm=spacing,
-            hu=np.ascontiguousarray(image),
-            n_scales=_scales_that_apply(np.array(lung[box], order="F"), spacing, threads or usable_cores()),
-            threads=threads or usable_cores(),
+            box=box, spacing_mm=spacing, hu=np.ascontiguousarray(image), n_scales=n_scales, threads=threads
         )
 
     def images(self) -> Iterator[tuple[float, Float32]]:
@@ -150,20 +155,6 @@ def discrete_gaussian(variance: float) -> Float32:
     n = 1 + int(np.argmax(total >= 1.0 - LOST_WEIGHT)) if total[-1] >= 1.0 - LOST_WEIGHT else weights.size - 1
     weights = weights[: n + 1]
     return np.asarray(weights / (weights[0] + 2.0 * weights[1:].sum()), dtype=np.float32)
-
-
-def _scales_that_apply(lung: Mask, spacing: Float, threads: int) -> UInt8:
-    """Return how many scales apply at each voxel of a box, `(nk, nj, ni)`.
-
-    The end of the image is no surface of the lung.
-    """
-    import edt
-
-    depth = edt.edt(lung, anisotropy=tuple(spacing), order="F", black_border=False, parallel=threads).T
-    count = np.zeros(depth.shape, dtype=np.uint8)
-    for limit in DEEPER_THAN_MM:
-        count += depth > limit
-    return count
 
 
 VESSEL_THRESHOLD = 0.25
@@ -340,6 +331,8 @@ def _large(
     must have its centre in the lung and in no airway, but may reach beyond: at the hilum the lung's mask cuts
     through vessels, and masks of walls reach into the vessels beside them.
     """
+    from scipy.ndimage import label
+
     tissue = (space.n_scales > 0) & ~airway
     # Rounding of scales that are given as decimals.
     first = next(n for n, sigma in enumerate(SIGMAS_MM) if sigma >= radius_mm - 1e-6)
@@ -350,17 +343,10 @@ def _large(
     if not inside.any():
         return inside
     found = solid & tissue & (_distance_mm(~inside, sides, space.threads) <= radius_mm)
-    # 1000 voxels of 0.7 mm.
-    return _without_small(found, 350.0 / float(np.prod(sides)))
-
-
-def _without_small(mask: Mask, least_voxels: float) -> Mask:
-    """Drop the connected pieces (26 neighbours) with fewer voxels."""
-    from scipy.ndimage import label
-
-    pieces, _ = label(mask, structure=np.ones((3, 3, 3), dtype=np.bool_))
-    # The voxels of the pieces are few beside those of the image, whose numbers bincount would copy.
-    keep = np.bincount(pieces[mask], minlength=1) >= least_voxels
+    pieces, _ = label(found, structure=np.ones((3, 3, 3), dtype=np.bool_))
+    # A piece with fewer than 1000 voxels of 0.7 mm is dropped.  The voxels of the pieces are few beside those
+    # of the image, whose numbers bincount would copy.
+    keep = np.bincount(pieces[found], minlength=1) >= 350.0 / float(np.prod(sides))
     keep[0] = False
     return np.asarray(keep[pieces])
 

@@ -88,7 +88,15 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
 
     skeleton, report = spanned_graph(points_lps, radius_mm, edges)
     trunk = find_trachea(skeleton, np.eye(3))
-    order, parent = _rooted(skeleton.neighbours, trunk.nodes[0])
+    # Nodes with parents first, and the position of each one's parent among them.
+    order, above, came_from = [trunk.nodes[0]], [-1], [-1]
+    for at, node in enumerate(order):
+        for other in skeleton.neighbours[node]:
+            if other != came_from[at]:
+                order.append(other)
+                above.append(at)
+                came_from.append(node)
+    parent = np.array(above)
     mm, radius = skeleton.mm[order], skeleton.depth_mm[order]
     branches = divide(mm, parent, radius, order.index(trunk.nodes[-1]))
     index = {id(branch): b for b, branch in enumerate(branches)}
@@ -103,18 +111,6 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
     ]
     tree = assemble(strands, report)
     return replace(tree, report=replace(report, warnings=warnings_of(tree)))
-
-
-def _rooted(neighbours: list[list[int]], root: int) -> tuple[list[int], Int]:
-    """List the nodes with parents first, and the position of each one's parent in this list."""
-    order, parent, came_from = [root], [-1], [-1]
-    for at, node in enumerate(order):
-        for other in neighbours[node]:
-            if other != came_from[at]:
-                order.append(other)
-                parent.append(at)
-                came_from.append(node)
-    return order, np.array(parent)
 
 
 def _contacts(voxel_tree: VoxelTree, prepared: PreparedLumen) -> tuple[GapBridged, ...]:

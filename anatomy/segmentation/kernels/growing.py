@@ -197,25 +197,9 @@ def ban_pockets(hu, state, near, size, mark, wide, rim, dark_hu, queue, parent, 
 
 @kernel()
 def grow_airway(
-    depth,
-    hu,
-    state,
-    shape,
-    lumen,
-    count,
-    levels,
-    least_layers,
-    front_factor,
-    front_slack,
-    wide,
-    rim,
-    dark_hu,
-    skin_share,
-    queue,
-    parent,
-    behind,
-    layer_ends,
-):
+    depth, hu, state, shape, lumen, count, levels, least_layers, front_factor, front_slack, wide, rim,
+    dark_hu, skin_share, queue, parent, behind, layer_ends,
+):  # fmt: skip
     """Add to the lumen, level by level, the pieces of a local minima map that branch off it.
 
     Args:
@@ -251,23 +235,14 @@ def grow_airway(
                 start = lumen[s] + d
                 for _ in range(REPEATS):
                     here = state[start]
-                    if depth[start] < level or here == LUMEN or here == BANNED or here == mark:
+                    if depth[start] < level or here == LUMEN or here == BANNED:
                         break
-                    if here == mark + 1:
+                    if here == mark or here == mark + 1:
                         break
                     size, layers, burst = flood(
-                        depth,
-                        state,
-                        near,
-                        start,
-                        level,
-                        mark,
-                        front_factor,
-                        front_slack,
-                        queue,
-                        parent,
+                        depth, state, near, start, level, mark, front_factor, front_slack, queue, parent,
                         layer_ends,
-                    )
+                    )  # fmt: skip
                     burst = burst or count + size > len(lumen)
                     if burst or rings_of(state, shape, mark, queue, size) > MOST_RINGS:
                         for q in range(size):
@@ -277,20 +252,9 @@ def grow_airway(
                     if layers < least_layers:
                         break
                     banned = ban_pockets(
-                        hu,
-                        state,
-                        near,
-                        size,
-                        mark,
-                        wide,
-                        rim,
-                        dark_hu,
-                        queue,
-                        parent,
-                        behind,
-                        layer_ends,
+                        hu, state, near, size, mark, wide, rim, dark_hu, queue, parent, behind, layer_ends,
                         layers,
-                    )
+                    )  # fmt: skip
                     if banned > 0:
                         undone += banned
                         for q in range(size):

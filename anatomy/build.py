@@ -280,10 +280,8 @@ def clearance_fields(
 ) -> dict[str, DistanceField]:
     """Return the fields of the clearance to each structure and to all of them, by name.
 
-    Args:
-        labels ((ni, nj, nk) uint16): See `anatomy.structures`.
-        fissures: Whether fissures are known, so that there are fields of them.
-        keep, tell, reused: As `keep`, `progress` and `reused` of `build_lung`.
+    `labels` `(ni, nj, nk)` are those of `anatomy.structures`; there are fields of fissures if these are
+    known.  `keep`, `tell` and `reused` are `keep`, `progress` and `reused` of `build_lung`.
     """
     geometry = corner_geometry(grid)
     return {

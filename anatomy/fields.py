@@ -31,8 +31,7 @@ ROUNDING_MM = 2e-5
 def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:
     """Return the `(3, 6)` array by which kernels find a point in `grid`, see `anatomy.kernels.field`.
 
-    Args:
-        half_voxels: Half side of an obstacle in voxels: `SOLID` boxes or `CENTRES`.
+    Half the side of an obstacle is `half_voxels`: that of `SOLID` boxes or of `CENTRES`.
     """
     geometry = np.zeros((3, 6))
     geometry[:, :4] = grid.ijk_from_lps[:3]

@@ -42,11 +42,9 @@ def kept_record(
 
     Args:
         kind: What it is, one of `anatomy.base.cache_entries`; the file is named after it.
-        version: Another one where `make` returns something else for the same `depends_on`, as other kernels
-            may.
-        depends_on: Plain values.
+        version: Another one where `make` returns something else for the same `depends_on`, plain values, as
+            other kernels may.
         cls: Class of the record, of arrays, plain values, and records of such.
-        cache: Folder of the cache; `anatomy.base.cache.default_cache()` if None.
         name: Whose it is; empty if it belongs to no patient.
         in_use: What has to stay in the cache as well.
 
@@ -115,13 +113,10 @@ def _save(kind: str, header: dict[str, str], made: object, path: Path) -> None:
 def kept(lung: "Organ", name: str, version: int, make: Callable[[], Any]) -> Any:
     """Return plain JSON values that follow from a lung: those kept with it, else those that `make` returns.
 
-    A lung that is not stored keeps nothing.  What is kept is made anew if it is missing, damaged or of
-    another version, and goes when the lung goes.
-
-    Args:
-        name: What they are; the file is named after it.
-        version: To be raised when `make` returns something else for the same lung.
-        make: Returns the values; they should say the same after they were written as JSON and read again.
+    A lung that is not stored keeps nothing.  What is kept, in a file of this name, is made anew if it is
+    missing, damaged or of another version, and goes when the lung goes.  The version is raised when `make`
+    returns something else for the same lung; its values should say the same after they were written as JSON
+    and read.
     """
     if lung.folder is None:
         return make()

@@ -27,13 +27,9 @@ def mask_findings(
 ) -> tuple[Finding, ...]:
     """Check the masks of a patient by all figures of `anatomy.plausibility.LIMITS`, and by their directions.
 
-    Args:
-        tree: Of their lumen.
-        lungs_lps (two (N, 3) float64 arrays): Points spread evenly over the left and the right lung, LPS mm;
-            empty if they cannot be told apart.
-
-    Returns:
-        Every check, what is usual included; those that `images.accepted` names are accepted.
+    `lungs_lps` are points `(N, 3)` spread evenly over the left and the right lung, LPS mm, empty if they
+    cannot be told apart.  Every check is returned, what is usual included; those that `images.accepted` names
+    are accepted.
     """
     found = findings_of(dict(_figures(images, tree)))
     found += _cut_off(images, tree)

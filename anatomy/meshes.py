@@ -57,12 +57,10 @@ class SurfaceMesh:
 
 
 def box_surface(mask: Mask, grid: Grid, *, beyond: bool = False) -> SurfaceMesh:
-    """Return the exact boundary of the voxels of `mask` as solid boxes.
+    """Return the exact boundary of the voxels of a mask `(ni, nj, nk)` as solid boxes, which may be none.
 
-    Args:
-        mask ((ni, nj, nk) bool): A mask on `grid`.  An empty mask has an empty surface.
-        grid: Use `Grid.crop` for a region of interest.
-        beyond: Whether all that lies beyond the grid belongs to the mask, too.
+    `Grid.crop` serves for a region of interest.  With `beyond` all that lies beyond the grid belongs to the
+    mask, too.
     """
     if beyond:
         rest = box_surface(~np.asarray(mask, dtype=bool), grid)

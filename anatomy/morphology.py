@@ -115,17 +115,10 @@ _THREADS = 2
 
 
 def closed(mask: Mask, radius_mm: float, spacing_mm: ArrayLike) -> Mask:
-    """Close a mask with a ball: dilation, then erosion [Fu2018, text of III-A.1].
+    """Close a mask `(ni, nj, nk)` with a ball: dilation, then erosion [Fu2018, text of III-A.1].
 
-    Every gap is filled into which no ball of this radius fits.  Beyond the edge of the array the mask is
-    taken to go on as it ends there.
-
-    Args:
-        mask ((ni, nj, nk) bool): Fortran-contiguous.
-        spacing_mm ((3,) float64): Voxel size along the axes.
-
-    Returns:
-        (ni, nj, nk) bool: Contains `mask`.
+    Every gap is filled into which no ball of this radius fits; all of the mask stays.  Beyond the edge of the
+    array the mask is taken to go on as it ends there.
     """
     if not mask.any():
         return mask.copy(order="F")

@@ -140,11 +140,8 @@ class Organ:
     ) -> Float:
         """Return exact distances in mm to the nearest voxel with any of `bits`, at most `cap_mm`.
 
-        Args:
-            points_lps: (N, 3) float64, LPS mm.
-            bits: Structures of `anatomy.structures` to measure to.
-            cap_mm: Search radius; the cost grows with its third power.
-            exempt_branch: Airway voxels of this branch are passed over; -1 for none.
+        The points are `(N, 3)` LPS mm, the bits structures of `anatomy.structures`.  The cost grows with the
+        third power of the cap.  Airway voxels of `exempt_branch` are passed over; -1 for none.
         """
         points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
         out = np.zeros(len(points))
@@ -156,10 +153,8 @@ class Organ:
     ) -> float:
         """Return the least of the distances of points to structures: exact below a cap, else a lower bound.
 
-        Args:
-            points_lps ((N, 3) float64, LPS mm): At least one.
-            field: The distance field of the structures.
-            bits, cap_mm, exempt_branch: As in `exact_clearance_mm`.
+        The points, at least one, are `(N, 3)` LPS mm, `field` is the distance field of the structures, and
+        the others are as in `exact_clearance_mm`.
         """
         points = np.ascontiguousarray(np.asarray(points_lps, dtype=np.float64).reshape(-1, 3))
         bounds = self.fields[field].lower_bound_mm(points)

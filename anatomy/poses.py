@@ -105,11 +105,8 @@ def poses_on_arc(frame: Float, roll_rad: float, curvature_per_mm: ArrayLike, len
 def poses_on_pieces(frame: Float, pieces: Float, step_mm: float) -> tuple[Float, Float]:
     """Return poses `(N, 4, 4)` at the ends of arcs and between them, and their arc lengths `(N,)`.
 
-    Args:
-        frame ((4, 4) float64): Where the first arc starts.
-        pieces ((P, 3) float64): Length in mm, roll before it in rad, which is kept for the next, and
-            curvature in 1/mm of each arc.
-        step_mm: Largest distance between two poses.
+    The first arc starts at `frame`.  `pieces` `(P, 3)` are length in mm, roll before it in rad, which is kept
+    for the next, and curvature in 1/mm of each; two poses are at most `step_mm` apart.
     """
     poses, lengths = [np.asarray(frame)[None]], [np.zeros(1)]
     for length, roll, curvature in pieces:

@@ -41,16 +41,9 @@ def open_lung(
 ) -> Lung:
     """Return the lung made from inputs with these hashes, from the cache or newly built.
 
-    What its masks fail of `anatomy.plausibility.CHECKS` is among its warnings.
-
-    Args:
-        sources: SHA-256 of every input file.
-        read: Reads the images; called only if the cache does not hold the lung.
-        cache: Folder of the cache; `anatomy.base.cache.default_cache()` if None.
-        progress: Told each step as it begins.
-        accept (collection of str): Names of the checks whose failure is accepted; others are refused.  None
-            refuses nothing.
-        reused: See `anatomy.build.build_lung`.
+    What its masks fail of `anatomy.plausibility.CHECKS` is among its warnings.  `read` reads the images, only
+    if the cache does not hold the lung.  A check that fails is refused unless `accept` has its name; None
+    refuses nothing.  `reused` is that of `anatomy.build.build_lung`.
 
     Raises:
         AnatomyError: If a check of the masks fails that is not accepted.

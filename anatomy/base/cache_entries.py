@@ -69,8 +69,7 @@ class CacheEntry:
 def cache_entries(cache: Path, formats: Mapping[str, str]) -> tuple[CacheEntry, ...]:
     """Return what a cache holds, the least recently used first.
 
-    Args:
-        formats: The present format by kind; entries of a kind that is not named count as current.
+    `formats` are the present formats by kind; entries of a kind that is not named count as current.
     """
     found = []
     for path in list(cache.iterdir()) if cache.is_dir() else []:
@@ -151,10 +150,7 @@ def overdue(
 ) -> Iterator[CacheEntry]:
     """Yield what is to go: leftovers, old formats, what is too old, then the least recently used of the rest.
 
-    Args:
-        entries: The least recently used first.
-        most_bytes: What may stay.
-        older_than_days: Time without use after which an entry goes.
+    `entries` begin with the least recently used; `most_bytes` may stay.
     """
     stay = []
     for entry in entries:
@@ -177,10 +173,8 @@ def overdue(
 def make_room(cache: Path, most_bytes: int, formats: Mapping[str, str], *, keep: tuple[Path, ...]) -> None:
     """Remove what a cache may not hold any longer, after something was stored; what cannot go stays.
 
-    Args:
-        most_bytes: How large the cache may be.
-        formats: See `cache_entries`.
-        keep: What is in use and stays, even if it alone is larger.
+    What is in use, `keep`, stays even if it alone is larger than `most_bytes`; `formats` as in
+    `cache_entries`.
     """
     entries = cache_entries(cache, formats)
     if sum(entry.size_bytes for entry in entries) <= most_bytes:

@@ -33,14 +33,9 @@ def settings(cls: type[T]) -> type[T]:
     """Make a class of annotated fields an immutable settings class that cannot hold a wrong value.
 
     The class is a frozen, keyword-only dataclass. Whatever creates an instance (the constructor,
-    `dataclasses.replace`, `parse`) checks it, and every fault becomes a `SettingsError`.
-
-    Args:
-        cls: Class whose fields are annotated with `quantity` or `text` and whose `__post_init__`, if any,
-            raises what `impossible` returns when two fields contradict each other.
-
-    Returns:
-        The settings class.
+    `dataclasses.replace`, `parse`) checks it, and every fault becomes a `SettingsError`.  Its fields are
+    annotated with `quantity` or `text`, and its `__post_init__`, if any, raises what `impossible` returns
+    when two fields contradict each other.
     """
     made = pydantic_dataclass(frozen=True, kw_only=True, config=_CONFIG)(cls)
     validated_init = made.__init__
@@ -65,12 +60,8 @@ def quantity(
 ) -> Any:
     """Annotate a finite number with its meaning and the range outside which it is absurd.
 
-    Args:
-        description: Meaning and effect; the unit is in the name of the field.
-        above, at_least, below, at_most: Ends of the allowed range; `MOST` either way where none is given.
-
-    Returns:
-        For use in `Annotated[float, quantity(...)]`. An integer is accepted, text and booleans are not.
+    The ends of the range are those of `MOST` where none is given.  For use in `Annotated[float,
+    quantity(...)]`: an integer is accepted, text and booleans are not.
     """
     at_least = -MOST if above is None and at_least is None else at_least
     at_most = MOST if below is None and at_most is None else at_most
@@ -100,13 +91,8 @@ def switch(description: str) -> Any:
 def impossible(key: str, value: object, allowed: str) -> PydanticCustomError:
     """Return the error to raise from `__post_init__` when fields contradict each other.
 
-    Args:
-        key: Dotted path of the offending field, from the class that raises.
-        value: What the field holds.
-        allowed: What it may hold, with the numbers that follow from the other fields.
-
-    Returns:
-        Becomes a `SettingsError` with the whole key path.
+    `key` is the dotted path of the field from the class that raises, and `allowed` says what it may hold,
+    with the numbers that follow from the other fields.  It becomes a `SettingsError` with the whole path.
     """
     return PydanticCustomError(
         "impossible", "{key} = {value}: {allowed}", {"key": key, "value": _shown(value), "allowed": allowed}
@@ -114,16 +100,10 @@ def impossible(key: str, value: object, allowed: str) -> PydanticCustomError:
 
 
 def parse(cls: type[T], mapping: Mapping[str, object], where: str, remedy: str = _REMEDY) -> T:
-    """Build settings from plain values, as read from TOML or JSON.
+    """Build settings, of a class made by `settings`, from plain values, as read from TOML or JSON.
 
-    Args:
-        cls: A class made by `settings`.
-        mapping: Values by key; nested settings are nested mappings.
-        where: Where the values come from (a file name), for the message.
-        remedy: What the user can do about a wrong value, for the message.
-
-    Returns:
-        instance of `cls`.
+    `where` says where the values come from, such as a file name, and `remedy` what the user can do about a
+    wrong one.
 
     Raises:
         SettingsError: For a missing or unknown key, a wrong type, a number that is not finite or outside its
@@ -153,19 +133,10 @@ def to_mapping(values: object) -> dict[str, Any]:
 
 
 def override(values: T, changes: Mapping[str, object], where: str = "overrides") -> T:
-    """Return settings with some values replaced, all checked together.
+    """Return settings with some values replaced, all checked together; errors as `parse`.
 
-    Args:
-        values (settings): What to start from.
-        changes: New values by dotted key path, e.g. ``{"needle.diameter_mm": 0.8}``; entries of arrays by
-            their number from 0.
-        where: Where the changes come from, for the message.
-
-    Returns:
-        settings of the same class.
-
-    Raises:
-        SettingsError: As `parse`.
+    The new values stand by dotted key path, e.g. ``{"needle.diameter_mm": 0.8}``, entries of arrays by their
+    number from 0.  `where` says for the message where they come from.
     """
     mapping = to_mapping(values)
     for path, value in changes.items():

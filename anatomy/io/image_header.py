@@ -200,11 +200,8 @@ def named_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> 
 def right_handed_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> tuple[Grid, bool]:
     """Make the grid of a file, with the first index counted the other way if its axes are left-handed.
 
-    Many programs store images so; nothing is mirrored as long as voxels and matrix agree.
-
-    Returns:
-        tuple of (Grid, bool): The right-handed grid, and whether the voxels must be reversed along their
-            first axis.
+    Many programs store images so; nothing is mirrored as long as voxels and matrix agree.  Also returned is
+    whether the voxels must be reversed along their first axis.
     """
     if not np.linalg.det(lps_from_ijk[:3, :3]) < 0.0:
         return named_grid(shape, lps_from_ijk, path), False

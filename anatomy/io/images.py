@@ -143,11 +143,9 @@ def read_parts(
 
 
 def read_labels(path: str | Path) -> Mapping[int, str]:
-    """Read the names of label values that a file carries in its header.
+    """Read the names of label values that a file carries in its header; empty if there are none.
 
-    Returns:
-        dict of label value to name: From the label table in the header extension of NIfTI, or the segments of
-            .seg.nrrd or DICOM; empty if there is none.
+    They stand in the label table in the header extension of NIfTI, or are the segments of .seg.nrrd or DICOM.
     """
     path = require_file(path)
     if _holds_segments(path):

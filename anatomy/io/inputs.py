@@ -20,11 +20,8 @@ _HEADER_LIMIT = 1 << 20
 def input_hashes(path: str | Path) -> dict[str, str]:
     """Return the SHA-256 of every file a patient may be read from, by its path in the patient's folder.
 
-    Args:
-        path: What `anatomy.io.load_patient` takes.
-
-    Returns:
-        Which file was stated as the label map is told apart by an entry of its own.
+    `path` is what `anatomy.io.load_patient` takes.  Which file was stated as the label map is told apart by
+    an entry of its own.
 
     Raises:
         FileError: If there is nothing at `path`, or a file cannot be read.

@@ -30,9 +30,7 @@ def mask_of(
     """Return the mask that the values of an image stand for, and what has to be said of it.
 
     Args:
-        values: (ni, nj, nk) of numbers.
         name: The file, for messages.
-        voxel_mm3: Volume of a voxel.
         role: What the mask shows, see `PARTS`; empty for a mask of one label.
         labels: The labels that count; if there are none, the image has to be a mask by itself: of two values,
             or fractions, of which those of at least a half count.

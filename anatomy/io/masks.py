@@ -41,13 +41,10 @@ class Placed:
 
 
 def place(array: Array, source: Grid, target: Grid, *, solid: bool = False, fill: float = 0) -> Placed:
-    """Place an image on another grid by the nearest position.
+    """Place an image `(ni, nj, nk)` on another grid by the nearest position, with `fill` beyond it.
 
-    Args:
-        array ((ni, nj, nk), of any type): The image on `source`.
-        solid: Whether every voxel that is not zero must remain: a voxel of the grid is also set if the centre
-            of one lies in it, so that thin obstacles leave no holes in coarser voxels.
-        fill: The value beyond the image.
+    With `solid` every voxel that is not zero remains: a voxel of the grid is also set if the centre of one
+    lies in it, so that thin obstacles leave no holes in coarser voxels.
     """
     target_from_source = target.ijk_from_lps @ source.lps_from_ijk
     source_from_target = source.ijk_from_lps @ target.lps_from_ijk
@@ -350,14 +347,7 @@ _BEYOND = {
 
 
 def placement(name: str, role: str, mask: Mask, grid: Grid, target: Grid, found: Placed) -> str:
-    """Say how a mask on another grid was placed by its header.
-
-    Args:
-        name, role: The file, and what it shows.
-        mask, grid: The mask on its own grid.
-        target: The common grid of the patient.
-        found: The mask on it.
-    """
+    """Say how a mask on a grid of its own was placed by its header on the grid `target` of the patient."""
     if found.n_voxels and found.n_lost == found.n_voxels:
         return (
             f"{name} lies outside the images: by its header it holds {grid.describe()}, the images hold "

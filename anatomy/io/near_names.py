@@ -32,11 +32,8 @@ def require_single(
 ) -> list[str]:
     """Refuse images that stand twice for one mask, and say which one is read of two that hold the same.
 
-    Args:
-        chosen: The images that are read: another one of the folder with the same name in other letters or
-            with another ending is their double.
-        others (iterable of (Path, Path)): Further pairs: an image that is read, and one that stands for the
-            same mask.
+    Another image of the folder with the name of a `chosen` one, in other letters or with another ending, is
+    its double.  `others` are further pairs: an image that is read, and one that stands for the same mask.
 
     Raises:
         AnatomyError: If the two of a pair differ.

@@ -81,19 +81,12 @@ def _sidecar_names(path: Path) -> dict[int, str]:
 
 
 def published_names(stem: str, values: set[float], path: Path) -> tuple[dict[int, str], str]:
-    """Name the labels of a TotalSegmentator file that stores no names, and say so.
+    """Name the labels of a TotalSegmentator file that stores no names, and say which table was used.
 
-    Args:
-        stem: File name without ending; a name that begins with "total" belongs to the task total.
-        values (set of numbers): The label values that occur.
-        path: For messages.
-
-    Returns:
-        - names (dict of label value to name)
-        - statement - A warning which table was used.
+    Of a file whose name begins with "total" the task total is meant; `values` are those that occur.
 
     Raises:
-        AnatomyError: If the values fit more than one published table.
+        AnatomyError: If the values fit no published table, or more than one.
     """
     if stem.startswith("total") and max(values, default=0) > _LAST_LABEL_OF_TOTAL_1:
         table, title = TOTAL_LOBES, "task total, version 2"

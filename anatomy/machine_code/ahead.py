@@ -52,9 +52,8 @@ def compile_ahead(
 ) -> int:
     """Compile kernels that commands call and that are not on disk; return how many were compiled.
 
-    Args:
-        commands: Such as "plan"; all that are known if empty.
-        fewest: Fewer missing kernels are left to be compiled when they are called.
+    Without `commands`, such as "plan", all that are known are meant.  Fewer missing kernels than `fewest` are
+    left to be compiled when they are called.
     """
     called = [n for n, call in enumerate(_calls()) if not commands or call["commands"].intersection(commands)]
     kernels = {n: _calls()[n] for n in called if _dispatcher(_calls()[n]) is not None}  # Some may be gone.

@@ -101,8 +101,7 @@ running = Sources()
 def kernel_digest(*rooms: str) -> str:
     """Return 16 hexadecimal digits that tell kernels, and the numba that compiles them, from all others.
 
-    Args:
-        *rooms: Packages whose kernels, and those that they call, count; all of the project if none is named.
+    The kernels of the packages `rooms` count, and those that they call; all of the project if none is named.
     """
     sources = Sources()
     names = set().union(*(sources.closure(name) for name in kernel_modules(*rooms, sources=sources)))

@@ -130,13 +130,9 @@ LEAST_DICE = 0.8
 def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume) -> dict[str, float]:
     """Return how well the motion leads lungs onto lungs, or raise AnatomyError if it does not.
 
-    Args:
-        labels ((ni, nj, nk) uint16): See `anatomy.structures`; on `grid`.
-        other: The lungs at the end of the breath that is farther from the phase of the masks.
-
-    Returns:
-        Dice of the moved lungs and of the lungs as they are with the others, and the mean distance of the
-        borders, mm.
+    `labels` are those of `anatomy.structures` on `grid`; `other` are the lungs at the end of the breath that
+    is farther from the phase of the masks.  Returned are Dice of the moved lungs and of the lungs as they are
+    with the others, and the mean distance of the borders, mm.
     """
     low, high = motion.grid.corners_lps.min(axis=0), motion.grid.corners_lps.max(axis=0)
     shape = np.ceil((high - low) / SAMPLE_MM).astype(int) + 1

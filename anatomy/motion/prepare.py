@@ -247,12 +247,8 @@ def continued_unfolded(values: Float, inside: Mask, spacing_mm: float) -> tuple[
     """Return a continuation that mends a field where it slides or folds, and the share of nodes it mends.
 
     A field of both lungs jumps from one to the other where they touch, and at the pleura; the nodes of cells
-    in which it does are continued over, too.
-
-    Args:
-        values ((ni, nj, nk, 3) float64): Displacements at nodes, mm.
-        inside ((ni, nj, nk) bool): The nodes in a lung.
-        spacing_mm: Distance of nodes.
+    in which it does are continued over, too.  `values` `(ni, nj, nk, 3)` are displacements in mm at nodes
+    `spacing_mm` apart, `inside` the nodes in a lung.
     """
     known = inside.copy()
     # Each takes away the nodes of one more layer of such cells.
@@ -314,10 +310,8 @@ class Fitted:
 def fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
     """Fit a thin-plate spline with the smoothness by which each half of the pairs predicts the other.
 
-    Args:
-        points ((N, 3) float64, LPS mm): Places in the masks.
-        vectors ((N, 3) float64): Displacements, mm.
-        lung: Whose they are, for messages.
+    Places in the masks `(N, 3)` LPS mm have displacements `(N, 3)` mm; `lung` says whose they are, for
+    messages.
 
     Raises:
         AnatomyError: If there are too few pairs, or they lie in a plane.

@@ -347,18 +347,11 @@ def _below_rim(tree: PlannedTree, territory: Territory, rim_mm: float) -> Planne
 def ends_below_pleura(
     sprouts: Sprouts, radius_mm: Float, freedom: UInt8, territory: Territory, rim_mm: float
 ) -> tuple[Sprouts, Float, Bool]:
-    """End the nameless branches of a tree where they run from deeper tissue into the rim.
+    """End the nameless branches of a tree where they run from deeper tissue into the rim, `rim_mm` deep.
 
-    A vessel that has not yet left the rim, on its way from the mediastinum, goes on.
-
-    Args:
-        sprouts: B branches, N points.
-        radius_mm: (N,) float64.
-        freedom ((B,) uint8): Nameless branches have 0, see `paint_tree`.
-        rim_mm: Depth of the rim.
-
-    Returns:
-        Sprouts, (M,) float64, (B,) bool: The tree that is left, its radii, and which branches those are.
+    A vessel that has not yet left the rim, on its way from the mediastinum, goes on.  The radii are those of
+    the points `(N,)`; nameless branches have the freedom 0, see `paint_tree`.  Returned are the tree that is
+    left, its radii, and which branches `(B,)` those are.
     """
     start = np.concatenate([[0], np.cumsum(sprouts.counts)])
     outside_rim = territory.depth_mm(np.vstack(sprouts.points)) >= rim_mm

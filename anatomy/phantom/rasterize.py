@@ -147,8 +147,7 @@ def _draw_fissures(canvas: Canvas, scale: float, open_share: float) -> None:
 def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
     """Draw a tree of kind "airway", "artery" or "vein"; `base` is the number of branches drawn before.
 
-    Returns:
-        (B,) bool: Which branches fitted and were drawn.
+    Returned is which branches `(B,)` fitted and were drawn.
     """
     sprouts = tree.sprouts
     allowed = np.zeros(len(LABELS), dtype=np.bool_)

@@ -156,10 +156,8 @@ def grow_veins(
 def make_way(tree: Sprouts, radius_mm: Float, obstacles: Obstacles, gap_mm: float, fixed: int) -> Float:
     """Bend the branches of `tree` (radii `(B,)`) until they pass `obstacles`; the first `fixed` points stay.
 
-    Positions move in place, branchings included.
-
-    Returns:
-        (N,) float64: Radius at every point: that of the branch, or less where it must squeeze through.
+    Positions move in place, branchings included.  Returned is the radius at every point `(N,)`: that of the
+    branch, or less where it must squeeze through.
     """
     from scipy.spatial import cKDTree
 

@@ -53,19 +53,14 @@ class Airways:
 
 
 def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] | None = None) -> Airways:
-    """Segment lumen and wall of the airways.
+    """Segment lumen and wall of the airways [Fu2018, III-A.2] [Aykac2003].
 
-    Args:
-        ct: Hounsfield units.
-        lungs: Both lungs, with a seed in the trachea and the rough central airway, on the grid of `ct`.
-        progress: Told what is being done.
+    `lungs` are both lungs, with a seed in the trachea and the rough central airway, on the grid of the CT in
+    Hounsfield units.
 
     Raises:
         AnatomyError: If there is no air at the seed.
         GridMismatchError: If `lungs` lie on another grid.
-
-    References:
-        [Fu2018], III-A.2; [Aykac2003]
     """
     from scipy import ndimage
 

@@ -198,7 +198,7 @@ REACH = 12
 
 
 def between(values: Array, places: Sequence[Float], *, cubic: bool = True) -> Array:
-    """Return an image at the nodes of another grid whose axes are parallel.
+    """Return an image at the nodes of another grid whose axes are parallel, Fortran-contiguous.
 
     A cubic spline swings beyond its voxels at sharp edges: it draws dark rims around vessels.  It is cut off
     at the values of the two voxels beside a place, axis by axis.  Axes whose places are voxels are copied.
@@ -208,9 +208,6 @@ def between(values: Array, places: Sequence[Float], *, cubic: bool = True) -> Ar
         places (three (N,) float64): Where along each axis, in voxels; beyond the ends the image goes on as it
             ends.
         cubic: Else linear.
-
-    Returns:
-        (Ni, Nj, Nk) of the same dtype, Fortran-contiguous.
     """
     planes = values.T
     across = np.zeros((len(planes), len(places[1]), len(places[0])), dtype=values.dtype)

@@ -43,11 +43,8 @@ class CentralAirway:
 def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) -> Iterator[CentralAirway]:
     """Find what may be trachea and main bronchi, the largest column of air first.
 
-    An image with much noise is smoothed if nothing else helps.
-
-    Args:
-        outside ((Ni, Nj, Nk) bool): Air around the patient.
-        seed_lps ((3,) float64): A point in the trachea, LPS mm, in place of the automatic search.
+    An image with much noise is smoothed if nothing else helps.  `outside` `(Ni, Nj, Nk)` is air around the
+    patient, and a point in the trachea `seed_lps` `(3,)` LPS mm takes the place of the automatic search.
 
     Raises:
         AnatomyError: If there is no column of air like a trachea, or the point does not lie in air.
@@ -265,18 +262,12 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
 
 
 def without_throat(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]:
-    """Cut the airway off at the throat, which `throat_level` finds.
+    """Cut the airway off at the throat, which `throat_level` finds; also return the length that was cut, mm.
 
-    Vocal cords that are closed while the breath is held taper the airway to a point, which
-    would be too narrow for any scope, although a scope passes them in fact.
-
-    Args:
-        lumen ((ni, nj, nk) bool): In the order of voxels of `canonical`.
-        seed_ijk ((3,) int64): A voxel in the trachea.
-
-    Returns:
-        - lumen ((ni, nj, nk) bool) - One flat end at the top; the same array if there is no throat.
-        - length_mm - How much was cut off.
+    Vocal cords that are closed while the breath is held taper the airway to a point, which would be too
+    narrow for any scope, although a scope passes them in fact.  `lumen` `(ni, nj, nk)` is in the order of
+    voxels of `canonical`, and returned as it is if there is no throat; `seed_ijk` `(3,)` is a voxel in the
+    trachea.
     """
     slice_mm = float(grid.spacing_mm[2])
     level = throat_level(lumen, seed_ijk, slice_mm)
@@ -291,15 +282,9 @@ def without_top(
 ) -> tuple[Mask, float]:
     """Cut the airway off at the throat; where no tree can be made of what is left, at its narrowest place.
 
-    A glottis may be as wide as the trachea: only the tree then tells that pharynx and mouth are there.
-
-    Args:
-        lumen, seed_ijk, grid: See `without_throat`.
-        tree_of: Makes the tree of a lumen, or an AnatomyError that says why there is none.
-
-    Returns:
-        - lumen ((ni, nj, nk) bool) - As it was where no cut gives it a tree.
-        - length_mm - How much was cut off.
+    A glottis may be as wide as the trachea: only the tree, or the AnatomyError, that `tree_of` returns then
+    tells that pharynx and mouth are there.  Where no cut gives it a tree the lumen stays as it was; the rest
+    as in `without_throat`.
     """
     lumen, cut_mm = without_throat(lumen, seed_ijk, grid)
     if isinstance(tree_of(lumen), AnatomyError):

@@ -32,12 +32,8 @@ def missing_lung(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> tupl
     """Warn of zones of the chest that hold hardly any lung.
 
     In every section across the chest this is the convex hull of both lungs and their mirror images about the
-    `midline`.  What is missing on both sides alike is told by how far the lungs reach back and down.
-
-    Args:
-        left, right: (ni, nj, nk) bool.
-        grid: In the order of voxels of `canonical`.
-        carina_lps: (3,) float64.
+    `midline`.  What is missing on both sides alike is told by how far the lungs reach back and down.  The
+    lungs are `(ni, nj, nk)` in the order of voxels of `canonical`, and the carina `(3,)` LPS mm.
     """
     points = sampled(left | right, grid, CUBE_MM)
     points[:, 0] -= midline(points, carina_lps)
@@ -199,14 +195,9 @@ def plausibility(
 ) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
     """Check lungs and airway by anatomy, with the limits and signs that masks of any source have to meet.
 
-    Args:
-        ct: Hounsfield units, in the order of voxels of `canonical`.
-        tree: Of the lumen of the airway, or why there is none.
-        slices_mm: How far the slices of the scan lie apart.
-
-    Returns:
-        - tuple of Finding - The checks that failed.
-        - tuple of str - Warnings.
+    The CT has Hounsfield units, in the order of voxels of `canonical`; the tree is that of the lumen, or says
+    why there is none; `slices_mm` is the distance of the slices of the scan.  Returned are the checks that
+    failed, and warnings.
     """
     median_hu = float(np.median(ct.array[lungs.mask]))
     found = [*_sizes(ct, lungs, median_hu)]

@@ -50,13 +50,9 @@ def has_thick_slices(ct: Volume) -> bool:
 
 
 def require_chest_ct(ct: Volume, *, thick_slices: bool = False) -> tuple[str, ...]:
-    """Refuse images that cannot be a CT of the chest in Hounsfield units.
+    """Refuse images that cannot be a CT of the chest in Hounsfield units; return warnings.
 
-    Args:
-        thick_slices: Whether slices of more than 3 mm are accepted.
-
-    Returns:
-        Warnings.
+    Slices of more than 3 mm are accepted with `thick_slices` alone.
 
     Raises:
         AnatomyError: If a voxel is not a number, the values are no Hounsfield units, air or tissue are

@@ -94,8 +94,7 @@ def read_network(path: Path) -> Network:
 def learned_airway(ct: Volume, network: Network) -> Mask:
     """Return the largest piece of what a network takes for airway, `(ni, nj, nk)`.
 
-    Args:
-        ct: Hounsfield units, in the order of voxels of `canonical`.
+    The CT has Hounsfield units, in the order of voxels of `canonical`.
 
     Raises:
         SettingsError: If onnxruntime is missing, or the network does not take a CT.

@@ -33,19 +33,12 @@ LEAST_HALF_THICKNESS_MM = 2.0
 
 
 def outside_air(hu: Float32, air: Mask) -> Mask:
-    """Mark the air around the patient.
+    """Mark the air around the patient, `(Ni, Nj, Nk)`; axis 2 of the coarse CT runs along the body.
 
-    In every axial slice, pieces of air that touch the edge of the image are taken, because the chest wall
-    closes the lungs off within a slice even where mouth or trachea open to the outside.  Where the field
-    of view cuts off the skin, a lung may touch the edge too; the lung holds tissue, so its median is
-    higher than that of air.
-
-    Args:
-        hu ((Ni, Nj, Nk) float32): Coarse CT, axis 2 along the body.
-        air ((Ni, Nj, Nk) bool): Voxels of air and lung.
-
-    Returns:
-        (Ni, Nj, Nk) bool.
+    In every axial slice, pieces of `air`, which holds lungs as well, that touch the edge of the image are
+    taken, because the chest wall closes the lungs off within a slice even where mouth or trachea open to the
+    outside.  Where the field of view cuts off the skin, a lung may touch the edge too; the lung holds tissue,
+    so its median is higher than that of air.
     """
     from scipy import ndimage
 
@@ -66,14 +59,10 @@ def outside_air(hu: Float32, air: Mask) -> Mask:
 
 
 def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
-    """Keep the pieces of air that are as large as a lung and lie at the bronchi.
+    """Keep the pieces of air as large as a lung that lie at the bronchi; AnatomyError if there is none.
 
-    Args:
-        air ((Ni, Nj, Nk) bool): What is as thin as lung, without the airway and the outside.
-        airway ((Ni, Nj, Nk) bool): Trachea and bronchi as far as they could be followed.
-
-    Raises:
-        AnatomyError: If there is none.
+    `air` `(Ni, Nj, Nk)` is what is as thin as lung, without the airway and the outside; `airway` are trachea
+    and bronchi as far as they could be followed.
     """
     from scipy import ndimage
 
@@ -100,15 +89,10 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
 
 
 def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> tuple[Mask, Mask]:
-    """Tell gas that no tissue runs through, a pneumothorax, a bulla or bowel, from lung.
+    """Tell gas that no tissue runs through, a pneumothorax, a bulla or bowel, from lung `(Ni, Nj, Nk)`.
 
-    Args:
-        lung ((Ni, Nj, Nk) bool): What was taken for lung.
-        air_hu: What air measures in the trachea, where scatter raises it as it raises gas beside it.
-
-    Returns:
-        gas, lung ((Ni, Nj, Nk) bool): The gas, and what is left of the lung: pieces that are gas for the most
-            part are none.
+    `air_hu` is what air measures in the trachea, where scatter raises it as it raises gas beside it.
+    Returned are the gas and what is left of the lung: pieces that are gas for the most part are none.
     """
     from scipy import ndimage
 
@@ -189,16 +173,9 @@ def coarse_lung_ex_vivo(
     """Find a lung surrounded by air, and its largest airway.
 
     The background is grown from the edge of the image until the lung is encountered [Fu2018, III-A.1]: the
-    threshold lies halfway between the air around and the lung.
-
-    Args:
-        seed_lps ((3,) float64): A point in the main bronchus or trachea, LPS mm.
-
-    Returns:
-        - threshold - What is denser is not lung, HU.
-        - airway
-        - sides ((Ni, Nj, Nk) int32) - 1 right lung, 2 left lung; one lung alone is labelled 1.
-        - warnings
+    threshold lies halfway between the air around and the lung.  Returned are the HU above which nothing is
+    lung, the airway, the sides (1 right lung, 2 left lung, one lung alone 1), and warnings.  A point in the
+    main bronchus or trachea may be given, LPS mm.
 
     Raises:
         AnatomyError: If there is no lung or no airway.

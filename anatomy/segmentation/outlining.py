@@ -46,15 +46,9 @@ SURFACE_STEPS, BELOW_WEIGHT = 30, 0.15
 
 
 def outline_nodule(ct: Volume, lungs: Mask, point_lps: ArrayLike) -> Mask:
-    """Outline the nodule at a point.
+    """Outline the nodule at a point `(3,)` LPS mm; return its voxels `(ni, nj, nk)` on those of the CT.
 
-    Args:
-        ct: Hounsfield units.
-        lungs ((ni, nj, nk) bool): Both lungs on the voxels of the CT; they may leave the nodule out.
-        point_lps ((3,) float64): A point in the nodule, LPS mm.
-
-    Returns:
-        (ni, nj, nk) bool.
+    `lungs` `(ni, nj, nk)` are both lungs, which may leave the nodule out.
 
     Raises:
         AnatomyError: If there is no lung around the point, nothing there is denser than lung, or what is

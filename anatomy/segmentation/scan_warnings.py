@@ -277,17 +277,10 @@ can be moved in their plane."""
 def misplaced(
     ct: Volume, images: Mapping[str, Array], lungs: Mask, lumen: Mask
 ) -> tuple[list[Finding], list[str]]:
-    """Check masks from elsewhere by the CT.
+    """Check masks and label maps from elsewhere, by the name of their image, by the CT.
 
-    Args:
-        ct: Hounsfield units.
-        images (mapping of str to (ni, nj, nk) array): Masks and label maps from elsewhere, by the name of the
-            image, on the voxels of the CT.
-        lungs, lumen ((ni, nj, nk) bool): Of the CT, wherever they come from.
-
-    Returns:
-        - list of Finding - The check `masks`, for each image that fails it.
-        - list of str - Warnings.
+    All are `(ni, nj, nk)` on the voxels of the CT in Hounsfield units; `lungs` and `lumen` are its own,
+    wherever they come from.  Returned are the check `masks` for each image that fails it, and warnings.
     """
     failed, warnings = [], []
     for name, image in images.items():

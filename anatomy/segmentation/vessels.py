@@ -51,13 +51,10 @@ class ScaleSpace:
 
     @classmethod
     def of(cls, hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, threads: int = 0) -> Self:
-        """Cut the box around the lung out of a CT.
+        """Cut the box around the lung, where responses are wanted, out of a CT in any memory order.
 
-        Args:
-            hu ((ni, nj, nk) int16 or float32): Hounsfield units, in any memory order.
-            lung ((ni, nj, nk) bool): Where responses are wanted.
-            spacing_mm ((3,) float64): Voxel size along i, j, k.
-            threads: 0 for all processors this process may use.
+        The CT in Hounsfield units and the lung are `(ni, nj, nk)`; 0 threads are all processors that this
+        process may use.
 
         Raises:
             GridMismatchError: If the shapes differ.
@@ -139,14 +136,10 @@ def share_axis(work: Callable[[int, int], None], length: int, threads: int) -> N
 
 
 def discrete_gaussian(variance: float) -> Float32:
-    """Return the weights of the discrete analogue of the Gaussian, centre first: exp(-t) I_n(t).
+    """Return the weights of the discrete Gaussian [Lindeberg1990], centre first: exp(-t) I_n(t).
 
-    Args:
-        variance: t, in squared voxels.  The weights are cut where they lose `LOST_WEIGHT`, and scaled to the
-            sum 1.
-
-    References:
-        [Lindeberg1990]
+    The variance is t, in squared voxels.  The weights are cut where they lose `LOST_WEIGHT`, and scaled to
+    the sum 1.
     """
     from scipy.special import ive
 
@@ -200,15 +193,10 @@ def segment_vessels(
     threads: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> Vessels:
-    """Find the vessels inside the lungs.
+    """Find the vessels inside the lungs; those of `large_radius_mm` or more are `large`.
 
-    Args:
-        ct: Hounsfield units.
-        lungs ((ni, nj, nk) bool): Both lungs, filled.
-        airways: Its lumen and wall never become vessel.
-        large_radius_mm: Vessels of this radius or more are `large`.
-        threads: 0 for all processors; the result does not depend on it.
-        progress: Gets what is being done.
+    The CT has Hounsfield units; `lungs` `(ni, nj, nk)` are both lungs, filled; lumen and wall of the airways
+    never become vessel.  The result does not depend on the threads, 0 for all processors.
 
     Raises:
         GridMismatchError: If the shapes differ.
@@ -374,15 +362,8 @@ ALPHA, BETA, C_HU = 0.5, 0.5, 70.0
 def vesselness(hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, threads: int = 0) -> Float32:
     """Return the greatest response over the scales that apply at each voxel [Fu2018, eqs. 3-5].
 
-    Args:
-        hu ((ni, nj, nk) int16 or float32): The CT in Hounsfield units.
-        lung ((ni, nj, nk) bool): Lungs with their vessels; the distance to its surface decides which scales
-            apply.
-        spacing_mm ((3,) float64): Voxel size along i, j, k.
-        threads: 0 for all processors; the result does not depend on it.
-
-    Returns:
-        (ni, nj, nk) float32: In [0, 1], Fortran-contiguous; 0 outside the lung.
+    The CT `hu` in Hounsfield units and the lungs with their vessels, whose depth decides which scales apply,
+    are `(ni, nj, nk)`.  So is what is returned, in [0, 1] and 0 outside the lung.
 
     Raises:
         GridMismatchError, AnatomyError: If the shapes differ; if the lung is empty.

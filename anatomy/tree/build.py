@@ -356,9 +356,8 @@ def _resample(
 ) -> tuple[Float, dict[int, int]]:
     """Space the points of a branch evenly between the nodes in `marks`, which are kept.
 
-    Returns:
-        - ijk ((n, 3) float64) - Without the point of the parent branch.
-        - index - Index in `ijk` of each node that was kept.
+    Returned are the points in voxels `(n, 3)`, without that of the parent branch, and the index of each node
+    that was kept.
     """
     line = branch.nodes if branch.attach < 0 else [branch.attach, *branch.nodes]
     keep = [n for n in range(len(line)) if n in (0, len(line) - 1) or line[n] in marks]

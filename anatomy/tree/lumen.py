@@ -191,12 +191,9 @@ def require_few_tunnels(skeleton: Int) -> None:
 
 
 def tunnels(voxels: Int) -> int:
-    """Return how many tunnels run through a connected set of voxels without cavities.
+    """Return how many tunnels run through a set of voxels `(N, 3)` without cavities, connected by corners.
 
     One minus the Euler number of the union of the voxels as closed boxes.
-
-    Args:
-        voxels ((N, 3) int64): Indices; voxels that share a corner are connected.
     """
     # Of the complex at doubled resolution a cell has as many dimensions as odd coordinates.
     middle = 2 * (voxels - voxels.min(axis=0)) + 1

@@ -61,17 +61,11 @@ def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
                 end.send(search.incumbent.step)
             found: list[tuple[Step | None, bool]] = [received(end, "search") for end in ends]
             iteration = turn * processes * ROUND_ITERATIONS
-            yield _best_of(search, [step for step, _more in found], iteration)
+            better = min((step for step, _more in found if step), key=lambda step: step.cost, default=None)
+            nothing = Step(iteration=iteration, phase="local search")
+            yield search.incumbent.improved(replace(better, iteration=iteration)) if better else nothing
             if search.is_futile(iteration) or not any(more for _step, more in found):
                 return
-
-
-def _best_of(search: ParallelSearch, found: list[Step | None], iteration: int) -> Step:
-    """Return the best of a round, if it is better than all before, and keep it."""
-    better = min((step for step in found if step is not None), key=lambda step: step.cost, default=None)
-    if better is None:
-        return Step(iteration=iteration, phase="local search")
-    return search.incumbent.improved(replace(better, iteration=iteration))
 
 
 def _work(search: ParallelSearch, number: int, processes: int, end: Connection) -> None:
@@ -179,14 +173,12 @@ class CostFinder:
         steps = search.steps() if processes == 1 else _parallel(search, self._request.method, processes)
         if self._gap is not None and processes == 1 and isinstance(search, AtlasSearch):
             steps = guided(search, steps, self._gap.bound)
+        about = self._request, self._task, self._atlas
         for step in steps:
             made = None
             if step.candidate is not None:
-                made = partial(self._made, step.candidate, step.iteration)
+                made = partial(plan_of, *about, step.candidate, step.iteration)
             yield Turn(iteration=step.iteration, phase=step.phase, make=made)
-
-    def _made(self, candidate: Candidate, iteration: int, elapsed_s: float) -> Plan:
-        return plan_of(self._request, self._task, self._atlas, candidate, iteration, elapsed_s)
 
     def is_met(self, best: Plan, iteration: int) -> bool:
         """Tell whether the gap is proved."""
@@ -233,7 +225,6 @@ def with_aim(plan: Plan, request: Request) -> Plan:
 
 def _parallel(search: PlanSearch, method: str, processes: int) -> Iterator[Step]:
     """Return the steps of a search in several processes."""
-
     if not isinstance(search, ParallelSearch):
         raise SettingsError(
             f"{processes} processes are asked for with {method}, each of whose samples depends on all before",

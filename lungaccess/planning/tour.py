@@ -143,7 +143,12 @@ def plan_tour(
                 expected="a point in the lungs, in LPS mm",
                 remedy="Check the frame of the coordinates",
             )
-    chosen = rule or _rule_of(atlas)
+    chosen = rule or ExitRule()
+    if rule is None and atlas is not None:
+        system, needle = atlas.system, atlas.system.needle
+        reach = system.tubes.max_extension_mm + (0.0 if needle is None else needle.max_length_mm)
+        # No exit farther from a lesion is of use: a lung is not wider.
+        chosen = ExitRule(reach_mm=min(reach, 200.0))
     exits: list[tuple[Exit, ...]] = []
     numbers: list[int] = []
     left_out: dict[int, str] = {}
@@ -181,15 +186,6 @@ def plan_tour(
     )
 
 
-def _rule_of(atlas: Atlas | None) -> ExitRule:
-    if atlas is None:
-        return ExitRule()
-    system, needle = atlas.system, atlas.system.needle
-    reach = system.tubes.max_extension_mm + (0.0 if needle is None else needle.max_length_mm)
-    # No exit farther from a lesion is of use: a lung is not wider.
-    return ExitRule(reach_mm=min(reach, 200.0))
-
-
 def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATIONS) -> ExitTest:
     """Return the test whether a coupled plan leads from a tree point to a lesion, `(3,)` LPS mm.
 
@@ -205,7 +201,13 @@ def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATI
     from lungaccess.problem.target import point_target
 
     target = point_target(atlas.lung, lesion_lps)
-    good = _points_of_arcs(atlas, target) or _points_of_plans(atlas, target, iterations)
+    good = _points_of_arcs(atlas, target)
+    if not good:
+        asked = Request.of(atlas.lung, atlas.system, target, goal=DEFAULT, iterations=iterations)
+        plans = run(asked, atlas=atlas, counterfactuals=False)
+        tips = np.stack([found.scope.lps_from_scope_tip[:3, 3] for found in plans])
+        away = np.linalg.norm(atlas.lung.tree.points_lps[:, None] - tips, axis=2)
+        good = frozenset(away.argmin(axis=0).tolist())
     return lambda _lesion, point: point in good
 
 
@@ -229,15 +231,6 @@ def _points_of_arcs(atlas: Atlas, target: Target) -> frozenset[int]:
         if direct.proved(entry) is not None:
             good.add(int(point))
     return frozenset(good)
-
-
-def _points_of_plans(atlas: Atlas, target: Target, iterations: int) -> frozenset[int]:
-    """Return the tree points nearest to the scope tips of the plans that a search finds."""
-    asked = Request.of(atlas.lung, atlas.system, target, goal=DEFAULT, iterations=iterations)
-    plans = run(asked, atlas=atlas, counterfactuals=False)
-    tips = np.stack([found.scope.lps_from_scope_tip[:3, 3] for found in plans])
-    away = np.linalg.norm(atlas.lung.tree.points_lps[:, None] - tips, axis=2)
-    return frozenset(away.argmin(axis=0).tolist())
 
 
 def tour_record(answer: TourAnswer) -> dict[str, Any]:

@@ -20,12 +20,8 @@ from lungaccess.problem.task import Task
 from stages.scope import Bronchoscope, ScopeMotion, prover_of
 from stages.tube import DEFAULT_ROTATIONS, DEFAULT_STOP_MM
 
-TIGHTEST_RADIUS_MM = 20.0
-THINNEST_NEEDLE_MM = 0.3
-RADIUS_STEP_MM = 1.0
-DIAMETER_STEP_MM = 0.05
 SCOPE_STEP_MM = 0.1
-"""Steps in which the changed parameters are given."""
+"""Step in which the diameter of the scope is given."""
 ROTATIONS = DEFAULT_ROTATIONS // 2
 STOP_MM = 2.0 * DEFAULT_STOP_MM
 """A thinner scope has many more tips; its deployments are enumerated more coarsely to save time."""
@@ -86,11 +82,12 @@ def needle_changes(task: Task, atlas: Atlas) -> Iterator[Counterfactual]:
         )
 
     name, present = "a needle with a radius of curvature", needle.min_radius_of_curvature_mm
-    yield from _least_change(task, atlas, name, present, TIGHTEST_RADIUS_MM, RADIUS_STEP_MM, tighter)
+    # Both are given in steps, of 1 and 0.05 mm, and no device is proposed beyond 20 and 0.3 mm.
+    yield from _least_change(task, atlas, name, present, 20.0, 1.0, tighter)
     if task.system.tubes.needle_shaft is not None:
         return
     name, present = "a needle with a diameter", needle.diameter_mm
-    yield from _least_change(task, atlas, name, present, THINNEST_NEEDLE_MM, DIAMETER_STEP_MM, thinner)
+    yield from _least_change(task, atlas, name, present, 0.3, 0.05, thinner)
 
 
 def _least_change(

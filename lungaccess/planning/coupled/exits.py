@@ -106,25 +106,22 @@ def feasible_exits(
     near = arcs.promising
     if scope_tips is not None:
         near = near[np.isin(atlas.deployments.site[near], scope_tips)]
-    near = _in_turns(near, atlas.deployments.site)
-    found, blocked = _Found.nothing(), Counter[str]()
+    # The first entry of every scope tip comes before the second of any, and so on.
+    order = np.argsort(atlas.deployments.site[near], kind="stable")
+    at = atlas.deployments.site[near][order]
+    first = np.flatnonzero(np.diff(at, prepend=-1))
+    rank = np.zeros(len(near), dtype=np.int64)
+    rank[order] = np.arange(len(near)) - np.repeat(first, np.diff(np.append(first, len(at))))
+    near = near[np.argsort(rank, kind="stable")]
+    found, blocked = None, Counter[str]()
     for begin in range(0, max(len(near), 1), CHUNK):
         chunk = near[begin : begin + CHUNK]
         blockers, cost, _least = arcs.evaluate(chunk, np.inf)
         blocked.update(arcs.reasons(blockers))
         clear = np.flatnonzero(blockers == 0)
-        found = found.joined(_Found.of(arcs, chunk[clear], cost[clear]))
+        these = _Found.of(arcs, chunk[clear], cost[clear])
+        found = these if found is None else found.joined(these)
         yield found.answer(arcs, len(near), begin + len(chunk), blocked)
-
-
-def _in_turns(entries: Int, site: Int) -> Int:
-    """Put the first entry of every scope tip before the second of any, and so on."""
-    order = np.argsort(site[entries], kind="stable")
-    at = site[entries][order]
-    first = np.flatnonzero(np.diff(at, prepend=-1))
-    rank = np.zeros(len(entries), dtype=np.int64)
-    rank[order] = np.arange(len(entries)) - np.repeat(first, np.diff(np.append(first, len(at))))
-    return entries[np.argsort(rank, kind="stable")]
 
 
 @frozen_record
@@ -135,12 +132,6 @@ class _Found:
     cost: Float
     length_mm: Float
     points: Float
-
-    @classmethod
-    def nothing(cls) -> "_Found":
-        return cls(
-            entries=np.zeros(0, np.int64), cost=np.zeros(0), length_mm=np.zeros(0), points=np.zeros((0, 3))
-        )
 
     @classmethod
     def of(cls, arcs: DirectCandidates, entries: Int, cost: Float) -> "_Found":
@@ -154,12 +145,7 @@ class _Found:
         return cls(entries=entries, cost=cost, length_mm=lengths, points=points)
 
     def joined(self, other: "_Found") -> "_Found":
-        return _Found(
-            entries=np.concatenate([self.entries, other.entries]),
-            cost=np.concatenate([self.cost, other.cost]),
-            length_mm=np.concatenate([self.length_mm, other.length_mm]),
-            points=np.concatenate([self.points, other.points]),
-        )
+        return _Found(**{name: np.concatenate([own, vars(other)[name]]) for name, own in vars(self).items()})
 
     def answer(
         self, arcs: DirectCandidates, in_workspace: int, tried: int, blocked: Counter[str]

@@ -119,8 +119,10 @@ def _advance(
         left = None if left is None else left - count
         if first is None and search.path is not None:
             first, first_path_s = search.path, clock() - began
+    stated = str(getattr(search, "outcome", "running"))
+    unstated = "nothing found" if search.path is None else "path"
     return PathSearch(
-        outcome=_outcome(search),
+        outcome=unstated if stated == "running" else stated,
         path=search.path,
         first_path=first,
         cost=search.cost,
@@ -154,13 +156,6 @@ def _by_ompl(
     return PathSearch(
         outcome="path", path=path, first_path=path, cost=path.length_mm, first_path_s=first_path_s
     )
-
-
-def _outcome(search: Search) -> str:
-    stated = str(getattr(search, "outcome", "running"))
-    if stated != "running":
-        return stated
-    return "nothing found" if search.path is None else "path"
 
 
 WALL_MM = 3.0
@@ -216,23 +211,22 @@ class NeedleAnswer(PathSearch):
             "no_path_is_proved": self.proved,
             "pierced_branches": list(self.branches),
             "begins_at_the_wall": self.at_wall,
-            "blocked": None
-            if self.obstruction is None
-            else obstruction_record(self.obstruction, self.proved, self.lobe),
+            "blocked": None,
             "open_passage": None if self.open_passage is None else asdict(self.open_passage),
             "path": None,
         }
-        if path is None:
-            return record
-        record["path"] = {
-            "first_path_s": self.first_path_s,
-            "length_mm": path.length_mm,
-            "max_angle_from_start_rad": path.max_angle_from_start_rad(),
-            "accumulated_turn_rad": path.accumulated_turn_rad,
-            "costs": self.known_costs,
-            "lps_from_start": path.lps_from_start.tolist(),
-            "arcs": path.arc_records(),
-        }
+        if self.obstruction is not None:
+            record["blocked"] = obstruction_record(self.obstruction, self.proved, self.lobe)
+        if path is not None:
+            record["path"] = {
+                "first_path_s": self.first_path_s,
+                "length_mm": path.length_mm,
+                "max_angle_from_start_rad": path.max_angle_from_start_rad(),
+                "accumulated_turn_rad": path.accumulated_turn_rad,
+                "costs": self.known_costs,
+                "lps_from_start": path.lps_from_start.tolist(),
+                "arcs": path.arc_records(),
+            }
         return record
 
 
@@ -313,26 +307,18 @@ def needle_question(lung: Organ, system: System, lps_from_start: Float, target_l
             expected="a target away from the start",
             remedy="Check that start and target are those of the question",
         )
-    if not isinstance(lung, Lung):
-        lung = _opened(lung, system, lps_from_start[:3, 3])
-    needle = system.require_needle("A path of the needle")
+    needle, point = system.require_needle("A path of the needle"), lps_from_start[:3, 3]
+    if not isinstance(lung, Lung) and lung.exact_clearance_mm(point, OUTSIDE, cap_mm=WALL_MM)[0] < WALL_MM:
+        # The surface of an organ is pierced at a start as near as this.
+        reach_mm = needle.exit_exemption_mm + needle.radius_mm + system.margins.total_mm
+        lung = with_entry(lung, point, reach_mm)
     environment = needle_environment(lung, needle, system.margins, with_fissures=not system.fissures_allowed)
-    point = lps_from_start[:3, 3]
     branches = pierced_branches(lung, point, environment.required_clearance_mm)
     at_wall = begins_at_wall(lung, point, needle.radius_mm)
     if at_wall:
         environment = begun_at_wall(environment, point, branches)
     query = Query(lps_from_start=lps_from_start, target=target_lps, branch=[*branches, -1][0])
     return NeedleQuestion(environment=environment, query=query, branches=branches, at_wall=at_wall)
-
-
-def _opened(organ: Organ, system: System, point: Float) -> Organ:
-    """Return an organ whose surface is pierced at a start, if it lies within `WALL_MM` of it."""
-    if organ.exact_clearance_mm(point, OUTSIDE, cap_mm=WALL_MM)[0] >= WALL_MM:
-        return organ
-    needle = system.require_needle("A path of the needle")
-    reach_mm = needle.exit_exemption_mm + needle.radius_mm + system.margins.total_mm
-    return with_entry(organ, point, reach_mm)
 
 
 def pierced_branches(lung: Organ, point: Float, near_mm: float) -> tuple[int, ...]:
@@ -349,8 +335,7 @@ def pierced_branches(lung: Organ, point: Float, near_mm: float) -> tuple[int, ..
     around = lung.labels[lung.grid.window(point, near_mm)]
     others = np.setdiff1d((around[(around & AIRWAY) != 0] >> BRANCH_SHIFT).astype(int) - 1, [-1, branch])
     meeting = {int(b) for b in others} & _meeting(lung, branch) if isinstance(lung, Lung) else set()
-    near = [b for b in sorted(meeting) if _distance_to_branch(lung, point, b, near_mm) < near_mm]
-    return (branch, *near)
+    return (branch, *(b for b in sorted(meeting) if _is_near(lung, point, b, near_mm)))
 
 
 def _meeting(lung: Lung, branch: int) -> set[int]:
@@ -363,13 +348,12 @@ def _meeting(lung: Lung, branch: int) -> set[int]:
     return joined - {branch}
 
 
-def _distance_to_branch(lung: Organ, point: Float, branch: int, cap_mm: float) -> float:
-    """Return the distance in mm from a point to the airway voxels of a branch as boxes, at most `cap_mm`."""
-    part = lung.grid.window(point, cap_mm)
+def _is_near(lung: Organ, point: Float, branch: int, near_mm: float) -> bool:
+    """Tell whether airway voxels of a branch, as boxes, come within `near_mm` of a point."""
+    part = lung.grid.window(point, near_mm)
     labels = lung.labels[part]
     of_branch = ((labels & AIRWAY) != 0) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == branch)
-    found = voxels_in(part, of_branch)
-    return float(lung.grid.box_distance_mm(found, point).min(initial=cap_mm))
+    return bool((lung.grid.box_distance_mm(voxels_in(part, of_branch), point) < near_mm).any())
 
 
 def begins_at_wall(lung: Organ, point: Float, radius_mm: float) -> bool:

@@ -192,44 +192,31 @@ class _FromScope:
 
     def _direct(self) -> tuple[Deployment, ArcPath] | None:
         """Return the proved direct arc of least estimated cost, those of the least bounds looked at first."""
-        near, (x, y, z) = self._near, self._target.tolist()
-        bounds = np.zeros(len(near))
-        cost_bounds(
-            self._evaluator.needle_arrays, self.entries.positions[near], self._near_mm, (x, y, z), bounds
-        )
-        near = near[np.argsort(bounds + self._before(near), kind="stable")]
+        near, every, (x, y, z) = self._near, self.entries, self._target.tolist()
+        bounds, some = np.zeros(len(near)), every.only(near)
+        cost_bounds(self._evaluator.needle_arrays, every.positions[near], self._near_mm, (x, y, z), bounds)
+        before = costs_of_tubes(self._evaluator, np.repeat(self._row, some.count, axis=0), some)
+        order = np.argsort(bounds + before, kind="stable")
+        near = near[order]
         # An arc that costs more than a clear one is of use only where the cheaper ones are not proved.
         for slack in (1.0, math.inf):
-            blockers, costs = self._arcs(near, slack)
+            blockers, costs = np.zeros(len(near), dtype=np.int64), np.zeros(len(near))
+            evaluate_arcs(
+                self._evaluator.needle_arrays, every.positions[near], every.tangents[near],
+                every.branch[near], before[order], (x, y, z), slack, math.inf, blockers, costs,
+            )  # fmt: skip
             clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
-            found = self._first_proved(near[clear[np.argsort(costs[clear], kind="stable")]])
+            found = None
+            for entry in near[clear[np.argsort(costs[clear], kind="stable")]].tolist():
+                deployment = self._deployment(entry)
+                path = path_through(deployment, np.zeros((0, 3)), self._target)
+                if self._evaluator.allows(self._frame, deployment, path):
+                    found = deployment, path
+                    break
             if found is not None or not len(clear):
                 break
         self._evaluator.count_blockers(blockers)
         return found
-
-    def _arcs(self, entries: Int, slack: float) -> tuple[Int, Float]:
-        """Return what blocks the direct arcs of some deployments, and what they cost; see `evaluate_arcs`."""
-        every, (x, y, z) = self.entries, self._target.tolist()
-        blockers, costs = np.zeros(len(entries), dtype=np.int64), np.zeros(len(entries))
-        evaluate_arcs(
-            self._evaluator.needle_arrays, every.positions[entries], every.tangents[entries],
-            every.branch[entries], self._before(entries), (x, y, z), slack, math.inf, blockers, costs,
-        )  # fmt: skip
-        return blockers, costs
-
-    def _before(self, entries: Int) -> Float:
-        """Return what the tubes of some deployments cost before their arcs."""
-        some = self.entries.only(entries)
-        return costs_of_tubes(self._evaluator, np.repeat(self._row, some.count, axis=0), some)
-
-    def _first_proved(self, entries: Int) -> tuple[Deployment, ArcPath] | None:
-        for entry in entries.tolist():
-            deployment = self._deployment(entry)
-            path = path_through(deployment, np.zeros((0, 3)), self._target)
-            if self._evaluator.allows(self._frame, deployment, path):
-                return deployment, path
-        return None
 
     def _searched(self) -> tuple[Deployment, ArcPath] | None:
         """Return the first path that the needle's own search finds, the nearest deployments first."""

@@ -4,8 +4,6 @@ What tubes do does not depend on where the scope's tip stands, so that a deploym
 the scope's frame; whether it is clear is looked at where the scope is.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 
 from anatomy.base.records import frozen_record
@@ -21,7 +19,7 @@ from lungaccess.problem.system import System
 from lungaccess.uncertainty.risk import Deviations
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_deviations, tubes_alone
 from stages.needle import needle_environment, workspace_lengths
-from stages.tube import Deployment, Deployments, DeploymentValidator, SiteEnumerator
+from stages.tube import Deployment, DeploymentValidator, SiteEnumerator
 
 DRAWS = 16
 """Draws in which the tubes of a choice are followed: they compare choices, which have the same luck."""
@@ -66,7 +64,8 @@ def planned_choice(plan: Plan, left: Sizes) -> Choices:
     tube, frame = plan.tube, np.array(plan.scope.lps_from_scope_tip)
     tubes = np.zeros((0, 11))
     if plan.system.tubes.planar:
-        tubes = DeviatedPlan(plan).kernel_inputs(_none(plan))[0].tubes[None]
+        none = Deviations(**no_deviations(1, 0 if plan.needle is None else len(plan.needle.arcs), 0))
+        tubes = DeviatedPlan(plan).kernel_inputs(none)[0].tubes[None]
     shapes, counts = np.array(tube.shape.arcs)[None], np.array([len(tube.shape.arcs)])
     return Choices(
         scope_from_tip=np.asarray(np.linalg.inv(frame) @ np.asarray(tube.lps_from_tip))[None],
@@ -131,7 +130,10 @@ def offered(
     found: dict[tuple[float, int], tuple[Deployment, Float]] = {}
     for frame in frames:
         row = np.concatenate([frame[:3, 3], frame[:3, 2], frame[:3, 0]])
-        entries = _some(enumerate_from(row, worthwhile), worthwhile)
+        entries = enumerate_from(row, worthwhile)
+        near = np.flatnonzero(worthwhile(entries.positions, entries.tangents))
+        # Deployments that are ranked from one tip, spread over all of them: those between are much like them.
+        entries = entries.only(near[:: -(-len(near) // 96) or 1])
         tips = np.repeat(row[None], entries.count, axis=0)
         spread = Spread(lung, system, tips, entries, target, errors, procedure, radius_mm)
         # Deployments that are kept from one tip, the likeliest: further ones are alike or worse.
@@ -143,16 +145,3 @@ def offered(
                     found[deployed] = made, frame
     every = [each for each, _frame in found.values()], [frame for _each, frame in found.values()]
     return Offer(choices=with_choices(planned, system, *every), deployed=tuple(found))
-
-
-def _some(entries: Deployments, worthwhile: Callable[[Float, Float], Bool]) -> Deployments:
-    """Return some of the deployments towards the target, evenly."""
-    near = np.flatnonzero(worthwhile(entries.positions, entries.tangents))
-    # Deployments that are ranked from one tip, spread over all of them: those between are much like them.
-    return entries.only(near[:: -(-len(near) // 96) or 1])
-
-
-def _none(plan: Plan) -> Deviations:
-    n_arcs = 0 if plan.needle is None else len(plan.needle.arcs)
-    twisted = 0 if plan.system.tubes.planar else len(plan.system.tubes.nested)
-    return Deviations(**no_deviations(1, n_arcs, twisted))

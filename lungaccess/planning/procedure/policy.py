@@ -5,7 +5,6 @@ have their chance from the same kernels.  The simulator of procedures decides by
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -270,7 +269,9 @@ class Policy:
             if found is not None and chosen.found[0, 0] > 0:
                 tube = tube_part(self._task, frame, found[0])
             each.append(replace(chosen, deployed=(tube,)))
-        return _joined(each)
+        names = [field.name for field in fields(Chosen) if field.name != "deployed"]
+        arrays = {name: np.concatenate([getattr(one, name) for one in each]) for name in names}
+        return Chosen(**arrays, deployed=tuple(tube for one in each for tube in one.deployed))
 
     def _deployed(self, frame: Float, number: int) -> TubeDeployment:
         """Return a deployment of the offer from a scope's tip as a plan states it."""
@@ -466,11 +467,7 @@ class Policy:
             needle = needle_part(path)
         tube = None
         if not tubes_out:
-            tube = (
-                chosen.deployed[0]
-                if chosen.deployed
-                else self._deployed(chosen.frames[0], chosen.found[0, 0])
-            )
+            tube = next(iter(chosen.deployed), None) or self._deployed(chosen.frames[0], chosen.found[0, 0])
             tube = replace(tube, lps_from_tip=chosen.tips[0])
         return Decision(
             action=action, chance=chance, again=self.worth[left],
@@ -586,12 +583,3 @@ def _same(arcs: Float, others: Float) -> Bool:
     """Tell which paths `(N, A, 3)` are the same but for rounding."""
     # Arcs that differ by less, in mm, rad and 1/mm, are the same: no hand or drive tells them apart.
     return np.asarray((np.abs(arcs - others) <= 1e-4).all(axis=(1, 2)))
-
-
-def _joined(parts: Sequence[Chosen]) -> Chosen:
-    arrays = {
-        each.name: np.concatenate([getattr(part, each.name) for part in parts])
-        for each in fields(Chosen)
-        if each.name != "deployed"
-    }
-    return Chosen(**arrays, deployed=tuple(tube for part in parts for tube in part.deployed))

@@ -32,7 +32,9 @@ class ProcedureRecord:
     def decide(self, measured: Measurements) -> Decision:
         """Return what the policy decides, and note it; errors as `Policy.decide`."""
         decision = self.policy.decide(measured)
-        self.steps.append(_plain({"measured": measured.record(), "decided": decision.record()}))
+        # A step is noted as it is read again from JSON.
+        step = {"measured": measured.record(), "decided": decision.record()}
+        self.steps.append(json.loads(json.dumps(step)))
         return decision
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -84,12 +86,6 @@ class ProcedureRecord:
 def plan_digest(plan: Plan) -> str:
     """Return the SHA-256 of a plan as it is written."""
     return hashlib.sha256(to_json(plan).encode()).hexdigest()
-
-
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values as they are read again from JSON."""
-    plain: dict[str, Any] = json.loads(json.dumps(values))
-    return plain
 
 
 def _tuples(value: Any) -> Any:

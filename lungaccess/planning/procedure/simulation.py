@@ -203,9 +203,11 @@ class _Run:
             seen = as_measured(scope_frames(starts), placing.position_mm, placing.direction_deg, noise[:, 0])
             likely = policy.scopes_measured(seen)
             chosen = policy.from_scopes(likely)
-            found.decided["scope"].append(
-                _Decided(~policy.goes_on(chosen.chances, 0), self._misses(likely.frames))
-            )
+            plan = policy.plan
+            planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip)) @ np.append(plan.end_lps, 1.0)
+            # How far from the target the plan would end without further errors from these scope tips.
+            misses = np.linalg.norm((likely.frames @ planned)[:, :3] - plan.goal_lps, axis=1)
+            found.decided["scope"].append(_Decided(~policy.goes_on(chosen.chances, 0), misses))
             goes = np.flatnonzero(policy.goes_on(chosen.chances, left))
             chosen = chosen.only(goes)
         else:
@@ -217,12 +219,6 @@ class _Run:
         over = np.zeros(len(rows), dtype=bool)
         over[goes] = complete
         return over
-
-    def _misses(self, likely: Float) -> Float:
-        """Return how far from the target the plan would end without further errors from scope tips."""
-        plan = self._policy.plan
-        planned = np.linalg.inv(np.asarray(plan.scope.lps_from_scope_tip)) @ np.append(plan.end_lps, 1.0)
-        return np.asarray(np.linalg.norm((likely @ planned)[:, :3] - plan.goal_lps, axis=1))
 
     def _devices_out(self, went: "_Went", left: int, at: Int, found: Found) -> Bool:
         """Let tubes and needles out, and note what came of it; tell which needles were inserted."""
@@ -329,6 +325,8 @@ def _report(policy: Policy, found: Found, samples: int, seed: int) -> ProcedureR
     touched = {name: (found.touched & flag) != 0 for name, flag in assessor.structures.items()}
     inserted = found.miss_mm[np.isfinite(found.miss_mm)]
     quantiles = {q: float(np.quantile(inserted, q)) for q in MISS_QUANTILES} if len(inserted) else {}
+    measured = (procedure.scope.measured, procedure.tubes.measured, procedure.needle.closed_loop)
+    used = [stage for stage, is_so in zip(STAGES, measured, strict=True) if is_so]
     left = np.ones(samples, dtype=bool)
     ends = {}
     causes = [(name, touched[name]) for name in ORDER if name in assessor.forbidden]
@@ -347,17 +345,10 @@ def _report(policy: Policy, found: Found, samples: int, seed: int) -> ProcedureR
         ends=MappingProxyType(ends),
         miss_mm=MappingProxyType(quantiles),
         placements=float(found.placements.mean()),
-        stages=tuple(
-            _stage(stage, found.decided.get(stage, [])) for stage in STAGES if _used(procedure, stage)
-        ),
+        stages=tuple(_stage(stage, found.decided.get(stage, [])) for stage in used),
         tissue=assessor.tissue,
         with_needle=assessor.plan.needle is not None,
     )
-
-
-def _used(procedure: Procedure, stage: str) -> bool:
-    used = (procedure.scope.measured, procedure.tubes.measured, procedure.needle.closed_loop)
-    return dict(zip(STAGES, used, strict=True))[stage]
 
 
 def _stage(stage: str, decided: list[_Decided]) -> StageReport:

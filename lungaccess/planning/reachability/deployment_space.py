@@ -177,7 +177,12 @@ def divided_space(
 
     The `passable` of the environment does not count; `between` is called now and then.
     """
-    arrays = _as_arrays(pieces)
+    counts = [len(piece.cones) for piece in pieces]
+    arrays = Pieces(
+        frames=np.array([piece.frame for piece in pieces]).reshape(-1, 3, 3),
+        cones=np.concatenate([np.zeros((0, 7)), *(piece.cones for piece in pieces)]),
+        first_cone=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+    )
     boxes, owners = _first_boxes(tubes, float(insertions.max()), pieces)
     looked = 0
     greatest = np.inf if not len(boxes) else float(_measures(boxes).max())
@@ -214,15 +219,6 @@ def in_tasks(pool: ThreadPoolExecutor, work: Callable[[Int], Any], rows: Int, si
     while begins := list(islice(tasks, 8)):
         list(pool.map(lambda begin: work(rows[begin : begin + size]), begins))
         yield rows[begins[0] : begins[-1] + size]
-
-
-def _as_arrays(pieces: Sequence[PlacePiece]) -> Pieces:
-    counts = [len(piece.cones) for piece in pieces]
-    return Pieces(
-        frames=np.array([piece.frame for piece in pieces]).reshape(-1, 3, 3),
-        cones=np.concatenate([np.zeros((0, 7)), *(piece.cones for piece in pieces)]),
-        first_cone=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-    )
 
 
 def _first_boxes(tubes: Float, longest: float, pieces: Sequence[PlacePiece]) -> tuple[Float, Int32]:

@@ -30,15 +30,10 @@ def counted_voxels(lung: Lung, grid: Grid, with_fissures: bool) -> Mask:
     bits = obstacle_bits(with_fissures)
     counted = np.zeros(grid.shape, dtype=bool, order="F")
     for k in range(grid.shape[2]):
-        counted[:, :, k] = (lung.labels_at(_layer_points(grid, k)) & bits) == 0
+        i, j = np.meshgrid(*map(np.arange, grid.shape[:2]), indexing="ij")
+        centres = grid.lps(np.stack([i, j, np.full_like(i, k)], axis=-1))
+        counted[:, :, k] = (lung.labels_at(centres) & bits) == 0
     return counted
-
-
-def _layer_points(grid: Grid, k: int) -> Float:
-    """Return the centres `(ni, nj, 3)` of a layer of voxels, LPS mm."""
-    ni, nj, _nk = grid.shape
-    i, j = np.meshgrid(np.arange(ni), np.arange(nj), indexing="ij")
-    return grid.lps(np.stack([i, j, np.full_like(i, k)], axis=-1))
 
 
 def scan_layers(

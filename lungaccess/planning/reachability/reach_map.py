@@ -5,7 +5,9 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,7 +39,6 @@ from stages.needle import (
     NO_CLEARANCE,
     SEARCHED,
     UNREACHED,
-    NeedleEnvironment,
     direct_arcs,
     needle_environment,
 )
@@ -289,40 +290,16 @@ def compare_reach(
     lung: Lung,
     systems: Iterable[System],
     *,
-    spacing_mm: float = DEFAULT_SPACING_MM,
-    arcs: int = DEFAULT_ARCS,
-    trees: int = 0,
-    phases: tuple[float, float] | None = None,
-    work: str | os.PathLike[str] | None = None,
     progress: Callable[[str, float], None] | None = None,
+    **settings: Any,
 ) -> tuple[ReachMap, ...]:
-    """Return the maps of several systems, all on the same grid.
+    """Return the maps of several systems, all on the same grid; settings are those of `map_reach`.
 
     Args:
-        lung, spacing_mm, arcs, trees, phases, work: See `map_reach`.
         progress: Told the name of the system and the share of its layers done.
     """
-    maps = []
-    for system in systems:
-        name = system.name
-
-        def tell(share: float, name: str = name) -> None:
-            if progress:
-                progress(name, share)
-
-        maps.append(
-            map_reach(
-                lung,
-                system,
-                spacing_mm=spacing_mm,
-                arcs=arcs,
-                trees=trees,
-                phases=phases,
-                work=work,
-                progress=tell,
-            )
-        )
-    return tuple(maps)
+    tell = progress or (lambda _name, _share: None)
+    return tuple(map_reach(lung, each, progress=partial(tell, each.name), **settings) for each in systems)
 
 
 def _key(
@@ -407,23 +384,16 @@ class ReachStream:
 
     def _again(self, points: ArrayLike, entries: Int) -> Bool:
         """Tell which points `(N, 3)` the arc from a deployment reaches with the needle of the system."""
-        environment, places = self._environment, np.asarray(points)
+        system, places = self._system, np.asarray(points)
+        environment = needle_environment(
+            self._lung,
+            system.require_needle("A direct arc"),
+            system.margins,
+            with_fissures=self._atlas.with_fissures,
+        )
         deployments, reached = self._atlas.deployments, np.zeros(len(entries), dtype=bool)
         for row in np.flatnonzero(entries >= 0).tolist():
             at = entries[row : row + 1]
-            blockers, _lengths, _costs = direct_arcs(
-                environment,
-                deployments.positions[at],
-                deployments.tangents[at],
-                deployments.branch[at],
-                places[row],
-            )
-            reached[row] = blockers[0] == 0
+            start = deployments.positions[at], deployments.tangents[at], deployments.branch[at]
+            reached[row] = direct_arcs(environment, *start, places[row])[0][0] == 0
         return reached
-
-    @property
-    def _environment(self) -> NeedleEnvironment:
-        needle = self._system.require_needle("A direct arc")
-        return needle_environment(
-            self._lung, needle, self._system.margins, with_fissures=self._atlas.with_fissures
-        )

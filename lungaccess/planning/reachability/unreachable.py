@@ -72,16 +72,18 @@ def open_places(lung: Lung, space: DeploymentSpace, found: Found) -> tuple[OpenP
     rows = np.flatnonzero(found.outcome != RULED_OUT)
     open_measure = space.measures[rows] * (1.0 - found.share[rows])
     total = float(space.measures.sum())
-    groups: list[tuple[int, list[int]]] = []
+    groups: list[tuple[int, list[int], Float]] = []
     for piece in np.unique(space.owners[rows]):
         first = tree.nearest_point_index.query(space.pieces[piece].cones[0, :3])[1]
         branch = int(tree.branch_of_point[first])
-        if groups and groups[-1][0] == branch and _near(space, groups[-1][1][-1], int(piece)):
-            groups[-1][1].append(int(piece))
+        start = space.pieces[piece].cones[0, :3]
+        # Open pieces of a branch that begin so near to each other are one place: a piece has 8 mm.
+        if groups and groups[-1][0] == branch and np.linalg.norm(groups[-1][2] - start) <= 12.0:
+            groups[-1] = branch, [*groups[-1][1], int(piece)], start
         else:
-            groups.append((branch, [int(piece)]))
+            groups.append((branch, [int(piece)], start))
     places = []
-    for branch, pieces in groups:
+    for branch, pieces, _start in groups:
         mine = np.isin(space.owners[rows], pieces)
         # A part that is too small to halve tells more than one that was not looked at to the end.
         best = rows[mine][np.lexsort((-open_measure[mine], found.outcome[rows[mine]] == TOO_MANY))[0]]
@@ -101,12 +103,6 @@ def open_places(lung: Lung, space: DeploymentSpace, found: Found) -> tuple[OpenP
             )
         )
     return tuple(sorted(places, key=lambda place: -place.share))
-
-
-def _near(space: DeploymentSpace, one: int, other: int) -> bool:
-    away = space.pieces[one].cones[0, :3] - space.pieces[other].cones[0, :3]
-    # Open pieces of a branch that begin so near to each other are one place: a piece has 8 mm.
-    return float(np.linalg.norm(away)) <= 12.0
 
 
 MOST_BOXES = 20_000_000
@@ -271,26 +267,15 @@ class UnreachableProof:
         space = self._space
         away = np.array([np.linalg.norm(piece.cones[0, :3] - target) for piece in space.pieces])
         nearest = np.argsort(away[space.owners], kind="stable")
+        devices = self._tubes, self._insertions, self._limits
+        about = environment, *devices, target, space.arrays, space.boxes, space.owners
         with ThreadPoolExecutor(THREADS) as pool:
             for left, to_the_end in ((TOO_MANY, False), (UNDECIDED, True)):
                 most = 1
                 while len(rows := nearest[found.outcome[nearest] == left]):
 
                     def work(some: Int, most: int = most, to_the_end: bool = to_the_end) -> None:
-                        rule_out(
-                            environment,
-                            self._tubes,
-                            self._insertions,
-                            self._limits,
-                            target,
-                            space.arrays,
-                            space.boxes,
-                            space.owners,
-                            some,
-                            most,
-                            to_the_end,
-                            found,
-                        )
+                        rule_out(*about, some, most, to_the_end, found)
 
                     # Looks that a thread may take at a time.
                     yield from in_tasks(pool, work, rows, max(16384 // most, 1))

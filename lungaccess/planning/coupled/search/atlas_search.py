@@ -83,16 +83,13 @@ class LocalSearchRounds:
         for n in range(1, iterations + 1):
             # Variations of an iteration, which takes about a millisecond.
             self._local_search.advance(run, 50)
-            yield self._evaluated(run) if n == iterations else Step(iteration=0, phase=self.phase)
-
-    def _evaluated(self, run: LocalSearchRun) -> Step:
-        """Return what a run has found, if that may be the best."""
-        # A run is evaluated in full only when its estimated cost has fallen by this factor, which saves time.
-        limit = min(0.999 * run.evaluated_cost, ESTIMATE_SLACK * self._incumbent.cost)
-        if not run.cost < limit:
-            return Step(iteration=0, phase=self.phase)
-        run.evaluated_cost = run.cost
-        return evaluated_step(self._evaluator, self.phase, self._local_search.candidate(run))
+            # A run is evaluated in full only when its estimated cost has fallen by this factor, to save time.
+            limit = min(0.999 * run.evaluated_cost, ESTIMATE_SLACK * self._incumbent.cost)
+            if n < iterations or not run.cost < limit:
+                yield Step(iteration=0, phase=self.phase)
+            else:
+                run.evaluated_cost = run.cost
+                yield evaluated_step(self._evaluator, self.phase, self._local_search.candidate(run))
 
 
 class AtlasSearch(ParallelSearch):
@@ -167,21 +164,17 @@ class AtlasSearch(ParallelSearch):
         """
         number, parts = self.share
         clear = self.direct.clear
+        first = different(self.atlas.deployments, clear)[number::parts].tolist()
         refused: set[int] = set()
-        for entry in self._entries(clear, different(self.atlas.deployments, clear)[number::parts], refused):
+        while first or len(refused) < len(clear):
+            entry = first.pop(0) if first else int(self._rng.choice(clear))
+            if entry in refused:
+                continue
             run = local_search.begin(self.arcs.candidate(entry))
             if run is not None:
                 yield run
             else:
                 refused.add(entry)
-
-    def _entries(self, clear: Int, first: Int, refused: set[int]) -> Iterator[int]:
-        """Yield deployments of the atlas: the first ones, then any that are clear until all are refused."""
-        yield from first.tolist()
-        while len(refused) < len(clear):
-            entry = int(self._rng.choice(clear))
-            if entry not in refused:
-                yield entry
 
     def _sampled(self, local_search: LocalSearch) -> Iterator[tuple[Step, Candidate | None]]:
         """Sample deployments near those of the atlas whose needle reaches the target, or nearly does."""

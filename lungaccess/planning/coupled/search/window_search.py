@@ -213,7 +213,13 @@ class WindowAims:
         motion, phases = require_motion(evaluator.task.lung), evaluator.phases
         held = phases is None or phases[0] <= motion.masks_phase <= phases[1]
         # An aim for phases without that of the masks may lie so far from the target: no lung moves by more.
-        near = _ending_near(evaluator, atlas, 2.0 * TOLERANCE_MM if held else 20.0)
+        within_mm, target = 2.0 * TOLERANCE_MM if held else 20.0, evaluator.task.target.lps_mm
+        if evaluator.task.system.needle is None:
+            away = np.linalg.norm(atlas.deployments.positions - target, axis=1)
+            near = np.flatnonzero(away <= near_mm(atlas, target)[atlas.deployments.site] + within_mm)
+        else:
+            limits = evaluator.environment.limits._replace(goal_tolerance_mm=within_mm)
+            near = atlas.index.holding(replace(evaluator.environment, limits=limits), target)[0]
         found = np.full((atlas.motions.count, 6), np.nan)
         for site in np.unique(atlas.deployments.site[near]).tolist():
             aim = evaluator.aim_from(np.ascontiguousarray(atlas.motions.tips[site, :3]))
@@ -226,16 +232,6 @@ class WindowAims:
     def reached(self) -> Float:
         """The aims `(S, 3)` of tips that are not ruled out; nan for all others."""
         return np.where((self.misses_mm > 0.0)[:, None], np.nan, self.points)
-
-
-def _ending_near(evaluator: WindowEvaluator, atlas: Atlas, within_mm: float) -> Int:
-    """Return the deployments from which devices may end within a distance of the target."""
-    target = evaluator.task.target.lps_mm
-    if evaluator.task.system.needle is None:
-        away = np.linalg.norm(atlas.deployments.positions - target, axis=1)
-        return np.flatnonzero(away <= near_mm(atlas, target)[atlas.deployments.site] + within_mm)
-    limits = evaluator.environment.limits._replace(goal_tolerance_mm=within_mm)
-    return atlas.index.holding(replace(evaluator.environment, limits=limits), target)[0]
 
 
 class WindowDirectSearch:

@@ -43,19 +43,16 @@ def aim_tubes(
     """Aim the tubes at targets from many scope tips, and validate and cost what hits them.
 
     Args:
-        obstacles: Obstacles.
         weights, map_weights (ObjectiveArrays): The objective without its costs of the map, which count from
             the exit on, and with these alone, which count beyond the wall that the tubes pierce.
         of_tubes (ObjectiveArrays): What counts for each mm of the tubes' width, beyond that wall, too.
-        scope_poses: (K, 9) float64.
-        allowed ((K,) bool): Which of these poses the scope can take.
-        pose_of ((N,) int64): The row of `scope_poses` of each attempt.
-        shapes (ManyShapes): The shapes from which they begin.
+        scope_poses, allowed ((K, 9) float64, (K,) bool): Scope tips, and which of them the scope can take.
+        pose_of ((N,) int64): The row of `scope_poses` of each attempt, which begins from one of the shapes.
         targets ((K, 3) float64): Where they are to end from each pose.
         enough (int): So many deployments end the attempts.
         found ((N, JOINTS + 2 n) float64): Receives rotation, estimated cost and joints; the cost is infinite
             where the tubes are refused.
-        why ((N,) int64): Receives ACCEPTED, MISSES, SPOILT_WAY, NOT_TRIED, or the reason of
+        why ((N,) int64): Receives ACCEPTED, MISSES, SPOILT_WAY, NOT_TRIED, or a reason of
             `stages.tube.kernels`.
     """
     environment, constants, design, near, shape = tube

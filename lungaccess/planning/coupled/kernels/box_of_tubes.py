@@ -33,13 +33,11 @@ class BoxTubes(NamedTuple):
     """The tubes of a box: the middle ones, and how the others differ.
 
     Args:
-        base, forward, normal (tuple of 3 float): The scope tip, LPS mm, its direction, and the direction in
-            which the tubes bend.
+        base, forward, normal (tuple of 3 float): The scope tip, LPS mm, its direction, and that of the bend.
         place, tilt, roll: How far the place (mm), the direction and the rotation (rad) may be from these.
         sharing, first_outer: What the outer insertion changes of the heading, rad, beyond an arc length, mm.
         opening: What the inner insertion changes of it, rad a mm, where the tubes go straight first.
-        outer, inner: Insertions of the middle tubes, mm; the inner one is the longest where all are bent
-            throughout.
+        outer, inner: Insertions of the middle tubes, mm; the inner one is the longest where all are bent.
     """
 
     base: Vector
@@ -236,16 +234,13 @@ def seen_target(tubes, kappa, target, family, tip, tangent, box):
 
     Every deployment moves the tip by a chain of motions: to its place, by its direction, its rotation, and
     along and in the bend of the tubes.  Seen from the tip the target makes the reverse motions, the place
-    first. The displacement by each is at most its rate times how far the target is from its centre; the
+    first.  The displacement by each is at most its rate times how far the target is from its centre; the
     remainder of second order of a chain is the sum over pairs of what the outer motion turns of what the
     inner has moved, and half the square of each.
 
     Args:
-        tubes, kappa: kappa in 1/mm.
         target (tuple of 3 float): LPS mm.
-        family: BoxTubes.
         tip, tangent (tuple of 3 float): Those of `tip_of`.
-        box: See the module.
 
     Returns:
         Seen: The displacement of first order by places and directions is for the caller to find.

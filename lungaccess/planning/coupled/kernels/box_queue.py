@@ -69,12 +69,10 @@ def _pop(boxes, heap, numbers):
 def begin_queue(environment, tubes, insertions, tips, target, longest, limit, first, last, state):
     """Let boxes wait that hold all deployments whose bound may be below a limit, from tips `first` to `last`.
 
-    Boxes of more than BEGUN_MM are divided at once, depth first.
+    Boxes of more than BEGUN_MM are divided at once, depth first.  Before `longest` (the greatest insertion,
+    mm) stand the arguments of `bound_box`.
 
     Args:
-        environment, tubes, insertions, tips, target: Those of `bound_box`.
-        longest (float): Greatest insertion, mm.
-        limit: float.
         first, last (int): Rows of tips, without the last; those of the first call begin with 0.
         state (tuple of arrays): Boxes (N, BOX_COLUMNS) float64, heap (N,) and unused rows (N,) int64, and
             numbers (2,) int64.
@@ -118,13 +116,10 @@ def begin_queue(environment, tubes, insertions, tips, target, longest, limit, fi
 
 @kernel(nogil=True)
 def divide(environment, tubes, insertions, tips, target, most, limit, state):
-    """Divide the box of the lowest bound, and so on.
+    """Divide the box of the lowest bound, and so on, at most so many times.
 
-    Args:
-        environment, tubes, insertions, tips, target: Those of `bound_box`.
-        most (int): Boxes to divide.
-        limit (float): Boxes whose bounds are as high are left out; it ends once there is no other.
-        state: See `begin_queue`.
+    Boxes whose bounds are as high as the limit are left out; it ends once there is no other.  For the other
+    arguments see `begin_queue`.
 
     Returns:
         tuple of (int, int): ENDED, EMPTY, FULL or WHOLE, and how many were divided.

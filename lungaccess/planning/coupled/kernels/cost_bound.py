@@ -84,11 +84,9 @@ class BoundEnvironment(NamedTuple):
 
 @inner_kernel
 def between(environment, begin, end, begin_off, end_off):
-    """Bound the cost of every path from near one point to near another from below.
+    """Bound the cost of every path from below that begins and ends near two points, LPS mm.
 
-    Args:
-        begin, end (tuple of 3 float): LPS mm.
-        begin_off, end_off (float): How far the path may begin and end from them, mm.
+    `begin_off` and `end_off` (mm) are how far from them it may begin and end.
     """
     far = math.sqrt((end[0] - begin[0]) ** 2 + (end[1] - begin[1]) ** 2 + (end[2] - begin[2]) ** 2)
     return as_far_as(environment, begin, end, begin_off, end_off, far - begin_off - end_off)
@@ -139,14 +137,11 @@ def as_far_as(environment, begin, end, begin_off, end_off, least):
 def along_tangent(environment, tip, tangent, swing, away, far, limit):
     """Bound the cost of every path from near a tip, which follows its direction at first, then any way.
 
+    It ends early once the bound is as high as the limit; it is inf if there is no path.
+
     Args:
-        tip, tangent (tuple of 3 float): LPS mm, and a unit vector.
         swing, away (float): How well direction (rad) and place (mm) are known.
         far (float): Every path is at least so long, mm.
-        limit (float): It ends early once the bound is as high.
-
-    Returns:
-        float: inf if there is no path.
     """
     kappa, exempt = environment.kappa, environment.exempt_mm
     x, y, z = tip
@@ -190,12 +185,8 @@ def bound_box(environment, tubes, insertions, tips, target, limit, box, same_tub
     Tubes are not looked at where the bound is `limit` or more without.
 
     Args:
-        environment: BoundEnvironment.
-        tubes: (N_TUBES,) float64.
         insertions ((N,) float64): See `stages.tube.kernels.greatest_insertions`.
         tips ((S, 9) float64): Scope tips, LPS mm.
-        target: tuple of 3 float.
-        limit: float.
         box ((BOX_COLUMNS,) float64): AWAY, WIDE and LOSS are filled.
         same_tubes (bool): Whether a box with the same tubes was looked at before, whose bound counts as well:
             then this is that of the paths alone.
@@ -277,14 +268,10 @@ def _by_halfway(environment, target, tip, tangent, swing, off, away, least, box)
 def least_distance(kappa, seen, off):
     """Return how far the tips of a box with the target in reach are at least, mm; inf if there is none.
 
-    The target moves, as the tips see it, with each side of the box.  To first order its distance from the
-    middle tip, and from the centre of the tightest circle there, change with each in proportion.  The least
-    distance with the target outside of that circle is that of a linear program with one condition.
-
-    Args:
-        kappa: float.
-        seen (Seen): Of a box with one scope tip.
-        off (float): How far beside the target a needle may end, mm.
+    The target, beside which a needle may end by `off` mm, moves, as the tips see it, with each side of the
+    box.  To first order its distance from the middle tip, and from the centre of the tightest circle there,
+    change with each in proportion.  The least distance with the target outside of that circle is that of a
+    linear program with one condition.
     """
     far = math.hypot(seen.aside, seen.ahead)
     if min(far, seen.size) < CORNER_MM:

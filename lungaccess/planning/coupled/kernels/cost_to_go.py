@@ -83,18 +83,15 @@ def _reduce(levels, shell):
 
 @kernel(nogil=True)
 def fill_shell(field, geometry, weights, off, limit, togo, k, behind, beyond, part, parts):
-    """Fill each `parts`-th row of cells of a shell of a `CostToGo`, when the shells before it are filled.
+    """Fill each `parts`-th row of cells, from `part` on, of the shell `k` behind those that are filled.
 
     Args:
         field, geometry: Corner field of the distance to all obstacles.
         weights (tuple of 2 float): Of the integral of 1 / clearance, and of the length in mm.
         off (float): How far from the target a path may end, mm.
         limit (float): Costs above are not told apart.
-        togo: CostToGo.
-        k (int): The shell.
         behind, beyond ((N, N) float64): The cost from half a shell beyond the last one, and the same for this
             one, whose rows are filled.
-        part, parts (int): Rows part, part + parts, ...
 
     Returns:
         bool: Whether paths from some cell cost less than `limit`.

@@ -185,13 +185,7 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
     A tube leaves its airway behind the last sample at which all tubes are in the lumen, and before the first
     at which all are out of every lumen.  Where they all leave one branch, other branches count as obstacles.
     A hazard also refuses tubes that leave beyond it and touch the wall from there on: see
-    `docs/theory/cost_bound.md`.
-
-    Args:
-        surroundings: TubeSurroundings.
-        tubes: (N_TUBES,) float64.
-        family: BoxTubes.
-        sweep (float): No tube of the box sweeps sideways by less, mm.
+    `docs/theory/cost_bound.md`.  No tube of the box sweeps sideways by less than `sweep` mm.
     """
     first_outer, longer = box[OUTER] - box[HALF + OUTER], 2.0 * box[HALF + INNER]
     shortest = max(box[INNER] - box[HALF + INNER], 0.0)

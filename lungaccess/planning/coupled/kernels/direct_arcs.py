@@ -32,10 +32,7 @@ def _clearance_bound(needle, x, y, z):
 def _cost_bound(needle, begin_mm, end_mm, length):
     """Return what any path of `length` mm or more costs at least.
 
-    Clearance is 1-Lipschitz: `s` mm from an end of the path it is at most that at the end and `s` more.
-
-    Args:
-        begin_mm, end_mm (float): Clearance at the two ends, or more.
+    Clearance is 1-Lipschitz: `s` mm from an end of the path it is at most that at the end, or more, and `s`.
     """
     objective = needle.objective
     cost = objective.length * length
@@ -63,10 +60,7 @@ def evaluate_arcs(needle, positions, tangents, branches, before, target, slack, 
     """Evaluate the single arc from each pose to the target, and prove those whose cost is low enough.
 
     Args:
-        positions, tangents: (N, 3) float64.
-        branches: (N,) int64.
         before ((N,) float64): What the tubes cost before the arc.
-        target: tuple of 3 floats.
         slack, best (float): Arcs that cost more than `slack` times the cheapest so far, at first `best`, are
             not tested.
         blockers ((N,) int64): Receives 0 for arcs that are proved clear, the label that blocks, -1 where no
@@ -122,18 +116,10 @@ def _strays(one, other, square):
 
 @kernel(nogil=True)
 def choose_separated(lines, order, separation_mm, chosen):
-    """Choose lines one after the other, each separated from all chosen before.
+    """Choose lines `(N, M, 3)` one after the other, each separated from all before; return how many.
 
     Two lines are separated if some point of either is `separation_mm` or more from all points of the other.
-
-    Args:
-        lines: (N, M, 3) float64, mm.
-        order ((K,) int64): Which lines to look at, the best first.
-        separation_mm: float.
-        chosen ((C,) int64): Receives at most C of them.
-
-    Returns:
-        int: How many were chosen.
+    They are looked at in an order `(K,)`, the best first; `chosen` `(C,)` receives at most C.
     """
     square = separation_mm * separation_mm
     count = 0

@@ -107,16 +107,12 @@ def improve(tube, needle, scope_poses, allowed, x, vias, count, target, tries, s
     """Improve a choice by a stochastic local search: vary it at random and keep what is cheaper.
 
     A choice is kept only if it is proved: the tubes by their whole way and `validate_arcs`, the needle by
-    `blocker_on_arc`.  The shape nearby in `tube` becomes that of the choice.
+    `blocker_on_arc`.  The shape nearby in `tube` becomes that of the choice.  So many variations are tried.
 
     Args:
-        scope_poses: (K, 9) float64.
-        allowed ((K,) bool): Which of these poses the scope can take.
-        x: (c,) float64.
-        vias ((MAX_VIAS, 3) float64): Both receive the best choice.
+        scope_poses, allowed ((K, 9) float64, (K,) bool): Scope tips, and which of them the scope can take.
+        x, vias ((c,) and (MAX_VIAS, 3) float64): Both receive the best choice.
         count (int): Number of vias in use.
-        target: tuple of 3 floats.
-        tries (int): How many variations are evaluated.
         state ((1,) uint64): State of the random numbers.
 
     Returns:
@@ -190,16 +186,11 @@ def sample_deployments(
 
     Args:
         scope_poses ((K, 9) float64): Poses that the scope can take.
-        pose_of ((N,) int64): The row of `scope_poses` of each deployment.
-        rotations ((N,) float64): Rotation of each, rad.
-        shapes (ManyShapes): The shape of each.
+        pose_of, rotations, shapes ((N,) int64, (N,) float64, ManyShapes): Of each deployment.
         spreads ((2,) float64): The largest change of rotations in rad and of insertions in mm.
-        target: tuple of 3 floats.
-        tries: int.
         cost_limit (float): Choices that cost as much or more are dropped.
         state ((1,) uint64): State of the random numbers.
-        best ((c,) float64): Receives the cheapest choice.
-        best_shape (ShapeArrays): Receives its shape.
+        best, best_shape ((c,) float64, ShapeArrays): Receive the cheapest choice and its shape.
 
     Returns:
         float: Its estimated cost, or `cost_limit` if there is none.

@@ -61,9 +61,7 @@ def costs_in_tissue(obstacles, of_tubes, tips, deployed, shape, arcs, first_arc,
     Args:
         tips ((N, 9) float64): The scope tip of each.
         deployed ((N, 2) float64): Rotation in rad, and arc length behind the wall, mm.
-        shape: (N,) int64.
-        arcs: (A, ARC_COLUMNS) float64.
-        first_arc ((S + 1,) int64): The arcs of all shapes, and where those of each begin.
+        shape, arcs, first_arc: The shape of each, the arcs of all shapes, and where those of each begin.
     """
     for n in range(costs.shape[0]):
         rotation, behind = deployed[n]

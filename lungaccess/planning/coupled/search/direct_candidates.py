@@ -95,9 +95,7 @@ def _chosen(
 ) -> list[int]:
     """Choose separated deployments from clear ones by rising cost; `proved` keeps the proofs."""
     lines = arcs.lines(ordered, SAMPLES)
-    # The first of every branch comes before all others.
-    first = np.sort(np.unique(arcs.atlas.deployments.branch[ordered], return_index=True)[1])
-    order = np.concatenate([first, np.setdiff1d(np.arange(len(ordered)), first)])
+    order = _branches_first(arcs.atlas.deployments.branch[ordered])
     while True:
         refused = [n for n, entry in enumerate(ordered.tolist()) if proved.get(entry, True) is None]
         places = np.zeros(count, dtype=np.int64)
@@ -108,3 +106,9 @@ def _chosen(
             proved[entry] = arcs.proved(entry)
         if all(proved[entry] is not None for entry in chosen):
             return chosen
+
+
+def _branches_first(branch: Int) -> Int:
+    """Return the order in which the first of every branch comes before all others."""
+    first = np.sort(np.unique(branch, return_index=True)[1])
+    return np.concatenate([first, np.setdiff1d(np.arange(len(branch)), first)])

@@ -148,11 +148,8 @@ def _set_turn(moves, t, r, sign):
 def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls):
     """Return the chance to first order that a needle stays clear along a path and ends in the goal.
 
-    Args:
-        base, forward (tuples of 3 floats): Scope tip.
-        tip ((4, 4) float64): Where the path starts.
-        count (int): Arcs of the path; without any it is the tubes that end in the goal.
-        rolls ((A + 1, 6) float64): Scratch: errors of each roll, and of the curvature.
+    The path starts at a tip (4, 4), behind a scope tip; without any of its `count` arcs it is the tubes that
+    end in the goal.  `rolls` (A + 1, 6) is scratch: errors of each roll, and of the curvature.
     """
     at, ahead = (tip[0, 3], tip[1, 3], tip[2, 3]), (tip[0, 2], tip[1, 2], tip[2, 2])
     about, _size = unit(cross(forward, ahead))
@@ -319,8 +316,7 @@ def find_places(places, measured, size, fallback, luck, likely, drawn):
 
     Args:
         places ((M, 3) float64): Where tips may be before anything is measured, all alike.
-        measured: (N, 3) float64.
-        size (float): Standard deviation of the measurement along each axis.
+        measured, size: (N, 3) float64, with this standard deviation along each axis.
         fallback ((N, D, 3) float64): Places to draw where too few of all are near what was measured.
         luck ((D,) float64): Numbers from 0 to 1, in rising order, that choose among them.
         likely ((N, 3) float64): Holds what holds where too few are near, and receives the mean.
@@ -372,20 +368,17 @@ def choose_tubes(
     """Choose tubes, and the needle behind them, from poses of the scope's tip.
 
     Args:
-        scene: Scene.
         sizes (pair of Sizes): What is left of the errors for a needle that is planned again behind the tubes,
             and for another.
         environment, constants: Of the tubes, see `stages.tube.kernels.placing`.
-        choices: Choices.
         planned, vias ((A, 3), (A - 1, 3) float64): The planned path of the needle and where its arcs meet, in
             the frame of its start.
         branch (int): The branch that is pierced as planned.
-        target: tuple of 3 floats.
         placed (pair of (N, 4, 4) and (N, D, 3) float64): Most likely poses of the scope's tip, and places
             where it may be.
         found ((N, 3) int64): Receives the number of the choice, arcs of the path, and the pierced branch.
-        chances ((N,) float64): Receives the chance of what was chosen, to first order.
-        arcs ((N, A, 3) float64): Receives the path.
+        chances, arcs ((N,), (N, A, 3) float64): Receive the chance of the choice to first order, and the
+            path.
     """
     count, known, blind = choices.rotations.shape[0], sizes[0], sizes[1]
     frames, drawn = placed
@@ -503,18 +496,14 @@ def _aside(scene, tip, target, number):
 
 @kernel(nogil=True)
 def choose_needles(scene, sizes, tips, branches, targets, asides, found, chances, arcs):
-    """Choose the path of the needle from poses of the tubes' tip.
+    """Choose the path of the needle from N poses of the tubes' tip, with what is left once it is measured.
 
     Args:
-        sizes (Sizes): What is left of the errors once the tip is measured.
-        tips: (N, 4, 4) float64.
-        branches: (N,) int64.
-        targets: (N, 3) float64.
         asides (int): Points beside the target that are aimed at where its centre cannot be reached.
         found ((N, 3) int64): Holds in its second column how many arcs the path so far has, and receives how
             many the new one has, and in the third one how many paths are proved clear.
-        chances: (N,) float64.
-        arcs ((N, A, 3) float64): Holds the path so far, and receives the new one.
+        chances, arcs ((N,), (N, A, 3) float64): Receive the chances and the paths; the latter hold those so
+            far.
     """
     most = arcs.shape[1]
     paths, rolls, vias = np.zeros((3, most, 3)), np.zeros((most + 1, 6)), np.zeros((most, 3))

@@ -196,12 +196,9 @@ def find_spread(around, sizes, tips, positions, tangents, exits, lengths, target
     """Note what the errors do to the direct arcs from N deployments to a target.
 
     Args:
-        around: Around.
-        sizes: Sizes.
         tips ((N, 9) float64): Point, direction and +x of each scope tip.
         positions, tangents ((N, 3) float64): Of the tips of the tubes.
         exits, lengths ((N,) float64): Arc length of the tubes at the exit and at their tip.
-        target: tuple of 3 floats.
         found ((N, N_FOUND) float64): Is filled.
     """
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -29,6 +29,16 @@ BOX_COLUMNS = HALF + SIDES
 
 
 @inner_kernel
+def _in_lps(frame, u, v, w):
+    """Return u X + v Y + w axis."""
+    return (
+        u * frame[0, 0] + v * frame[1, 0] + w * frame[2, 0],
+        u * frame[0, 1] + v * frame[1, 1] + w * frame[2, 1],
+        u * frame[0, 2] + v * frame[1, 2] + w * frame[2, 2],
+    )
+
+
+@inner_kernel
 def turned_vector(frame, east, north, x, y, z):
     """Rotate x X + y Y + z axis by the rotation vector east X + north Y; see the module."""
     angle = math.hypot(east, north)
@@ -38,11 +48,7 @@ def turned_vector(frame, east, north, x, y, z):
     u = x * c + n * z * s + e * along
     v = y * c - e * z * s + n * along
     w = z * c + (e * y - n * x) * s
-    return (
-        u * frame[0, 0] + v * frame[1, 0] + w * frame[2, 0],
-        u * frame[0, 1] + v * frame[1, 1] + w * frame[2, 1],
-        u * frame[0, 2] + v * frame[1, 2] + w * frame[2, 2],
-    )
+    return _in_lps(frame, u, v, w)
 
 
 @inner_kernel
@@ -57,22 +63,13 @@ def _turning(frame, east, north, x, y):
     q = (1.0 - math.cos(angle)) / angle if angle > 0.0 else 0.0
     along = (1.0 - p) * (e * x + n * y)
     u, v, w = p * x + along * e, p * y + along * n, q * (e * y - n * x)
-    return (
-        u * frame[0, 0] + v * frame[1, 0] + w * frame[2, 0],
-        u * frame[0, 1] + v * frame[1, 1] + w * frame[2, 1],
-        u * frame[0, 2] + v * frame[1, 2] + w * frame[2, 2],
-    )
+    return _in_lps(frame, u, v, w)
 
 
 @inner_kernel
 def place_of(frame, box):
     """Return the place in the middle of a box, LPS mm, and how far from it those of others are at most."""
-    x, y, z = box[PLACE_X], box[PLACE_Y], box[PLACE_Z]
-    middle = (
-        x * frame[0, 0] + y * frame[1, 0] + z * frame[2, 0],
-        x * frame[0, 1] + y * frame[1, 1] + z * frame[2, 1],
-        x * frame[0, 2] + y * frame[1, 2] + z * frame[2, 2],
-    )
+    middle = _in_lps(frame, box[PLACE_X], box[PLACE_Y], box[PLACE_Z])
     return middle, norm((box[HALF + PLACE_X], box[HALF + PLACE_Y], box[HALF + PLACE_Z]))
 
 
@@ -104,11 +101,7 @@ def sum_changes(seen, family, tangent, target, frame, box, sums, costs):
     """Sum up by how much the target moves as the tips of a box see it, to first order.
 
     Args:
-        seen: Seen.
-        family: BoxTubes.
-        tangent (tuple of 3 float): Direction of the middle tip.
-        target (tuple of 3 float): LPS mm.
-        frame, box: See the module.
+        tangent, target (tuples of 3 float): Direction of the middle tip, and LPS mm.
         sums ((3,) float64): Receives by how much the target may move along the line from the centre of the
             tightest circle in the plane of tip and target, across it, and along the tip's direction, mm.
         costs ((SIDES,) float64): Receives what each side of the box costs, mm.

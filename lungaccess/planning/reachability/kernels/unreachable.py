@@ -60,12 +60,10 @@ MOST_WAITING = 400
 
 
 class Pieces(NamedTuple):
-    """Pieces of the airway as the kernels take them, see `lungaccess.planning.reachability.deployment_space`.
+    """Pieces of the airway with their frames `(P, 3, 3)`, see `places_of_tips`.
 
-    Args:
-        frames: (P, 3, 3) float64.
-        cones ((N, 7) float64): Of all pieces, one after the other.
-        first_cone: (P + 1,) int64.
+    `cones` `(N, 7)` are those of all pieces, one after the other, and `first_cone` `(P + 1,)` where each
+    begins.
     """
 
     frames: np.ndarray
@@ -220,12 +218,8 @@ def measures(boxes, out):
 def divide(environment, tubes, insertions, pieces, boxes, owners, greatest, parts, part_owners):
     """Halve the boxes that are larger than `greatest`, and keep the halves that may hold a deployment.
 
-    Args:
-        environment, tubes, insertions: See `rule_out`; the target does not count.
-        pieces: Pieces.
-        boxes ((N, BOX_COLUMNS) float64, owners : (N,) int32): The boxes and the numbers of their pieces.
-        greatest (float): Measure of a box.
-        parts ((2 N, BOX_COLUMNS) float64, part_owners : (2 N,) int32): Receive what is kept.
+    Arguments are those of `rule_out`; `parts` and `part_owners`, twice as long as the boxes, receive what is
+    kept.
 
     Returns:
         int: How many are kept.
@@ -262,15 +256,10 @@ def rule_out(
     """Try to rule out all deployments of boxes, each by halving it again and again.
 
     Args:
-        environment: ProofEnvironment.
-        tubes: (N_TUBES,) float64.
         insertions ((N,) float64): See `stages.tube.kernels.greatest_insertions`.
-        limits: Limits.
         target ((3,) float64): LPS mm.
-        pieces: Pieces.
-        boxes ((M, BOX_COLUMNS) float64, owners : (M,) int32): The boxes and the numbers of their pieces.
-        rows ((R,) int64): Those to look at.
-        most (int): Boxes to look at for each of them.
+        boxes, owners ((M, BOX_COLUMNS) float64, (M,) int32): The boxes and the numbers of their pieces.
+        rows, most ((R,) int64, int): Those to look at, and boxes to look at for each of them.
         to_the_end (bool): Whether to go on after a part that is too small to halve.
         found (Found): Its rows receive what is found.
     """

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lungaccess.plans.schema import schema_of
+from lungaccess.plans.file import schema_of
 from lungaccess.problem.error_files import error_preset_names, load_errors
 from lungaccess.problem.errors import UNITS, BreathingError, ErrorModel
 from lungaccess.problem.system import System

@@ -3,8 +3,8 @@
     python -m experiments.rare_events [--quick]
 
 Three plans in synthetic patients are carried out with small errors.  The chance that a structure is touched
-is estimated with weights from twenty thousand draws (`lungaccess.uncertainty.risk.rare`), and counted in a
-hundred million.
+is estimated with weights from twenty thousand draws (`lungaccess.uncertainty.risk.rare_share`), and counted
+in a hundred million.
 """
 
 from __future__ import annotations

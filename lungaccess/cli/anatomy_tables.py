@@ -38,14 +38,21 @@ MOTION_WORDS = {
 """The figures of a motion in words, see `anatomy.motion`."""
 
 if TYPE_CHECKING:
+    from typing_extensions import TypeIs
     from anatomy.airway_tree import Repair
     from anatomy.lung import Lung
     from anatomy.organ import Organ
 
 
+def is_lung(organ: Organ) -> TypeIs[Lung]:
+    """Tell whether an organ is a lung; a liver has neither tree nor lobes."""
+    from anatomy.lung import Lung
+
+    return isinstance(organ, Lung)
+
+
 def organ_record(lung: Organ) -> dict[str, Any]:
     """Return what was understood of a patient; a liver has neither tree nor lobes."""
-    from anatomy.lung import Lung
     from lungaccess.problem.nodules import nodules_of
 
     ml = lung.grid.voxel_volume_mm3 / 1000.0
@@ -66,7 +73,7 @@ def organ_record(lung: Organ) -> dict[str, Any]:
         "start_names": list(lung.start_names),
         "targets_lps": [point.tolist() for point in lung.targets_lps],
         "target_names": list(lung.target_names),
-        **(_airways(lung) if isinstance(lung, Lung) else {}),
+        **(_airways(lung) if is_lung(lung) else {}),
         "nodules": [
             {
                 "number": each.number,
@@ -76,7 +83,7 @@ def organ_record(lung: Organ) -> dict[str, Any]:
                 "centre_lps": each.centre_lps.tolist(),
                 **(
                     {"segment": lung.segment_at(each.centre_lps), "lobe": lung.lobe_at(each.centre_lps)}
-                    if isinstance(lung, Lung)
+                    if is_lung(lung)
                     else {}
                 ),
             }
@@ -100,9 +107,7 @@ def checks_table(lung: Organ) -> Table:
 
 def _breathing(lung: Organ) -> dict[str, Any]:
     """Return what is known of the breathing, as plain values; nothing where nothing is."""
-    from anatomy.lung import Lung
-
-    motion = lung.motion if isinstance(lung, Lung) else None
+    motion = lung.motion if is_lung(lung) else None
     if motion is None:
         return {}
     names = ("source", "key", "masks_phase", "amplitude", "hysteresis", "warning_only")
@@ -150,10 +155,9 @@ def lobe_voxels(lung: Lung) -> dict[str, int]:
 def structure_voxels(lung: Organ) -> dict[str, int]:
     """Return how many voxels each structure has that is there."""
     from anatomy import structures
-    from anatomy.lung import Lung
 
     counts = {
-        f"inside the {'lung' if isinstance(lung, Lung) else 'liver'}": int(
+        f"inside the {'lung' if is_lung(lung) else 'liver'}": int(
             np.count_nonzero((lung.labels & structures.OUTSIDE) == 0)
         )
     }
@@ -169,8 +173,6 @@ def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
 
     With `details` every repair of the airway tree has a line; they are counted else.
     """
-    from anatomy.lung import Lung
-
     starts = zip(lung.start_names, (pose[:3, 3] for pose in lung.starts), strict=False)
     targets = zip(lung.target_names, lung.targets_lps, strict=False)
     places = [(name, ", ".join(f"{c:.1f}" for c in point)) for name, point in (*starts, *targets)]
@@ -179,8 +181,8 @@ def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
         _nodule_table(lung),
         checks_table(lung),
-        *(_tree_tables(lung, details) if isinstance(lung, Lung) else ()),
-        *(_motion_tables(lung) if isinstance(lung, Lung) else ()),
+        *(_tree_tables(lung, details) if is_lung(lung) else ()),
+        *(_motion_tables(lung) if is_lung(lung) else ()),
         terminal.table("Starts and targets", ("name", "LPS, mm"), places),
         terminal.table(
             "Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]
@@ -190,7 +192,6 @@ def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
 
 
 def _nodule_table(lung: Organ) -> Table:
-    from anatomy.lung import Lung
     from lungaccess.problem.nodules import nodules_of
 
     found = nodules_of(lung)
@@ -202,7 +203,7 @@ def _nodule_table(lung: Organ) -> Table:
             f"{each.size.long_axis_mm:.1f} x {each.size.perpendicular_mm:.1f}",
             f"{each.size.volume_ml:.2f}",
             ", ".join(f"{c:.1f}" for c in each.centre_lps),
-            lung.region_at(each.centre_lps) if isinstance(lung, Lung) else "",
+            lung.region_at(each.centre_lps) if is_lung(lung) else "",
         )
         for each in found
     ]
@@ -263,10 +264,8 @@ def _motion_tables(lung: Lung) -> list[Table]:
 
 
 def _patient_rows(lung: Organ) -> list[terminal.Row]:
-    from anatomy.lung import Lung
-
     rows: list[terminal.Row] = [("working grid", lung.grid.describe())]
-    if not isinstance(lung, Lung):
+    if not is_lung(lung):
         return rows
     rows += [
         ("carina, LPS mm", ", ".join(f"{c:.1f}" for c in lung.tree.carina_lps)),
@@ -297,10 +296,8 @@ def _repairs(lung: Lung) -> list[tuple[str, Repair]]:
 
 
 def _volume_rows(lung: Organ) -> list[terminal.Row]:
-    from anatomy.lung import Lung
-
     ml = lung.grid.voxel_volume_mm3 / 1000.0
-    counts = structure_voxels(lung) | (lobe_voxels(lung) if isinstance(lung, Lung) else {})
+    counts = structure_voxels(lung) | (lobe_voxels(lung) if is_lung(lung) else {})
     return [(name, f"{count * ml:.1f}", f"{count}") for name, count in counts.items()]
 
 

@@ -23,7 +23,7 @@ from anatomy.base.checksums import DamagedCacheWarning
 from anatomy.base.errors import AnatomyError, FileError, LungaccessError
 from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import KernelsNotKeptWarning
-from lungaccess.cli import plan_tables, result_folder, terminal
+from lungaccess.cli import result_folder, terminal
 from lungaccess.cli.commands.benchmark import benchmark
 from lungaccess.cli.commands.check import check, insert, window
 from lungaccess.cli.commands.devices import design, presets, shapes, tubes
@@ -39,6 +39,7 @@ from lungaccess.cli.commands.see import report, steps, view
 from lungaccess.cli.commands.study import study
 from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXAMPLES, EXIT_CODES, START_PAGE, epilogue
 from lungaccess.cli.exit_code import ExitCode
+from lungaccess.cli.plan_search import no_plan_record
 from lungaccess.cli.terminal import error_console
 from lungaccess.plans.version import software_version
 
@@ -216,7 +217,7 @@ def _explain(error: LungaccessError, as_json: bool) -> ExitCode:
 
     if isinstance(error, NoPlan):
         if as_json:
-            terminal.show_json(plan_tables.no_plan_record(error))
+            terminal.show_json(no_plan_record(error))
         else:
             terminal.show_no_plan(error)
         return ExitCode.NEGATIVE

@@ -1,6 +1,7 @@
 """Numbers that options take, each with the range in which it makes sense."""
 
 import math
+import operator
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -31,25 +32,18 @@ class Within:
 
     def __call__(self, kind: object, value: float | None) -> None:
         """Raise ValueError, whose text says what is allowed, if a value lies outside."""
-        if value is None or (math.isfinite(value) and self._holds(value) and not 0.0 < abs(value) < LEAST):
+        ends = (
+            ("above", self.above, operator.gt), ("at least", self.at_least, operator.ge),
+            ("below", self.below, operator.lt), ("at most", self.at_most, operator.le),
+        )  # fmt: skip
+        stated = [(word, end, holds) for word, end, holds in ends if end is not None]
+        kept = value is not None and all(holds(value, end) for _word, end, holds in stated)
+        if value is None or (kept and math.isfinite(value) and not 0.0 < abs(value) < LEAST):
             return
         noun = "a whole number" if isinstance(value, int) else "a finite number"
-        raise ValueError(f"{noun} {self._ends}".strip())
-
-    def _holds(self, value: float) -> bool:
-        return (
-            (self.above is None or value > self.above)
-            and (self.at_least is None or value >= self.at_least)
-            and (self.below is None or value < self.below)
-            and (self.at_most is None or value <= self.at_most)
+        raise ValueError(
+            f"{noun} {' and '.join(f'{word} {end:.10g}' for word, end, _holds in stated)}".strip()
         )
-
-    @property
-    def _ends(self) -> str:
-        """The range in words."""
-        ends = (("above", self.above), ("at least", self.at_least), ("below", self.below))
-        stated = [f"{word} {end:.10g}" for word, end in (*ends, ("at most", self.at_most)) if end is not None]
-        return " and ".join(stated)
 
 
 def whole(kind: object, tokens: Sequence[Token]) -> int:

@@ -14,6 +14,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
 from anatomy.base.records import frozen_value
 from anatomy.plausibility import require_known_checks
+from lungaccess.cli import terminal
 from lungaccess.cli.numbers import Count, NotNegative, Probability, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from lungaccess.problem.goals import SUCCESS, WINDOW
@@ -86,6 +87,12 @@ class OutputOptions:
     """
 
     json: bool = False
+
+    def tell(self, record: object) -> None:
+        """Print plain values where JSON is asked for, and no text for people after them."""
+        if self.json:
+            terminal.show_json(record)
+            terminal.console.quiet = True
 
 
 @Parameter(name="*")
@@ -287,7 +294,15 @@ class ErrorOptions:
 
         model = load_errors() if self.errors is None else load_errors(self.errors)
         for stated in self.known:
-            model = with_known(model, *_kind_and_size(stated))
+            kind, _equals, size = stated.partition("=")
+            try:
+                known = float(size)
+            except ValueError:
+                raise SettingsError(
+                    f"--known is {stated!r}",
+                    expected="a kind of error and its size, such as scope_direction=0.5",
+                ) from None
+            model = with_known(model, kind.replace("-", "_"), known)
         return model
 
     def given(self) -> ErrorModel | None:
@@ -299,17 +314,6 @@ class ErrorOptions:
         from lungaccess.problem.procedures import load_procedure
 
         return None if self.procedure is None else load_procedure(self.procedure)
-
-
-def _kind_and_size(stated: str) -> tuple[str, float]:
-    """Return a kind of error and its size of a text such as scope_direction=0.5."""
-    kind, _equals, size = stated.partition("=")
-    try:
-        return kind.replace("-", "_"), float(size)
-    except ValueError:
-        raise SettingsError(
-            f"--known is {stated!r}", expected="a kind of error and its size, such as scope_direction=0.5"
-        ) from None
 
 
 @Parameter(name="*")

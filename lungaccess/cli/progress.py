@@ -121,9 +121,8 @@ class StepDisplay(_Shown):
         self.step("", share)
 
 
-def progress(description: str) -> StepDisplay:
-    """Return a display of work in steps, for a `with` statement."""
-    return StepDisplay(description)
+progress = StepDisplay
+"""Makes a display of work in steps, for a `with` statement."""
 
 
 class SearchDisplay(_Shown):

@@ -302,7 +302,7 @@ class ErrorModel:
         vessel_border: How far the vessels reach out of their masks, all of them alike; where it is 0, it is
             what the patient's own segmentation states, see `lungaccess.uncertainty.risk.breathing.model_for`.
         wall: What is known of the contact of shaft and wall, which errors of the distribution "resting" need;
-            see `lungaccess.uncertainty.risk.resting`.
+            see `lungaccess.uncertainty.risk.breathing`.
         place: Other errors by the place of the scope's tip; of several that hold the last one counts.
 
     Raises:

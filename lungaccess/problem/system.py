@@ -189,8 +189,11 @@ class System:
         return self.needle
 
 
-preset_names = functools.partial(_FILES.names_in, _PRESETS)
-"""Returns the names of the systems that ship with the package, sorted."""
+def preset_names() -> tuple[str, ...]:
+    """Return the names of the systems that ship with the package, sorted."""
+    return _FILES.names_in(_PRESETS)
+
+
 needle_preset_names = functools.partial(_FILES.names_in, _NEEDLES)
 """Returns those for the needle stage alone: published needles; scope and tubes are as large as these need."""
 tube_preset_names = functools.partial(_FILES.names_in, _TUBES)

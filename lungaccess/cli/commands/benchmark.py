@@ -72,9 +72,7 @@ def make(
     claim_folder(out, ())
     with progress("making synthetic patients") as shown:
         made = write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
-    if output.json:
-        terminal.show_json({"folder": str(out), "phantoms": [each.name for each in made]})
-        return ExitCode.OK
+    output.tell({"folder": str(out), "phantoms": [each.name for each in made]})
     terminal.say(
         f"Written to {out}: {len(made)} phantoms, their queries in case.json, the rules in benchmark.json"
     )
@@ -129,9 +127,7 @@ def run(
             study, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
         )
     written = [] if answers is None else _write_answers(out, answers)
-    if output.json:
-        terminal.show_json(asdict(done) | {"results": str(out), "answers": [str(path) for path in written]})
-        return ExitCode.of(not done.failed)
+    output.tell(asdict(done) | {"results": str(out), "answers": [str(path) for path in written]})
     terminal.say(
         f"{done.runs} runs: {done.stored_before} were stored, {done.added} added, {done.failed} could not be "
         f"made. Written to {out}"
@@ -303,25 +299,23 @@ def med_rad(
     if out is not None:
         write_rows(rows, out)
     headings, lines = summary_rows(rows, recorded)
-    if output.json:
-        terminal.show_json(
-            {
-                "rules": rules,
-                "system": device.name if rules == "ours" else None,
-                "budget_cpu_s": budget,
-                "queries": [dict(zip(headings, line, strict=True)) for line in lines],
-            }
+    output.tell(
+        {
+            "rules": rules,
+            "system": device.name if rules == "ours" else None,
+            "budget_cpu_s": budget,
+            "queries": [dict(zip(headings, line, strict=True)) for line in lines],
+        }
+    )
+    shown = f"by the rules of {rules}" + (f", {device.name}" if rules == "ours" else "")
+    terminal.show_wide([terminal.table(f"Published needle queries {shown}", headings, lines)])
+    if recorded is not None:
+        terminal.say(
+            "The peer's columns: recorded runs by the rules of unc, on another machine. Its times do not"
+            " compare; success and length do, by equal rules. Lengths include what is left to the target."
         )
-    else:
-        shown = f"by the rules of {rules}" + (f", {device.name}" if rules == "ours" else "")
-        terminal.show_wide([terminal.table(f"Published needle queries {shown}", headings, lines)])
-        if recorded is not None:
-            terminal.say(
-                "The peer's columns: recorded runs by the rules of unc, on another machine. Its times do not"
-                " compare; success and length do, by equal rules. Lengths include what is left to the target."
-            )
-        if out is not None:
-            terminal.say(f"All runs are in {out}")
+    if out is not None:
+        terminal.say(f"All runs are in {out}")
     return ExitCode.of(any(row.solved for row in rows))
 
 

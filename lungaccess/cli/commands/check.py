@@ -23,6 +23,7 @@ from lungaccess.cli.options import (
     PlanFile,
     require_picture,
 )
+from lungaccess.cli.plan_search import check_tables, show_findings, show_headline
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -69,7 +70,6 @@ def check(
             expected="an edited curve",
             remedy="Add --curve scene.mrml#needle",
         )
-    from lungaccess.cli.plan_tables import check_tables, show_findings, show_headline
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.system import load_system
 
@@ -78,9 +78,7 @@ def check(
     followed = errors.given_procedure()
     lung = output.load(patient, thick_slices=True)
     appraisal = appraise(stored, lung, errors=model, procedure=followed, system=device)
-    if output.json:
-        terminal.show_json({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
-        return ExitCode.of(appraisal.accepted)
+    output.tell({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
     show_headline(appraisal.headline)
     show_findings(appraisal)
     if everything:
@@ -92,7 +90,6 @@ def _check_curve(
     plan: Path, patient: Path, text: str, out: Path | None, output: PatientOptions, *, everything: bool
 ) -> ExitCode:
     from anatomy.io.markups import parse_reference, read_named_curve
-    from lungaccess.cli.plan_tables import check_tables, show_headline
     from lungaccess.judging.appraisal import Headline
     from lungaccess.plans.plan import Plan
     from lungaccess.showing.slicer import check_curve
@@ -110,9 +107,7 @@ def _check_curve(
     report = edited.report
     if out is not None and report.accepted:
         edited.plan.save(out)
-    if output.json:
-        terminal.show_json({"device": edited.device, "edited": edited.words, **report.to_mapping()})
-        return ExitCode.of(report.accepted)
+    output.tell({"device": edited.device, "edited": edited.words, **report.to_mapping()})
     terminal.say(edited.words)
     show_headline(Headline.of(report, None))
     for finding in (*report.refusals, *report.unchecked):
@@ -163,10 +158,8 @@ def window(
         from lungaccess.showing.report import window_png
 
         window_png(found, picture)
-    if output.json:
-        told = {} if in_place is None else {"needle_in_tissue_not_proved": asdict(in_place)}
-        terminal.show_json({**plain(found), "share": found.share, "words": found.words, **told})
-        return ExitCode.of(len(found.phases) > 0)
+    told = {} if in_place is None else {"needle_in_tissue_not_proved": asdict(in_place)}
+    output.tell({**plain(found), "share": found.share, "words": found.words, **told})
     terminal.say(found.words)
     rows = [(f"{of_hundred(a, up=True)} to {percent(b)}", percent(b - a)) for a, b in found.phases.tolist()]
     rows += [("not decided", percent(found.undecided_share))]
@@ -262,14 +255,12 @@ def insert(
     if picture is not None:
         files.append(str(insertions_png(found, lung, picture)))
     record = found.to_mapping()
-    if output.json:
-        terminal.show_json({**record, "plan_accepted": accepted, "files": files})
-    else:
-        if not accepted:
-            terminal.say("The check REFUSES this plan: `lungaccess check` says why.")
-        terminal.show([_table(found, record)])
-        if files:
-            terminal.say(f"Written: {', '.join(files)}")
+    output.tell({**record, "plan_accepted": accepted, "files": files})
+    if not accepted:
+        terminal.say("The check REFUSES this plan: `lungaccess check` says why.")
+    terminal.show([_table(found, record)])
+    if files:
+        terminal.say(f"Written: {', '.join(files)}")
     return ExitCode.of(accepted)
 
 

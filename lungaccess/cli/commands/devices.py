@@ -300,9 +300,7 @@ def shapes(
     found = design_shapes(device, cache=output.cache)
     if out is not None:
         save_shapes(found, out)
-    if output.json:
-        terminal.show_json(shapes_record(device.name, found))
-        return ExitCode.of(found.count > 0)
+    output.tell(shapes_record(device.name, found))
     terminal.show(
         [terminal.table(f"Shapes of {device.name}", ("", "", "limit"), _shapes_rows(device.name, found))]
     )
@@ -375,9 +373,7 @@ def design(
     best = found.front[0]
     values = {each.system.name: each.values for each in found.counted}
     front_png(found.criteria, values, [each.system.name for each in found.front], out / "front.png")
-    if output.json:
-        terminal.show_json(found.record())
-        return ExitCode.of(any(best.reached))
+    output.tell(found.record())
     _show(asked.study.name, found)
     terminal.console.print(settings_toml(best.system), soft_wrap=True)
     terminal.say(f"Written to {out}: device.toml, the device above; front/, design.json, front.png")

@@ -18,6 +18,7 @@ from lungaccess.cli.commands.see import shown_ct
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Hertz, Port, Seconds
 from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
+from lungaccess.cli.plan_search import show_headline
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder, require_new_file
 
@@ -57,7 +58,6 @@ def export(
             expected="a folder for 3D Slicer, for the motion in time, for models, or for DICOM",
             remedy="Add --slicer DIR",
         )
-    from lungaccess.cli.plan_tables import show_headline
     from lungaccess.judging.appraisal import appraise
     from lungaccess.showing.live import plan_trajectory, write_trajectory
     from lungaccess.showing.model_files import export_models
@@ -84,14 +84,12 @@ def export(
             written[dicom] = export_dicom(
                 stored, lung, dicom, shown_ct(ct, patient), appraisal, anonymise=anonymise
             )
-    if output.json:
-        folders = [{"folder": str(folder), "files": list(files)} for folder, files in written.items()]
-        answer = {**(folders[0] if folders else {}), "accepted": appraisal.accepted}
-        terminal.show_json(answer | ({"others": folders[1:]} if folders[1:] else {}))
-    else:
-        for folder, files in written.items():
-            terminal.say(f"Written to {folder}: {', '.join(files)}")
-        show_headline(appraisal.headline)
+    folders = [{"folder": str(folder), "files": list(files)} for folder, files in written.items()]
+    answer = {**(folders[0] if folders else {}), "accepted": appraisal.accepted}
+    output.tell(answer | ({"others": folders[1:]} if folders[1:] else {}))
+    for folder, files in written.items():
+        terminal.say(f"Written to {folder}: {', '.join(files)}")
+    show_headline(appraisal.headline)
     return ExitCode.of(appraisal.accepted)
 
 
@@ -121,7 +119,6 @@ def stream(
         loop: Begin the motion again when it has ended.
         seconds: End after so long; until Ctrl-C if not given.
     """
-    from lungaccess.cli.plan_tables import show_headline
     from lungaccess.judging.appraisal import Headline
     from lungaccess.judging.checking import check
     from lungaccess.planning.procedure import Policy
@@ -134,10 +131,8 @@ def stream(
         stored.require_lung(lung)
         report = check(stored, lung)
         if not report.accepted:
-            if output.json:
-                terminal.show_json({"accepted": False, **report.to_mapping()})
-            else:
-                show_headline(Headline.of(report, None))
+            output.tell({"accepted": False, **report.to_mapping()})
+            show_headline(Headline.of(report, None))
             return ExitCode.NEGATIVE
         followed = errors.given_procedure()
         session = LiveSession(
@@ -150,10 +145,8 @@ def stream(
         with contextlib.suppress(KeyboardInterrupt):
             session.run(seconds)
         counts = session.counts
-    if output.json:
-        terminal.show_json(asdict(counts))
-    else:
-        terminal.show([_table(counts)])
+    output.tell(asdict(counts))
+    terminal.show([_table(counts)])
     return ExitCode.OK
 
 
@@ -264,7 +257,7 @@ def template_text(kind: Kind) -> str:
 
 def schema_text(kind: Kind) -> str:
     """Return the JSON Schema of the files of a kind; SettingsError if its files have no keys."""
-    from lungaccess.plans.schema import schema_of
+    from lungaccess.plans.file import schema_of
 
     if kind not in SCHEMAS:
         raise SettingsError(f"Files of the kind {kind} have no keys", expected=f"one of {', '.join(SCHEMAS)}")

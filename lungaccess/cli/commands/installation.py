@@ -35,10 +35,8 @@ def doctor(*, cache: Path | None = None, output: OutputOptions = OutputOptions()
         cache: Folder of prepared anatomies; the usual one if not given.
     """
     health = examine(cache)
-    if output.json:
-        terminal.show_json(health)
-    else:
-        _show_doctor(health)
+    output.tell(health)
+    _show_doctor(health)
     return ExitCode.of(not health["complaints"])
 
 
@@ -218,10 +216,8 @@ def selftest(
 
     with progress("proofs") as shown:
         outcomes = self_test(kind, progress=shown.step)
-    if output.json:
-        terminal.show_json([{**asdict(each), "held": each.held} for each in outcomes])
-    else:
-        _show_selftest(outcomes)
+    output.tell([{**asdict(each), "held": each.held} for each in outcomes])
+    _show_selftest(outcomes)
     return ExitCode.of(all(each.held for each in outcomes))
 
 
@@ -260,10 +256,8 @@ def show(*, output: CacheOptions = CacheOptions()) -> ExitCode:
     folder = output.cache or default_cache()
     entries, limit = _entries(folder), cache_limit_bytes()
     size = sum(entry.size_bytes for entry in entries)
-    if output.json:
-        rows = [_record(entry) for entry in entries]
-        terminal.show_json({"folder": str(folder), "size_bytes": size, "limit_bytes": limit, "entries": rows})
-        return ExitCode.OK
+    rows = [_record(entry) for entry in entries]
+    output.tell({"folder": str(folder), "size_bytes": size, "limit_bytes": limit, "entries": rows})
     if entries:
         headings = ("kind", "patient", "size", "pictures", "last used", "name")
         terminal.show([terminal.table(f"Kept in {folder}", headings, [_row(entry) for entry in entries])])
@@ -305,7 +299,7 @@ def _entries(folder: Path) -> tuple[CacheEntry, ...]:
     from anatomy.base.cache_entries import cache_entries
     from anatomy.store import stored_format
     from lungaccess.planning.coupled.atlas import atlas_format
-    from lungaccess.uncertainty.risk.resting import resting_format
+    from lungaccess.uncertainty.risk.breathing import resting_format
     from stages.tube import shapes_format
 
     formats = {
@@ -325,12 +319,10 @@ def _remove(entries: Iterable[CacheEntry], output: CacheOptions) -> ExitCode:
         remove_entry(entry)
         gone.append(entry)
     size = sum(entry.size_bytes for entry in gone)
-    if output.json:
-        terminal.show_json({"removed": [_record(entry) for entry in gone], "size_bytes": size})
-    else:
-        for each in gone:
-            terminal.say(f"  {each.kind} {each.patient or each.path.name}, {size_in_words(each.size_bytes)}")
-        terminal.say(f"Removed {len(gone)} of what was kept, {size_in_words(size)}.")
+    output.tell({"removed": [_record(entry) for entry in gone], "size_bytes": size})
+    for each in gone:
+        terminal.say(f"  {each.kind} {each.patient or each.path.name}, {size_in_words(each.size_bytes)}")
+    terminal.say(f"Removed {len(gone)} of what was kept, {size_in_words(size)}.")
     return ExitCode.OK
 
 

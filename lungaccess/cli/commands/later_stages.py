@@ -27,6 +27,7 @@ from lungaccess.cli.options import (
     require_map,
     require_picture,
 )
+from lungaccess.cli.plan_search import arcs_table, no_plan_record
 from lungaccess.cli.progress import progress
 from stages.needle import DEFAULT, Objective
 
@@ -80,7 +81,6 @@ def replan(
         poses = {"scope": scope, "tubes": tube, "needle": needle}
         followed = _Followed(plan, errors, placement, radius, record)
         return _decided(patient, poses, frame, followed, output)
-    from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.planning.one_stage import replan_from_scope, replan_from_tube
     from lungaccess.plans.no_plan import NoPlan
 
@@ -100,10 +100,8 @@ def replan(
             raise
         terminal.show_json(no_plan_record(failure))
         return ExitCode.NEGATIVE
-    if output.json:
-        terminal.show_json(found.record())
-    else:
-        terminal.show(_replan_tables(found, has_map=lung.cost is not None))
+    output.tell(found.record())
+    terminal.show(_replan_tables(found, has_map=lung.cost is not None))
     return ExitCode.OK
 
 
@@ -146,10 +144,8 @@ def _decided(
         decision = record.decide(Measurements.of(**poses, placements=followed.placement))  # type: ignore[arg-type]
     if kept is not None:
         record.save(kept)
-    if output.json:
-        terminal.show_json(decision.record())
-    else:
-        terminal.show(decision_tables(decision))
+    output.tell(decision.record())
+    terminal.show(decision_tables(decision))
     return ExitCode.OK if decision.goes_on else ExitCode.NEGATIVE
 
 
@@ -180,7 +176,6 @@ def _pose(given: str, stage: str, frame: FrameOfPose) -> tuple[Float, Plan | Non
 
 
 def _replan_tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
-    from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.plans.costs import costs_in_words, known_costs
 
     tube, needle = found.tube, found.needle
@@ -223,7 +218,6 @@ def tube_rows(tube: TubeDeployment) -> list[tuple[str, str]]:
 
 def decision_tables(decision: Decision) -> list[Table]:
     """Return what a policy says is to be done next."""
-    from lungaccess.cli.plan_tables import arcs_table
 
     rows = [("estimated chance of success so", f"{of_hundred(decision.chance)} of 100")]
     if decision.again:
@@ -291,28 +285,22 @@ def needle(
         checked = check_needle_alone(
             lung, device, pose, answer.path.arcs, aim.lps_mm, branches=answer.branches, at_wall=answer.at_wall
         )
-    if output.json:
-        terminal.show_json(answer.record() | {"check": checked and checked.to_mapping()})
-    else:
-        terminal.show(_needle_tables(answer, is_lung=isinstance(lung, Lung)))
-        if checked is not None:
-            verdict = "accepts" if checked.accepted else "REFUSES"
-            terminal.say(
-                "\n".join([f"The independent check {verdict} the path.", *map(str, checked.refusals)])
-            )
-        elif answer.path is not None:
-            terminal.say("The independent check reads lungs alone: this path was not checked.")
+    output.tell(answer.record() | {"check": checked and checked.to_mapping()})
+    terminal.show(_needle_tables(answer, is_lung=isinstance(lung, Lung)))
+    if checked is not None:
+        verdict = "accepts" if checked.accepted else "REFUSES"
+        terminal.say("\n".join([f"The independent check {verdict} the path.", *map(str, checked.refusals)]))
+    elif answer.path is not None:
+        terminal.say("The independent check reads lungs alone: this path was not checked.")
     if out is not None:
         from lungaccess.showing.report import needle_png
 
         needle_png(answer, lung, out)
-        if not output.json:
-            terminal.say(f"Written to {out}")
+        terminal.say(f"Written to {out}")
     return ExitCode.of(answer.path is not None and (checked is None or checked.accepted))
 
 
 def _needle_tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
-    from lungaccess.cli.plan_tables import arcs_table
     from lungaccess.planning.one_stage import obstruction_rows
     from lungaccess.plans.costs import costs_in_words
 

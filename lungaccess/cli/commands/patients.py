@@ -149,9 +149,7 @@ def segment(
                 found = out / REFUSED_PICTURE
                 terminal.progress_console.print(f"{found} shows what was found", highlight=False)
             raise
-    if output.json:
-        terminal.show_json(made.record)
-        return ExitCode.OK
+    output.tell(made.record)
     terminal.show(_tables(made.result, made.quality))
     terminal.show_warnings(made.warnings)
     terminal.say(_written(made.result))
@@ -264,9 +262,7 @@ def phantom(
         {"lps_mm": nodule.centre_lps.tolist(), "radius_mm": float(nodule.radius_mm)}
         for nodule in made.nodules
     ]
-    if output.json:
-        terminal.show_json({"folder": str(out), "name": made.images.name, "nodules": nodules})
-        return ExitCode.OK
+    output.tell({"folder": str(out), "name": made.images.name, "nodules": nodules})
     rows = [
         ("lps:" + ",".join(f"{value:.1f}" for value in nodule.centre_lps), f"{2.0 * nodule.radius_mm:.1f}")
         for nodule in made.nodules

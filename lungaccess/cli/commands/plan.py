@@ -25,7 +25,14 @@ from lungaccess.cli.options import (
     TargetOptions,
     ToolText,
 )
-from lungaccess.cli.plan_search import RESULTS, PlanJob, plan_and_report, system_of
+from lungaccess.cli.plan_search import (
+    RESULTS,
+    PlanJob,
+    no_plan_record,
+    plan_and_report,
+    show_headline,
+    system_of,
+)
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
 from lungaccess.problem.goals import SUCCESS
@@ -34,7 +41,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from anatomy.lung import Lung
-    from lungaccess.cli.plan_search import PlanJob
     from lungaccess.judging.appraisal import Appraisal
     from lungaccess.judging.explanation import Explanation
     from lungaccess.planning import Alternative
@@ -148,7 +154,6 @@ def plan(
             there is no plan: the nearest miss, what blocks, which preset or change of device would do, what
             is proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is.
     """
-    from lungaccess.cli.plan_tables import no_plan_record
     from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.system import systems_with_tool
 
@@ -319,9 +324,7 @@ def alternatives(
     if drawing := trade_off_svg(found):
         write_text(out / TRADE_OFF, drawing)
     refused = sum(not each.accepted for each in appraisals)
-    if output.json:
-        terminal.show_json(_records(found, appraisals, out, lung.cost is not None))
-        return ExitCode.of(not refused)
+    output.tell(_records(found, appraisals, out, lung.cost is not None))
     _show(lung, found, appraisals)
     if found[0].plan.system_choice:
         terminal.say(" ".join(found[0].plan.system_choice))
@@ -330,7 +333,6 @@ def alternatives(
 
 
 def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal]) -> None:
-    from lungaccess.cli.plan_tables import show_headline
 
     best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
     terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")

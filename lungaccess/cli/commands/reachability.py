@@ -84,9 +84,7 @@ def reach(
         from lungaccess.showing.report.html import reach_page
 
         reach_page(maps, lung, page)
-    if output.json:
-        terminal.show_json(written)
-        return ExitCode.OK
+    output.tell(written)
     terminal.show([_region_table(each) for each in maps])
     if len(maps) > 1:
         terminal.show([_comparison_table(maps)])
@@ -224,10 +222,8 @@ def certify(
         from lungaccess.showing.report.open_places import open_places_png
 
         open_places_png(lung, proof, verdict, point, out)
-    if output.json:
-        asked = {"patient": lung.name, "system": device.name, "target_lps_mm": point.tolist()}
-        terminal.show_json(asked | made_by() | _as_json(verdict))
-        return ExitCode.of(verdict.proved)
+    asked = {"patient": lung.name, "system": device.name, "target_lps_mm": point.tolist()}
+    output.tell(asked | made_by() | _as_json(verdict))
     rows = [
         ("system", device.name),
         ("outcome", "proved unreachable" if verdict.proved else "not proved: it may be reachable or not"),

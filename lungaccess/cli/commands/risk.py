@@ -74,11 +74,9 @@ def risk(
                 radius_mm=radius,
                 processes=processes,
             )
-        if output.json:
-            terminal.show_json(procedure_record(found) | resting_record(rested))
-        else:
-            terminal.say(Headline.of(None, found).chance_text)
-            terminal.show([*procedure_tables(found), _resting_table(rested)])
+        output.tell(procedure_record(found) | resting_record(rested))
+        terminal.say(Headline.of(None, found).chance_text)
+        terminal.show([*procedure_tables(found), _resting_table(rested)])
         return ExitCode.OK
     samples = samples or DEFAULT_SAMPLES
     with progress("deviating the plan"):
@@ -87,18 +85,11 @@ def risk(
         kept = find_tolerances(
             stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius
         )
-    if output.json:
-        terminal.show_json(record(report, kept) | resting_record(rested))
-    else:
-        terminal.say(Headline.of(None, report).chance_text)
-        terminal.show(
-            [
-                _outcome_table(report),
-                _sensitivity_table(report),
-                _tolerance_table(kept),
-                _resting_table(rested),
-            ]
-        )
+    output.tell(record(report, kept) | resting_record(rested))
+    terminal.say(Headline.of(None, report).chance_text)
+    terminal.show(
+        [_outcome_table(report), _sensitivity_table(report), _tolerance_table(kept), _resting_table(rested)]
+    )
     return ExitCode.OK
 
 
@@ -330,16 +321,14 @@ def start_region(
     if scope:
         with progress("trying poses of the scope"):
             of_scope = safe_scope_region(stored, lung, seed=seed)
-    if output.json:
-        told = {} if of_scope is None else {"scope": of_scope.record()}
-        terminal.show_json({**region.record(), **told})
-    else:
-        terminal.say(f"{region.words}.")
-        if of_scope is not None:
-            terminal.say(f"{of_scope.words}.")
-        found = [(words, str(count)) for words, count in region.tried.counts.items()]
-        counts = terminal.table(f"{region.tried.kinds.size} starts were tried", ("found", "starts"), found)
-        terminal.show([_proved_table(region), _tried_table(region), counts])
+    told = {} if of_scope is None else {"scope": of_scope.record()}
+    output.tell({**region.record(), **told})
+    terminal.say(f"{region.words}.")
+    if of_scope is not None:
+        terminal.say(f"{of_scope.words}.")
+    found = [(words, str(count)) for words, count in region.tried.counts.items()]
+    counts = terminal.table(f"{region.tried.kinds.size} starts were tried", ("found", "starts"), found)
+    terminal.show([_proved_table(region), _tried_table(region), counts])
     return ExitCode.OK
 
 

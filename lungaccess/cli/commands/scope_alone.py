@@ -53,11 +53,9 @@ def advise(
     with progress("steering the scope"):
         advice = advise_scope(lung, device, stated.centre_lps(lung), lesion_radius, seed=seed)
     save_advice(advice, out)
-    if output.json:
-        terminal.show_json(advice.as_json())
-    else:
-        _show_advise(advice)
-        terminal.say(f"Written to {out}: {ADVICE_FILE}, {CAMERA_FILE}")
+    output.tell(advice.as_json())
+    _show_advise(advice)
+    terminal.say(f"Written to {out}: {ADVICE_FILE}, {CAMERA_FILE}")
     return ExitCode.of(advice.path.reached)
 
 
@@ -150,9 +148,7 @@ def tour(
         )
     write_json(out / "tour.json", tour_record(answer))
     tour_png(answer, lung, out / "tour.png")
-    if output.json:
-        terminal.show_json(tour_record(answer))
-        return ExitCode.of(not answer.left_out)
+    output.tell(tour_record(answer))
     _show_tour(answer, speed, per_lesion)
     terminal.say(f"Written to {out}: tour.json, tour.png")
     for number, why in answer.left_out.items():

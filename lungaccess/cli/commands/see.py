@@ -13,7 +13,7 @@ from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, Port, SamplesOrNone, Seed
 from lungaccess.cli.options import DEFAULT_SYSTEM, ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
-from lungaccess.cli.plan_search import HISTORY_FILE
+from lungaccess.cli.plan_search import HISTORY_FILE, advised, steps_table
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import held, keep_earlier
 
@@ -51,7 +51,6 @@ def report(
         seed: Seed of that estimate; 0 if not given.
         instructions: Whether instructions for the scope are listed step by step.
     """
-    from lungaccess.cli.plan_search import advised
     from lungaccess.judging.appraisal import appraise
     from lungaccess.showing.report.html import PageOptions, bronchoscopy_webp, plan_page
 
@@ -83,9 +82,7 @@ def report(
         if movie is not None:
             bronchoscopy_webp(stored, lung, movie)
     files = [str(file) for file in (page, movie) if file is not None]
-    if output.json:
-        terminal.show_json({"files": files, "page_bytes": page.stat().st_size})
-        return ExitCode.OK
+    output.tell({"files": files, "page_bytes": page.stat().st_size})
     written = ", ".join(files)
     size = page.stat().st_size / 1e6
     terminal.say(f"Written: {written} (the page has {size:.1f} MB)")
@@ -181,10 +178,8 @@ def view(
     )  # fmt: skip
 
     def started(address: Address) -> None:
-        if output.json:
-            terminal.show_json({"address": address.url, "port": address.port})
-        else:
-            terminal.say(f"The explorer is at {address.url}\nCtrl-C ends it.")
+        output.tell({"address": address.url, "port": address.port})
+        terminal.say(f"The explorer is at {address.url}\nCtrl-C ends it.")
         if browser:
             webbrowser.open(address.url)
 
@@ -194,7 +189,6 @@ def view(
 
 def steps(plan: PlanFile, patient: PatientOfPlan, *, output: PatientOptions = PatientOptions()) -> ExitCode:
     """Print step by step how the bronchoscope of a plan moves; with --json also every state, for motors."""
-    from lungaccess.cli.plan_tables import steps_table
     from lungaccess.plans.scope_steps import motion_record
 
     stored, lung = output.load_plan(plan, patient)

@@ -57,12 +57,9 @@ def run(
         done = run_study(
             asked, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
         )
-    if output.json:
-        terminal.show_json(
-            asdict(done) | {"results": str(out), "groups": [asdict(g) for g in summarise(out)]}
-        )
-        return ExitCode.of(not done.failed)
-    terminal.show([_table(asked.name, summarise(out))])
+    groups = summarise(out)
+    output.tell(asdict(done) | {"results": str(out), "groups": [asdict(group) for group in groups]})
+    terminal.show([_table(asked.name, groups)])
     terminal.console.print(
         f"{done.runs} runs: {done.stored_before} were stored, {done.added} added in {done.wall_s:.1f} s. "
         f"Written to {out}"
@@ -88,10 +85,8 @@ def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     from lungaccess.running.study.tables import summarise
 
     groups = summarise(results)
-    if output.json:
-        terminal.show_json([asdict(group) for group in groups])
-    else:
-        terminal.show([_table(str(results), groups)])
+    output.tell([asdict(group) for group in groups])
+    terminal.show([_table(str(results), groups)])
     return ExitCode.OK
 
 
@@ -120,9 +115,7 @@ def export(
         )
     written = [] if csv is None else export_csv(results, csv)
     written += [] if parquet is None else export_parquet(results, parquet)
-    if output.json:
-        terminal.show_json({"written": [str(path) for path in written]})
-        return ExitCode.OK
+    output.tell({"written": [str(path) for path in written]})
     for path in written:
         terminal.say(f"Written to {path}")
     return ExitCode.OK
@@ -138,9 +131,7 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
     from lungaccess.running.study.tables import differences
 
     found = differences(first, second)
-    if output.json:
-        terminal.show_json(found)
-        return ExitCode.of(not found)
+    output.tell(found)
     for each in found:
         terminal.say(each)
     terminal.console.print("They differ." if found else "They hold the same runs with the same answers.")

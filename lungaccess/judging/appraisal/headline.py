@@ -5,7 +5,7 @@ from enum import IntEnum, StrEnum
 from anatomy.base.records import frozen_value
 from anatomy.base.words import of_hundred, plural, range_of_hundred
 from lungaccess.judging.checking import CheckReport
-from lungaccess.judging.checking.needle_load import FINDING as NEEDLE_LOAD
+from lungaccess.judging.checking.outcome import NEEDLE_LOAD
 from lungaccess.planning.procedure.report import NO_PATH
 from lungaccess.planning.success.estimate import Estimate, chance_of
 from lungaccess.plans.chance import Chance

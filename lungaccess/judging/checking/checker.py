@@ -12,8 +12,7 @@ from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.completion import Motions, completed_plan
 from lungaccess.judging.checking.deployment import check_deployment
 from lungaccess.judging.checking.findings import PASS, CheckReport, Finding, Findings
-from lungaccess.judging.checking.needle_load import check_needle_load
-from lungaccess.judging.checking.outcome import TISSUE, check_tubes_at_target
+from lungaccess.judging.checking.outcome import TISSUE, check_needle_load, check_tubes_at_target
 from lungaccess.judging.checking.record import check_record
 from lungaccess.judging.checking.scope import check_scope
 from lungaccess.judging.checking.steering import check_needle

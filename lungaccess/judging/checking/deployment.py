@@ -12,7 +12,14 @@ from anatomy.base.errors import LungaccessError
 from anatomy.base.typed import Float, Labels
 from anatomy.shafts import SlottedSegment
 from lungaccess.judging.checking import shapes
-from lungaccess.judging.checking.boxes import Environment, PathDistances
+from lungaccess.judging.checking.boxes import (
+    Environment,
+    PathDistances,
+    airway_except,
+    branch_of,
+    has,
+    labels_at,
+)
 from lungaccess.judging.checking.clearances import (
     REACH_MM,
     check_clear,
@@ -28,7 +35,6 @@ from lungaccess.judging.checking.findings import (
 )
 from lungaccess.judging.checking.scope import motion_of
 from lungaccess.judging.checking.shapes import Curve, distance_to_polyline, radius_at
-from lungaccess.judging.checking.space import airway_except, branch_of, has, labels_at
 from lungaccess.judging.checking.wall_exit import Exit, check_exit, check_wall_run
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from anatomy import structures
 from anatomy.base.typed import Bool, Float
-from lungaccess.judging.checking.boxes import Environment
+from lungaccess.judging.checking.boxes import Environment, branch_of, has, labels_at, region_around
 from lungaccess.judging.checking.clearances import (
     CLEARANCE_TOLERANCE_MM,
     REACH_MM,
@@ -17,7 +17,6 @@ from lungaccess.judging.checking.clearances import (
 )
 from lungaccess.judging.checking.findings import POSITION_TOLERANCE_MM, CheckReport, Findings, check_rigid
 from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
-from lungaccess.judging.checking.space import branch_of, has, labels_at, region_around
 from lungaccess.judging.checking.steering import check_limits, run_of_frames
 from lungaccess.problem.system import System
 

@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
-from lungaccess.judging.checking.boxes import Boxes, Environment
+from lungaccess.judging.checking.boxes import Boxes, Environment, not_lumen
 from lungaccess.judging.checking.findings import (
     ANGLE_TOLERANCE_RAD,
     POSITION_TOLERANCE_MM,
@@ -19,7 +19,6 @@ from lungaccess.judging.checking.findings import (
     check_rigid,
     check_same_pose,
 )
-from lungaccess.judging.checking.space import not_lumen
 from lungaccess.plans.parts import ScopeInsertion
 from lungaccess.problem.system import System
 from stages.scope.device import Bronchoscope

@@ -7,7 +7,7 @@ import numpy as np
 
 from anatomy import structures
 from anatomy.base.typed import Float
-from lungaccess.judging.checking.boxes import Environment
+from lungaccess.judging.checking.boxes import Environment, Select, airway_except, branch_of, has, labels_at
 from lungaccess.judging.checking.clearances import (
     REACH_MM,
     check_clear,
@@ -25,7 +25,6 @@ from lungaccess.judging.checking.findings import (
 )
 from lungaccess.judging.checking.outcome import check_costs, check_target, check_tool, forbidden_bits
 from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate, needle_pieces
-from lungaccess.judging.checking.space import Select, airway_except, branch_of, has, labels_at
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from stages.needle.device import Needle

@@ -7,10 +7,9 @@ import numpy as np
 from anatomy import structures
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
-from lungaccess.judging.checking.boxes import Environment
+from lungaccess.judging.checking.boxes import Environment, branch_of, has, labels_at, region_around
 from lungaccess.judging.checking.findings import POSITION_TOLERANCE_MM, Findings
 from lungaccess.judging.checking.shapes import Curve, radius_at
-from lungaccess.judging.checking.space import branch_of, has, labels_at, region_around
 from lungaccess.plans.plan import Plan
 
 if TYPE_CHECKING:

@@ -16,12 +16,11 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.meshes import MeshDistance, SurfaceMesh
 from lungaccess.judging.checking import shapes
-from lungaccess.judging.checking.boxes import Environment
+from lungaccess.judging.checking.boxes import Environment, Select, airway_except, has, labels_at, not_lumen
 from lungaccess.judging.checking.deployment import OUT_OF_LUMEN_MM, RIM_POINTS, WALL_ZONE_MM
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.outcome import forbidden_bits
 from lungaccess.judging.checking.shapes import Curve, cut_at, integrate
-from lungaccess.judging.checking.space import Select, airway_except, has, labels_at, not_lumen
 from lungaccess.plans.plan import Plan
 
 if TYPE_CHECKING:

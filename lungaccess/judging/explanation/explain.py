@@ -11,8 +11,15 @@ from lungaccess.judging.answering import Attempt, first_attempt
 from lungaccess.judging.appraisal import DRAWS, SEED
 from lungaccess.judging.checking import Checker
 from lungaccess.judging.explanation.blocking import arc_beyond_limits, look_along, map_starts
-from lungaccess.judging.explanation.explanation import DONE, NOT_TRIED, TIME_IS_UP, Change, Explanation, Part
-from lungaccess.judging.explanation.neighbours import Surroundings
+from lungaccess.judging.explanation.explanation import (
+    DONE,
+    NOT_TRIED,
+    TIME_IS_UP,
+    Change,
+    Explanation,
+    Part,
+    Surroundings,
+)
 from lungaccess.planning.coupled import (
     Atlas,
     Counterfactual,

@@ -11,12 +11,12 @@ if TYPE_CHECKING:
         RiskReport,
         Sensitivity,
         assess,
+        rare_share,
         rare_touch,
     )
     from lungaccess.uncertainty.risk.assessor import STRUCTURES, RiskAssessor
+    from lungaccess.uncertainty.risk.breathing import RestingRow, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.deviations import Deviations
-    from lungaccess.uncertainty.risk.rare import rare_share
-    from lungaccess.uncertainty.risk.resting import RestingRow, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.start_region import proved_body, safe_start_region, tried_body
     from lungaccess.uncertainty.risk.statistics import Share
     from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances

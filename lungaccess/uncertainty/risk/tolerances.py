@@ -15,8 +15,7 @@ from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import BREATHING, CURVATURE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
-from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
-from lungaccess.uncertainty.risk.draws import Draws
+from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, Draws
 from lungaccess.uncertainty.risk.statistics import Share
 
 DEFAULT_PROBABILITY = 0.95

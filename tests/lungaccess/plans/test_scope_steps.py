@@ -13,9 +13,8 @@ import pytest
 
 from anatomy.lung import Lung
 from lungaccess.cli import terminal
-from lungaccess.cli.plan_tables import steps_table
-from lungaccess.judging.checking.boxes import Environment
-from lungaccess.judging.checking.space import not_lumen
+from lungaccess.cli.plan_search import steps_table
+from lungaccess.judging.checking.boxes import Environment, not_lumen
 from lungaccess.plans.insertion import scope_insertion, scope_motion, with_simplest_motion
 from lungaccess.plans.picture import Hole
 from lungaccess.plans.plan import Plan

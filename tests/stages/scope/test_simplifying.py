@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from anatomy.lung import Lung
-from lungaccess.judging.checking.boxes import Environment
+from lungaccess.judging.checking.boxes import Environment, not_lumen
 from lungaccess.judging.checking.scope import least_gap_mm, motion_of
-from lungaccess.judging.checking.space import not_lumen
 from lungaccess.problem.system import load_system
 from stages.scope import MotionProver, ScopeMotion, find_motions, prover_of
 from stages.scope.simplifying import legs_of

@@ -11,8 +11,7 @@ from anatomy.lung import Lung
 from anatomy.meshes import point_distances_mm
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
 from lungaccess.judging.appraisal.headline import Grade
-from lungaccess.judging.checking.boxes import Environment
-from lungaccess.judging.checking.space import Select, airway_except, has, labels_at
+from lungaccess.judging.checking.boxes import Environment, Select, airway_except, has, labels_at
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingWindow
 from lungaccess.showing.report.clock import PROVED, limit_names, on_rim, sectors

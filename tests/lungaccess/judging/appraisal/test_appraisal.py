@@ -17,7 +17,7 @@ import lungaccess as la
 from anatomy.base.errors import SettingsError
 from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
-from lungaccess.cli.plan_tables import GRADE_STYLES
+from lungaccess.cli.plan_search import GRADE_STYLES
 from lungaccess.judging.appraisal import Appraisal, Appraiser, Geometry, Grade, Headline, limits_of
 from lungaccess.judging.appraisal.headline import FAIR_FROM, GOOD_FROM, grade_of_chance
 from lungaccess.judging.checking import Finding

@@ -13,7 +13,7 @@ from experiments.support.mutants import channel, load
 from experiments.support.mutants.mutant import Case
 from lungaccess.judging.checking import check
 from lungaccess.judging.checking.findings import Findings
-from lungaccess.judging.checking.needle_load import check_needle_load
+from lungaccess.judging.checking.outcome import check_needle_load
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion

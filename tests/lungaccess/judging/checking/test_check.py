@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from anatomy import structures
 from anatomy.base.settings import override
-from lungaccess.cli.plan_tables import check_tables
+from lungaccess.cli.plan_search import check_tables
 from lungaccess.judging.checking import Finding, check
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.plans.plan import Plan

@@ -13,9 +13,17 @@ from scipy.linalg import expm
 
 from anatomy import structures
 from lungaccess.judging.checking import shapes
-from lungaccess.judging.checking.boxes import Boxes, PathDistances, Tiles
+from lungaccess.judging.checking.boxes import (
+    Boxes,
+    PathDistances,
+    Select,
+    Tiles,
+    airway_except,
+    has,
+    labels_at,
+    not_lumen,
+)
 from lungaccess.judging.checking.findings import angle_between
-from lungaccess.judging.checking.space import Select, airway_except, has, labels_at, not_lumen
 
 ARC = st.tuples(st.floats(0.01, 20.0), st.floats(-6.3, 6.3), st.floats(0.0, 0.05))
 

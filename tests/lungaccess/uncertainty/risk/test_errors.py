@@ -31,8 +31,7 @@ from lungaccess.problem.errors import (
     PositionError,
 )
 from lungaccess.uncertainty.risk.breathing import phase
-from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations
-from lungaccess.uncertainty.risk.draws import Draws
+from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, Draws
 
 PRESETS = [load_errors(name) for name in error_preset_names()]
 MODELS = st.sampled_from([each for each in PRESETS if not each.rests])

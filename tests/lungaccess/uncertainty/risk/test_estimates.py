@@ -15,9 +15,8 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel, PositionError
 from lungaccess.uncertainty.risk import assess, rare_share, rare_touch
-from lungaccess.uncertainty.risk.assessment import Sensitivity, sensitivities
+from lungaccess.uncertainty.risk.assessment import Luck, Sensitivity, sensitivities
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
-from lungaccess.uncertainty.risk.rare import Luck
 
 
 @pytest.fixture(scope="module")

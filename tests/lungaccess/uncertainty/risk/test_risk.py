@@ -37,8 +37,13 @@ from lungaccess.problem.errors import (
 from lungaccess.uncertainty.risk.assessment import assess
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
-from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts, no_deviations
-from lungaccess.uncertainty.risk.draws import Draws
+from lungaccess.uncertainty.risk.deviations import (
+    Deviations,
+    Draws,
+    deviated_pieces,
+    deviated_starts,
+    no_deviations,
+)
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
 from lungaccess.uncertainty.risk.statistics import Share

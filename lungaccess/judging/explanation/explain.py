@@ -125,7 +125,7 @@ class Explainer:
         untried = [each for each in others if each.name not in known]
         tried: list[Attempt] = []
         self._part_of_needle("what blocks the direct arcs", self._what_blocks)
-        self._part_of_needle("map of the starts", lambda: self._found.update(starts=map_starts(self._arcs)))
+        self._part_of_needle("map of the starts", self._starts)
         if self._task.with_fissures:
             self._part_of_needle("crossing a fissure", self._through_fissures)
         self._part("nearest point that is reached", self._neighbour)
@@ -202,6 +202,9 @@ class Explainer:
         self._found |= {"blocking": blocking, "blocked_arc": arc}
         if arc is None:
             self._found["arc_beyond_limits"] = arc_beyond_limits(self._arcs)
+
+    def _starts(self) -> None:
+        self._found["starts"] = map_starts(self._arcs)
 
     def _through_fissures(self) -> None:
         """Try the direct arcs from the same deployments with fissures that are no obstacles."""

@@ -83,13 +83,7 @@ class CostHistory:
 
 @frozen_value
 class PlanJob:
-    """What to plan and where to, and what to do with the plan.
-
-    Args:
-        asked: Everything of the request but the patient and the target in it.
-        guide: What a newcomer is told of the pictures, before plan and headline are shown; the page is made,
-            too.
-    """
+    """What to plan and where to, and what to do with the plan; with a guide a page is made, too."""
 
     asked: Asked
     target: StatedTarget

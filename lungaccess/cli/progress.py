@@ -55,10 +55,7 @@ def _bar(*more: ProgressColumn) -> Progress:
 
 
 class _Shown:
-    """Something whose progress is shown within a `with` statement.
-
-    While kernels are compiled the bar says so, with the name of the kernel instead of what is being done.
-    """
+    """Something whose progress is shown within a `with` statement, or which kernel is compiled meanwhile."""
 
     _progress: Progress
     _task: TaskID
@@ -98,10 +95,7 @@ class _Shown:
 
 
 class StepDisplay(_Shown):
-    """Shows work that is done in steps.
-
-    The bar moves back and forth as long as nobody knows which share is done.
-    """
+    """Shows work in steps; the bar moves back and forth as long as nobody knows which share is done."""
 
     def __init__(self, description: str) -> None:
         self._description = description

@@ -25,10 +25,7 @@ _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\
 
 
 class _Console(Console):
-    """A console on which no text of others is markup or commands the terminal.
-
-    It leaves it to the command line what happens when nobody reads on.
-    """
+    """A console on which no text of others is markup or commands; a closed pipe is for others to mind."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(markup=False, emoji=False, **settings)

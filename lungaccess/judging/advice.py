@@ -46,12 +46,7 @@ degrees or, of the curvature, its logarithm."""
 
 @frozen_value
 class Advice:
-    """One thing that lifts the chance of success.
-
-    Args:
-        success: How many procedures succeed with it, on the draws of the trial.
-        options: Words that the command `lungaccess plan` needs more for it.
-    """
+    """One thing that lifts the chance: what succeeds with it on trial, and the words `plan` needs for it."""
 
     words: str
     success: Share

@@ -41,10 +41,8 @@ class Plan(Record):
     """One plan: scope motion, tube deployment and needle arcs, with costs, margins and provenance.
 
     Args:
-        schema: `lungaccess.plans.file.SCHEMA`.
         patient_name, lung_key: The patient, and the content hash of the lung planned on.
         sources: SHA-256 of every image file.
-        breath_hold: In which breath-hold the image was taken.
         system_fingerprint: SHA-256 of the system's settings.
         target_lps: (3,) float64, LPS mm.
         target_origin: Where the target came from; starts with "nodule" if it is the nodule mask.

@@ -173,7 +173,6 @@ class CurvatureError(_Term):
     """The factor by which a needle bends more or less than planned, the same in all arcs of an insertion.
 
     Args:
-        distribution: "lognormal-factor", the only one: the logarithm of the factor is normal.
         median: Factor that half of the needles exceed.
         patient_ln, attempt_ln: Standard deviation of the logarithm, see `PositionError`.
         straight_share: Share of the attempts in which the needle does not bend at all, whatever was drawn
@@ -244,12 +243,9 @@ def _require_fit(kind: str, term: Term | None) -> None:
 
 @settings
 class Place:
-    """Errors of other sizes where the scope's tip stands in some of the airways.
+    """Errors of other sizes where the scope's tip stands in some of the airways, as classes of `ErrorModel`.
 
-    Args:
-        generation_from, generation_to: Generations of the tip's airway for which it holds, both included; the
-            trachea is 0.
-        scope_position, ... (of the classes of `ErrorModel`): What stands there in place of the model's own.
+    Both generations are included; the trachea is 0.
     """
 
     lobe: Annotated[str, text("lobe of the scope's tip, any if empty", may_be_empty=True)] = ""

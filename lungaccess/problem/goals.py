@@ -23,9 +23,6 @@ class Goal:
     """What is made small, or large.
 
     Args:
-        name: What the command line, studies and plans call it.
-        words: What people call it.
-        unit: "" for a pure number.
         of: Returns its value of a plan in a lung, finite; the plan states it, and the check computes it
             again.  None for costs, success and windows, which a plan states by itself.
         objective: The costs that it weighs, where it is a cost.

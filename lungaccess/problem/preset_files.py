@@ -15,12 +15,9 @@ _ROOM = resources.files("lungaccess.problem")
 
 @frozen_value
 class PresetFiles:
-    """The presets of one kind of settings, and files of one's own.
+    """The presets of one kind of settings, in folders of the package, and files of one's own.
 
-    Args:
-        what: What one of them is called in an error.
-        folders: Where the presets lie in the package.
-        expected, remedy: What a file holds, and what to do where it does not.
+    Errors call such settings `what`, say what a file is `expected` to hold, and what to do as a `remedy`.
     """
 
     what: str

@@ -19,12 +19,7 @@ from lungaccess.problem.nodules import find_nodule
 
 @frozen_record
 class Target:
-    """Where the needle has to end.
-
-    Args:
-        lps_mm: (3,) float64, LPS mm.
-        origin: Where it came from; starts with "nodule" if it lies in the nodule mask.
-    """
+    """Where the needle has to end, (3,) LPS mm; `origin` starts with "nodule" if that is in the mask."""
 
     lps_mm: Float
     origin: str

@@ -30,12 +30,7 @@ PACKAGES = Path(__file__).resolve().parents[3]
 
 
 class Kind(NamedTuple):
-    """One kind of proof.
-
-    Args:
-        seeds: Of the cases: those in which bounds are close to the truth, and that take little time in
-            Python.
-    """
+    """One kind of proof, and seeds of cases in which bounds are close to the truth and Python is quick."""
 
     proves: str
     draw: Callable[[np.random.Generator], Case]
@@ -89,12 +84,9 @@ class Failure:
 
 @frozen_value
 class Outcome:
-    """What became of the cases of one kind.
+    """What became of the cases of one kind: where kernels and plain Python differ, and contradictions.
 
-    Args:
-        differences: Cases in which compiled kernels and plain Python differ; None if kernels were not
-            compiled here.
-        contradictions: Cases in which the answers contradict the truth.
+    There are no differences, but None, if kernels were not compiled here.
     """
 
     kind: str

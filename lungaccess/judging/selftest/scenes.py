@@ -23,12 +23,9 @@ ROUNDING_MM = 1e-7
 
 @frozen_record
 class Case:
-    """One drawn case of a proof.
+    """One drawn case of a proof: what the kernels answered, `(N,)`, and a comparison with the truth.
 
-    Args:
-        answers ((N,) float64): What the kernels answered.
-        contradiction: Compares the answers with the truth; returns "" or what contradicts it, with both
-            numbers.
+    The comparison returns "" or what contradicts it, with both numbers.
     """
 
     answers: Float

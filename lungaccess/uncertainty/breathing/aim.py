@@ -71,10 +71,7 @@ class MovingTarget:
         self._middle = motion.masks_phase if middle is None else middle
 
     def aim(self, tip_lps: Float, towards: float | None = None) -> Aim:
-        """Return the aim from a place `(3,)` of the scope's tip.
-
-        `towards` is another phase than `middle` about which it is made.
-        """
+        """Return the aim from a place `(3,)` of the scope's tip, about a phase in place of `middle`."""
         rigid = carrier(self._motion, tip_lps, self._side)
         point = np.zeros(3)
 

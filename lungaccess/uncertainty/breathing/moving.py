@@ -22,10 +22,6 @@ class Moving:
 
     The lung of the target moves as the plan's window has it.  The other lung has its own displacement, which
     takes over smoothly beyond the middle, so that a picture of both has no tear.
-
-    Args:
-        tissue: With that one displacement for both lungs.
-        rigid: What carries the tubes and the needle.
     """
 
     tissue: Motion

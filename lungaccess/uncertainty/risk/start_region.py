@@ -44,7 +44,6 @@ def safe_start_region(
         radius_mm: How far from the target a path may end; by default the radius of the goal of `assess`, 0
             for exactly at the target.
         offset_mm, tilt_deg: Largest distance and angle from the planned start of the poses that are tried.
-        poses: About how many are tried.
         iterations: Of the search from a pose from which no simple path is clear.
 
     Raises:

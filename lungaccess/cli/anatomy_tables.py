@@ -12,6 +12,7 @@ from rich.table import Table
 from anatomy.base.words import percent
 from anatomy.plausibility import ACCEPTED, DOUBTFUL, FITS, REFUSED
 from lungaccess.cli import terminal
+from lungaccess.plans.record import picked
 
 VERDICTS = (REFUSED, ACCEPTED, DOUBTFUL, FITS)
 """In this order checks are shown: what has to be looked at comes first."""
@@ -57,9 +58,7 @@ def organ_record(lung: Organ) -> dict[str, Any]:
 
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
-        "name": lung.name,
-        "kind": lung.kind,
-        "key": lung.key,
+        **picked(lung, "name kind key"),
         "grid": {
             "shape": list(lung.grid.shape),
             "spacing_mm": lung.grid.spacing_mm.tolist(),
@@ -110,8 +109,7 @@ def _breathing(lung: Organ) -> dict[str, Any]:
     motion = lung.motion if is_lung(lung) else None
     if motion is None:
         return {}
-    names = ("source", "key", "masks_phase", "amplitude", "hysteresis", "warning_only")
-    stated = {name: getattr(motion, name) for name in names}
+    stated = picked(motion, "source key masks_phase amplitude hysteresis warning_only")
     return {"breathing": {**stated, **motion.figures}}
 
 

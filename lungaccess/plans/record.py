@@ -12,6 +12,11 @@ from anatomy.base.typed import Array
 from anatomy.grid import read_only
 
 
+def picked(of: object, names: str) -> dict[str, Any]:
+    """Return some fields of a record, whose names stand between spaces, as JSON takes them."""
+    return {name: getattr(of, name) for name in names.split()}
+
+
 def shaped(*shape: int | None, dtype: type = np.float64) -> dict[str, Any]:
     """Return the metadata that make a field of a `Record` an array; None stands for any length."""
     return {"shape": shape, "dtype": dtype}

@@ -18,6 +18,7 @@ from lungaccess.cli.numbers import Angle, NotNegative, Processes
 from lungaccess.cli.options import DEFAULT_SYSTEM, CacheOptions, OutputOptions, require_picture
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import claim_folder, keep_earlier
+from lungaccess.plans.record import picked
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -228,12 +229,8 @@ def _show_json(answer: TubeAnswer, propose: bool) -> None:
     if propose:
         comparison = compare_sequences(answer)
         written["sequences"] = [
-            {
-                "name": each.sequence.name,
-                "lateral_sweep_mm": each.lateral_sweep_mm,
-                "follow_the_leader_error_mm": each.follow_the_leader_error_mm,
-                "least_determinant": each.least_determinant,
-            }
+            {"name": each.sequence.name}
+            | picked(each, "lateral_sweep_mm follow_the_leader_error_mm least_determinant")
             for each in comparison.deployed
         ]
         written["refused_sequences"] = comparison.refused
@@ -246,9 +243,7 @@ def _proposal(proposal: DesignProposal) -> dict[str, object]:
     from anatomy.base.settings import to_mapping
 
     return {
-        "lateral_sweep_mm": proposal.lateral_sweep_mm,
-        "tip_offset_mm": proposal.tip_offset_mm,
-        "tip_angle_rad": proposal.tip_angle_rad,
+        **picked(proposal, "lateral_sweep_mm tip_offset_mm tip_angle_rad"),
         "outer": to_mapping(proposal.tubes.outer),
         "inner": to_mapping(proposal.tubes.inner),
     }

@@ -22,6 +22,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative
 from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
+from lungaccess.plans.record import picked
 
 if TYPE_CHECKING:
     from anatomy.base.cache_entries import CacheEntry
@@ -336,10 +337,7 @@ def _row(entry: CacheEntry) -> terminal.Row:
 def _record(entry: CacheEntry) -> dict[str, object]:
     return {
         "path": str(entry.path),
-        "kind": entry.kind,
-        "patient": entry.patient,
-        "size_bytes": entry.size_bytes,
-        "pictures_bytes": entry.pictures_bytes,
+        **picked(entry, "kind patient size_bytes pictures_bytes"),
         "last_used_days_ago": round(entry.days_unused, 3),
         "current_format": entry.current,
     }

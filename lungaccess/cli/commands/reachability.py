@@ -24,6 +24,7 @@ from lungaccess.cli.options import (
 )
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
+from lungaccess.plans.record import picked
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -246,21 +247,11 @@ def certify(
 def _as_json(verdict: ReachVerdict) -> dict[str, object]:
     return {
         "proved_unreachable": verdict.proved,
-        "boxes": verdict.boxes,
-        "share_ruled_out": verdict.share_ruled_out,
-        "finished": verdict.finished,
-        "rests_on": verdict.rests_on,
+        **picked(verdict, "boxes share_ruled_out finished rests_on"),
         "open_place_lps_mm": None if verdict.open_lps is None else verdict.open_lps.tolist(),
         "open_places": [
-            {
-                "branch": place.branch,
-                "generation": place.generation,
-                "name": place.name,
-                "share": place.share,
-                "narrowest": place.narrowest,
-                "tip_lps_mm": place.tip_lps.tolist(),
-                "insertions_mm": list(place.insertions_mm),
-            }
+            picked(place, "branch generation name share narrowest")
+            | {"tip_lps_mm": place.tip_lps.tolist(), "insertions_mm": list(place.insertions_mm)}
             for place in verdict.open_places
         ],
     }

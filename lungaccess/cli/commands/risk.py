@@ -13,6 +13,7 @@ from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative, Positive, Probability, Processes, Samples, SamplesOrNone, Seed
 from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile, ToolText
 from lungaccess.cli.progress import progress
+from lungaccess.plans.record import picked
 from lungaccess.uncertainty.risk.statistics import Share
 
 if TYPE_CHECKING:
@@ -99,34 +100,18 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
         "reaches": report.reaches.to_mapping(),
         "forbidden": list(report.forbidden),
         "rare": {
-            name: {
-                "probability": rare.value,
-                "interval_95": list(rare.interval),
-                "effective_samples": rare.effective_samples,
-                "centres": rare.centres,
-            }
+            name: {"probability": rare.value, "interval_95": list(rare.interval)}
+            | picked(rare, "effective_samples centres")
             for name, rare in report.rare.items()
         },
         "sensitivity": [
-            {
-                "kind": each.kind,
-                "first_order": each.first_order,
-                "total": each.total,
-                "changes": each.changes.to_mapping(),
-                "succeeds_with_it_alone": each.alone.to_mapping(),
-            }
+            picked(each, "kind first_order total")
+            | {"changes": each.changes.to_mapping(), "succeeds_with_it_alone": each.alone.to_mapping()}
             for each in report.sensitivity
         ],
         "tolerances": [
-            {
-                "kind": each.kind,
-                "unit": each.unit,
-                "stated": each.stated,
-                "probability": each.probability,
-                "largest": each.largest,
-                "margin": list(each.margin),
-                "succeeds_with_it_alone": report.alone[each.kind].to_mapping(),
-            }
+            picked(each, "kind unit stated probability largest margin")
+            | {"succeeds_with_it_alone": report.alone[each.kind].to_mapping()}
             for each in kept
         ],
     }
@@ -223,11 +208,9 @@ def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
 
     return {
         "errors": {**to_mapping(report.model), "name": report.model.label},
-        "samples": report.samples,
-        "seed": report.seed,
+        **picked(report, "samples seed"),
         "counts_as_success": chance_of(report).success_words,
-        "radius_mm": report.radius_mm,
-        "radius_origin": report.radius_origin,
+        **picked(report, "radius_mm radius_origin"),
         "succeeds": report.succeeds.to_mapping(),
         "touches": {name: share.to_mapping() for name, share in report.touches.items()},
         "miss_mm": {f"{share:g}": miss for share, miss in report.miss_mm.items()},

@@ -17,6 +17,7 @@ from lungaccess.judging.checking import Checker, CheckReport
 from lungaccess.planning.success import Estimate, chance_of, estimate_success
 from lungaccess.plans.costs import known_costs
 from lungaccess.plans.plan import Plan
+from lungaccess.plans.record import picked
 from lungaccess.plans.scope_steps import motion_record
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel
@@ -187,9 +188,7 @@ def plan_record(
         "folder": str(folder),
         "files": list(files),
         "advice": list(advice),
-        "digest": plan.digest,
-        "objective": plan.objective,
-        "cost": plan.cost,
+        **picked(plan, "digest objective cost"),
         "cost_bound": plan.cost_bound or None,
         "gap": plan.gap,
         "costs": known_costs(plan.costs, has_map=lung.cost is not None),

@@ -13,6 +13,7 @@ from anatomy.io.frames import LPS_FROM_RAS
 from lungaccess.judging.answering import Attempt
 from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Structure
 from lungaccess.judging.explanation.explanation import Change, Explanation
+from lungaccess.plans.record import picked
 from lungaccess.plans.version import made_by
 
 Row = tuple[str, ...]
@@ -166,12 +167,7 @@ def explanation_record(explanation: Explanation) -> Record:
         "attempts": dict(e.failure.attempts),
         "starts": None if e.starts is None else dict(e.starts.counts),
         "blocking": [
-            {
-                **_structure(each.place),
-                "arcs": each.arcs,
-                "arcs_at_place": each.arcs_at_place,
-                "of_arcs": each.of,
-            }
+            {**_structure(each.place), **picked(each, "arcs arcs_at_place"), "of_arcs": each.of}
             for each in e.blocking
         ],
         "nearest_miss": {

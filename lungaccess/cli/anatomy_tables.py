@@ -40,6 +40,7 @@ MOTION_WORDS = {
 
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
+
     from anatomy.airway_tree import Repair
     from anatomy.lung import Lung
     from anatomy.organ import Organ

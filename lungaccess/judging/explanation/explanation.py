@@ -12,7 +12,8 @@ from anatomy.poses import spread_directions
 from anatomy.structures import obstacle_bits
 from lungaccess.judging.answering import Attempt
 from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Blocking, StartMap, region_of
-from lungaccess.planning.coupled import Counterfactual, DirectCandidates, reach_scan
+from lungaccess.planning.coupled import Counterfactual, reach_scan
+from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.planning.one_system import run
 from lungaccess.planning.reachability import ReachVerdict
 from lungaccess.plans.no_plan import NoPlan

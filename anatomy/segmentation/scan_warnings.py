@@ -16,6 +16,7 @@ from anatomy.base.typed import Array, Float, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.mask_findings import share_at_lumen
+from anatomy.lobes import UNKNOWN
 from anatomy.morphology import bounds, components, distance_mm, window
 from anatomy.nodule_size import NoduleSize, nodule_size
 from anatomy.plausibility import LIMITS, Finding
@@ -211,6 +212,8 @@ def quality_of(parts: Parts) -> Quality:
         "large vessels": parts.large_vessels,
         "all vessels": parts.all_vessels,
         "nodule": parts.nodule,
+        "band of the fissures": (parts.fissures > 0) & (parts.fissures < UNKNOWN),
+        "lung without known fissures": parts.fissures == UNKNOWN,
     }
     volumes = {name: float(np.count_nonzero(mask)) * litre for name, mask in counted.items()}
     both, (least, most) = volumes["right lung"] + volumes["left lung"], LIMITS["lungs_l"].usual

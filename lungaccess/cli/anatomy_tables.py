@@ -269,7 +269,7 @@ def _patient_rows(lung: Organ) -> list[terminal.Row]:
     rows += [
         ("carina, LPS mm", ", ".join(f"{c:.1f}" for c in lung.tree.carina_lps)),
         ("breath hold", lung.breath_hold or "not stated"),
-        ("fissures", "known" if lung.has_fissures else "not known"),
+        ("fissures", _fissures(lung)),
         ("cost map", "given" if lung.cost is not None else "not given"),
         ("lobes", "given" if lung.lobes is not None else "not given"),
         ("start poses, targets", f"{len(lung.starts)}, {len(lung.targets_lps)}"),
@@ -282,6 +282,18 @@ def _patient_rows(lung: Organ) -> list[terminal.Row]:
         counted = ", ".join(f"{count} x {kind}" for kind, count in kinds.items())
         rows.append(("repairs of the airway tree", f"{counted}; --details lists them"))
     return rows
+
+
+def _fissures(lung: Lung) -> str:
+    """Return what is known of the fissures, in words."""
+    from anatomy.lobes import UNKNOWN
+
+    if lung.fissure_band is None or not lung.has_fissures:
+        return "known" if lung.has_fissures else "not known"
+    counts = np.bincount(lung.fissure_band.array.ravel(order="K"), minlength=UNKNOWN + 1)
+    ml = lung.grid.voxel_volume_mm3 / 1000.0
+    rest = f"; not known in {counts[UNKNOWN] * ml:.0f} ml" if counts[UNKNOWN] else ""
+    return f"within a band of {counts[1:50].sum() * ml:.0f} ml with 95 %{rest}"
 
 
 def _repairs(lung: Lung) -> list[tuple[str, Repair]]:

@@ -203,7 +203,11 @@ def outlined(lung: Lung, ct: Volume, point_lps: Float) -> tuple[Lung, dict[str, 
     box = lung.grid.window(point_lps + np.array([[-OUTLINE_MM], [OUTLINE_MM]]), 0.0)
     grid = lung.grid.crop([each.start for each in box], [each.stop for each in box])
     around = Volume(grid=grid, array=resampled(ct, grid, 1, -1024.0).astype(np.float32))
-    inside = outline_nodule(around, (lung.labels[box] & OUTSIDE) == 0, point_lps)
+    try:
+        inside = outline_nodule(around, (lung.labels[box] & OUTSIDE) == 0, point_lps)
+    except AnatomyError as error:
+        remedy = 'Put the cross into its middle, or paint it under "Mend the masks"'
+        raise AnatomyError(error.found, expected=error.expected, remedy=remedy) from error
     nodules = np.zeros(lung.grid.shape, dtype=np.bool_, order="F")
     nodules[box] = inside
     labels = np.array(lung.labels, order="F")

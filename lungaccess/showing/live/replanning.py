@@ -108,6 +108,8 @@ class TrackedReplanner:
             tubes, needle, words = self._planned(name, lps_from_device)
         except LungaccessError as reason:
             tubes, needle, words = None, None, f"no plan: {reason.found}"
+        if name != TARGET:
+            words = f"{words}; {self._to_target(name, lps_from_device)}"
         took = time.process_time() - began
         return Answer(name=name, words=words, tubes_lps=tubes, needle_lps=needle, processor_s=took)
 
@@ -126,6 +128,18 @@ class TrackedReplanner:
             tubes = poses_on_pieces(rest.lps_from_measured, pieces, PATH_STEP_MM)[0][:, :3, 3]
         needle = rest.path.sample(PATH_STEP_MM)[0] if rest.needle is not None else None
         return tubes, needle, f"plan: cost {rest.cost:.4g}, needle {rest.path.length_mm:.1f} mm"
+
+    def _to_target(self, name: str, lps_from_device: Float) -> str:
+        """Say how far the target is ahead of a device and aside of its axis; an alarm if beyond its bend."""
+        x, y, ahead = lps_from_device[:3, :3].T @ (self.target_lps - lps_from_device[:3, 3])
+        aside = math.hypot(x, y)
+        words = f"target {ahead:.1f} mm ahead and {aside:.1f} mm aside"
+        if name != NEEDLE_TIP or self._plan.system.needle is None:
+            return words
+        # One arc along the axis here leads to a point with the curvature 2 a / (a^2 + d^2).
+        curvature = 2.0 * aside / max(aside**2 + ahead**2, SHORTEST_MM**2)
+        beyond = ahead < 0.0 or curvature > self._plan.system.needle.max_curvature_per_mm
+        return f"ALARM: {words}, beyond the bend of the needle" if beyond and aside > SHORTEST_MM else words
 
     def _decided(self, policy: Policy, name: str, pose: Float) -> tuple[Float | None, Float | None, str]:
         """Return what the policy says about a pose, after those of the stages before it."""

@@ -12,13 +12,13 @@ import numpy as np
 
 from anatomy.base.typed import UInt8
 from anatomy.grid import Volume
-from anatomy.io.placement import place
+from anatomy.io.masks import place
 from anatomy.lobes import LOBES, UNKNOWN, fissures_between
+from anatomy.morphology import largest_piece
 from anatomy.phantom.patient import Size
 from anatomy.segmentation.airway import segment_airway
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.closing import largest_piece
 from anatomy.segmentation.lobes import OF_LUNG, Lobes, segment_lobes
 from anatomy.segmentation.lungs import Lungs, segment_lungs
 from anatomy.segmentation.scan_warnings import tree_or_error

@@ -15,8 +15,8 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
-from anatomy.mask_findings import share_at_lumen
 from anatomy.lobes import UNKNOWN
+from anatomy.mask_findings import share_at_lumen
 from anatomy.morphology import bounds, components, distance_mm, window
 from anatomy.nodule_size import NoduleSize, nodule_size
 from anatomy.plausibility import LIMITS, Finding

@@ -24,8 +24,6 @@ exclude_patterns = ["_build", "_templates", "pictures"]
 html_theme = "furo"
 html_title = f"lungaccess {release}"
 templates_path = ["_templates"]
-html_static_path = ["_static"]
-html_js_files = ["versions.js"]
 html_sidebars = {
     "**": [
         "sidebar/brand.html", "sidebar/versions.html", "sidebar/search.html", "sidebar/scroll-start.html",

@@ -2,21 +2,22 @@
 
     python packaging/publish_docs.py SITE FOLDER
 
-SITE is what `make docs` built.  FOLDER gets a folder of that version, `versions.json`, which the list of
-versions on every page reads, newest first, and an `index.html` that leads to the newest release.  Pages of a
-version that is there already are replaced in one step.
+SITE is what `make docs` built.  FOLDER gets a folder of that version, and an `index.html` that leads to the
+newest release.  Pages of a version that is there already are replaced in one step.  Every page of every
+version then links to the same page of the others, or to their first page where they have none.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import shutil
 import sys
 from pathlib import Path
 
+PLACE = re.compile(r'(<div id="versions"[^>]*>).*?(</div>)', re.DOTALL)
+"""The part of a page that `docs/_templates/sidebar/versions.html` leaves for the versions."""
 NUMBER = re.compile(r"\d+(?:\.\d+)+")
 INDEX = """<!doctype html>
 <meta charset="utf-8">
@@ -53,9 +54,23 @@ def publish(site: Path, folder: Path) -> list[str]:
     shutil.rmtree(old, ignore_errors=True)
     versions = [each.name for each in folder.iterdir() if NUMBER.fullmatch(each.name) and each.is_dir()]
     versions.sort(key=lambda name: [int(part) for part in name.split(".")], reverse=True)
-    _write(folder / "versions.json", json.dumps(versions) + "\n")
+    for each in versions:
+        _link_versions(folder, each, versions)
     _write(folder / "index.html", INDEX.format(newest=versions[0]))
     return versions
+
+
+def _link_versions(folder: Path, version: str, versions: list[str]) -> None:
+    """Let every page of a version link to the same page of all versions."""
+    for page in (folder / version).rglob("*.html"):
+        same = page.relative_to(folder / version)
+        up = "../" * len(same.parts)
+        pages = {each: same if (folder / each / same).is_file() else "index.html" for each in versions}
+        links = (f'<a href="{up}{each}/{pages[each]}">{each}</a>' for each in versions if each != version)
+        text = page.read_text(encoding="utf-8")
+        linked = PLACE.sub(rf"\1Version {' '.join([version, *links])}\2", text, count=1)
+        if linked != text:
+            _write(page, linked)
 
 
 def _write(file: Path, text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
 import tomllib
 from pathlib import Path
@@ -147,7 +146,9 @@ def site(tmp_path: Path) -> Path:
     """Return a built documentation of version 0.9.0."""
     folder = tmp_path / "site"
     folder.mkdir()
-    (folder / "index.html").write_text("pages of 0.9.0")
+    (folder / "index.html").write_text('pages of 0.9.0 <div id="versions">Version 0.9.0</div>')
+    (folder / "how_to").mkdir()
+    (folder / "how_to/old.html").write_text('<div id="versions">Version 0.9.0</div>')
     (folder / "version.txt").write_text("0.9.0\n")
     return folder
 
@@ -158,10 +159,12 @@ def test_versions_lie_side_by_side_newest_first(site: Path, tmp_path: Path) -> N
     (site / "version.txt").write_text("0.10.0\n")
     assert publish_docs.publish(site, published) == ["0.10.0", "0.9.0"]
     (site / "index.html").write_text("better pages")
+    (site / "how_to/old.html").unlink()
     publish_docs.publish(site, published)
     assert (published / "0.10.0/index.html").read_text() == "better pages"
-    assert (published / "0.9.0/index.html").read_text() == "pages of 0.9.0"
-    assert json.loads((published / "versions.json").read_text()) == ["0.10.0", "0.9.0"]
+    assert '0.9.0 <a href="../0.10.0/index.html">0.10.0</a>' in (published / "0.9.0/index.html").read_text()
+    # The newer version has no such page: its first page is there in its place.
+    assert '<a href="../../0.10.0/index.html">' in (published / "0.9.0/how_to/old.html").read_text()
     assert "0.10.0/index.html" in (published / "index.html").read_text()
     assert not [each for each in published.iterdir() if each.name.startswith(".")]
 

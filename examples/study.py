@@ -9,9 +9,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-from lungaccess.running.study.driver import run_study
-from lungaccess.running.study.settings import study_of
-from lungaccess.running.study.tables import summarise
+from lungaccess.running.study import run_study, study_of, summarise
 
 if __name__ == "__main__":  # the worker processes import this file
     study = study_of(

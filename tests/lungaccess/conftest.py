@@ -148,6 +148,7 @@ def make_lung(*, fissures: bool = True, nodule: bool = True) -> Any:
         breath_hold=None,
         motion=None,
         lobes=None,
+        fissure_band=None,
         nodule_labels=None,
         findings=(),
         mask_words="the masks of Toy",

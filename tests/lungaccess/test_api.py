@@ -26,7 +26,6 @@ FACADES = (
     "lungaccess",
     "lungaccess.judging",
     "lungaccess.judging.appraisal",
-    "lungaccess.running.benchmark",
     "lungaccess.judging.checking",
     "lungaccess.planning",
     "lungaccess.planning.coupled",

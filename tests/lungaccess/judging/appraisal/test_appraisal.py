@@ -35,6 +35,7 @@ KEYS = {
     "verdict",
     "geometry",
     "fissures_unknown",
+    "fissure_chance",
     "needle_load",
     "success",
     "stated_by_plan",

@@ -173,10 +173,20 @@ def test_a_stroke_in_a_slice_becomes_another_plan(painted: PatientSource, tmp_pa
             page.frame()
             canvas = "document.getElementById('slice-axial')"
             width, height = page.run(f"return [{canvas}.clientWidth, {canvas}.clientHeight]")
-            page.pointer("mousePressed", "slice-axial", width / 2 - 4, height / 2)
-            page.pointer("mouseMoved", "slice-axial", width / 2 + 4, height / 2)
-            page.screenshot(tmp_path / "stroke.png")
-            page.pointer("mouseReleased", "slice-axial", width / 2 + 4, height / 2)
+
+            def stroke() -> None:
+                page.pointer("mousePressed", "slice-axial", width / 2 - 4, height / 2)
+                page.pointer("mouseMoved", "slice-axial", width / 2 + 4, height / 2)
+                page.screenshot(tmp_path / "stroke.png")
+                page.pointer("mouseReleased", "slice-axial", width / 2 + 4, height / 2)
+
+            for control, value in {
+                "mend-structure": "vessel",
+                "mend-tool": "paint",
+                "mend-radius": "2",
+            }.items():
+                page.choose(control, value)
+            stroke()
             page.wait("document.getElementById('mend-words').textContent.includes('changed')")
             second = page.wait(f"{PLANNED} && s.plan.digest !== {json.dumps(first['digest'])}")
             page.screenshot(tmp_path / "mended.png")
@@ -184,6 +194,17 @@ def test_a_stroke_in_a_slice_becomes_another_plan(painted: PatientSource, tmp_pa
             assert second["plan"]["digest"] != first["digest"]
             page.click("mend-undo")
             page.wait(f"{PLANNED} && s.plan.digest === {json.dumps(first['digest'])}")
+            # One slice alone, of a fissure, and what is as dense within a level.
+            page.click("mend-flat")
+            for tool in ("paint", "fill"):
+                for control, value in {
+                    "mend-structure": "fissure",
+                    "mend-tool": tool,
+                    "mend-level": "60",
+                }.items():
+                    page.choose(control, value)
+                stroke()
+                page.wait("/changed|nothing|no /i.test(document.getElementById('mend-words').textContent)")
             assert page.messages() == []
     finally:
         served.stop()

@@ -22,7 +22,7 @@ def test_an_answer_that_cannot_be_sent_is_a_failure_of_its_question_alone(
     def answering(asked: Asked, _turn: Turn) -> Iterator[Part]:
         yield Part({"answer": "place", "mm": math.nan if asked.question.id == 1 else 1.0})
 
-    thread = threading.Thread(target=Worker(there, answering).run)
+    thread = threading.Thread(target=Worker(there, answering, renew=lambda _source: None).run)
     thread.start()
     for number in (1, 2):
         question = PlaceQuestion(id=number, slot=str(number), point=(0.0, 0.0, 0.0))

@@ -10,9 +10,8 @@ from stages.scope.route.centreline import Centreline, from_tree
 from stages.scope.route.guide_path import nearest_links
 from stages.scope.route.planner import Replanner, plan_route
 from stages.scope.route.proof import RouteLimits, prove
-from stages.scope.tour.exits import find_exits
 from stages.scope.tour.itinerary import shortest_tour
-from stages.scope.tour.subtree import circuits, subtree_to
+from stages.scope.tour.subtree import circuits, find_exits, subtree_to
 
 COLD_RUN = """
 from benchmarks.bench_route import Routes, Tours

@@ -202,8 +202,7 @@ def random_mechanics(count: int, designs: int, seed: int = 0) -> list[TubeMechan
 def tours(lesions: int) -> list[Subtree]:
     """Return the subtrees to random lesions in `TOUR_MODELS` random airways."""
     from experiments.support.tour_models import random_airway, random_lesions
-    from stages.scope.tour.exits import find_exits
-    from stages.scope.tour.subtree import subtree_to
+    from stages.scope.tour.subtree import find_exits, subtree_to
 
     made = []
     for seed in range(TOUR_MODELS):

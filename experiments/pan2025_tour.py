@@ -22,9 +22,8 @@ from experiments.support.anatomies import anatomy, default_anatomies
 from experiments.support.results import Result, setting_of, study_parser, write_result
 from experiments.support.tour_models import random_airway, random_lesions
 from lungaccess.showing.report import style
-from stages.scope.tour.exits import Exit, find_exits
 from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary, shortest_tour
-from stages.scope.tour.subtree import SAME_RESISTANCE, Subtree, circuits, subtree_to
+from stages.scope.tour.subtree import SAME_RESISTANCE, Exit, Subtree, circuits, find_exits, subtree_to
 
 LESIONS = (3, 4, 5, 6, 7, 8, 9)
 MODELS, DRAWS = 100, 20

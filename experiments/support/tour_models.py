@@ -8,7 +8,7 @@ from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Float
 from anatomy.tree.branches import Strand, assemble
-from stages.scope.tour.exits import ExitRule
+from stages.scope.tour.subtree import ExitRule
 
 ORDERS = 8
 FIRST_ANGLE_ORDER, FIRST_ANGLE_DEG = 5, 21.0

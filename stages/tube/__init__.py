@@ -29,13 +29,13 @@ if TYPE_CHECKING:
         tree_of_shapes,
     )
     from stages.tube.device import BentPiece, ConcentricTubes, Tube, straightening
-    from stages.tube.environment import DEFAULT_ROTATIONS, tube_constants, tube_environment
     from stages.tube.equilibrium import Equilibrium, check_nesting
     from stages.tube.errors import ConvergenceError
     from stages.tube.following import DeployedSequence, SnapError, deploy
     from stages.tube.kernels import DesignArrays, ManyShapes, ShapeArrays, TubeEnvironment
     from stages.tube.mechanics import Batch, TubeMechanics
     from stages.tube.one_shape import (
+        DEFAULT_ROTATIONS,
         NearbyShape,
         Neighbourhood,
         copies,
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
         shape_arrays,
         shape_of_arrays,
         shape_or_reason,
+        tube_constants,
+        tube_environment,
         with_any_sweep,
         without_limits,
     )

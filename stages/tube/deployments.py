@@ -20,8 +20,8 @@ from stages.tube import kernels
 from stages.tube.arcs import points_on_arcs
 from stages.tube.design_shapes import ShapeTree, coarser_shapes, shapes_of
 from stages.tube.device import ConcentricTubes
-from stages.tube.environment import DEFAULT_ROTATIONS, THREADS, tube_constants, tube_environment
 from stages.tube.kernels import placing
+from stages.tube.one_shape import DEFAULT_ROTATIONS, THREADS, tube_constants, tube_environment
 from stages.tube.shapes import TubeShapes
 from stages.tube.validation import REASONS
 

@@ -1,4 +1,4 @@
-"""Single deployments of any joint values, proved by the way to them, and as arrays that a search changes."""
+"""Single deployments of any joint values, proved by the way to them, and tubes and lungs for the kernels."""
 
 import math
 from collections.abc import Sequence
@@ -11,18 +11,65 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
+from anatomy.lung import Lung
 from anatomy.margins import Margins
+from anatomy.structures import obstacle_bits
+from stages.tube import kernels
 from stages.tube.arcs import TubeShape
 from stages.tube.device import ConcentricTubes, Tube
-from stages.tube.environment import tube_constants
 from stages.tube.equilibrium import SAME_MM, matrices
 from stages.tube.following import deploy
+from stages.tube.kernels import TubeEnvironment
 from stages.tube.kernels import one_shape as kernel
 from stages.tube.kernels import shapes as columns
 from stages.tube.kernels.one_shape import DesignArrays, ManyShapes, ShapeArrays
 from stages.tube.mechanics import TubeMechanics
 from stages.tube.sequences import BEND_RAD, together
 from stages.tube.shapes import SNAPS, STRAINS, SWEEPS, TubeShapes, strained_radii
+
+DEFAULT_ROTATIONS = 24
+"""Rotations 15 degrees apart: at 30 mm of curve, tips are about 3 mm apart, as far as the stops."""
+THREADS = 2
+"""The kernels run without the interpreter's lock; more threads would wait for memory."""
+
+
+def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
+    """Return what the tubes collide with in a lung, its fissures too if they are obstacles."""
+    field = lung.obstacle_field(with_fissures=with_fissures)
+    bits = obstacle_bits(with_fissures)
+    depth = lung.lumen_depth
+    return TubeEnvironment(
+        field=field.corners,
+        labels=lung.labels,
+        geometry=field.geometry,
+        bits=bits,
+        lumen=depth.corners,
+        lumen_geometry=depth.geometry,
+        mediastinal=lung.tree.mediastinal,
+    )
+
+
+def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
+    """Return the `(N_TUBES,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad.
+
+    Curvatures and the length of the curve are 0 where the tubes are not planar.
+    """
+    constants = np.zeros(kernels.N_TUBES)
+    inner, outer = tubes.inner, tubes.outermost
+    if tubes.planar:
+        constants[kernels.OVERLAP_CURVATURE] = tubes.overlap_curvature_per_mm
+        constants[kernels.INNER_CURVATURE] = tubes.free_curvature_per_mm
+        constants[kernels.CURVED_LENGTH] = inner.curved_length_mm
+    constants[kernels.OUTER_RADIUS] = outer.radius_mm
+    constants[kernels.INNER_RADIUS] = inner.radius_mm
+    constants[kernels.MARGIN] = margins.total_mm
+    constants[kernels.MIN_WALL_ANGLE] = math.radians(tubes.min_wall_angle_deg)
+    constants[kernels.MAX_SWEEP] = tubes.max_lateral_sweep_mm
+    constants[kernels.MAX_EXTENSION] = tubes.max_extension_mm
+    constants[kernels.MAX_PROTRUSION] = tubes.max_inner_protrusion_mm
+    constants[kernels.MAX_WALL_RUN] = tubes.max_wall_run_mm
+    return constants
+
 
 KEPT = 16
 """Designs in memory: a system, and variants of it that are compared with it."""

@@ -13,8 +13,7 @@ from stages.tube import kernels
 from stages.tube.arcs import TubeShape, points_on_arcs
 from stages.tube.design_shapes import shapes_of
 from stages.tube.device import ConcentricTubes
-from stages.tube.environment import tube_constants, tube_environment
-from stages.tube.one_shape import design_arrays, shape_or_reason
+from stages.tube.one_shape import design_arrays, shape_or_reason, tube_constants, tube_environment
 
 REASONS: dict[int, str] = {
     kernels.NO_EXIT: "the tube does not leave the airway",

@@ -28,9 +28,8 @@ from stages.scope.motions import ScopeMotions, find_motions
 from stages.scope.route.centreline import from_graph, from_tree
 from stages.scope.route.planner import plan_route
 from stages.scope.route.proof import RouteLimits
-from stages.scope.tour.exits import find_exits
 from stages.scope.tour.itinerary import shortest_tour
-from stages.scope.tour.subtree import subtree_to
+from stages.scope.tour.subtree import find_exits, subtree_to
 from stages.tube.device import BentPiece, Tube
 from stages.tube.mechanics import TubeMechanics
 from tests.fuzz.run import not_finite

@@ -18,10 +18,8 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Int
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.infeasibility.kernels import bitmaps, blocked, bounds
-from stages.needle.infeasibility.kernels import reachability_pruning as pruning
 from stages.needle.infeasibility.kernels import reachable_sets as sets
-from stages.needle.infeasibility.passage import Passage, tightest
-from stages.needle.infeasibility.plane import ROUNDING, PathBounds, Plane
+from stages.needle.infeasibility.passage import ROUNDING, Passage, PathBounds, Plane, tightest
 from stages.needle.obstruction import blocked_end
 from stages.needle.path import Query
 
@@ -148,7 +146,7 @@ class NoPathProof:
         else:
             ahead = float(self._chord @ query.lps_from_start[:3, 2])
             aside = math.sqrt(max(total**2 - ahead**2, 0.0))
-            if pruning.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_DISTANCE_MM:
+            if bounds.escape_depth(aside, ahead, 1.0 / self._kappa) < -self._tolerance - LEAST_DISTANCE_MM:
                 self._end("no path", "the target lies outside the workspace of the start")
 
     def _measure(self) -> None:
@@ -252,7 +250,7 @@ class NoPathProof:
     def _forward(self, number: int) -> None:
         """Add a plane: the states reached from the plane before, or the start."""
         plane = self._allowed(number)
-        pruning.prune_unreachable(
+        bounds.prune_unreachable(
             plane.bits, plane.window, self._scale, self._paths.ends, number * self._depth, self._reference,
             self._environment.limits.max_angle_rad,
         )  # fmt: skip

@@ -1,19 +1,142 @@
-"""The tightest place of the states that a proof of no path has left.
+"""The states that paths can have on planes between start and target, and the tightest place that is left.
 
 The backward reachable set of a target tells where every path to it may come from, whatever its start;
 docs/theory/unreachable.md derives it.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from anatomy.base.records import frozen_value
-from anatomy.base.typed import Float
+from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.typed import Float, Int, UInt64
 from stages.needle.environment import NeedleEnvironment
+from stages.needle.infeasibility.kernels import bitmaps, bounds
 from stages.needle.infeasibility.kernels.backward_reach import SHELL_MM, BackwardReach, fill_backward_reach
-from stages.needle.infeasibility.plane import PathBounds, Plane
+
+ROUNDING = 1e-8
+"""Share by which curvature and angles are taken too large, so that rounding rules out no path."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """States on one plane: bits (V, U, Y, W) and the cell numbers (v, u, y, x) of their first cell."""
+
+    bits: UInt64
+    window: Int
+
+    def trimmed(self) -> "Plane":
+        """Return the same without empty rows and columns at the edges."""
+        box = np.zeros(8, dtype=np.int64)
+        bitmaps.extent(self.bits, box)
+        v0, v1, u0, u1, y0, y1, w0, w1 = (int(n) for n in box)
+        bits = self.bits[v0 : v1 + 1, u0 : u1 + 1, y0 : y1 + 1, w0 : w1 + 1]
+        return Plane(np.ascontiguousarray(bits), self.window + np.array([v0, u0, y0, 64 * w0]))
+
+    @property
+    def ends(self) -> Int:
+        """Cell numbers of the last cell."""
+        nv, nu, rows, words = self.bits.shape
+        last: Int = self.window + np.array([nv, nu, rows, 64 * words]) - 1
+        return last
+
+    def refined(self, *, directions: bool, require: Callable[[int], None]) -> "Plane":
+        """Return the same states in cells of half the side, those of directions too if asked.
+
+        `require` is called with the number of bytes that this takes, before it does.
+        """
+        halved = np.array([directions, directions, True, True])
+        shape = np.where(halved, 2 * np.array(self.bits.shape) + 1, self.bits.shape)
+        require(8 * math.prod(int(n) for n in shape))
+        bits = np.zeros(tuple(shape), dtype=np.uint64)
+        bitmaps.refine(self.bits, directions, bits)
+        return Plane(bits, np.where(halved, 2 * self.window - 1, self.window))
+
+    @property
+    def places(self) -> Int:
+        """Cells (N, 2) of position, numbers (y, x), in which the plane has a state of any direction."""
+        words = np.ascontiguousarray(np.bitwise_or.reduce(self.bits, axis=(0, 1))).astype("<u8")
+        cells = np.unpackbits(words.view(np.uint8), axis=1, bitorder="little")
+        return np.asarray(np.argwhere(cells) + self.window[2:], dtype=np.int64)
+
+    def probed_cells(self, moves: Float) -> tuple[Int, Int]:
+        """Return which cells of position the tangents of the states can meet at some depths.
+
+        Args:
+            moves ((D,) float64): Cells of position by which a tangent moves up to each depth, for each cell
+                of direction.
+
+        Returns:
+            corners, shape ((D, 2) int64): Numbers (y, x) of the first cells, and how many there are.
+        """
+        low, high = self.window, self.ends
+        corners = np.zeros((len(moves), 2), dtype=np.int64)
+        shape = np.zeros((len(moves), 2), dtype=np.int64)
+        for axis in (0, 1):
+            ends = np.stack([moves * low[axis], moves * high[axis]])
+            corners[:, axis] = low[axis + 2] + np.floor(ends.min(axis=0)) - 1
+            shape[:, axis] = high[axis + 2] + np.ceil(ends.max(axis=0)) + 2 - corners[:, axis]
+        return corners, shape
+
+
+@frozen_record
+class PathBounds:
+    """Bounds of the places and directions of all paths.
+
+    Args:
+        ends ((ENDS_SIZE,) float64): See `stages.needle.infeasibility.kernels.bounds`.
+        steepest: Largest sine of the angle between a path and the line from start to target.
+        aside_mm, before_mm: How far aside of that line, and how far before the start or behind the target, a
+            path can go.
+    """
+
+    ends: Float
+    steepest: float
+    aside_mm: float
+    before_mm: float
+
+    @classmethod
+    def of(cls, total_mm: float, tolerance_mm: float, kappa: float, length_mm: float) -> "PathBounds":
+        """Return the bounds for a target `total_mm` from the start.
+
+        Args:
+            total_mm, tolerance_mm: Distance from start to target, and how far from the target a path may end.
+            kappa: Greatest curvature, 1/mm.
+            length_mm: Greatest length of a path.
+        """
+        radius, widest = 1.0 / kappa, total_mm + tolerance_mm
+        ends = np.zeros(bounds.ENDS_SIZE)
+        ends[: bounds.LONGEST] = total_mm, tolerance_mm
+        ends[bounds.SPINDLE_RADIUS] = math.inf
+        steepest, longest, highest = 1.0, length_mm, math.inf
+        if widest < 2.0 * radius:
+            half = math.asin(0.5 * widest / radius)
+            tilt = math.asin(tolerance_mm / total_mm)
+            offset = radius * math.cos(half)
+            ends[bounds.SPINDLE_MIDDLE :] = 0.5 * widest, offset, radius + widest * tilt
+            steepest = math.sin(min(half + tilt + ROUNDING, 0.5 * math.pi))
+            longest = min(longest, 2.0 * half * radius)
+            highest = radius + widest * tilt - offset
+        longest += tolerance_mm
+        ends[bounds.LONGEST] = longest
+        return cls(
+            ends=ends,
+            steepest=steepest,
+            aside_mm=min(0.5 * math.sqrt(longest**2 - total_mm**2) + bounds.SPARE, highest),
+            before_mm=0.5 * (longest - total_mm) + bounds.SPARE,
+        )
+
+    def width_mm(self, depth_mm: float, kappa: float) -> float:
+        """Return about how wide paths spread at a depth without obstacles, by their start and the spindle."""
+        of_start = kappa * depth_mm**2
+        radius, total = float(self.ends[bounds.SPINDLE_RADIUS]), float(self.ends[bounds.TOTAL])
+        if not math.isfinite(radius):
+            return of_start
+        aside = math.sqrt(max(radius**2 - (depth_mm - 0.5 * total) ** 2, 0.0))
+        return min(of_start, 2.0 * max(aside - float(self.ends[bounds.SPINDLE_OFFSET]), 0.0))
+
 
 CELL = 0.008
 """Side of a cell of the plane of directions: 0.016 rad in the middle, 0.8 mm at 50 mm."""

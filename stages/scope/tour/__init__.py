@@ -5,19 +5,23 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from stages.scope.tour.exits import Exit, ExitRule, ExitTest, exits_of, find_exits
     from stages.scope.tour.itinerary import Itinerary, one_by_one_mm, plan_itinerary, shortest_tour
     from stages.scope.tour.subtree import (
         MOST_COMBINATIONS,
         MOST_LESIONS,
         SAME_RESISTANCE,
         Circuits,
+        Exit,
+        ExitRule,
+        ExitTest,
         Reading,
         Resistances,
         Subtree,
         branch_resistances,
         circuits,
         combinations,
+        exits_of,
+        find_exits,
         subtree_to,
     )
 

@@ -8,8 +8,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Int
 from anatomy.grid import read_only
-from stages.scope.tour.exits import Exit
-from stages.scope.tour.subtree import Subtree
+from stages.scope.tour.subtree import Exit, Subtree
 
 
 @frozen_record

@@ -18,9 +18,9 @@ from stages.tube import (
     tree_of_shapes,
     tube_shapes,
 )
-from stages.tube.environment import tube_constants, tube_environment
 from stages.tube.kernels.shapes import bend_towards, carried
 from stages.tube.kernels.wall_exit import ACCEPTED, IN_TISSUE, PHASE, march, reset
+from stages.tube.one_shape import tube_constants, tube_environment
 from stages.tube.shapes import TubeShapes
 from tests.stages.tube.test_deployments import FRAMES, MARGINS, TIPS, TUBES, scene
 from tests.stages.tube.test_shapes import PAIR

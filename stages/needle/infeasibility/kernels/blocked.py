@@ -9,8 +9,7 @@ from anatomy.kernels.field import exact_distance, interpolate_squared
 from anatomy.kernels.labels import LUMEN
 from stages.needle.infeasibility.kernels import bounds
 from stages.needle.infeasibility.kernels.bitmaps import ONE, and_shifted, find_box, or_shifted
-from stages.needle.infeasibility.kernels.bounds import SPARE, TOLERANCE, TOTAL
-from stages.needle.infeasibility.kernels.reachability_pruning import place_margin
+from stages.needle.infeasibility.kernels.bounds import SPARE, TOLERANCE, TOTAL, place_margin
 from stages.needle.kernels.proof import kept_from_lumen
 
 NEIGHBOURS = 26

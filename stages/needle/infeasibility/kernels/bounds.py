@@ -1,11 +1,11 @@
-"""What is known of all paths: how fast direction and place can change from plane to plane."""
+"""What is known of all paths: how fast direction and place change, what is out of reach of either end."""
 
 import math
 
 import numpy as np
 
 from anatomy.kernels.compiling import inner_kernel, kernel
-from stages.needle.infeasibility.kernels.bitmaps import find_box
+from stages.needle.infeasibility.kernels.bitmaps import ALL, find_box
 
 # What `scale` holds: sides of cells in mm and as a slope, slope of the start (v, u), curvature in 1/mm, and
 # the largest sine of the angle between a path and the planes' normal.
@@ -91,3 +91,139 @@ def largest_reach(scale, depth, blur, window, nv, nu):
             steepest = max(steepest, steepest_sine(slope_v, slope_u, scale))
     change = largest_slope_change(steepest, scale, depth)
     return int(math.floor(change / scale[SLOPE_CELL] + blur * HALF_DIAGONAL + SPARE))
+
+
+# With a type of its own a constant is no literal, for each of which what is called would be compiled anew.
+_FIRST_BIT = np.int64(0)
+
+
+@kernel(nogil=True)
+def escape_depth(rho, h, radius):
+    """Return how deep a point lies among the points that no needle reaches, as a number below 0, in mm.
+
+    It is `rho` mm aside of the needle and `h` mm ahead.  A needle that turns by 180 degrees in all reaches
+    neither points in the torus of its tightest circles nor, behind it, points less than two radii aside.
+    Points outside get 0 or more.  The number is 1-Lipschitz.
+    """
+    if h >= 0.0:
+        return math.hypot(radius - rho, h) - radius
+    return -min(math.hypot(rho, h), 2.0 * radius - rho)
+
+
+@inner_kernel
+def place_margin(h, y, x, scale, ends):
+    """Return a margin of a place in mm; if it is below 0, no path leads through the place.
+
+    The margin is 1-Lipschitz.  The place lies `h` mm deep, and (y, x) mm aside of the line to the target.
+    """
+    radius = 1.0 / scale[KAPPA]
+    norm2 = 1.0 + scale[FIRST_V] ** 2 + scale[FIRST_U] ** 2
+    ahead = (h + y * scale[FIRST_V] + x * scale[FIRST_U]) / math.sqrt(norm2)
+    aside2 = y * y + x * x
+    rho = math.sqrt(max(h * h + aside2 - ahead * ahead, 0.0))
+    margin = escape_depth(rho, ahead, radius)
+    detour = math.sqrt(h * h + aside2) + math.sqrt((ends[TOTAL] - h) ** 2 + aside2)
+    margin = min(margin, 0.5 * (ends[LONGEST] - detour))
+    if ends[SPINDLE_RADIUS] < math.inf:
+        from_centre = math.hypot(math.sqrt(aside2) + ends[SPINDLE_OFFSET], h - ends[SPINDLE_MIDDLE])
+        margin = min(margin, ends[SPINDLE_RADIUS] - from_centre)
+    return margin + SPARE
+
+
+@inner_kernel
+def _state_margin(h, y, x, slope_v, slope_u, blur, scale, ends):
+    """Return the same for a state; `blur` is the angle between a cell's directions and its centre's."""
+    radius = 1.0 / scale[KAPPA]
+    norm = math.sqrt(1.0 + slope_v * slope_v + slope_u * slope_u)
+    aside2 = y * y + x * x
+    left = ends[TOTAL] - h
+    sideways = y * slope_v + x * slope_u
+    ahead = (left - sideways) / norm
+    away2 = left * left + aside2
+    margin = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius)
+    margin += math.sqrt(away2) * blur + ends[TOLERANCE]
+    # The same path backward leads to the start.
+    ahead = (h + sideways) / norm
+    away2 = h * h + aside2
+    back = escape_depth(math.sqrt(max(away2 - ahead * ahead, 0.0)), ahead, radius) + math.sqrt(away2) * blur
+    return min(margin, back) + HALF_DIAGONAL * scale[CELL] + SPARE
+
+
+@kernel(nogil=True)
+def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
+    """Remove the states of a plane from which the goal cannot be reached, or which the start cannot reach.
+
+    Args:
+        depth (float): Of the plane, mm.
+        reference ((3,) float64): Direction from which the limit of the angle counts: its component along the
+            planes' normal, and its row and column.
+        max_angle (float): That limit, rad.
+    """
+    nv, nu, rows, words = states.shape
+    cell = scale[CELL]
+    top = scale[TOP_SINE] / math.sqrt(1.0 - scale[TOP_SINE] ** 2)
+    possible = np.zeros((rows, words), np.uint64)
+    for y in range(rows):
+        side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
+        x = _FIRST_BIT
+        while x < 64 * words:
+            side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
+            margin = place_margin(depth, side_y, side_x, scale, ends) + HALF_DIAGONAL * cell
+            x = _set_run(possible[y], x, margin, cell)
+    box = np.zeros(4, np.int64)
+    row = np.zeros(words, np.uint64)
+    for v in range(nv):
+        for u in range(nu):
+            slope_v, slope_u = slope_of(v, u, window, scale)
+            slope = math.hypot(slope_v, slope_u)
+            least = max(slope - HALF_DIAGONAL * scale[SLOPE_CELL], 0.0)
+            blur = HALF_DIAGONAL * scale[SLOPE_CELL] / math.sqrt(1.0 + least * least)
+            cosine = (reference[0] + slope_v * reference[1] + slope_u * reference[2]) / math.hypot(1.0, slope)
+            if least > top or math.acos(max(min(cosine, 1.0), -1.0)) - blur > max_angle + SPARE:
+                states[v, u] = 0
+                continue
+            for y in range(rows):
+                for w in range(words):
+                    states[v, u, y, w] &= possible[y, w]
+            if not find_box(states[v, u], box):
+                continue
+            # The margin at the middle of the box may decide all of it.
+            middle_y = (0.5 * (box[0] + box[1]) + window[2]) * cell + depth * scale[FIRST_V]
+            middle_x = (32.0 * (box[2] + box[3] + 1) - 0.5 + window[3]) * cell + depth * scale[FIRST_U]
+            away = 0.5 * cell * math.hypot(box[1] - box[0], 64.0 * (box[3] - box[2] + 1))
+            margin = _state_margin(depth, middle_y, middle_x, slope_v, slope_u, blur, scale, ends)
+            if margin >= (1.0 + blur) * away:
+                continue
+            if margin < -(1.0 + blur) * away:
+                states[v, u] = 0
+                continue
+            for y in range(box[0], box[1] + 1):
+                row[box[2] : box[3] + 1] = 0
+                side_y = (y + window[2]) * cell + depth * scale[FIRST_V]
+                x = 64 * box[2]
+                while x < 64 * (box[3] + 1):
+                    side_x = (x + window[3]) * cell + depth * scale[FIRST_U]
+                    margin = _state_margin(depth, side_y, side_x, slope_v, slope_u, blur, scale, ends)
+                    x = _set_run(row[: box[3] + 1], x, margin, (1.0 + blur) * cell)
+                for w in range(box[2], box[3] + 1):
+                    states[v, u, y, w] &= row[w]
+
+
+@inner_kernel
+def _set_run(row, x, margin, step):
+    """Set the bits from `x` on if `margin` is not negative, as far as its sign is sure; return their end.
+
+    The margin changes by at most `step` from bit to bit.
+    """
+    run = min(max(int(math.ceil(abs(margin) / step)), 1), 64 * row.shape[0] - x)
+    end = x + run
+    if margin < 0.0:
+        return end
+    for w in range(x // 64, (end - 1) // 64 + 1):
+        value = ALL
+        if w == x // 64:
+            value &= ALL << np.uint64(x - 64 * w)
+        if end < 64 * (w + 1):
+            value &= ALL >> np.uint64(64 * (w + 1) - end)
+        row[w] |= value
+    return end

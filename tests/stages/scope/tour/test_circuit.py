@@ -9,7 +9,6 @@ import pytest
 
 from anatomy.base.errors import SettingsError
 from experiments.support.tour_models import random_airway, random_lesions
-from stages.scope.tour.exits import find_exits
 from stages.scope.tour.subtree import (
     EXAMPLE_BETA,
     LEFT,
@@ -17,6 +16,7 @@ from stages.scope.tour.subtree import (
     Subtree,
     branch_resistances,
     circuits,
+    find_exits,
     subtree_to,
 )
 from tests.stages.scope.tour.trees import ends_of, exit_at, figure_1

@@ -9,7 +9,7 @@ import pytest
 
 from anatomy.base.errors import SettingsError, TargetError
 from experiments.support.tour_models import random_airway, random_lesions
-from stages.scope.tour.exits import ExitRule, find_exits
+from stages.scope.tour.subtree import ExitRule, find_exits
 from tests.stages.scope.tour.trees import figure_1, straight_branches
 
 

@@ -10,9 +10,8 @@ import pytest
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import SettingsError
 from experiments.support.tour_models import random_airway, random_lesions
-from stages.scope.tour.exits import find_exits
 from stages.scope.tour.itinerary import one_by_one_mm, plan_itinerary, shortest_tour
-from stages.scope.tour.subtree import Subtree, circuits, subtree_to
+from stages.scope.tour.subtree import Subtree, circuits, find_exits, subtree_to
 from tests.stages.scope.tour.trees import (
     by_trying_everything,
     ends_of,

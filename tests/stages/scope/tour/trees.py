@@ -8,9 +8,8 @@ import numpy as np
 
 from anatomy.airway_tree import AirwayTree, TreeReport
 from anatomy.tree.branches import Strand, assemble
-from stages.scope.tour.exits import Exit
 from stages.scope.tour.itinerary import plan_itinerary
-from stages.scope.tour.subtree import Subtree
+from stages.scope.tour.subtree import Exit, Subtree
 
 
 def straight_branches(ends: list[tuple[int, tuple[float, float, float]]], radius: float = 2.0) -> AirwayTree:

@@ -19,12 +19,8 @@ def directions(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) ->
 
     Each direction is told by signs that do not depend on each other: 1 as in a patient whose header is right,
     -1 against it, 0 undecided.  Only a header that is wrong, or organs that are mirrored, turn all signs of a
-    direction around; it is in doubt if one is.
-
-    Args:
-        left, right ((N, 3) float64, LPS mm): About one point in every cube of `SAMPLE_MM` of each lung.
-        lowest_mm: The height z of the lowest voxels of the image, LPS mm: a lung that reaches them may be cut
-            off.
+    direction around; it is in doubt if one is.  The lungs are about one point in every cube of `SAMPLE_MM`,
+    `(N, 3)` LPS mm; one that reaches `lowest_mm`, the height of the lowest voxels, may be cut off.
     """
     lungs = [left, right]
     top, carina = tree.points_lps[0], tree.carina_lps

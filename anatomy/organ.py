@@ -36,14 +36,8 @@ class Organ:
             "obstacle" without fissures, "obstacle_fissure" with them.  The "pleura" of a liver is its
             capsule.
         nodules, cost: Nodule mask; cost map in [0, 1] or infinite.  Both on `grid`.
-        nodule_labels: uint16 numbers of the nodules by the patient's files, on `grid`, if these tell more
-            than one apart.
-        starts, targets_lps (tuple of arrays): Poses `lps_from_tip` (4, 4) and points (3,) that came with the
-            patient.
-        start_names, target_names: How users name them.
-        breath_hold: In which breath-hold the image was taken, if stated.
-        vessel_border_mm: See `PatientImages`.
-        sources: SHA-256 of every input file.
+        nodule_labels: As in `PatientImages`, on `grid`; starts, targets and their names, `breath_hold`,
+            `vessel_border_mm` and `sources` are those of it, too.
         warnings: What was assumed or repaired on the way in.
         findings: What the checks of the masks found, see `anatomy.plausibility`; none for masks that were not
             checked.

@@ -14,16 +14,10 @@ SUPERIOR = np.array([0.0, 0.0, 1.0])
 
 
 def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = None) -> Float:
-    """Return the frame at a point with +z along `forward`.
+    """Return the read-only frame `(4, 4)` at a point `(3,)` LPS mm, +z along `forward` of any length.
 
-    Args:
-        point_lps: (3,) float64, LPS mm.
-        forward ((3,) float64): Need not be of unit length.
-        sideways ((3,) float64): +x is its part perpendicular to `forward`; by default anterior, or superior
-            where the device points along the anterior axis.
-
-    Returns:
-        (4, 4) float64, read-only.
+    +x is the part of `sideways` perpendicular to `forward`; by default anterior, or superior where the device
+    points along the anterior axis.
 
     Raises:
         FrameError: If a direction has no length or both are parallel.

@@ -49,34 +49,23 @@ def open_lung(
         AnatomyError: If a check of the masks fails that is not accepted.
         FileError: If the cache cannot be written.
     """
-    lung = _stored_or_built(sources, read, cache, progress, reused)
+    key = lung_key(sources)
+    folder = (cache or default_cache()) / folder_name(key)
+    lung = _load(folder, warn=True)
+    if lung is not None:
+        note_use(folder / META)
+    else:
+        most_bytes = cache_limit_bytes()
+        if progress:
+            progress("reading images")
+        lung = _build_into(folder, key, read(), progress, reused)
+        make_room(folder.parent, most_bytes, {"anatomy": stored_format()}, keep=(folder,))
     findings = with_accepted(lung.findings, accept or ())
     if accept is not None:
         require_plausible(findings, accept)
     said = {old.warning: new.warning for old, new in zip(lung.findings, findings, strict=True)}
     object.__setattr__(lung, "findings", findings)
     object.__setattr__(lung, "warnings", tuple(said.get(each, each) for each in lung.warnings))
-    return lung
-
-
-def _stored_or_built(
-    sources: dict[str, str],
-    read: Callable[[], PatientImages],
-    cache: Path | None,
-    progress: Callable[[str], None] | None,
-    reused: Reused | None,
-) -> Lung:
-    key = lung_key(sources)
-    folder = (cache or default_cache()) / folder_name(key)
-    stored = _load(folder, warn=True)
-    if stored is not None:
-        note_use(folder / META)
-        return stored
-    most_bytes = cache_limit_bytes()
-    if progress:
-        progress("reading images")
-    lung = _build_into(folder, key, read(), progress, reused)
-    make_room(folder.parent, most_bytes, {"anatomy": stored_format()}, keep=(folder,))
     return lung
 
 

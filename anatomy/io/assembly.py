@@ -119,10 +119,7 @@ MAY_BE_EMPTY = ("fissures", "nodules")
 def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any) -> PatientImages:
     """Make the `PatientImages` of masks that were read, after checking that none is missing or empty.
 
-    Args:
-        name, kind: As in `PatientImages`.
-        where: The patient's folder, for messages.
-        others: Further fields of `PatientImages`; `warnings` and `sources` are added to.
+    Messages name the patient's folder, `where`.  Of the further fields `warnings` and `sources` are added to.
 
     Raises:
         AnatomyError: If lumen, vessels or lung is missing, or a mask is empty.  An empty mask of fissures or

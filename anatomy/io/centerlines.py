@@ -54,20 +54,6 @@ class VtkFile:
     field_data: dict[str, Array]
 
 
-def read_vtk_xml(path: str | Path) -> VtkFile:
-    """Read a PolyData (lines only) or UnstructuredGrid file.
-
-    Raises:
-        FileError: If the file is missing, damaged, truncated, of another kind or compressed otherwise than by
-            zlib.
-    """
-    path = require_file(path)
-    with reading(path):
-        if path.stat().st_size > MOST_BYTES:
-            raise ValueError(f"it has more than {MOST_BYTES >> 20} MiB")
-        return _Reader(path.read_bytes()).file()
-
-
 class _Reader:
     """The bytes of a file and how its arrays are stored."""
 
@@ -246,16 +232,16 @@ def read_centerlines(path: str | Path, *, frame: Frame | None = None) -> AirwayT
 
 
 def read_centerline_graph(path: str | Path, *, frame: Frame | None = None) -> tuple[Float, Float, Int]:
-    """Read the lines of a centreline file of any tubes, airways or vessels; see `read_centerlines`.
+    """Read the lines of a centreline file of any tubes, airways or vessels, plain or compressed by zlib.
 
-    Returns:
-        (N, 3) float64, (N,) float64, (E, 2) int64: Points in LPS mm, radii in mm, and pairs of points that
-            follow each other on a line.
-
-    Raises:
-        FileError, FrameError: As `read_centerlines`.
+    Returned are points `(N, 3)` LPS mm, radii `(N,)` mm, and pairs of points `(E, 2)` that follow each other
+    on a line; parameters and errors are those of `read_centerlines`.
     """
-    file = read_vtk_xml(path)
+    path = require_file(path)
+    with reading(path):
+        if path.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it has more than {MOST_BYTES >> 20} MiB")
+        file = _Reader(path.read_bytes()).file()
     lps_from_file = LPS_FROM[_frame(file, path, frame)]
     points, radii, edges, count = [], [], [], 0
     for piece in file.pieces:

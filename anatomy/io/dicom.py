@@ -90,13 +90,9 @@ def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
 
 
 def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
-    """Read a CT series in Hounsfield units.
+    """Read a CT series in Hounsfield units, (ni, nj, nk); k runs along the normal of the slices.
 
-    Args:
-        series_uid: Which series to read; it must be given when the folder holds more than one.
-
-    Returns:
-        Hounsfield units, (ni, nj, nk); k runs along the normal of the slices.
+    Which series it is must be given when the folder holds more than one.
 
     Raises:
         FileError: If the choice of series is open, slices are missing, damaged, empty, doubled or unevenly

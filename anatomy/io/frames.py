@@ -55,14 +55,9 @@ def _point_error(text: str, problem: str) -> FrameError:
 
 
 def read_pose(path: str | Path, frame: Frame | None) -> Float:
-    """Read a 4x4 pose whose +z column is the direction of insertion.
+    """Read a 4x4 pose `lps_from_tip`, LPS mm, from 16 numbers; +z is the direction of insertion.
 
-    Args:
-        path: path of a text file of 16 numbers.
-        frame ("ras" or "lps"): The frame of the numbers, because the file cannot state it; None is refused.
-
-    Returns:
-        lps_from_tip ((4, 4) float64, LPS mm)
+    The file cannot state the frame of its numbers: that is given, and None is refused.
 
     Raises:
         FileError: If the file does not hold 4x4 finite numbers.

@@ -65,14 +65,6 @@ class ImageHeader:
         ni, nj, nk = self.grid.shape
         return ni * nj * nk * self.components
 
-    @property
-    def stored_shape(self) -> tuple[int, ...]:
-        """Shape of the stored numbers, the index that runs fastest first."""
-        if self.components == 1:
-            return self.grid.shape
-        n = (self.components,)
-        return n + self.grid.shape if self.components_first else self.grid.shape + n
-
 
 def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes: int) -> tuple[int, int, int]:
     """Return the shape of an image of three dimensions that a file of `stored_bytes` can hold.

@@ -33,11 +33,9 @@ _LARGEST_BYTES = 1 << 28
 
 @frozen_record
 class ControlPoint:
-    """A point of a markup.
+    """A point of a markup, and the frame `(4, 4)` LPS mm that 3D Slicer keeps at it.
 
-    Args:
-        lps_from_point ((4, 4) float64): Its place, LPS mm, and the frame that 3D Slicer keeps at it.
-        oriented: Whether that frame was stated: 3D Slicer gives every point that of its screen, RAS.
+    It is oriented if that frame was stated: 3D Slicer gives every point that of its screen, RAS.
     """
 
     label: str
@@ -55,12 +53,10 @@ class ControlPoint:
 
 @frozen_record
 class Markup:
-    """A list of points or a curve, as 3D Slicer saved it.
+    """A list of points or a curve, as 3D Slicer saved it; its points are those that are placed.
 
-    Args:
-        name: As in the scene, or in its file where there is no scene.
-        kind: "Fiducial", "Curve", "Line" or another of 3D Slicer's types.
-        points: Those that are placed.
+    The name is that in the scene, or in its file where there is no scene, and the kind "Fiducial", "Curve",
+    "Line" or another of its types.
     """
 
     name: str

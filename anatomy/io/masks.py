@@ -25,13 +25,10 @@ SHIFT_TOLERANCE = 0.05
 
 @frozen_record
 class Placed:
-    """An image on the grid it was placed on.
+    """An image on the grid it was placed on, with the fill value beyond it.
 
-    Args:
-        array: With the fill value beyond the image.
-        n_voxels, n_lost: How many voxels of the image are not zero, and how many of these lie outside the
-            grid.
-        is_resampled: Whether the voxels of the two grids do not coincide.
+    `n_voxels` of the image are not zero, and `n_lost` of these lie outside the grid; it is resampled if the
+    voxels of the two grids do not coincide.
     """
 
     array: Array
@@ -274,24 +271,22 @@ class _Gathered:
         if covers_same_voxels(grid, self._basis_grid):
             return np.asarray(found.array)
         if grid.shape == self._basis_grid.shape:
-            self._state_move(name, grid, mask, found)
+            # How much of a file lies in the lungs by its header is said once these are known.
+            by_index = place(mask, self._basis_grid, self._grid).array
+            offset_mm = grid.lps(np.zeros(3)) - self._basis_grid.lps(np.zeros(3))
+            self._later.append(
+                lambda lung: moved(
+                    name,
+                    self._basis,
+                    offset_mm,
+                    found,
+                    share_by_header=_share(found.array, lung),
+                    share_by_index=_share(by_index, lung),
+                )
+            )
         else:
             self._statements.append(placement(name, role, mask, grid, self._grid, found))
         return np.asarray(found.array)
-
-    def _state_move(self, name: str, grid: Grid, mask: Mask, found: Placed) -> None:
-        """Remember to say, once the lungs are known, how much of a file lies in them by its header."""
-        by_index = place(mask, self._basis_grid, self._grid).array
-        self._later.append(
-            lambda lung: moved(
-                name,
-                self._basis,
-                grid.lps(np.zeros(3)) - self._basis_grid.lps(np.zeros(3)),
-                found,
-                share_by_header=_share(found.array, lung),
-                share_by_index=_share(by_index, lung),
-            )
-        )
 
     def finish(self) -> Iterable[str]:
         """Yield how files were placed."""

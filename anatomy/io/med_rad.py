@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from anatomy.base.errors import AnatomyError, FileError, FrameError
+from anatomy.base.errors import AnatomyError, FrameError
 from anatomy.base.files import sha256
 from anatomy.base.typed import Float
 from anatomy.grid import Grid
@@ -26,7 +26,6 @@ LUNG_FILES: Mapping[str, tuple[str, ...]] = {
     "fissures": ("fissures", "fissure"),
 }
 """Names of the files of a lung by role, that of the collection first; the case of letters is the same."""
-_BRAIN = ("brain", "ventricles", "globipallidi", "globipaladii")
 _FRAME_ON_DISK: Frame = "ras"
 
 
@@ -34,17 +33,6 @@ def is_med_rad(folder: Path) -> bool:
     """Tell whether a folder holds a lung of Med-RAD: a bronchial tree, and vessels, lungs or lobes."""
     roles = {source.role for source in lung_sources(folder)}
     return "lumen" in roles and len(roles) > 1
-
-
-def require_no_brain(folder: Path) -> None:
-    """Refuse a brain of Med-RAD in words; FileError if the folder is one."""
-    found = [name for name in _BRAIN if name in by_name(folder)]
-    if "brain" in found and (len(found) > 1 or "vessels" in by_name(folder)):
-        raise FileError(
-            f"{folder} is a brain of Med-RAD ({', '.join(found)}): brains are not planned for",
-            expected="a lung or a liver",
-            remedy="Of Med-RAD, the folders of Lungs and Liver are understood",
-        )
 
 
 def load_med_rad(folder: Path) -> PatientImages:
@@ -120,11 +108,8 @@ def numbered_nodules(images: Mapping[str, Path]) -> list[MaskSource]:
 def text_poses(folder: Path, grid: Grid) -> tuple[dict[str, Any], dict[str, str]]:
     """Read the files whose names end in `start1` and the like as poses, and `target` and the like as points.
 
-    A name that holds both, such as `target1_start2.txt`, is a start.
-
-    Returns:
-        - dict - Fields of `PatientImages`: starts `(4, 4)` and targets `(3,)`, LPS mm, and their names.
-        - dict - The SHA-256 of the files.
+    A name that holds both, such as `target1_start2.txt`, is a start.  Returned are fields of `PatientImages`,
+    starts `(4, 4)` and targets `(3,)` LPS mm and their names, and the SHA-256 of the files.
 
     Raises:
         FileError: If a file holds no pose or point.

@@ -89,10 +89,7 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
     A displacement field or transform follows ITK: at a point p in LPS mm stands the vector, LPS mm, that
     leads p to the same tissue at the other end of the breath.  (NIfTI fields with the intent code 1006 are
     RAS on disk.)  Landmark pairs are lines of six numbers: a place at end-exhale and the same tissue at
-    end-inhale.
-
-    Args:
-        masks: Of the masks; a transform is evaluated over it.
+    end-inhale.  A transform is evaluated over the grid of the masks.
 
     Raises:
         SettingsError: If the keys contradict each other, or the phase of the masks or the direction is not
@@ -265,13 +262,10 @@ def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
 
 
 def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
-    """Return a displacement field from end-exhale to end-inhale: a B-spline by mutual similarity.
+    """Return a displacement field `(ni, nj, nk, 3)` LPS mm from end-exhale to end-inhale: a B-spline.
 
     CTs are compared by correlation; two masks by the distance to their borders, which tells nothing of the
     motion inside but what the border implies.
-
-    Returns:
-        Grid, (ni, nj, nk, 3) float64: LPS mm.
 
     Raises:
         AnatomyError: If an image is constant, or one is a mask and the other is not, or nothing is found.

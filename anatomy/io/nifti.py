@@ -62,11 +62,8 @@ def open_nifti(
 ) -> tuple[image_header.ImageHeader, Iterator[bytes]]:
     """Read everything before the voxels, and return it with the bytes of the voxels.
 
-    Args:
-        path: A plain or compressed file.
-        frame ("ras" or "lps"): The frame to assume if the file states none (both transform codes 0).
-        components: Numbers a voxel: 1, or 3 for a displacement field, which has five dimensions (ni, nj, nk,
-            1, 3).
+    The frame is assumed if the file states none (both transform codes 0).  A displacement field of three
+    components has five dimensions (ni, nj, nk, 1, 3).
 
     Raises:
         FileError: If it is no NIfTI image of three dimensions with plain numbers.

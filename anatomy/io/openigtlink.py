@@ -31,13 +31,10 @@ NUMBER_TOLERANCE = 10.0 * ORTHONORMAL_TOLERANCE
 
 @frozen_record
 class Received:
-    """A message that was read.
+    """A message that was read: the pose `(4, 4)` LPS mm of a TRANSFORM, or the text of a STRING.
 
-    Args:
-        name: Name of the device that it is of.
-        time_s: When it was sent, seconds since 1970 by the sender's clock; 0 if it did not say.
-        lps_from_device ((4, 4) float64 or None): The pose of a TRANSFORM, LPS mm.
-        text: The text of a STRING.
+    It has the name of the device that it is of, and the seconds since 1970 by the sender's clock when it was
+    sent, 0 if it did not say.
     """
 
     name: str

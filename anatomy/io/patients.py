@@ -12,7 +12,8 @@ from anatomy.io.ct_cases import cases_in, require_no_ct_case
 from anatomy.io.dicom_seg import is_dicom
 from anatomy.io.images import image_suffix, images_in, read_volume
 from anatomy.io.liver import is_liver
-from anatomy.io.med_rad import is_med_rad, load_med_rad, lung_sources, require_no_brain, require_roles
+from anatomy.io.med_rad import is_med_rad, load_med_rad, lung_sources, require_roles
+from anatomy.io.near_names import by_name
 from anatomy.io.own_masks import DESCRIPTION, load_own_masks, motion_alone, with_motion
 from anatomy.io.totalsegmentator import has_lobes, is_totalsegmentator, load_totalsegmentator
 from anatomy.patient import PatientImages
@@ -98,7 +99,14 @@ def _refuse(folder: Path) -> NoReturn:
             remedy="For a liver there are `lungaccess info`, `lungaccess needle` and `lungaccess route`, "
             "which takes --lumen portal-vein, hepatic-vein or hepatic-artery",
         )
-    require_no_brain(folder)
+    held = by_name(folder)
+    brain = [name for name in ("brain", "ventricles", "globipallidi", "globipaladii") if name in held]
+    if "brain" in brain and (len(brain) > 1 or "vessels" in held):
+        raise FileError(
+            f"{folder} is a brain of Med-RAD ({', '.join(brain)}): brains are not planned for",
+            expected="a lung or a liver",
+            remedy="Of Med-RAD, the folders of Lungs and Liver are understood",
+        )
     require_no_ct_case(folder)
     if lung_sources(folder):
         if has_lobes(folder):
@@ -108,7 +116,9 @@ def _refuse(folder: Path) -> NoReturn:
                 remedy=f"Run TotalSegmentator -i CT.nii.gz -o {folder} --task lung_vessels",
             )
         require_roles(folder, lung_sources(folder))
-    within = patients_in(folder)
+    # Patients, of any kind, that lie one or two folders below, or the cases of a data set.
+    below = _folders_in(folder)
+    within = cases_in(folder) or [path for each in below for path in _here(each) or _below(each)]
     if within:
         shown = ", ".join(str(path.relative_to(folder)) for path in within[:_SHOWN])
         rest = f" and {len(within) - _SHOWN} more" if len(within) > _SHOWN else ""
@@ -125,12 +135,6 @@ def _refuse(folder: Path) -> NoReturn:
         "(task lung_vessels), a case of AeroPath or ATM'22, or a folder with a patient.toml",
         remedy=describe_yourself(),
     )
-
-
-def patients_in(folder: Path) -> list[Path]:
-    """Return the patients, of any kind, that lie one or two folders below, or the cases of a data set."""
-    cases = cases_in(folder)
-    return cases or [path for below in _folders_in(folder) for path in _here(below) or _below(below)]
 
 
 def _below(folder: Path) -> list[Path]:

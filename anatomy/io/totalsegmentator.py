@@ -131,10 +131,8 @@ def has_lobes(folder: Path) -> bool:
 def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> PatientImages:
     """Read the masks of tasks lung_vessels and total from one folder.
 
-    Args:
-        folder: Holds one mask a structure (`lung_airways.nii.gz`, ...), or label maps whose labels are named
-            in the header or a side-car, or both.
-        label_map: A file of the folder to read as a label map even if it names no labels.
+    It holds one mask a structure (`lung_airways.nii.gz`, ...), or label maps whose labels are named in the
+    header or a side-car, or both.  `label_map` is read as one even if it names no labels.
 
     Raises:
         AnatomyError: If a structure is missing or empty, or labels cannot be told apart.

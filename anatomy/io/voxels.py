@@ -17,12 +17,6 @@ _ANY_HEADER = 47  # zlib or gzip, found out from the first bytes
 _MAGIC_GZIP = b"\x1f\x8b"
 
 
-def is_gzip(path: Path) -> bool:
-    """Tell whether a file begins like a gzip file, whatever its name."""
-    with path.open("rb") as stream:
-        return stream.read(2) == _MAGIC_GZIP
-
-
 def pieces(path: Path, offset: int = 0, *, compressed: bool | None = None) -> Iterator[bytes]:
     """Yield the bytes of a plain or compressed file from an offset on, in pieces of a few MiB.
 
@@ -32,15 +26,9 @@ def pieces(path: Path, offset: int = 0, *, compressed: bool | None = None) -> It
         FileError: At the end of a compressed file whose checksum is wrong or that was cut short.
     """
     with path.open("rb") as stream:
+        packed = stream.read(2) == _MAGIC_GZIP if compressed is None else compressed
         stream.seek(offset)
-        packed = is_gzip(path) if compressed is None else compressed
-        yield from inflate(stream, path) if packed else plain_pieces(stream)
-
-
-def plain_pieces(stream: BinaryIO) -> Iterator[bytes]:
-    """Yield the rest of `stream` in pieces."""
-    while piece := stream.read(PIECE_BYTES):
-        yield piece
+        yield from inflate(stream, path) if packed else iter(lambda: stream.read(PIECE_BYTES), b"")
 
 
 def inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
@@ -88,7 +76,10 @@ def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Arra
     Raises:
         FileError: If there are fewer or many more bytes than the header says, or they are damaged.
     """
-    values = np.zeros(header.stored_shape, np.float32 if header.is_scaled else header.dtype, order="F")
+    # The index that runs fastest comes first.
+    n = (header.components,) if header.components > 1 else ()
+    shape = n + header.grid.shape if header.components_first else header.grid.shape + n
+    values = np.zeros(shape, np.float32 if header.is_scaled else header.dtype, order="F")
     flat = values.reshape(-1, order="F")
     for at, chunk in _chunks(header, stream, path):
         flat[at : at + chunk.size] = chunk

@@ -30,9 +30,7 @@ At = Callable[[Float], Float]
 def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm: float) -> Motion:
     """Bring what was read to the masks, and test it.
 
-    Args:
-        labels ((ni, nj, nk) uint16): See `anatomy.structures`; on `grid`.
-        middle_x_mm: x of the carina.
+    `labels` are those of `anatomy.structures` on `grid`; `middle_x_mm` is x of the carina.
 
     Raises:
         AnatomyError: If the motion folds tissue, leads to the head on inhalation or the lungs away from the

@@ -33,13 +33,6 @@ def smooth_maximum(a: Array, b: Array, width: float) -> Array:
     return np.asarray(np.maximum(a, b) + overlap * overlap / (4 * width))
 
 
-def ellipsoid_distance(dx: Array, dy: Array, dz: Array, radii: tuple[float, float, float]) -> Array:
-    """Return the signed distance along the ray from the centre to an ellipsoid (negative inside)."""
-    rho = np.sqrt((dx / radii[0]) ** 2 + (dy / radii[1]) ** 2 + (dz / radii[2]) ** 2) + 1e-6
-    length = np.sqrt(dx * dx + dy * dy + dz * dz)
-    return np.asarray(length - length / rho)
-
-
 def _power(u: Array) -> Array:
     return np.asarray(u * u * np.sqrt(u))
 
@@ -116,13 +109,12 @@ class Chest:
         return self.right, self.left
 
     def heart(self, x: Array, y: Array, z: Array) -> Array:
-        """Return the distance to the heart in mm (negative inside)."""
-        s = self.scale
-        centre = self.heart_centre
-        distance = ellipsoid_distance(
-            x / s - centre[0], y / s - centre[1], z / s - centre[2], self.heart_radii
-        )
-        return np.asarray(s * distance)
+        """Return the distance to the heart, an ellipsoid, along rays from its centre, mm; negative inside."""
+        s, radii = self.scale, self.heart_radii
+        dx, dy, dz = (a / s - centre for a, centre in zip((x, y, z), self.heart_centre, strict=True))
+        rho = np.sqrt((dx / radii[0]) ** 2 + (dy / radii[1]) ** 2 + (dz / radii[2]) ** 2) + 1e-6
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        return np.asarray(s * (length - length / rho))
 
     def lung(self, side: Side, x: Array, y: Array, z: Array) -> Array:
         """Return the approximate distance to the pleura of one lung in mm (negative inside)."""

@@ -37,16 +37,12 @@ MOTION_FILE = "motion.nrrd"
 def write_phantom(
     phantom: Phantom, folder: str | Path, *, breathing: bool = False, with_ct: bool = True
 ) -> Path:
-    """Write masks, `patient.toml`, CT and the truth of a phantom into `folder`, which is made if needed.
+    """Write masks, `patient.toml`, CT and the truth of a phantom into a folder, made if needed; return it.
 
-    `lumen`, `wall`, `vessels`, `lung`, `fissures`, `nodules`, `ct`, `labels` and `lobes` become NIfTI
-    images; `truth.json` holds the centrelines, the nodules and the meaning of the labels (LPS mm).
-    Without `with_ct` there is no CT, which takes most of the room.  With `breathing` there is `motion.nrrd`
-    as well, and `patient.toml` names it.  `patient.toml` is written last, so that a folder that has it is
-    complete.
-
-    Returns:
-        The folder.
+    `lumen`, `wall`, `vessels`, `lung`, `fissures`, `nodules`, `ct`, `labels` and `lobes` become NIfTI images;
+    `truth.json` holds the centrelines, the nodules and the meaning of the labels (LPS mm). Without `with_ct`
+    there is no CT, which takes most of the room.  With `breathing` there is `motion.nrrd` as well, and
+    `patient.toml` names it.  `patient.toml` is written last, so that a folder that has it is complete.
 
     Raises:
         FileError: If the folder cannot be written to.

@@ -220,18 +220,6 @@ class PlannedTree:
         return np.vstack(self.sprouts.points)
 
 
-@frozen_value
-class VesselRule:
-    """How vessels follow from a tree: diameters of `calibre` times the tree's, down to `limit_mm`.
-
-    They are drawn in voxels of `spacing_mm`.
-    """
-
-    calibre: float
-    limit_mm: float
-    spacing_mm: float
-
-
 @frozen_record
 class PatientPlan:
     """What a phantom holds besides the chest."""
@@ -254,14 +242,12 @@ def plan_patient(
     bullae = place_bullae(territory, traits.emphysema, scale, rng)
     # The diameter at which vessels end: in small patients later, in coarse voxels earlier.
     # Severe emphysema destroys vessels up to half as thick again.
-    limit_mm = traits.vessel_limit_mm * (1.0 + 0.5 * traits.emphysema)
-    vessels = VesselRule(
-        calibre=traits.vessel_calibre, limit_mm=limit_mm * max(scale, spacing_mm), spacing_mm=spacing_mm
-    )
+    limit_mm = traits.vessel_limit_mm * (1.0 + 0.5 * traits.emphysema) * max(scale, spacing_mm)
+    calibre = traits.vessel_calibre
     sprouts, rule = grow_airways(territory, scale, rng, traits)
     airways = _plan_airways(sprouts, spacing_mm)
     rim_mm = scale * traits.vessel_rim_mm
-    arteries = _below_rim(_plan_arteries(sprouts, scale, vessels), territory, rim_mm)
+    arteries = _below_rim(_plan_arteries(sprouts, scale, calibre, limit_mm, spacing_mm), territory, rim_mm)
     tubes = Obstacles(
         centres=np.vstack([airways.points_lps, arteries.points_lps]),
         radii=np.concatenate([airways.outer_mm, arteries.outer_mm]),
@@ -273,10 +259,9 @@ def plan_patient(
         centres=np.vstack([tubes.centres, *(n.centre_lps for n in nodules)]),
         radii=np.concatenate([tubes.radii, [n.radius_mm for n in nodules]]),
     )
-    root_mm, calibre = rule.root_diameter_mm, vessels.calibre
-    rule = replace(rule, smallest_diameter_mm=vessels.limit_mm, root_diameter_mm=calibre * root_mm)
+    rule = replace(rule, smallest_diameter_mm=limit_mm, root_diameter_mm=calibre * rule.root_diameter_mm)
     grown = grow_veins(territory, obstacles, rule, scale, rng)
-    sprouts, radius = _vessel_part(grown, replace(vessels, calibre=1.0))
+    sprouts, radius = _vessel_part(grown, 1.0, limit_mm, spacing_mm)
     # Veins from this diameter on lie outside the lung and may be drawn there.
     freedom = (np.array(sprouts.diameter_mm) > 6.0 * scale).astype(np.uint8)
     freedom[0] = 2
@@ -307,11 +292,13 @@ def _plan_airways(sprouts: Sprouts, spacing_mm: float) -> PlannedTree:
     return PlannedTree(sprouts=drawn, inner_mm=0.5 * diameter, outer_mm=outer, freedom=_freedom(drawn))
 
 
-def _vessel_part(sprouts: Sprouts, rule: VesselRule) -> tuple[Sprouts, Float]:
-    """Return the branches that carry a drawn vessel, and the vessel's radius `(B,)`."""
-    part = sprouts.pruned(rule.calibre * np.array(sprouts.diameter_mm) >= rule.limit_mm)
-    radius_mm = 0.5 * rule.calibre * np.array(part.diameter_mm)
-    return part, np.maximum(radius_mm, GAPLESS_RADIUS * rule.spacing_mm)
+def _vessel_part(
+    sprouts: Sprouts, calibre: float, limit_mm: float, spacing_mm: float
+) -> tuple[Sprouts, Float]:
+    """Return the branches that carry a vessel of `calibre` times their diameter, and its radius `(B,)`."""
+    part = sprouts.pruned(calibre * np.array(sprouts.diameter_mm) >= limit_mm)
+    radius_mm = 0.5 * calibre * np.array(part.diameter_mm)
+    return part, np.maximum(radius_mm, GAPLESS_RADIUS * spacing_mm)
 
 
 def _vessels(
@@ -324,8 +311,10 @@ def _vessels(
     return PlannedTree(sprouts=sprouts, inner_mm=radius, outer_mm=radius, freedom=freedom)
 
 
-def _plan_arteries(sprouts: Sprouts, scale: float, rule: VesselRule) -> PlannedTree:
-    airways, radius = _vessel_part(sprouts, rule)
+def _plan_arteries(
+    sprouts: Sprouts, scale: float, calibre: float, limit_mm: float, spacing_mm: float
+) -> PlannedTree:
+    airways, radius = _vessel_part(sprouts, calibre, limit_mm, spacing_mm)
     # Pulmonary trunk, right and left pulmonary artery of an adult.
     radius[:CENTRAL_BRANCHES] = scale * np.array((12.5, 9.5, 9.5))
     diameter = np.array(airways.diameter_mm)
@@ -333,7 +322,7 @@ def _plan_arteries(sprouts: Sprouts, scale: float, rule: VesselRule) -> PlannedT
     arteries = copy_arteries(airways, outer, radius, scale)
     obstacles = Obstacles(centres=np.vstack(airways.points), radii=np.repeat(outer, airways.counts))
     fixed = int(arteries.counts[:CENTRAL_BRANCHES].sum())
-    return _vessels(arteries, radius, obstacles, rule.spacing_mm, fixed, _freedom(arteries))
+    return _vessels(arteries, radius, obstacles, spacing_mm, fixed, _freedom(arteries))
 
 
 def _below_rim(tree: PlannedTree, territory: Territory, rim_mm: float) -> PlannedTree:

@@ -12,8 +12,8 @@ import numpy as np
 from anatomy.base.errors import AnatomyError, GridMismatchError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int16, Mask
-from anatomy.grid import Grid, Volume, freeze_arrays
-from anatomy.morphology import bounds, distance_mm, near, window
+from anatomy.grid import Volume, freeze_arrays
+from anatomy.morphology import bounds, distance_mm, window
 from anatomy.segmentation.growing import Ground, grow
 from anatomy.segmentation.kernels.local_minima import depth_slice, smooth_slice
 
@@ -168,22 +168,14 @@ _THREADS = 2
 
 
 def local_minima_map(hu: Int16, spacing_mm: Float, upright: int) -> Int16:
-    """Return the local minima map of a volume.
+    """Return the local minima map of a volume `(nk, nj, ni)` in HU, C-contiguous; it is nowhere negative.
 
     Of one direction of slices it is the map of the paper.  Where the voxels are near to cubes, it is the
-    median of the maps of all three directions.
+    median of the maps of all three directions; elsewhere the axis `upright`, along which a CT is sliced, is
+    used alone.
 
-    Args:
-        hu ((nk, nj, ni) int16, C-contiguous): Hounsfield units.
-        spacing_mm ((3,) float64): Voxel size along these axes.
-        upright: The axis along which a CT is sliced, used alone where the voxels are not near to cubes.
-
-    Returns:
-        (nk, nj, ni) int16, C-contiguous: Not negative, HU.
-
-    Notes:
-        The paper takes the maximum over the scales 1 to N.  A closing with a larger diamond is nowhere lower,
-        nor is what is reconstructed from it: the largest scale alone gives that maximum.
+    The paper takes the maximum over the scales 1 to N.  A closing with a larger diamond is nowhere lower, nor
+    is what is reconstructed from it: the largest scale alone gives that maximum.
     """
     # Slices are used in the directions in which their pixels are squarer than this.
     if spacing_mm.max() > 1.5 * spacing_mm.min():
@@ -224,12 +216,3 @@ def _some(slices: Int16, scale: int, out: Int16, first: int) -> None:
         smooth_slice(work[0], work[1])
         depth_slice(work[1], scale, work[2:], queue, waiting, work[0])
         out[n] = work[0]
-
-
-WALL_MM = 1.5
-"""Walls of lobar bronchi are 1 to 1.5 mm thick; those of thinner ones less."""
-
-
-def wall_around(lumen: Mask, grid: Grid) -> Mask:
-    """Return the wall of airways that came without one: all within `WALL_MM` of the lumen."""
-    return near(lumen, WALL_MM, grid.spacing_mm) & ~lumen

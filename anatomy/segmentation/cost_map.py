@@ -19,26 +19,15 @@ if TYPE_CHECKING:
 def cost_map(
     vessels: Vessels, airways: Airways, lung_mask: Mask, grid: Grid, *, total_radius_mm: float = 0.0
 ) -> Volume:
-    """Return M_cost: infinite in obstacles, elsewhere the vesselness.
+    """Return M_cost [Fu2018, sec. IV-A and IV-B]: infinite in obstacles, elsewhere the vesselness, 0 to 1.
 
-    Obstacles are all voxels outside the lung, the lumen and wall of the airways, and the large vessels.
-
-    Args:
-        lung_mask ((ni, nj, nk) bool): Both lungs, filled.
-        grid: The grid of all of them.
-        total_radius_mm: Radius of the needle and safety margin by which obstacles are grown, see
-            `inflation_voxels`.  The default of 0 leaves them as they are: the planners keep their clearance
-            by a proved distance.
-
-    Returns:
-        float32 in [0, 1], or infinite.
+    Obstacles are all voxels outside the lungs, which are filled, the lumen and wall of the airways, and the
+    large vessels.  They are grown by `total_radius_mm`, the radius of the needle and a safety margin, see
+    `inflation_voxels`.  By default they are not: the planners keep their clearance by a proved distance.
 
     Raises:
         GridMismatchError: If a mask has another shape.
         SettingsError: If the radius is negative or not finite.
-
-    References:
-        [Fu2018, sec. IV-A and IV-B]
     """
     parts = {
         "vesselness": vessels.vesselness,

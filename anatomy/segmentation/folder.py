@@ -38,17 +38,13 @@ NOTES = {
 class SegmentationFolder:
     """Images of one CT in a folder, with a record that tells made ones from corrected ones.
 
-    An image counts as corrected if its file is not one that was written here, or if a file of the same
-    name with another ending (`airway.seg.nrrd`) lies beside it.  Corrected files are moved to the folder
-    `corrections`, and count until they are removed from there.  The record is written before a file gets
-    its name, so that a run that was killed at any moment leaves no made file that looks corrected.
+    An image counts as corrected if its file is not one that was written here, or if a file of the same name
+    with another ending (`airway.seg.nrrd`) lies beside it.  Corrected files are moved to the folder
+    `corrections`, and count until they are removed from there.  The record is written before a file gets its
+    name, so that a run that was killed at any moment leaves no made file that looks corrected.
 
-    Args:
-        folder: Made if needed.
-        grid: The grid of the CT, which all images get.
-        ct_digest: Content of the CT.
-        inputs: Files that are read: none of them may lie where an image is written or looked for.
-        force: Whether files of others may lie there; masks then count as corrections.
+    No input may lie where an image is written or looked for.  With `force` files of others may lie there;
+    masks then count as corrections.
 
     Raises:
         AnatomyError: If the folder holds corrections made for another CT.

@@ -65,14 +65,10 @@ class Lungs:
 def segment_lungs(
     ct: Volume, *, ex_vivo: bool = False, seed_lps: ArrayLike | None = None, progress: Progress | None = None
 ) -> Lungs:
-    """Segment both lungs by region growing and closing.
+    """Segment both lungs of a CT in Hounsfield units by region growing and closing.
 
-    Args:
-        ct: Hounsfield units.
-        ex_vivo: The image shows an inflated lung in air, not a patient.
-        seed_lps ((3,) float64): A point in the trachea (of a lung ex vivo: in its main bronchus), LPS mm;
-            found by itself if None.
-        progress: Told each step as it begins.
+    With `ex_vivo` the image shows an inflated lung in air, not a patient.  A point in the trachea, ex vivo in
+    the main bronchus, `(3,)` LPS mm, is found by itself if it is not given.
 
     Raises:
         AnatomyError: If there is no trachea or no lung.

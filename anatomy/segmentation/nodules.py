@@ -26,17 +26,11 @@ LEAST_STOUT_ML, MOST_SLENDER = 0.35, 2.0
 def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
     """Draw the nodules that radiologists outlined in a CT, by the majority of those who outlined each.
 
-    The file is JSON: `{"annotations": [{"contours": [{"z_mm": -510.8, "ij": [[184, 245], ...],
-    "inclusion": true}, ...]}, ...]}`, one annotation a radiologist and nodule, as the LIDC-IDRI
-    database has them [Armato2011].  `ij` are columns and rows of the DICOM slice at `z_mm` (LPS); a contour
-    runs through the first pixels outside the nodule, and one with `"inclusion": false` cuts a hole.
-
-    Args:
-        grid: The grid of the CT; its axes run along the LPS axes.
-
-    Returns:
-        (ni, nj, nk) bool: A voxel belongs to a nodule if at least half of those who outlined this nodule have
-            it inside.
+    The file is JSON: `{"annotations": [{"contours": [{"z_mm": -510.8, "ij": [[184, 245], ...], "inclusion":
+    true}, ...]}, ...]}`, one annotation a radiologist and nodule, as the LIDC-IDRI database has them
+    [Armato2011].  `ij` are columns and rows of the DICOM slice at `z_mm` (LPS); a contour runs through the
+    first pixels outside the nodule, and one with `"inclusion": false` cuts a hole.  A voxel belongs to a
+    nodule if at least half of those who outlined this nodule have it inside.
 
     Raises:
         FileError: If the file has another form, or holds no contour.

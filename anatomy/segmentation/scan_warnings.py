@@ -250,13 +250,10 @@ def _leaks(tree: AirwayTree) -> list[str]:
 
 @frozen_value
 class Fit:
-    """What moving a mask by `STEP_MM` costs at least, HU.
+    """By how much a mask must fit the CT better in place than moved: worst of six directions, and mean.
 
-    Args:
-        brighter: Whether what is shown is brighter than what is around it.
-        least_hu, mean_hu: By how much it must be brighter, or darker, in place than moved: in the worst of
-            six directions, and on average.
-        doubt_hu: What the worst direction has in phantoms, halved.
+    What is shown is brighter or darker than what is around it.  `doubt_hu` is what the worst direction has in
+    phantoms, halved.
     """
 
     brighter: bool

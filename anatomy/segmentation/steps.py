@@ -15,8 +15,9 @@ from anatomy.io.frames import parse_point
 from anatomy.io.images import read_mask, read_volume
 from anatomy.io.mask_values import require_label_values
 from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
+from anatomy.morphology import near
 from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
-from anatomy.segmentation.airway import Airways, wall_around
+from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.central_airway import without_top
 from anatomy.segmentation.folder import (
@@ -201,7 +202,8 @@ class Steps:
                         f"The upper {cut_mm:.0f} mm of the airway were left out: it narrows there as at "
                         "the larynx. Look at it in segmentation.png if the patient has a narrow trachea.",
                     )
-            wall = wall_around(lumen, grid) if wall is None else wall
+            # Walls of lobar bronchi are 1 to 1.5 mm thick; those of thinner ones less.
+            wall = near(lumen, 1.5, grid.spacing_mm) & ~lumen if wall is None else wall
             said = airway_warnings(self._tree_of(lumen), lungs.left, lungs.right, grid)
             said = (*said, *cut_off(lungs.central_airway, lumen, grid))
             return {"airway": lumen, "airway_wall": wall & ~lumen}, {"warnings": [*said, *warnings]}

@@ -77,7 +77,10 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
         apart = [piece for piece in pieces if not lumen[tuple(piece.voxels[0])]]
         left_out = _left_out(lumen, apart[:MOST_NAMED], grid)
     bridges &= ~box
-    solid = fill_cavities(lumen | bridges)
+    # Every hole that faces do not connect to the corner of the box is filled.
+    solid = lumen | bridges
+    outside, holes = ndimage.label(~solid)
+    solid = solid if holes < 2 else np.asarray(outside != outside[0, 0, 0])
     cavity_voxels = int(solid.sum()) - int((lumen | bridges).sum())
     depth = depth_of_centres(lumen, grid.spacing_mm)
     return PreparedLumen(
@@ -147,14 +150,6 @@ def depth_of_centres(mask: Bool, spacing_mm: Float) -> Float32:
     return np.asarray(edt.edt(mask, anisotropy=spacing, black_border=True, parallel=1))
 
 
-def fill_cavities(mask: Bool) -> Bool:
-    """Return `mask` with every hole that faces do not connect to the array's corner filled."""
-    from scipy import ndimage
-
-    outside, count = ndimage.label(~mask)
-    return mask.copy(order="K") if count < 2 else np.asarray(outside != outside[0, 0, 0])
-
-
 def _pieces(labels: Int32, sizes: Int, main: int, spacing_mm: Float) -> list[Piece]:
     """List the other pieces that are long enough to have a direction, largest first."""
     from scipy import ndimage
@@ -180,14 +175,6 @@ def require_at_most(count: int, most: int, what: str) -> None:
             expected=f"at most {most}: a CT shows some hundred branches",
             remedy="Give the mask of the airway lumen alone; noise, or a leak into the lung, looks like this",
         )
-
-
-def require_few_tunnels(skeleton: Int) -> None:
-    """Raise AnatomyError if the lines of a skeleton `(M, 3)` meet again too often for a tree of airways."""
-    if len(skeleton):
-        # Airways never meet again: a tunnel is a fault of the mask, and a CT shows some hundred branches.
-        # Middle lines of airways have some thousand voxels; among so many of noise are tunnels enough.
-        require_at_most(tunnels(skeleton[:50_000]), 500, "tunnels, where airways meet again")
 
 
 def tunnels(voxels: Int) -> int:

@@ -67,13 +67,9 @@ class LoopOpened(Repair):
 class TreeReport:
     """What was changed or left out while the tree was made.
 
-    Args:
-        gaps_bridged, spurs_pruned, loops_opened, pieces_left_out (tuple of records): Each with `position_lps`
-            and `length_mm`; pieces of a few voxels are counted alone.
-        components_dropped: Separate pieces of the mask that were left out.
-        voxels_dropped: Voxels in these pieces.
-        cavity_voxels: Voxels of holes enclosed in the lumen; the tree runs around them.
-        warnings: What a user should look at before trusting the tree.
+    Pieces of a few voxels that are left out are counted alone, with their voxels.  `cavity_voxels` are those
+    of holes enclosed in the lumen, around which the tree runs; the warnings say what to look at before
+    trusting the tree.
     """
 
     gaps_bridged: tuple[GapBridged, ...] = ()

@@ -19,14 +19,10 @@ ENTRY_BRANCH = 0
 
 @frozen_record
 class LiverImages:
-    """What was read from disk for one liver, on one voxel grid.
+    """What was read from disk for one liver, on one grid; shared fields are those of `PatientImages`.
 
-    Args:
-        liver, nodules: Bool masks; the nodules are None if there is no mask of them.
-        lumens: The vessels by name, such as "portal-vein": obstacles of a needle, and what a catheter moves
-            in.
-        starts, targets_lps, start_names, target_names, sources, warnings: As in
-            `anatomy.patient.PatientImages`.
+    Liver and nodules are bool masks; the nodules are None if there is no mask of them.  The vessels by name,
+    such as "portal-vein", are obstacles of a needle, and what a catheter moves in.
     """
 
     name: str

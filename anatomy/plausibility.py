@@ -61,12 +61,9 @@ class Finding:
 class Limit:
     """Between which values a figure of the masks is usual, and between which it is possible.
 
-    Args:
-        check: A key of `CHECKS`.
-        words, form: The sentence with a place for the figure, and how the figure is written: without a form
-            it is a share.
-        usual, possible ((least, greatest)): Beyond the one is a warning, beyond the other a refusal.
-        reason: Where the limits are from.
+    The check is a key of `CHECKS`.  The sentence has a place for the figure, which is a share if no form is
+    stated.  Beyond the usual values is a warning, beyond the possible ones a refusal; the reason says where
+    the limits are from.
     """
 
     check: str

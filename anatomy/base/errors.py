@@ -4,12 +4,7 @@
 class LungaccessError(Exception):
     """Base of all errors that a user can cause and mend.
 
-    The message states what was found, what was expected and what to do about it.
-
-    Args:
-        found: What the input holds.
-        expected: What it should hold.
-        remedy: What the user can do.
+    The message states what was found, what was expected and what can be done about it.
     """
 
     def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:

@@ -13,19 +13,15 @@ from anatomy.grid import Grid, Volume
 class MotionSource:
     """Motion between end-exhale (phase 0) and end-inhale (phase 1) of quiet breathing, in LPS mm.
 
-    One of three kinds: a displacement field (`grid` and `vectors`), landmark pairs (`exhale_lps` and
-    `inhale_lps`), or the model of a population (`population_motion_mm`).
+    One of three kinds: a displacement field, `vectors` `(ni, nj, nk, 3)` at the voxel centres of `grid`;
+    landmark pairs, the same places of tissue at both ends, `exhale_lps` and `inhale_lps` `(N, 3)`; or the
+    model of a population for a 95 % motion of the patient, `population_motion_mm`.
 
     Args:
-        description: Where it came from, in words.
         masks_phase: The phase that the patient's masks show.
-        amplitude: Motion from phase 0 to 1 as a share of that of the source.
+        amplitude, hysteresis: See `Motion`.
         maps_from ("end-exhale" or "end-inhale"): Where the points of a displacement field lie; the vectors
             lead to the other end.
-        vectors ((ni, nj, nk, 3) float64): Displacements at the voxel centres of `grid`.
-        exhale_lps, inhale_lps ((N, 3) float64): The same places of tissue at both ends.
-        population_motion_mm: 95 % motion of the patient.
-        hysteresis: See `Motion`.
         other_lungs: The lungs at the end of the breath that is farther from the phase of the masks, to
             compare with.
     """

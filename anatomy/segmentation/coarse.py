@@ -23,11 +23,8 @@ class CoarseCt:
 
     Args:
         hu ((Ni, Nj, Nk) float32): Hounsfield units, not below -1200; contiguous along axis 0.
-        grid: The grid of `hu`.
-        fine_shape ((3,) int): Shape of the CT.
-        step ((3,) int): Voxels in a block, along the axes of the CT.
-        order ((3,) int): Axis of the CT that each axis here follows.
-        flipped ((3,) bool): Whether an axis here runs against that axis of the CT.
+        fine_shape, step: Shape of the CT, and voxels in a block, along its axes.
+        order, flipped: Axis of the CT that each axis here follows, and whether against it.
     """
 
     hu: Float32

@@ -51,9 +51,7 @@ class Ground:
     """What the airway grows in; arrays `(nk, nj, ni)`, C-contiguous.
 
     Args:
-        hu (int16): The CT.
-        smooth (int16): The CT with less noise.
-        depth (int16): Its map of local minima.
+        hu, smooth, depth (int16): The CT, the CT with less noise, and its map of local minima.
         lung: Where thin airways may go on.
         spacing_mm ((3,) float64): Voxel size along these axes.
         lung_hu, dark_hu: The tissue of the lung, and half-way between air and it.

@@ -91,7 +91,7 @@ def _toml(value: Any, decimals: int = 3) -> str:
         return f"{{ {', '.join(f'{key} = {each}' for key, each in named)} }}"
     if isinstance(value, tuple | list):
         return f"[{', '.join(_toml(each, 2) for each in value)}]"
-    return f"{value:.{decimals}f}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else f"{value:.{decimals}f}"
 
 
 def load_own_masks(description: Path) -> PatientImages:

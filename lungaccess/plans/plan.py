@@ -65,8 +65,8 @@ class Plan(Record):
         system_choice: Where the system was chosen among several: in sentences, which were tried, why each
             failed, and why this one was chosen; see `lungaccess.judging.answering`.  Empty otherwise.
         timing: Seconds; the only values that differ between two equal runs.
-        fissure_chance: Chance that tubes or needle cross a fissure, from the band it lies in; None where none
-             is known.
+        fissure_chance: Chance that tubes or needle of the worst pass cross a fissure, from its band; None
+            where none is known.
         chance: Of success, counted on draws that no search saw: for a plan that was searched by it, and of
             studies that count it; None for any other.
         window: The phases of the breath in which it is proved clear and on target; None where no motion was
@@ -158,6 +158,7 @@ class Plan(Record):
 
     def with_further(self, others: Iterable["Plan"]) -> "Plan":
         """Return the plan with the passes of other plans from the same place of the scope after its own."""
+        others = tuple(others)
         made = tuple(
             Pass(
                 tube=each.tube, needle=needle, exemption=each.exemption, clearance_mm=each.clearance_mm,
@@ -166,7 +167,8 @@ class Plan(Record):
             for each in others
             if (needle := each.needle) is not None
         )  # fmt: skip
-        return replace(self, further=made)
+        chances = [one.fissure_chance for one in (self, *others) if one.fissure_chance is not None]
+        return replace(self, further=made, fissure_chance=max(chances, default=None))
 
     @property
     def same_tubes(self) -> tuple[int, ...]:

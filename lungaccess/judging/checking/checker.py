@@ -107,7 +107,7 @@ def check_fissure_chance(plan: Plan, lung: "Lung", found: Findings) -> None:
         )
     chance = lung.fissure_chance(np.concatenate(points))
     if chance is None:
-        found.true(f"{name}.known", stated is None and most is None, FISSURES_UNKNOWN_HERE)
+        found.true(f"{name}.known", most is None, FISSURES_UNKNOWN_HERE)
         found.unchecked("patient.fissures", FISSURES_UNKNOWN_HERE)
         return
     if found.true(f"{name}.known", stated is not None, "a band of the fissures is known"):

@@ -177,7 +177,7 @@ class Request:
                 expected="a patient with a motion: [motion] in its patient.toml",
                 remedy="Leave phases and window out, or state a motion; see docs/how_to/breathing.md",
             )
-        if self.lung.fissure_band is None and any(each.max_fissure_chance for each in self.systems):
+        if any(each.max_fissure_chance for each in self.systems) and self.lung.fissure_band is None:
             raise AnatomyError(
                 f"Where the fissures of {self.lung.name} may lie is not known, and a chance is asked for",
                 expected="a patient with fissure_band in its patient.toml, as `segment` writes it",

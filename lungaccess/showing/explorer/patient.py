@@ -16,7 +16,7 @@ from lungaccess.problem import System, Target, load_system, preset_names, resolv
 from lungaccess.problem.nodules import nodules_of
 from lungaccess.showing.explorer.worker import PatientSource
 from lungaccess.showing.report.html.meshes import structure_meshes
-from lungaccess.showing.report.html.volumes import CODES, CtFile, page_image
+from lungaccess.showing.report.html.volumes import CtFile, fine_image, page_image
 from lungaccess.showing.report.reach import COLOURS
 
 MOST_NODULES = 50
@@ -102,7 +102,8 @@ def scene_parts(lung: Lung, source: PatientSource) -> Iterator[dict[str, Any]]:
     """Yield the voxels of the whole lung, then its surfaces."""
     around = np.asarray(lung.tree.carina_lps)
     image = page_image(lung, around[None], patient_ct(source.ct))
-    yield {"image": _some(image, slice(0, 1))}
+    ct = image["ct"]
+    yield {"image": {**image, "labels": image["labels"][:1], "ct": None if ct is None else ct[:1]}}
     yield {"structures": structure_meshes(lung)}
 
 
@@ -110,17 +111,7 @@ def image_parts(lung: Lung, source: PatientSource, around_lps: ArrayLike) -> dic
     """Return the fine voxels around a point; within the images, where the point lies beyond them."""
     low, high = _box(lung)
     around = np.clip(np.asarray(around_lps, dtype=np.float64), low, high)
-    return {"image": _some(page_image(lung, around[None], patient_ct(source.ct)), slice(1, 2))}
-
-
-def _some(image: dict[str, Any], which: slice) -> dict[str, Any]:
-    ct = image["ct"]
-    return {
-        **image,
-        "labels": image["labels"][which],
-        "ct": None if ct is None else ct[which],
-        "codes": CODES,
-    }
+    return {"image": fine_image(lung, around[None], patient_ct(source.ct))}
 
 
 @lru_cache(maxsize=1)

@@ -81,11 +81,29 @@ def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packe
     Raises:
         AnatomyError: If the CT does not hold the devices.
     """
+    labels = label_volumes(lung, device_lps)
+    return _image(lung, labels, ct, None if ct is None else ct_volumes(ct, lung, device_lps))
+
+
+def fine_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packed:
+    """Return the fine voxels of `page_image` alone, which takes a tenth of the time.
+
+    Raises:
+        AnatomyError: If the CT does not hold the devices.
+    """
+    fine = page_grids(lung.grid, device_lps)[1]
+    if ct is not None:
+        _require_holds(ct, device_lps)
+    found = None if ct is None else [_packed(fine, _ct_bytes(ct, fine), differences=True)]
+    return _image(lung, [_fine_labels(lung, fine)], ct, found)
+
+
+def _image(lung: Lung, labels: list[Packed], ct: Volume | None, voxels: list[Packed] | None) -> Packed:
     grid = lung.grid if ct is None else ct.grid
     return {
         "codes": CODES,
-        "labels": label_volumes(lung, device_lps),
-        "ct": None if ct is None else ct_volumes(ct, lung, device_lps),
+        "labels": labels,
+        "ct": voxels,
         "hounsfield": HU_OF_BYTE.tolist(),
         "grid": {"shape": list(grid.shape), "lps_from_ijk": grid.lps_from_ijk.tolist()},
     }
@@ -131,14 +149,19 @@ def label_volumes(lung: Lung, device_lps: Float) -> list[Packed]:
     """Return the structures, coarse and fine, for a page; the coarse ones are kept with the lung."""
     coarse, fine = page_grids(lung.grid, device_lps)
     shape = np.array(lung.grid.shape)
+    return [
+        kept(lung, "labels", LABELS_VERSION, lambda: _labels_on(lung, coarse, np.zeros(3, np.int64), shape)),
+        _fine_labels(lung, fine),
+    ]
+
+
+def _fine_labels(lung: Lung, fine: Grid) -> Packed:
+    shape = np.array(lung.grid.shape)
     corners = np.stack(np.meshgrid(*[(0, n - 1) for n in fine.shape], indexing="ij"), axis=-1).reshape(-1, 3)
     places = np.floor(lung.grid.ijk(fine.lps(corners))).astype(np.int64)
     low = np.clip(places.min(axis=0) - 2, 0, shape - 1)
     high = np.clip(places.max(axis=0) + 4, low + 1, shape)
-    return [
-        kept(lung, "labels", LABELS_VERSION, lambda: _labels_on(lung, coarse, np.zeros(3, np.int64), shape)),
-        _labels_on(lung, fine, low, high),
-    ]
+    return _labels_on(lung, fine, low, high)
 
 
 def _labels_on(lung: Lung, grid: Grid, low: Int, high: Int) -> Packed:
@@ -152,12 +175,7 @@ def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
     Raises:
         AnatomyError: If the CT does not hold the devices.
     """
-    if not ct.grid.contains(device_lps).all():
-        raise AnatomyError(
-            "The CT does not hold all points of the plan",
-            expected=f"an image in the patient's frame, this one is {ct.grid.describe()}",
-            remedy="Give the CT from which the masks were made",
-        )
+    _require_holds(ct, device_lps)
     factor = 1.0
     while True:
         found = [
@@ -168,6 +186,15 @@ def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
         if sum(len(each["voxels"]["data"]) for each in found) <= 8_500_000:
             return found
         factor *= 1.2
+
+
+def _require_holds(ct: Volume, device_lps: Float) -> None:
+    if not ct.grid.contains(device_lps).all():
+        raise AnatomyError(
+            "The CT does not hold all points of the plan",
+            expected=f"an image in the patient's frame, this one is {ct.grid.describe()}",
+            remedy="Give the CT from which the masks were made",
+        )
 
 
 def page_grids(grid: Grid, device_lps: Float, factor: float = 1.0) -> tuple[Grid, Grid]:

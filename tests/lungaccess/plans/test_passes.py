@@ -25,6 +25,7 @@ from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.request import Request
 from lungaccess.problem.system import system_fingerprint, with_tool
 from lungaccess.problem.tools import load_tool
+from lungaccess.showing.report.html.tables import plan_name, shown_name
 from lungaccess.uncertainty.risk import assess
 from lungaccess.uncertainty.risk.assessor import RiskAssessor, drawn_anew
 from lungaccess.uncertainty.risk.statistics import share_of
@@ -138,6 +139,23 @@ def test_hands_are_told_what_to_do_between_passes(plans: tuple[Plan, Plan]) -> N
     assert len(several.redirections) == PASSES - 1 and one.redirections == ()
     names = [curve.name for curve in several.shown_curves()]
     assert names[:3] == ["scope", "tubes", "needle"] and {"needle_2", "needle_3"} <= set(names)
+
+
+def test_pictures_number_the_passes_and_tables_tell_them_from_the_whole() -> None:
+    assert [shown_name(n, 3) for n in (0, 2, 3)] == [
+        ("Pass 1", "1"),
+        ("Pass 3", "3"),
+        ("Alternative 1", "A1"),
+    ]
+    assert [plan_name(n, 3) for n in (0, 2)] == ["All 3 passes of the plan", "Pass 3 alone"]
+    assert [shown_name(n, 1) for n in (0, 2)] == [("The plan", "0"), ("Alternative 2", "2")]
+
+
+def test_passes_leave_tubes_that_are_turned(plans: tuple[Plan, Plan], small_lung: Lung) -> None:
+    several = plans[1]
+    ends = np.array([each.end_lps for each in several.passes])
+    assert np.linalg.norm(ends - ends[0], axis=1).max() > 1.0, "they end apart"
+    assert max(several.same_tubes) > 0, "a needle so short cannot bend so far from the same tubes"
 
 
 def test_passes_need_a_tool_and_the_chance(small_lung: Lung) -> None:

@@ -114,7 +114,7 @@ def run(
         scheduler: Address of a running dask scheduler; this machine if not given.
         workers: How many processes on this machine.
     """
-    from lungaccess.running.benchmark.synthetic.reference import benchmark_study
+    from lungaccess.running.benchmark.synthetic.submission import benchmark_study
     from lungaccess.running.study.driver import run_study
 
     devices_asked = {"systems": names_of(devices)} if devices is not None else {}
@@ -139,8 +139,7 @@ def run(
 
 def _write_answers(results: Path, folder: Path) -> list[Path]:
     from anatomy.base.files import require_writable_folder
-    from lungaccess.running.benchmark.synthetic.reference import submissions_of
-    from lungaccess.running.benchmark.synthetic.submission import write_submission
+    from lungaccess.running.benchmark.synthetic.submission import submissions_of, write_submission
 
     require_writable_folder(folder)
     written = []

@@ -69,8 +69,10 @@ class CostBound:
         """Once it has begun."""
         self._workers = ThreadPoolExecutor(QUEUES)
         self._running: list[Future[None]] = []
-        self._value, self._left_out = 0.0, math.inf
-        self._lowest: list[tuple[int, float, float, float]] = []
+        self.known, self._left_out = 0.0, math.inf
+        """The bound when the boxes were last divided to the end, while others may be divided now."""
+        self.lowest: list[tuple[int, float, float, float]] = []
+        """Scope tip, rotation (rad) and insertions (mm) in the middle of some of the lowest boxes then."""
         self.settled = False
         """Whether it rises no more."""
 
@@ -78,20 +80,7 @@ class CostBound:
     def value(self) -> float:
         """The bound: 0 before it has begun."""
         self.finish()
-        return self._value
-
-    @property
-    def known(self) -> float:
-        """The bound when the boxes were last divided to the end, while others may be divided now."""
-        return self._value
-
-    @property
-    def lowest(self) -> list[tuple[int, float, float, float]]:
-        """Scope tip, rotation (rad) and insertions (mm) in the middle of some of the lowest boxes.
-
-        Those when the boxes were last divided to the end, while others may be divided now.
-        """
-        return self._lowest
+        return self.known
 
     def start(self, cost: float, boxes: int) -> None:
         """Begin to divide so many boxes in other threads; `finish` waits for them.
@@ -104,11 +93,16 @@ class CostBound:
             return
         self._left_out = min(self._left_out, cost)
         if not self.queues:
-            environment = _environment(self._task, self._tips, cost, self._beside_mm)
+            evaluator = CandidateEvaluator(self._task)
+            limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
+            limits = limits._replace(goal_tolerance_mm=limits.goal_tolerance_mm + self._beside_mm)
+            tubes = tube_environment(self._task.lung, with_fissures=self._task.with_fissures)
+            weights, target = (objective.inverse_clearance, objective.length), self._task.target.lps_mm
+            environment = bound_environment(tubes, limits, weights, target, self._tips, cost)
             insertions = np.zeros(int(self._tubes[MAX_EXTENSION] / INSERTION_STEP_MM) + 1)
             # Spacing of the insertions that are tried for the greatest one.
             greatest_insertions(self._tubes, self._tubes[MAX_EXTENSION], 0.01, insertions)
-            x, y, z = self._task.target.lps_mm.tolist()
+            x, y, z = target.tolist()
             for n in range(QUEUES):
                 tips = np.ascontiguousarray(self._tips[n::QUEUES])
                 about = (environment, self._tubes, insertions, tips, (x, y, z))
@@ -125,18 +119,13 @@ class CostBound:
         if any(not each.begun for each in self.queues):
             return
         least = min(self.queues, key=lambda each: each.value)
-        self._value, self.settled = min(least.value, self._left_out), least.settled
+        self.known, self.settled = min(least.value, self._left_out), least.settled
         # Deployments that are tried in one step, in the middle of the lowest boxes: less than a millisecond.
-        self._lowest = [
+        self.lowest = [
             (tip * QUEUES + n, rotation, outer, inner)
             for n, each in enumerate(self.queues)
             for tip, rotation, outer, inner in each.lowest(2)
         ]
-
-    def improve(self, cost: float, boxes: int) -> float:
-        """Divide so many boxes as `start` does, and return the bound."""
-        self.start(cost, boxes)
-        return self.value
 
 
 class BoxQueue:
@@ -190,15 +179,6 @@ class BoxQueue:
         inner = rows[:, INNER]
         columns = rows[:, TIP], rows[:, ROTATION], np.clip(rows[:, OUTER], 0.0, inner), inner
         return [(int(tip), *rest) for tip, *rest in zip(*(each.tolist() for each in columns), strict=True)]
-
-
-def _environment(task: Task, tips: Float, limit: float, beside_mm: float) -> BoundEnvironment:
-    evaluator = CandidateEvaluator(task)
-    limits, objective = evaluator.environment.limits, evaluator.needle_arrays.objective
-    limits = limits._replace(goal_tolerance_mm=limits.goal_tolerance_mm + beside_mm)
-    tubes = tube_environment(task.lung, with_fissures=task.with_fissures)
-    weights = objective.inverse_clearance, objective.length
-    return bound_environment(tubes, limits, weights, task.target.lps_mm, tips, limit)
 
 
 def bound_environment(

@@ -62,11 +62,6 @@ class LayerBound:
             self.known = self._through_tissue() if self._task.system.needle is None else self._to_target()
             self.settled = True
 
-    def improve(self, cost: float, boxes: int) -> float:
-        """Find the bound, and return it."""
-        self.start(cost, boxes)
-        return self.known
-
     def _through_tissue(self) -> float:
         """Return the bound of tubes that end at the target, on layers about the lumen."""
         from scipy import ndimage

@@ -9,10 +9,11 @@ if TYPE_CHECKING:
         NeedleAnswer,
         PathSearch,
         needle_question,
+        obstruction_rows,
         plan_needle,
+        reason_in_words,
         search_path,
     )
-    from lungaccess.planning.one_stage.obstruction import obstruction_rows, reason_in_words
     from lungaccess.planning.one_stage.replan import (
         RestOfPlan,
         ScopeReplanner,

@@ -19,8 +19,7 @@ from lungaccess.planning.coupled.kernels.local_search import MAX_VIAS, improve
 from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.planning.coupled.search.direct_arcs import costs_of_tubes
 from lungaccess.planning.coupled.search.local_search import TubeChoice, path_through, tube_arguments
-from lungaccess.planning.one_stage.needle import needle_question
-from lungaccess.planning.one_stage.obstruction import reason_in_words
+from lungaccess.planning.one_stage.needle import needle_question, reason_in_words
 from lungaccess.plans.assemble import (
     needle_clearance_mm,
     needle_part,

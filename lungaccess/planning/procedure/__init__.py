@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
-    from lungaccess.planning.procedure.decision import Decision, Measurements
+    from lungaccess.planning.procedure.choices import Decision, Measurements
     from lungaccess.planning.procedure.insertion import WATCHED, insert_plan
     from lungaccess.planning.procedure.policy import Policy
     from lungaccess.planning.procedure.record import ProcedureRecord

@@ -20,13 +20,15 @@ from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.planning.one_stage import replan_from_tube
 from lungaccess.planning.procedure.choices import (
     DRAWS,
+    Action,
+    Decision,
+    Measurements,
     Offer,
     offered,
     planned_choice,
     scope_frames,
     with_choices,
 )
-from lungaccess.planning.procedure.decision import Action, Decision, Measurements
 from lungaccess.planning.procedure.kernels import decisions as kernel
 from lungaccess.planning.procedure.spread import (
     ASIDE,

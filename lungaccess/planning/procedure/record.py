@@ -10,7 +10,7 @@ from anatomy.base.errors import PlanFileError
 from anatomy.base.files import read_text, write_text
 from anatomy.base.settings import parse, to_mapping
 from anatomy.lung import Lung
-from lungaccess.planning.procedure.decision import Decision, Measurements
+from lungaccess.planning.procedure.choices import Decision, Measurements
 from lungaccess.planning.procedure.policy import Policy
 from lungaccess.plans.file import to_json
 from lungaccess.plans.plan import Plan

@@ -66,7 +66,13 @@ def places_of_tips(lung: Lung, not_lumen: Array, least_depth_mm: float) -> tuple
     to_lps = np.linalg.inv(depth.geometry[:, :3]).T
     geometry = lung.obstacle_field(with_fissures=False).geometry
     # Of a narrow scope that would be all of the lattice.
-    voxels = voxels[_beside_lumen((voxels + 0.5 - depth.geometry[:, 3]) @ to_lps, not_lumen, geometry)]
+    middles = (voxels + 0.5 - depth.geometry[:, 3]) @ to_lps
+    at = np.floor(middles @ geometry[:, :3].T + geometry[:, 3]).astype(np.int64)
+    # Those that lie in a voxel of the lumen, next to one, or beyond the grid.
+    beside = np.any((at < 0) | (at >= not_lumen.shape), axis=1)
+    for step in product((-1, 0, 1), repeat=3):
+        beside |= not_lumen[tuple(np.clip(at + step, 0, np.array(not_lumen.shape) - 1).T)] == 0
+    voxels = voxels[beside]
     part = (np.arange(PARTS) + 0.5) / PARTS
     parts = np.stack(np.meshgrid(part, part, part, indexing="ij"), axis=-1).reshape(-1, 3)
     centres = (voxels[:, None] + parts - depth.geometry[:, 3]) @ to_lps
@@ -82,16 +88,6 @@ def places_of_tips(lung: Lung, not_lumen: Array, least_depth_mm: float) -> tuple
     entered = np.unique(regions[tuple(at[inside].T)])
     mask &= np.isin(regions, entered[entered > 0])
     return mask, np.asarray(centres[hold & mask[tuple(voxels.T)][:, None]])
-
-
-def _beside_lumen(points: Float, not_lumen: Array, geometry: Float) -> Mask:
-    """Tell which points `(N, 3)` lie in a voxel of the lumen, next to one, or beyond the grid."""
-    at = np.floor(points @ geometry[:, :3].T + geometry[:, 3]).astype(np.int64)
-    beside: Mask = np.any((at < 0) | (at >= not_lumen.shape), axis=1)
-    last = np.array(not_lumen.shape) - 1
-    for step in product((-1, 0, 1), repeat=3):
-        beside |= not_lumen[tuple(np.clip(at + step, 0, last).T)] == 0
-    return beside
 
 
 def place_pieces(lung: Lung, centres: Float, leaving: Mask, reach_mm: float) -> list[PlacePiece]:

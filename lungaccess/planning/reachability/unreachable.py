@@ -299,21 +299,20 @@ class UnreachableProof:
         reach = distance_mm / lung.grid.spacing_mm + 1.0
         low = np.maximum(np.floor(at - reach).astype(int), 0)
         high = np.ceil(at + reach).astype(int) + 1
-        near = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-        regions = np.unique(self._free[near])
+        window = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        regions = np.unique(self._free[window])
         regions = regions[regions > 0]
         if regions.tobytes() not in self._passable:
             passable = np.isin(self._free, regions)
             self._passable = {regions.tobytes(): distance_corners(passable, lung.grid.spacing_mm)}
-        return self._surroundings(self._passable[regions.tobytes()], self._backward_reach(target))
-
-    def _backward_reach(self, target: Float) -> BackwardReach:
-        """Return where the needle's paths to a target come from; the middle is where most tips are."""
         if self._needle is None:
-            return NOT_BOUNDED
+            return self._surroundings(self._passable[regions.tobytes()])
+        # Where the needle's paths to a target come from: the middle is where most tips are.
         starts = np.array([piece.cones[0, :3] for piece in self._space.pieces]).reshape(-1, 3) - target
         near = starts[np.linalg.norm(starts, axis=1) <= 2.0 * self._limits.max_length_mm]
-        return backward_reach(self._needle, target, near.mean(axis=0) if len(near) else np.array([0, 0, 1.0]))
+        middle = near.mean(axis=0) if len(near) else np.array([0, 0, 1.0])
+        backward = backward_reach(self._needle, target, middle)
+        return self._surroundings(self._passable[regions.tobytes()], backward)
 
     def _surroundings(self, passable: np.ndarray, backward: BackwardReach = NOT_BOUNDED) -> ProofEnvironment:
         lung = self._lung

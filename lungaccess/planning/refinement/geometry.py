@@ -85,7 +85,9 @@ class Geometry:
         self.features: Any = self._features(x)
         self.middle = x[at["middle"]]
         self.tip = self._tip()
-        self.frames = self._needle_frames()
+        self.frames = [self.tip]
+        for a, (bx, by) in enumerate(self.bends):
+            self.frames.append(self.frames[-1].along(kappa * bx, kappa * by, self.lengths[a]))
 
     def _value(self, name: str) -> Any:
         return self._p[self._layout.parameters[name]]
@@ -173,31 +175,20 @@ class Geometry:
             thicker += self._value("middle_radius_step_mm") * _before(self.middle[m], s)
         return thicker
 
-    def _needle_frames(self) -> list[Frame]:
-        frames = [self.tip]
-        for a in range(self._layout.arcs):
-            bx, by = self.bends[a]
-            frames.append(frames[-1].along(self._kappa * bx, self._kappa * by, self.lengths[a]))
-        return frames
-
     def needle_points(self) -> tuple[list[Any], list[Any]]:
         """Return points amid equal steps of the exempt length, then of every arc, and the steps' lengths."""
         points, steps = [], []
         zone = self._value("exempt_mm")
         for a in range(self._layout.arcs):
-            begin = zone if a == 0 else 0.0
+            begin, (kx, ky) = zone if a == 0 else 0.0, (self._kappa * bend for bend in self.bends[a])
             pieces = [(0.0, zone, self._layout.zone_points)] if a == 0 else []
             pieces.append((begin, self.lengths[a], self._layout.arc_points))
             for low, high, count in pieces:
                 step = (high - low) / count
                 for m in range(count):
-                    points.append(self._on_arc(a, low + (m + 0.5) * step))
+                    points.append(self.frames[a].point_at(kx, ky, low + (m + 0.5) * step))
                     steps.append(step)
         return points, steps
-
-    def _on_arc(self, a: int, s: Any) -> Any:
-        bx, by = self.bends[a]
-        return self.frames[a].point_at(self._kappa * bx, self._kappa * by, s)
 
     def turn(self) -> Any:
         """Return the accumulated turn in rad, a little overstated."""

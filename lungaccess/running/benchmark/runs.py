@@ -116,6 +116,10 @@ def _row(
             reason = f"{reason_in_words(found.obstruction)} ({proved})"
         return replace(about, proved=found.proved, reason=reason)
     first = found.first_path or found.path
+    # Clearance is measured at points so far apart: a tenth of a voxel.
+    points, lengths = found.path.sample(0.05)
+    exempt_mm = environment.limits.exempt_mm if query.branch >= 0 else 0.0
+    clear = obstacle_clearance_mm(environment.obstacles, points[lengths >= exempt_mm])
     return replace(
         about,
         proved=found.proved,
@@ -123,7 +127,7 @@ def _row(
         first_cpu_ms=None if found.first_path_s is None else 1e3 * found.first_path_s,
         first_length_mm=_length(first, query),
         length_mm=_length(found.path, query),
-        clearance_mm=_clearance(environment, query, found.path),
+        clearance_mm=float(clear.min()) if len(clear) else None,
         arcs=tuple(found.path.arc_records()),
     )
 
@@ -131,14 +135,6 @@ def _row(
 def _length(path: ArcPath, query: Query) -> float:
     """Return the length of a path with the distance that it leaves to the target."""
     return path.length_mm + float(np.linalg.norm(path.frames()[-1][:3, 3] - query.target))
-
-
-def _clearance(environment: NeedleEnvironment, query: Query, path: ArcPath) -> float | None:
-    # Clearance is measured at points so far apart: a tenth of a voxel.
-    points, lengths = path.sample(0.05)
-    exempt_mm = environment.limits.exempt_mm if query.branch >= 0 else 0.0
-    beyond = points[lengths >= exempt_mm]
-    return float(obstacle_clearance_mm(environment.obstacles, beyond).min()) if len(beyond) else None
 
 
 Pose = Callable[[PublishedQuery, float], tuple[NeedleEnvironment, Query]]

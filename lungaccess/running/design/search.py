@@ -194,16 +194,16 @@ class _Search:
                 remedy="`lungaccess study export` shows why. Start it again: it goes on from what is stored; "
                 "for the kernels here, name another folder",
             )
-        made = [self._outcomes(each, own) for each, own in zip(devices, runs, strict=True)]
-        return [replace(each, values=self._values(each)) for each in made]
+        counted = []
+        for each, own in zip(devices, runs, strict=True):
+            rows = [next(self._maker.results.rows(_OUTCOME, (run.key,))) for run in own]
+            chances = tuple((chance or 0.0) if accepted else 0.0 for accepted, chance in rows)
+            made = replace(each, reached=tuple(bool(accepted) for accepted, _ in rows), chances=chances)
+            counted.append(replace(made, values=self._values(made)))
+        return counted
 
     def _values(self, contender: Contender) -> tuple[float, ...]:
         return tuple(CRITERIA[name].value(contender) for name in self._design.make_large)
-
-    def _outcomes(self, contender: Contender, runs: Sequence[Run]) -> Contender:
-        rows = [next(self._maker.results.rows(_OUTCOME, (run.key,))) for run in runs]
-        chances = tuple((chance or 0.0) if accepted else 0.0 for accepted, chance in rows)
-        return replace(contender, reached=tuple(bool(accepted) for accepted, _ in rows), chances=chances)
 
 
 def _with(run: Run, system: System) -> Run:

@@ -276,7 +276,10 @@ def runs_of(
                 first_plan=study.budget.first_plan,
                 **counted,
             )
-            yield from _runs_to(study, case, problem)
+            for planner in study.planner:
+                for start in case.starts if planner.kind == "needle" else (0,):
+                    of_start = replace(problem, start=start)
+                    yield from (Run(problem=of_start, planner=planner, seed=seed) for seed in study.seeds)
 
 
 Point = tuple[float, float, float]
@@ -285,14 +288,6 @@ Point = tuple[float, float, float]
 def beside(name: str, folder: Path) -> str:
     """Return the name of a preset as it is, and that of a file as it lies in the study's folder."""
     return str(folder / name) if name.endswith(".toml") else name
-
-
-def _runs_to(study: Study, case: Case, problem: Problem) -> Iterator[Run]:
-    """Yield the runs of a problem with every planner, start and seed."""
-    for planner in study.planner:
-        for start in case.starts if planner.kind == "needle" else (0,):
-            for seed in study.seeds:
-                yield Run(problem=replace(problem, start=start), planner=planner, seed=seed)
 
 
 def _targets(case: Case, lung: Lung) -> list[tuple[Point, str]]:

@@ -16,7 +16,7 @@ from anatomy.io.patients import load_patient
 from anatomy.lung import Lung
 from lungaccess.cli.app import main
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.planning.one_stage.obstruction import reason_in_words
+from lungaccess.planning.one_stage.needle import reason_in_words
 from lungaccess.problem.system import load_system
 from lungaccess.problem.target import resolve_target
 from lungaccess.uncertainty.breathing.window import require_motion

@@ -298,10 +298,7 @@ class WindowSearch(AtlasSearch):
 
 
 class WindowTubeSearch(TubeSearch):
-    """The tubes aimed at the aims of all scope tips, then along each motion, and variations of the best.
-
-    Parameters and attributes are those of `WindowSearch`.
-    """
+    """The tubes aimed at the aims of all scope tips, then along each motion, and variations of the best."""
 
     def __init__(self, evaluator: WindowEvaluator, atlas: Atlas) -> None:
         self.window_evaluator, self.aims = evaluator, WindowAims.of(evaluator, atlas)

@@ -17,7 +17,6 @@ from anatomy.base.records import frozen_value
 from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from lungaccess.judging.checking import Checker
-from lungaccess.plans.plan import Plan
 from lungaccess.problem.patients import load_patient
 from lungaccess.problem.system import load_system
 from lungaccess.running.benchmark.runs import decimals, require_table_file
@@ -184,6 +183,13 @@ class _Scorer:
             more = f"; and {len(refusals) - REASONS} more" if len(refusals) > REASONS else ""
             reason = "; ".join(refusals[:REASONS]) + more
             return _named(query, planner, REFUSED, reason=reason, cpu_s=answer.cpu_s)
+        success = None
+        if self._samples:
+            from lungaccess.uncertainty.risk import assess
+
+            # Every plan has the same luck.
+            report_of_risk = assess(plan, self._lung, samples=self._samples, seed=281, each_kind=False)
+            success = report_of_risk.succeeds.value
         return _named(
             query,
             planner,
@@ -192,19 +198,10 @@ class _Scorer:
             cpu_s=answer.cpu_s,
             cost=plan.costs["inverse_clearance"],
             needle_mm=plan.costs["length_mm"],
-            success=self._success(plan),
+            success=success,
             breath_share=None if plan.window is None else plan.window.share,
             not_checked=", ".join(each.name for each in report.unchecked),
         )
-
-    def _success(self, plan: Plan) -> float | None:
-        """Return the estimated chance of success; every plan has the same luck."""
-        from lungaccess.uncertainty.risk import assess
-
-        if not self._samples:
-            return None
-        report = assess(plan, self._lung, samples=self._samples, seed=281, each_kind=False)
-        return report.succeeds.value
 
     def _is_proved(self, query: BenchmarkQuery) -> bool:
         from lungaccess.planning.reachability import UnreachableProof

@@ -69,6 +69,12 @@ def _least_sweep(tubes: Any, box: Any) -> float:
     return float(least_sweep(tubes, box))
 
 
+def improved(bound: CostBound, cost: float, boxes: int) -> float:
+    """Divide so many boxes, and return the bound."""
+    bound.start(cost, boxes)
+    return bound.value
+
+
 def _boxes(rng: np.random.Generator, count: int) -> tuple[Grid, NDArray[np.bool_]]:
     mask = np.zeros(SHAPE, dtype=bool)
     mask[tuple(rng.integers(0, SHAPE, size=(count, 3)).T)] = True
@@ -302,7 +308,7 @@ def test_no_deployment_costs_less_than_the_bound(
     task = Task(lung=small_lung, system=SYSTEM, target=target, objective=Objective.of(objective))
     *_, best = plans_of(small_lung, target, atlas, iterations=20, goal=objective)
     bound = CostBound(task, atlas)
-    values = [bound.improve(2.0 * best.cost, 5000) for _ in range(4)]
+    values = [improved(bound, 2.0 * best.cost, 5000) for _ in range(4)]
     assert values == sorted(values)
     assert values[-1] > 0.0
     arcs, rng, accepted, least = DirectArcs(task, atlas), np.random.default_rng(5), 0, math.inf
@@ -358,7 +364,7 @@ def _attacked(
         arcs, bound = DirectArcs(task, atlas), CostBound(task, atlas)
         if not len(arcs.in_workspace):
             continue
-        bound.improve(60.0, 1)
+        improved(bound, 60.0, 1)
         done += 1
         for entry in rng.choice(arcs.in_workspace, each):
             found = _accepted_beside(arcs, atlas, int(entry), end, rng)
@@ -406,7 +412,7 @@ def test_no_box_with_accepted_tubes_is_ruled_out_but_those_at_a_hazard_are(
     """Boxes about accepted tubes, at random and next to refused ones, and tubes refused at their exit."""
     task = Task(lung=small_lung, system=SYSTEM, target=target)
     bound = CostBound(task, atlas)
-    bound.improve(0.0, 1)
+    improved(bound, 0.0, 1)
     surroundings, tubes = bound.queues[0].about[0].surroundings, bound.queues[0].about[1]
     tips = atlas.motions.tips
     validator = DirectArcs(task, atlas).evaluator.tubes

@@ -32,7 +32,6 @@ from lungaccess.running.benchmark.synthetic.cases import (
     require_cases,
     unproved_phantom,
 )
-from lungaccess.running.benchmark.synthetic.reference import method_choice
 from lungaccess.running.benchmark.synthetic.scoring import (
     CLAIMED,
     MISSING,
@@ -48,6 +47,7 @@ from lungaccess.running.benchmark.synthetic.scoring import (
 from lungaccess.running.benchmark.synthetic.submission import (
     SCHEMA,
     answer_of_plan,
+    method_choice,
     read_submission,
     submission_of,
     submission_schema,

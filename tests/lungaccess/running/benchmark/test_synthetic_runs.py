@@ -20,7 +20,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system
 from lungaccess.running.benchmark.synthetic import scoring
 from lungaccess.running.benchmark.synthetic.cases import all_queries, write_benchmark
-from lungaccess.running.benchmark.synthetic.reference import benchmark_study, submissions_of
 from lungaccess.running.benchmark.synthetic.scoring import (
     CERTIFIED,
     CLAIMED,
@@ -31,7 +30,13 @@ from lungaccess.running.benchmark.synthetic.scoring import (
     score_sheet,
     score_submission,
 )
-from lungaccess.running.benchmark.synthetic.submission import Submission, SubmittedAnswer, read_submission
+from lungaccess.running.benchmark.synthetic.submission import (
+    Submission,
+    SubmittedAnswer,
+    benchmark_study,
+    read_submission,
+    submissions_of,
+)
 from lungaccess.running.study.driver import run_study
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.tables import differences

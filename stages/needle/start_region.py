@@ -136,12 +136,7 @@ class TriedStarts:
 
 @frozen_record
 class StartRegion:
-    """From which poses near a planned start the needle reaches its target clear, within all limits.
-
-    Args:
-        radius_mm: So far from the target a path may end.
-        max_curvature_per_mm: Of the needle.
-    """
+    """From which poses near a planned start the needle reaches `radius_mm` of its target, clear."""
 
     lps_from_start: Float
     target: Float

@@ -88,10 +88,8 @@ class Bronchoscope:
 def laid_pieces(states: Float, bending_length_mm: float) -> Float:
     """Return length in mm, roll before it in rad and curvature in 1/mm `(P, 3)` of each arc of a body.
 
-    The section lays the shaft where it advances; the section itself is the last arc.
-
-    Args:
-        states ((M, 3) float64): Advance in mm, twist in rad and bend in rad; see `stages.scope.ScopeMotion`.
+    The section lays the shaft where it advances; the section itself is the last arc.  States `(M, 3)` are
+    those of a `stages.scope.ScopeMotion`.
     """
     advance, twist, bend = states.T
     moved = np.flatnonzero(np.diff(advance) > SHORTEST_MM) + 1

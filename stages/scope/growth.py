@@ -15,8 +15,6 @@ STEP_MM = 1.0
 """Advance from layer to layer: about a voxel and a half, far shorter than a bending section."""
 TANGENT_MM = 3.0
 """The direction of a route is that of its chord so far each way: several voxels, less than a branch."""
-TURNED_A_LAYER = 16
-"""States of a layer from which tips are turned, spread over those that it keeps, the best among them."""
 
 
 @frozen_record
@@ -230,7 +228,8 @@ class Growth:
         begins = np.append(0, np.cumsum([len(rows) for rows in self._rows]))
         used = sorted({layer for layers in self._layers.values() for layer, _ in layers})
         ends = [len(self._rows[layer]) - 1 for layer in used]
-        spread = [np.unique(np.linspace(0, end, TURNED_A_LAYER).astype(np.int64)) for end in ends]
+        # States of a layer from which tips are turned, spread over those that it keeps, the best among them.
+        spread = [np.unique(np.linspace(0, end, 16).astype(np.int64)) for end in ends]
         some = [begins[layer] + members for layer, members in zip(used, spread, strict=True)]
         return StateTree(
             states=np.concatenate(self._rows),

@@ -15,6 +15,7 @@ from anatomy.base.typed import Bool, Float, Int
 from anatomy.fields import corner_geometry
 from anatomy.grid import read_only
 from anatomy.lung import Lung
+from anatomy.morphology import bounds, window
 from anatomy.structures import LUMEN, OUTSIDE
 from stages.scope.device import SHORTEST_MM, Bronchoscope
 from stages.scope.kernels.body import MOST_TWIST_RAD, Walls, motion_room
@@ -207,26 +208,16 @@ _WALLS: WeakKeyDictionary[Lung, Walls] = WeakKeyDictionary()
 def walls_of(lung: Lung) -> Walls:
     """Return the walls around the lumen of a lung, made once."""
     if lung not in _WALLS:
-        _WALLS[lung] = _walls(lung)
+        inside = (lung.labels & LUMEN) != 0
+        low, high = bounds(inside, 1)
+        solid = np.where(inside[window(low, high)], np.uint16(0), np.uint16(OUTSIDE))
+        _WALLS[lung] = Walls(
+            solid=read_only(np.asfortranarray(solid)),
+            geometry=corner_geometry(lung.grid.crop(low, high)),
+            depth=lung.lumen_depth.corners,
+            depth_geometry=lung.lumen_depth.geometry,
+        )
     return _WALLS[lung]
-
-
-def _walls(lung: Lung) -> Walls:
-    inside = (lung.labels & LUMEN) != 0
-    low, high = np.zeros(3, dtype=np.int64), np.array(lung.grid.shape)
-    for axis in range(3):
-        others = tuple(k for k in range(3) if k != axis)
-        filled = np.flatnonzero(inside.any(axis=others))
-        if len(filled):
-            low[axis], high[axis] = max(filled[0] - 1, 0), min(filled[-1] + 2, high[axis])
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    solid = np.asfortranarray(np.where(inside[box], np.uint16(0), np.uint16(OUTSIDE)))
-    return Walls(
-        solid=read_only(solid),
-        geometry=corner_geometry(lung.grid.crop(low, high)),
-        depth=lung.lumen_depth.corners,
-        depth_geometry=lung.lumen_depth.geometry,
-    )
 
 
 def kernel_device(scope: Bronchoscope, max_curvature_per_mm: float) -> Device:

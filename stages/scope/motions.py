@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from anatomy import poses as frames
 from anatomy.airway_tree import AirwayTree
+from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int, Labels
 from anatomy.lung import Lung
@@ -231,23 +232,17 @@ class ScopeMotions:
             AnatomyError: If there is no tip.
         """
         if not self.count:
-            raise _no_tip()
+            raise AnatomyError(
+                "No motion brings this bronchoscope to a place from which tubes leave the airway",
+                expected="at least one scope tip",
+                remedy="Use a thinner bronchoscope, or one whose bending section bends more tightly",
+            )
         away = np.linalg.norm(self.tips[:, :3] - np.asarray(point_lps, dtype=np.float64), axis=1)
         direction = np.asarray(forward, dtype=np.float64)
         cosine = self.tips[:, 3:6] @ (direction / np.linalg.norm(direction))
         angle = np.arccos(np.clip(cosine, -1.0, 1.0))
         # Ten degrees count as much as a mm.
         return int(np.argmin(np.hypot(away, angle / math.radians(10.0))))
-
-
-def _no_tip() -> Exception:
-    from anatomy.base.errors import AnatomyError
-
-    return AnatomyError(
-        "No motion brings this bronchoscope to a place from which tubes leave the airway",
-        expected="at least one scope tip",
-        remedy="Use a thinner bronchoscope, or one whose bending section bends more tightly",
-    )
 
 
 def find_motions(
@@ -288,6 +283,9 @@ def find_motions(
         spacing_mm=spacing_mm,
     )
     kept, number = states.only(tips[:, turning.SOURCE].astype(np.int64))
+    entry = np.eye(4)
+    if len(states.states):
+        entry[:3] = states.states[0, : kernel.U].reshape(4, 3).T
     return ScopeMotions(
         tips=tips[:, :9],
         tree_point=tree_point,
@@ -296,19 +294,11 @@ def find_motions(
         max_curvature_per_mm=tips[:, turning.TIP_CURVATURE],
         state=number,
         settings=tips[:, turning.TWIST_TO : turning.BY_STRAIGHT + 1],
-        lps_from_entry=_entry(states),
+        lps_from_entry=entry,
         states=kept,
         bending_length_mm=device.length,
         passages=passages,
     )
-
-
-def _entry(states: StateTree) -> Float:
-    """Return the base frame of the first state, the world's frame if there is none."""
-    entry = np.eye(4)
-    if len(states.states):
-        entry[:3] = states.states[0, : kernel.U].reshape(4, 3).T
-    return entry
 
 
 TURN_SPOKES = 12

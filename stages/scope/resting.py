@@ -19,6 +19,7 @@ from anatomy.fields import corner_geometry, distance_corners
 from anatomy.grid import Grid, read_only
 from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
+from anatomy.morphology import bounds, window
 from anatomy.structures import LUMEN
 from stages.scope.device import Bronchoscope, laid_pieces
 from stages.scope.kernels import resting as kernel
@@ -278,13 +279,10 @@ def signed_depth(inside: Mask, grid: Grid) -> Lumen:
     """Return the signed depth in a lumen `(ni, nj, nk)` bool: voxels are boxes, and the border is at 0."""
     # The wall is known so far outside the lumen: farther than any shaft reaches into it.
     wide = np.ceil(6.0 / grid.spacing_mm).astype(np.int64)
-    low, high = np.zeros(3, dtype=np.int64), np.array(grid.shape)
-    for axis in range(3):
-        filled = np.flatnonzero(inside.any(axis=tuple(k for k in range(3) if k != axis)))
-        if len(filled):
-            low[axis], high[axis] = filled[0] - wide[axis], filled[-1] + 1 + wide[axis]
+    low, high = bounds(inside)
+    low, high = low - wide, high + wide
     first, last = np.maximum(low, 0), np.minimum(high, grid.shape)
-    part = inside[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
+    part = inside[window(first, last)]
     # An airway at the border of the image goes on beyond it, as the shaft does.
     part = np.pad(part, np.column_stack([first - low, high - last]), mode="edge")
     depth = distance_corners(~part, grid.spacing_mm).astype(np.float32)

@@ -238,8 +238,7 @@ class Simplifier:
     def _fitted(self, legs: Legs, bounds: Float | None = None) -> Legs | None:
         """Return legs near to some that end in the pose and are proved, None if none are found.
 
-        Args:
-            bounds ((n, 2) float64): Those of the unknowns, if they are narrower than those of the device.
+        Bounds `(n, 2)` of the unknowns are given where they are narrower than those of the device.
         """
         x = legs.unknowns
         # Spacing of the places of a leg that are looked at as it is fitted: less than a lumen is wide.

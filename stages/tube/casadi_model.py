@@ -32,6 +32,7 @@ from stages.tube.casadi_rates import (
     landmarks_mm,
     rest_curvature_per_mm,
     rotation_of,
+    runge_kutta,
     state_rates,
 )
 from stages.tube.device import Tube
@@ -47,11 +48,9 @@ _NEWTON = {"abstol": 1e-12, "abstolStep": 1e-13, "max_iter": 60, "error_on_fail"
 
 @frozen_value
 class Order:
-    """The order in which ends and bends of the tubes follow each other, seen from the tip.
+    """The order in which ends and bends of the tubes follow each other, the farthest from the plate first.
 
-    Args:
-        landmarks (tuple of (tube, index)): Landmarks ahead of the plate, the farthest first.  Those of a tube
-            are the places where its precurvature changes, counted from its base, and its end, the last.
+    A landmark is a tube and an index: places where its precurvature changes, from its base, and its end.
     """
 
     landmarks: tuple[tuple[int, int], ...]
@@ -194,11 +193,7 @@ class OrderedTubes:
             rest.append(rest_curvature_per_mm(tube, marks, len(marks) - count))
         twisting = [tube.torsional_stiffness_n_mm2 for tube in self._tubes]
         rate = casadi.Function("rate", [state], [state_rates(state, bending, twisting, rest)])
-        first = rate(state)
-        second = rate(state + 0.5 * length * first)
-        third = rate(state + 0.5 * length * second)
-        fourth = rate(state + length * third)
-        after = state + length / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+        after = runge_kutta(rate, state, length)
         return casadi.Function("step", [state, length], [after])
 
 

@@ -67,7 +67,6 @@ def state_rates(
 ) -> Any:
     """Return the derivative of the state by the arc length [Rucker2010]."""
     n = len(bending)
-    w, x, y, z = casadi.vertsplit(state[ROTATION])
     relative = [casadi.SX(0), *casadi.vertsplit(state[FIRST_ANGLE + 1 : FIRST_ANGLE + n])][:n]
     rates = [state[FIRST_ANGLE + n + i] / twisting[i] for i in range(n)]
     turns = [about_z(angle)[:2, :2] for angle in relative]
@@ -76,13 +75,31 @@ def state_rates(
     for i in range(n):
         own = turns[i].T @ shared
         moments.append(bending[i] * (own[0] * rest[i][1] - own[1] * rest[i][0]))
-    forward = casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
-    a, b, c = shared[0], shared[1], rates[0]
-    spin = casadi.vertcat(
-        -x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
-    )
+    spin = spin_of(state[ROTATION], shared[0], shared[1], rates[0])
     others = [rates[i] - rates[0] for i in range(1, n)]
-    return casadi.vertcat(forward, 0.5 * spin, rates[0], *others, *moments)
+    return casadi.vertcat(forward_of(state[ROTATION]), spin, rates[0], *others, *moments)
+
+
+def forward_of(quaternion: Any) -> Any:
+    """Return the forward direction of a quaternion (w, x, y, z)."""
+    w, x, y, z = casadi.vertsplit(quaternion)
+    return casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
+
+
+def spin_of(quaternion: Any, a: Any, b: Any, c: Any = 0) -> Any:
+    """Return the derivative of a quaternion by a curvature (a, b) and a torsion c in its own frame."""
+    w, x, y, z = casadi.vertsplit(quaternion)
+    turned = -x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
+    return 0.5 * casadi.vertcat(*turned)
+
+
+def runge_kutta(rate: Any, state: Any, length: Any, *more: Any) -> Any:
+    """Return the state after a step of the method of order 4."""
+    first = rate(state, *more)
+    second = rate(state + 0.5 * length * first, *more)
+    third = rate(state + 0.5 * length * second, *more)
+    fourth = rate(state + length * third, *more)
+    return state + length / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
 
 
 def about_z(angle: Any) -> Any:

@@ -21,7 +21,16 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import read_only
 from stages.tube.casadi_model import CasadiTubes
-from stages.tube.casadi_rates import SAME_MM, bending_n_mm2, landmarks_mm, rest_curvature_per_mm
+from stages.tube.casadi_rates import (
+    SAME_MM,
+    about_z,
+    bending_n_mm2,
+    forward_of,
+    landmarks_mm,
+    rest_curvature_per_mm,
+    runge_kutta,
+    spin_of,
+)
 from stages.tube.device import Tube
 from stages.tube.errors import ConvergenceError
 from stages.tube.sequences import BEND_RAD, joint_steps, together
@@ -183,11 +192,7 @@ class _Shooting:
         state, length = casadi.SX.sym("state", FIRST_ANGLE + 4 * n + 7), casadi.SX.sym("step_mm")
         share = casadi.SX.sym("share")
         rate = casadi.Function("rate", [state, share], [self._rates(state, share, middle, tissue)])
-        first = rate(state, share)
-        second = rate(state + 0.5 * length * first, share)
-        third = rate(state + 0.5 * length * second, share)
-        fourth = rate(state + length * third, share)
-        after = state + length / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+        after = runge_kutta(rate, state, length, share)
         return casadi.Function("step", [state, length, share], [after])
 
     def _rates(self, state: Any, share: Any, middle: float, tissue: float) -> Any:
@@ -202,7 +207,7 @@ class _Shooting:
         marks = landmarks_mm(self._needle)
         stiff = bending_n_mm2(self._needle, marks, int(np.searchsorted(marks, middle - self._needle_rear)))
         loaded, before = state[: FIRST_ANGLE + 2 * n], state[FIRST_ANGLE + 2 * n :]
-        ahead, ahead_before = _forward(loaded[ROTATION]), _forward(before[ROTATION])
+        ahead, ahead_before = forward_of(loaded[ROTATION]), forward_of(before[ROTATION])
         off = loaded[POSITION] - before[POSITION]
         across = off - ahead_before * casadi.dot(ahead_before, off)
         # A vector in the frame of a quaternion.
@@ -216,34 +221,17 @@ class _Shooting:
             (loaded[FIRST_ANGLE:], local, sum(bending) + share * stiff),
             (before[7:], casadi.SX.zeros(3), sum(bending)),
         ):
-            turns = [_rotated(part[i], rest[i]) for i in range(n)]
+            turns = [about_z(part[i])[:2, :2] @ rest[i] for i in range(n)]
             u = (moment[:2] + sum(bending[i] * turns[i] for i in range(n))) / total
             twists = [part[n + i] / self._twisting[i] if bending[i] else casadi.SX(0) for i in range(n)]
             pulls = [bending[i] * (u[0] * turns[i][1] - u[1] * turns[i][0]) for i in range(n)]
             rates.append((u, [*twists, *pulls]))
         (u, twisted), (u_before, twisted_before) = rates
         return casadi.vertcat(
-            ahead, _spin(loaded[ROTATION], u), tissue * across, casadi.cross(loaded[FORCE], ahead), *twisted,
-            ahead_before, _spin(before[ROTATION], u_before), *twisted_before,
+            ahead, spin_of(loaded[ROTATION], u[0], u[1]), tissue * across, casadi.cross(loaded[FORCE], ahead),
+            *twisted,
+            ahead_before, spin_of(before[ROTATION], u_before[0], u_before[1]), *twisted_before,
         )  # fmt: skip
-
-
-def _forward(quaternion: Any) -> Any:
-    """Return the forward direction of a quaternion (w, x, y, z)."""
-    w, x, y, z = casadi.vertsplit(quaternion)
-    return casadi.vertcat(2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z)
-
-
-def _rotated(angle: Any, vector: Float) -> Any:
-    c, s = casadi.cos(angle), casadi.sin(angle)
-    return casadi.vertcat(c * vector[0] - s * vector[1], s * vector[0] + c * vector[1])
-
-
-def _spin(quaternion: Any, u: Any) -> Any:
-    """Return the derivative of a quaternion by a curvature (2,) in its own frame."""
-    w, x, y, z = casadi.vertsplit(quaternion)
-    a, b = u[0], u[1]
-    return 0.5 * casadi.vertcat(-x * a - y * b, w * a - z * b, w * b + z * a, x * b - y * a)
 
 
 STEP_MM = 1.0

@@ -62,9 +62,8 @@ class ShapeTree:
 def tree_of_shapes(shapes: TubeShapes, *, tolerance_mm: float | None = None) -> ShapeTree:
     """Return the tree of shapes that share their beginnings within a tolerance.
 
-    Args:
-        tolerance_mm: Largest distance between shapes that share a stretch; how far they really are enters
-            clearances.  TOLERANCE_MM, or EXACT_MM where nothing twists, if None.
+    How far they really are apart enters clearances.  The tolerance is TOLERANCE_MM, or EXACT_MM where nothing
+    twists, if None.
     """
     if tolerance_mm is None:
         tolerance_mm = TOLERANCE_MM if shapes.rotations_rad.any() else EXACT_MM

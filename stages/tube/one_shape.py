@@ -215,12 +215,7 @@ class NearbyShape:
 
 
 class Neighbourhood:
-    """One deployment of tubes, from which others nearby are reached straight.
-
-    Args:
-        insertions_mm, rotations_rad, tip_angles_rad ((n,) float64): Of that deployment, the innermost first;
-            see `TubeShapes`.
-    """
+    """One deployment `(n,)` of tubes, from which others nearby are reached straight; see `TubeShapes`."""
 
     def __init__(
         self, mechanics: TubeMechanics, insertions_mm: Float, rotations_rad: Float, tip_angles_rad: Float

@@ -134,10 +134,7 @@ def alternating(
 ) -> Sequence:
     """Turn in the scope, then insert by increments in turns, the innermost tube ahead.
 
-    The other parameters and the errors are those of `together`.
-
-    Args:
-        increment_mm: How far a tube moves before it is the next one's turn.
+    A tube moves by an increment before it is the next one's turn.  All else is as with `together`.
     """
     if not 0.0 < increment_mm < np.inf:
         raise SettingsError(f"The increment is {increment_mm:g} mm", expected="a finite length above 0")

@@ -242,13 +242,10 @@ class TrueNeedle:
 
 
 class Commands:
-    """What the needle is told to do: the arcs of a plan, in small pieces.
+    """What the needle is told to do: the arcs of a plan, in small pieces, up to a curvature that can be had.
 
     A needle that bends more than it is told is told to bend less, as by spinning it for a part of the time;
     one that bends less is told to bend more, as far as it can.
-
-    Args:
-        most_per_mm: Greatest curvature that can be commanded.
     """
 
     def __init__(self, plan: ArcPath, most_per_mm: float) -> None:

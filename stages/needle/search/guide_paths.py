@@ -37,11 +37,7 @@ Work = tuple[int, bool]
 
 
 class GuidePathFinder:
-    """Finds guide paths for the searches of a portfolio.
-
-    Args:
-        seed: Of how lattices are turned.
-    """
+    """Finds guide paths for the searches of a portfolio; the seed is that of how lattices are turned."""
 
     def __init__(
         self, environment: NeedleEnvironment, query: Query, *, seed: int, objective: Objective

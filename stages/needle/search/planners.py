@@ -1,6 +1,6 @@
 """The searches of the needle stage by name."""
 
-from typing import Protocol
+from collections.abc import Callable
 
 from anatomy.base.plugins import registered
 from stages.needle.environment import NeedleEnvironment
@@ -13,14 +13,8 @@ from stages.needle.search.optimal import OptimalSearch
 from stages.needle.search.portfolio import PortfolioSearch
 from stages.needle.search.resolution import ResolutionSearch
 
-
-class MakeSearch(Protocol):
-    """Makes a search."""
-
-    def __call__(
-        self, environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
-    ) -> Search:
-        """Return a search for paths of low cost; the same seed repeats it."""
+MakeSearch = Callable[..., Search]
+"""Makes a search for cheap paths of an environment, a query, a seed that repeats it, and an `objective`."""
 
 
 def _makes(

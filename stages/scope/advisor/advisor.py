@@ -57,11 +57,9 @@ LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
 
 
 class PathSearch:
-    """Algorithm 2 from a state, repeated with retreats until the goal is reached.
+    """Algorithm 2 from a state, repeated with retreats until the goal of the environment is reached.
 
-    Args:
-        goal: Of the environment's field.
-        options: In reproduction the look-ahead is never shortened and nothing is retried.
+    In reproduction the look-ahead is never shortened and nothing is retried.
     """
 
     def __init__(self, environment: ScopeEnvironment, goal: Goal, options: PathSettings, seed: int) -> None:

@@ -47,12 +47,7 @@ class Weights:
 
 @frozen_value
 class Motion:
-    """Advance with a twist and a bend.
-
-    Args:
-        advance_mm: Negative: pull back.
-        twist_rad, bend_rad: Alpha and beta when the advance is done.
-    """
+    """An advance, back if negative, and the twist alpha and bend beta when it is done."""
 
     advance_mm: float
     twist_rad: float

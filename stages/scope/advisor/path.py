@@ -115,12 +115,7 @@ class ScopePath:
 
 @frozen_record
 class FlyThrough:
-    """Camera poses along a path; F poses.
-
-    Args:
-        lps_from_camera ((F, 4, 4) float64): The camera looks along +z.
-        inserted_mm ((F,) float64): How far the scope is advanced at each pose.
-    """
+    """Camera poses `(F, 4, 4)` along a path, looking along +z, and how far the scope is advanced `(F,)`."""
 
     lps_from_camera: Float
     inserted_mm: Float

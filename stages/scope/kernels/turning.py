@@ -34,8 +34,6 @@ POLAR_RAD = math.radians(15.0)
 AZIMUTHS = 8
 SIDES = 3
 """And by whether they lie on the axis, or beside it before or behind the direction they are turned to."""
-OFF_AXIS_MM = 1.0
-"""Nearer to the axis tips count as on it: about a voxel and a half."""
 TRIES = 12
 """A kind is given up after so many tries: most are refused for the same wall."""
 TWIST_TO, BEND_TO, BY_STRAIGHT, TIP_ROOM, TIP_CURVATURE, SOURCE = 9, 10, 11, 12, 13, 14
@@ -108,7 +106,8 @@ def kind_of(places, near, tip):
     off2 = max(x * x + y * y + z * z - along * along, 0.0)
     cost = off2 + (0.3 * abs(polar - ring * POLAR_RAD) / POLAR_RAD) ** 2
     side = 0
-    if off2 > OFF_AXIS_MM**2:
+    # Nearer to the axis tips count as on it: about a voxel and a half.
+    if off2 > 1.0**2:
         towards = x * tip[3] + y * tip[4] + z * tip[5] - along * cosine
         side = 1 if towards >= 0.0 else 2
     if ring == 0 and side == 0:

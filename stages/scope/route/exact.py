@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import DEGREE, Curve
@@ -54,26 +54,10 @@ FURTHER_STARTS: tuple[tuple[float, tuple[Stage, ...]], ...] = (
 work: the quick ones first."""
 
 
-@frozen_value
-class Level:
-    """At how many samples the program holds, and how much stricter it is than the limits.
-
-    Args:
-        per_span: Samples a span; the first is the knot, where the curvature can peak.
-        spare_curvature: Share of the limit.
-        spare_mm: Depth.
-    """
-
-    per_span: int
-    spare_curvature: float
-    spare_mm: float
-
-
-LEVELS = (
-    Level(per_span=4, spare_curvature=0.01, spare_mm=0.02),
-    Level(per_span=8, spare_curvature=0.01, spare_mm=0.02),
-    Level(per_span=16, spare_curvature=0.02, spare_mm=0.03),
-)
+Level = tuple[int, float, float]
+"""Samples a span, of which the first is the knot, where the curvature can peak; and how much stricter the
+program is than the limits: a share of that of curvature, and a depth in mm."""
+LEVELS: tuple[Level, ...] = ((4, 0.01, 0.02), (8, 0.01, 0.02), (16, 0.02, 0.03))
 
 
 @frozen_record
@@ -111,17 +95,18 @@ def repaired(
     low, high = free
     guide, lumen, limits = problem.guide, problem.centreline, problem.limits
     begin, end = max(low - DEGREE, 0), min(high, curve.n_spans)
-    count = level.per_span * (end - begin) + 1
+    per_span, spare_curvature, spare_mm = level
+    count = per_span * (end - begin) + 1
     first, rows, samples = np.zeros(count, dtype=np.int64), np.zeros((count, 3, 4)), np.zeros((count, 7))
     along, with_radius = guide.along_mm, np.column_stack((guide.points_mm, guide.radius_mm))
     control = np.array(curve.control_mm)
-    take_samples(control, curve.knots, begin, end, level.per_span, along, with_radius, first, rows, samples)
+    take_samples(control, curve.knots, begin, end, per_span, along, with_radius, first, rows, samples)
     limit, worst, ends = limits.max_curvature_per_mm, np.inf, guide.points_mm[[0, -1]]
     for bending, times, rounds, steps in (*start, FINAL_STAGE):
         # Weight of the squared distance from the guide path, in radii; small against the limits.
         weights = np.array((
-            0.02, bending / limit**2, times * limit, limits.needed_mm, level.spare_curvature,
-            level.spare_mm, limits.end_tolerance_mm,
+            0.02, bending / limit**2, times * limit, limits.needed_mm, spare_curvature,
+            spare_mm, limits.end_tolerance_mm,
         ))  # fmt: skip
         program = Program(
             low, high, first, rows, samples, lumen.cones, *lumen.cells, guide.cones, weights, ends
@@ -134,9 +119,7 @@ def repaired(
 def segments(proof: Proof, n_control: int, margin: int, *, ends_free: bool) -> list[tuple[int, int]]:
     """Return the ranges of control points to free for the spans that are not proved, widened and merged.
 
-    Args:
-        margin: Spans added on both sides.
-        ends_free: Whether the first and last control points may move.
+    `margin` spans are added on both sides; the first and last control points move where the ends are free.
     """
     lowest, highest = (0, n_control) if ends_free else (1, n_control - 1)
     found: list[tuple[int, int]] = []

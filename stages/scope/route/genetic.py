@@ -77,11 +77,8 @@ def repair_genetic(
 ) -> tuple[Curve, bool]:
     """Return a curve with its bends refitted, and whether each segment passed the paper's own tests.
 
-    Those tests look at the path points alone; prove the curve to know.
-
-    Args:
-        seed: The same seed gives the same curve, with or without an executor.
-        executor: Searches the segments side by side.
+    Those tests look at the path points alone; prove the curve to know.  The same seed gives the same curve,
+    with or without an executor, which searches the segments side by side.
     """
     chosen = GeneticSettings()
     points, parts = cut_segments(tentative, centreline, limits, chosen.margin_share)

@@ -22,8 +22,6 @@ CLOSE_MM = 1e-8
 TURN_MM = 20.0
 """A turn of one tube against the others counts as so many mm of insertion a radian: about how far it moves a
 tip that is some tens of millimetres out."""
-LONGEST_STEP_MM = 8.0
-"""Longer steps are shortened to this: about the distance between two bends of a usual tube."""
 
 
 @inner_kernel
@@ -88,7 +86,8 @@ def _change(design, near, shape, want_aside, want_ahead, change):
     for m in range(2 * n):
         change[m] = rates[0, m] * u + rates[1, m] * v
         longest = max(longest, abs(change[m]))
-    share = min(1.0, LONGEST_STEP_MM / longest) if longest > 0.0 else 1.0
+    # Longer steps are shortened to this: about the distance between two bends of a usual tube.
+    share = min(1.0, 8.0 / longest) if longest > 0.0 else 1.0
     for m in range(2 * n):
         change[m] *= share * (1.0 if m < n else 1.0 / TURN_MM)
     return True

@@ -75,9 +75,6 @@ def sampled_sweep(tubes, outer, inner, every):
 INSERTION_STEP_MM = 0.05
 """The step of the outer tube in the table of greatest insertions."""
 
-SAMPLED_EVERY = 25
-"""Samples of the sweep of which one is looked at for that table: the sweep peaks elsewhere."""
-
 
 @inner_kernel
 def sweep_slope(bend):
@@ -131,7 +128,8 @@ def greatest_insertions(tubes, longest, spacing, insertions):
             outer = (m + (n + 0.5) / tried) * INSERTION_STEP_MM
             inner = longest
             while inner > max(greatest, outer - spacing):
-                over = sampled_sweep(tubes, min(outer, inner), inner, SAMPLED_EVERY) - tubes[MAX_SWEEP]
+                # Samples of the sweep of which one is looked at for that table: the sweep peaks elsewhere.
+                over = sampled_sweep(tubes, min(outer, inner), inner, 25) - tubes[MAX_SWEEP]
                 # Half a spacing for the outer tube, and what the least step passes over.
                 over -= 0.75 * slope * spacing
                 if over <= 0.0:

@@ -37,16 +37,12 @@ LOOK_MM = 0.02
 """Spacing of the points that are looked up for lumen while the axis leaves: well below CORNER_MM."""
 RUN_STEP_MM = 0.02
 """The run of the body in the wall is known to this at each place where it begins or ends."""
-RUN_REACH_MM = 0.3
-"""How far beyond the radius the wall is searched: half a voxel, since a longer search costs its cube."""
 WALL_ZONE_MM = 1.0
 """Within this length the tube pierces the wall; airways that tubes leave have thinner walls."""
 OUT_OF_LUMEN_MM = 0.02
 """Least distance from the axis to any lumen, once it is in the tissue."""
 NORMAL_RADIUS_MM = 2.5
 """The wall's normal is that of the lumen within this radius: larger than voxels, smaller than branches."""
-BISECTIONS = 12
-"""Halvings of a step to find where the axis leaves the lumen: to less than 0.001 mm."""
 
 # Typed numbers: a kernel is compiled once more for every literal that it is called with.
 _NOBODY = np.int64(-1)
@@ -130,7 +126,8 @@ def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
     """Find where the axis leaves the lumen between two arc lengths of a piece, and judge it as an exit."""
     _field, labels, geometry, _bits, _lumen, _lumen_geometry, mediastinal = environment
     branch = int(trace[BRANCH])
-    for _ in range(BISECTIONS):
+    # Halvings of a step to find where the axis leaves the lumen: to less than 0.001 mm.
+    for _ in range(12):
         middle = 0.5 * (inside + outside)
         x, y, z = point_on_arc(pose, bend, middle)
         if label_at(labels, geometry, x, y, z) & LUMEN:
@@ -231,7 +228,8 @@ def _run_in_wall(environment, pose, bend, begin, end, radius):
     s = begin
     while s < end:
         x, y, z = point_on_arc(pose, bend, s)
-        distance, _label = exact_distance(labels, geometry, x, y, z, AIRWAY, -1, radius + RUN_REACH_MM)
+        # How far beyond the radius the wall is searched: half a voxel, since a longer search costs its cube.
+        distance, _label = exact_distance(labels, geometry, x, y, z, AIRWAY, -1, radius + 0.3)
         step = min(max(abs(distance - radius), RUN_STEP_MM), end - s)
         if distance < radius + RUN_STEP_MM:
             run += step

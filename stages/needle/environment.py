@@ -217,15 +217,9 @@ def direct_arcs(
     blockers = np.zeros(len(branches), dtype=np.int64)
     costs = np.zeros((len(branches), 2))
     start_trial.direct_arcs(
-        environment.obstacles,
-        environment.limits,
-        _plain(positions),
-        _plain(tangents),
-        np.array(branches, dtype=np.int64),
-        _plain(target),
-        blockers,
-        costs,
-    )
+        environment.obstacles, environment.limits, _plain(positions), _plain(tangents),
+        np.array(branches, dtype=np.int64), _plain(target), blockers, costs,
+    )  # fmt: skip
     return blockers, costs[:, 0], costs[:, 1]
 
 

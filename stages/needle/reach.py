@@ -175,16 +175,9 @@ class StartIndex:
         found = np.zeros(self.count, dtype=np.int64)
         lengths = np.zeros(self.count)
         count = kernel.workspace_query(
-            self._bounds,
-            self._begins,
-            self._order,
-            self._positions,
-            self._tangents,
-            np.asarray(target, dtype=np.float64),
-            environment.limits,
-            found,
-            lengths,
-        )
+            self._bounds, self._begins, self._order, self._positions, self._tangents,
+            np.asarray(target, dtype=np.float64), environment.limits, found, lengths,
+        )  # fmt: skip
         nearest = np.lexsort((found[:count], lengths[:count]))
         return found[:count][nearest], lengths[:count][nearest]
 

@@ -77,15 +77,9 @@ class MotionProver:
         entry = frame_columns(motion.lps_from_entry)
         where = np.zeros(1, dtype=np.int64)
         room = motion_room(
-            self._walls,
-            self._scope.radius_mm + self._scope.lumen_margin_mm,
-            self._scope.bending_length_mm,
-            entry,
-            motion.states,
-            turn_mm,
-            step_mm,
-            where,
-        )
+            self._walls, self._scope.radius_mm + self._scope.lumen_margin_mm, self._scope.bending_length_mm,
+            entry, motion.states, turn_mm, step_mm, where,
+        )  # fmt: skip
         if room < 0.0:
             return f"the scope is not proved to be free of the wall from state {int(where[0])} on"
         return float(room)
@@ -137,14 +131,9 @@ class MotionProver:
         shifts = np.ascontiguousarray(np.atleast_1d(np.asarray(shifts_mm, dtype=np.float64)))
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
         shifted_tips(
-            self._walls,
-            self._device,
-            frame_columns(motion.lps_from_entry),
-            motion.states,
-            shifts,
-            tips,
+            self._walls, self._device, frame_columns(motion.lps_from_entry), motion.states, shifts, tips,
             rooms,
-        )
+        )  # fmt: skip
         _nearest, inside = in_tip_region(self._tree, tips)
         proved = (rooms >= 0.0) & inside
         return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=proved | (shifts == 0.0))

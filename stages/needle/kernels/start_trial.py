@@ -83,19 +83,9 @@ def try_starts(
             kinds[n] = VIA
         elif iterations > 0:
             _count, _used, solved = grow_rrt(
-                obstacles,
-                limits,
-                objective,
-                branch,
-                goal,
-                nodes,
-                parents,
-                _ONE,
-                iterations,
-                share,
-                state,
+                obstacles, limits, objective, branch, goal, nodes, parents, _ONE, iterations, share, state,
                 math.inf,
-            )
+            )  # fmt: skip
             if solved:
                 kinds[n] = SEARCHED
 

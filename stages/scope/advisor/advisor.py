@@ -132,16 +132,10 @@ class PathSearch:
             randomness[0] = self._rng.integers(1, 2**62)
         least = look_ahead_mm if self._environment.reproduction else self._least
         count, end = kernel.compute_path(
-            self._environment.arrays,
-            self._environment.scope,
-            weights.array,
-            self._goal.voxel,
-            np.array([look_ahead_mm, options.sub_step_mm, least, left_mm]),
-            randomness,
-            self._looks,
-            states[done:],
-            info[done:],
-        )
+            self._environment.arrays, self._environment.scope, weights.array, self._goal.voxel,
+            np.array([look_ahead_mm, options.sub_step_mm, least, left_mm]), randomness, self._looks,
+            states[done:], info[done:],
+        )  # fmt: skip
         return states[: done + count], info[: done + count], int(end)
 
     def _path(self, states: Float, info: Float, reached: bool, used: int) -> ScopePath:

@@ -133,14 +133,9 @@ def evaluate_motions(
     if own is not None:
         table[CANDIDATES, kernel.TWIST], table[CANDIDATES, kernel.BEND] = own.twist_rad, own.bend_rad
     best = kernel.best_motion(
-        environment.arrays,
-        environment.scope,
-        state.array,
-        float(advance_mm),
-        weights.array,
-        offsets(rng),
+        environment.arrays, environment.scope, state.array, float(advance_mm), weights.array, offsets(rng),
         table,
-    )
+    )  # fmt: skip
     mine = None
     if own is not None:
         row = table[CANDIDATES]

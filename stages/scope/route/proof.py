@@ -91,16 +91,9 @@ def prove(curve: Curve, centreline: Centreline, *, max_curvature_per_mm: float, 
     points = np.zeros((curve.n_spans, 3))
     bounds = np.array((0.0, np.inf))
     kernel.prove_spans(
-        curve.control_mm,
-        curve.knots,
-        centreline.cones,
-        *centreline.cells,
-        float(max_curvature_per_mm),
-        float(needed_mm),
-        verdicts,
-        points,
-        bounds,
-    )
+        curve.control_mm, curve.knots, centreline.cones, *centreline.cells, float(max_curvature_per_mm),
+        float(needed_mm), verdicts, points, bounds,
+    )  # fmt: skip
     return Proof(
         verdicts=read_only(verdicts),
         points_mm=read_only(points),

@@ -419,13 +419,7 @@ def circuits(subtree: Subtree) -> Circuits:
     first = np.concatenate(((0,), np.cumsum(sizes)))
     printed, reduced = np.zeros(count), np.zeros(count)
     all_resistances(
-        subtree.parent,
-        subtree.resistance,
-        subtree.side,
-        subtree.exit_vertex,
-        subtree.exit_resistance,
-        first,
-        printed,
-        reduced,
-    )
+        subtree.parent, subtree.resistance, subtree.side, subtree.exit_vertex, subtree.exit_resistance,
+        first, printed, reduced,
+    )  # fmt: skip
     return Circuits(first=read_only(first), printed=read_only(printed), reduced=read_only(reduced))

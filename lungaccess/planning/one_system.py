@@ -3,12 +3,11 @@
 from collections.abc import Callable, Iterator
 
 from lungaccess.planning.coupled.atlas import Atlas, build_atlas, require_same
-from lungaccess.planning.driver import Finder, ProgressEvent, atlas_event, drive, place_part
+from lungaccess.planning.driver import ProgressEvent, atlas_event, drive, place_part
 from lungaccess.planning.searches import CostFinder, require_method
 from lungaccess.planning.success.finder import ContestFinder
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request
-from lungaccess.problem.task import Task
 
 
 def run(
@@ -43,12 +42,5 @@ def run(
     atlas = atlas or build_atlas(
         request.lung, request.system, progress=lambda share: tell(atlas_event(share))
     )
-    finder = finder_of(request, task, place_part(request, atlas), counterfactuals)
-    return drive(finder, request, tell)
-
-
-def finder_of(request: Request, task: Task, atlas: Atlas, counterfactuals: bool) -> Finder:
-    """Return what finds plans of a request."""
-    if request.counts:
-        return ContestFinder(request, task, atlas, counterfactuals)
-    return CostFinder(request, task, atlas, counterfactuals)
+    made = ContestFinder if request.counts else CostFinder
+    return drive(made(request, task, place_part(request, atlas), counterfactuals), request, tell)

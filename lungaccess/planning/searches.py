@@ -82,7 +82,7 @@ def _work(search: ParallelSearch, number: int, processes: int, end: Connection) 
         except EOFError:
             return
         if best is not None:
-            search.incumbent.adopt(best)
+            search.incumbent.improved(best)
         made = list(islice(steps, ROUND_ITERATIONS))
         found = [step for step in made if step.candidate is not None]
         end.send((found[-1] if found else None, len(made) == ROUND_ITERATIONS))

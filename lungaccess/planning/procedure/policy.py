@@ -552,9 +552,8 @@ class Policy:
 
     @cached_property
     def _tube_arrays(self) -> tuple[object, Float]:
-        tubes = self.system.tubes
-        fissures = self.plan.fissures_are_obstacles
-        return tube_environment(self.lung, with_fissures=fissures), tube_constants(tubes, self.system.margins)
+        environment = tube_environment(self.lung, with_fissures=self.plan.fissures_are_obstacles)
+        return environment, tube_constants(self.system.tubes, self.system.margins)
 
     @cached_property
     def _task(self) -> Task:

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice, zip_longest
 from pathlib import Path
 from statistics import median
@@ -143,21 +143,25 @@ def export_csv(path: Path, folder: Path) -> list[Path]:
     Raises:
         FileError: If the results cannot be read or the folder cannot be written.
     """
+    return _export(path, folder, ".csv", _write_csv)
+
+
+def _export(path: Path, folder: Path, suffix: str, write: Callable[[Table, Path], None]) -> list[Path]:
     require_writable_folder(folder)
     written = []
     with ResultsFile(path) as results:
         for name in QUERIES:
-            columns, rows = table(results, name)
-            target = folder / f"{name}.csv"
-            with (
-                atomic_write(target) as temporary,
-                open(temporary, "w", newline="", encoding="utf-8") as stream,
-            ):
-                writer = csv.writer(stream)
-                writer.writerow(columns)
-                writer.writerows(rows)
+            target = folder / f"{name}{suffix}"
+            with atomic_write(target) as temporary:
+                write(table(results, name), temporary)
             written.append(target)
     return written
+
+
+def _write_csv(content: Table, path: Path) -> None:
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream).writerow(content.columns)
+        csv.writer(stream).writerows(content.rows)
 
 
 def export_parquet(path: Path, folder: Path) -> list[Path]:
@@ -174,15 +178,7 @@ def export_parquet(path: Path, folder: Path) -> list[Path]:
             expected="pyarrow",
             remedy="pip install 'lungaccess[study]', or export CSV",
         ) from error
-    require_writable_folder(folder)
-    written = []
-    with ResultsFile(path) as results:
-        for name in QUERIES:
-            target = folder / f"{name}.parquet"
-            with atomic_write(target) as temporary:
-                _write_parquet(table(results, name), temporary)
-            written.append(target)
-    return written
+    return _export(path, folder, ".parquet", _write_parquet)
 
 
 def _write_parquet(content: Table, path: Path) -> None:

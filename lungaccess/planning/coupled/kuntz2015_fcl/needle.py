@@ -51,21 +51,18 @@ class Solid:
 
         A line that does not touch the surface lies on one side of it.
         """
-        if self._holds(self._lung.grid.values_at(self._lung.labels, line_lps, OUTSIDE)).any():
-            return True
-        return self._surface.polyline_distance_mm(line_lps) <= distance_mm
+        return self._holds_any(line_lps) or self._surface.polyline_distance_mm(line_lps) <= distance_mm
 
     def distance_mm(self, point_lps: Float) -> float:
         """Return the distance of a point `(3,)` from the solid, 0 inside it."""
-        if self._holds(self._lung.grid.values_at(self._lung.labels, point_lps, OUTSIDE)):
-            return 0.0
-        return self._surface.polyline_distance_mm(point_lps)
+        return 0.0 if self._holds_any(point_lps) else self._surface.polyline_distance_mm(point_lps)
 
     def depth_mm(self, point_lps: Float) -> float:
         """Return how far inside the solid a point `(3,)` lies, 0 outside it."""
-        if not self._holds(self._lung.grid.values_at(self._lung.labels, point_lps, OUTSIDE)):
-            return 0.0
-        return self._surface.polyline_distance_mm(point_lps)
+        return self._surface.polyline_distance_mm(point_lps) if self._holds_any(point_lps) else 0.0
+
+    def _holds_any(self, points_lps: Float) -> bool:
+        return bool(self._holds(self._lung.grid.values_at(self._lung.labels, points_lps, OUTSIDE)).any())
 
 
 class Obstacles:

@@ -138,22 +138,13 @@ class ReferenceSearch(ParallelSearch):
         if isinstance(deployment, str):
             self.counts[deployment] += 1
             return None
-        path = self._path(deployment, placement.needle_seed)
+        iterations, time_s = self._budget
+        rng = np.random.Generator(np.random.PCG64(placement.needle_seed))
+        about = deployment.lps_from_tip, self.task.target.lps_mm, deployment.branch, rng
+        path = self._needle_rrt.plan(*about, iterations=iterations, time_s=time_s)
         self._spend("needle", began)
         self.counts[NO_PATH if path is None else FOUND] += 1
         return None if path is None else Candidate(tip=tip, deployment=deployment, path=path)
-
-    def _path(self, deployment: Deployment, seed: int) -> ArcPath | None:
-        """Carry out line 9."""
-        iterations, time_s = self._budget
-        return self._needle_rrt.plan(
-            deployment.lps_from_tip,
-            self.task.target.lps_mm,
-            deployment.branch,
-            np.random.Generator(np.random.PCG64(seed)),
-            iterations=iterations,
-            time_s=time_s,
-        )
 
     def _proved(self, found: Candidate) -> Candidate | None:
         """Return what was found with the tubes and the needle as the planner proves them."""

@@ -127,11 +127,6 @@ class Incumbent:
         """The best candidate."""
         return None if self.step is None else self.step.candidate
 
-    def adopt(self, step: Step) -> None:
-        """Take over a step if it is better."""
-        if step.cost < self.cost:
-            self.step = step
-
     def improved(self, step: Step) -> Step:
         """Take over a step if it is better, else return it without its candidate."""
         if step.candidate is not None and step.cost < self.cost:

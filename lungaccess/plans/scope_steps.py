@@ -10,9 +10,8 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from lungaccess.plans.bifurcations import route_bifurcations
+from lungaccess.plans.bifurcations import STRAIGHT_AHEAD, Picture, lps_from_camera, route_bifurcations
 from lungaccess.plans.insertion import scope_motion, shown_motion
-from lungaccess.plans.picture import STRAIGHT_AHEAD, Picture, lps_from_camera
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.channel import bend_factor
 from stages.scope import ScopeMotion, prover_of
@@ -256,5 +255,5 @@ def _goes_on(lung: Lung, route: Int, lps_from_eye: Float) -> str:
 
 
 def goes_on_words(hour: int) -> str:
-    """Say that the airway goes on at an hour of `lungaccess.plans.picture.Hole.hour`."""
+    """Say that the airway goes on at an hour of `lungaccess.plans.bifurcations.Hole.hour`."""
     return f"towards {hour} o'clock in the picture" if hour else STRAIGHT_AHEAD

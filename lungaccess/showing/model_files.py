@@ -10,7 +10,7 @@ import numpy as np
 from anatomy.base.files import atomic_write, require_writable_folder, write_json
 from anatomy.lung import Lung
 from anatomy.meshes import SurfaceMesh
-from lungaccess.plans.picture import HALF_ANGLE_RAD, lps_from_camera
+from lungaccess.plans.bifurcations import HALF_ANGLE_RAD, lps_from_camera
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.live import plan_trajectory
 from lungaccess.showing.slicer.export import STEP_MM, STRUCTURES

@@ -8,6 +8,6 @@ if TYPE_CHECKING:
     from lungaccess.judging.checking.checker import Checker, check
     from lungaccess.judging.checking.completion import Motions
     from lungaccess.judging.checking.findings import CheckReport, Finding
-    from lungaccess.judging.checking.needle_alone import check_needle_alone
+    from lungaccess.judging.checking.steering import check_needle_alone
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

@@ -17,8 +17,14 @@ if TYPE_CHECKING:
     from lungaccess.uncertainty.risk.assessor import STRUCTURES, RiskAssessor
     from lungaccess.uncertainty.risk.breathing import RestingRow, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.deviations import Deviations
-    from lungaccess.uncertainty.risk.start_region import proved_body, safe_start_region, tried_body
     from lungaccess.uncertainty.risk.statistics import Share
-    from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances
+    from lungaccess.uncertainty.risk.tolerances import (
+        LARGEST,
+        Tolerance,
+        find_tolerances,
+        proved_body,
+        safe_start_region,
+        tried_body,
+    )
 
 __getattr__, __dir__ = lazy_exports(__name__, __file__)

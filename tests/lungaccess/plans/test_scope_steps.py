@@ -15,8 +15,8 @@ from anatomy.lung import Lung
 from lungaccess.cli import terminal
 from lungaccess.cli.plan_search import steps_table
 from lungaccess.judging.checking.boxes import Environment, not_lumen
+from lungaccess.plans.bifurcations import Hole
 from lungaccess.plans.insertion import scope_insertion, scope_motion, with_simplest_motion
-from lungaccess.plans.picture import Hole
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.scope_steps import (
     goes_on_words,

@@ -35,7 +35,7 @@ from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingWindow, WindowLimit
 from lungaccess.problem.task import Task
-from lungaccess.uncertainty.breathing.aim import Aim, MovingTarget
+from lungaccess.uncertainty.breathing.moving import Aim, MovingTarget
 from lungaccess.uncertainty.breathing.window import (
     TOLERANCE_MM,
     breathing_window,

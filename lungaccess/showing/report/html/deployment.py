@@ -13,11 +13,10 @@ from anatomy.kernels.sight import follow_rays
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
-from lungaccess.plans.bifurcations import route_bifurcations
+from lungaccess.plans.bifurcations import HALF_ANGLE_RAD, camera_aside_mm, route_bifurcations
 from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
 from lungaccess.plans.insertion import SHOWN_STEP_MM, shown_motion
-from lungaccess.plans.picture import HALF_ANGLE_RAD, camera_aside_mm
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.pack import Packed, pack
 from stages.needle import Objective

@@ -23,9 +23,8 @@ from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.window import Breath, check_window
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingAim, BreathingWindow
-from lungaccess.uncertainty.breathing.aim import MovingTarget
 from lungaccess.uncertainty.breathing.kernels.rigid import Rigid, carried, rate_bounds, turned
-from lungaccess.uncertainty.breathing.moving import carried_needle
+from lungaccess.uncertainty.breathing.moving import MovingTarget, carried_needle
 from lungaccess.uncertainty.breathing.window import breathing_window, device_points, with_window
 from tests.lungaccess.motions import motion_by
 

@@ -19,7 +19,7 @@ HU[15, 20, 12] = 45.0
 
 
 def hu_at(box: Window) -> np.ndarray:
-    return HU[box]
+    return np.asarray(HU[box])
 
 
 def meant(stroke: Stroke, structure: np.ndarray = NOTHING) -> np.ndarray:

@@ -52,6 +52,7 @@ from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.uncertainty.risk import RiskAssessor
+from lungaccess.uncertainty.risk.assessor import in_threads
 from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import deviated_starts, judging
 from stages.needle import ArcPath, Limits, NeedleEnvironment, Objective, Obstacles, needle_environment
@@ -239,11 +240,16 @@ class Policy:
         x, y, z = self._target.tolist()
         # Another needle than one that is planned again behind the tubes starts blindly.
         known = self._left, self._left._replace(tip_known=False, tip=0.0)
-        kernel.choose_tubes(
-            self._scene, known, *self._tube_arrays, choices, self._planned, self._vias,
-            self.plan.exemption.branch, (x, y, z), (np.ascontiguousarray(frames), placed.drawn),
-            found, chances, arcs,
-        )  # fmt: skip
+        prepared = self._scene, known, *self._tube_arrays, choices, self._planned, self._vias
+        frames = np.ascontiguousarray(frames)
+
+        def choose(part: slice) -> None:
+            kernel.choose_tubes(
+                *prepared, self.plan.exemption.branch, (x, y, z), (frames[part], placed.drawn[part]),
+                found[part], chances[part], arcs[part],
+            )  # fmt: skip
+
+        in_threads(choose, count)
         chosen = found[:, 0]
         same = _same(arcs[:, : len(self._planned)], self._planned)
         deployed: tuple[TubeDeployment, ...] = ()

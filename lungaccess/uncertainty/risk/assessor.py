@@ -177,7 +177,7 @@ class RiskAssessor:
                 ends[part],
             )
 
-        _in_threads(find, count)
+        in_threads(find, count)
         return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken, ends=ends)
 
     def follow(
@@ -221,7 +221,7 @@ class RiskAssessor:
             for own in inputs:
                 keep_clear(*own, self._obstacles, self._forbidden_flags, part.start, done[part])
 
-        _in_threads(find, deviations.count)
+        in_threads(find, deviations.count)
         return done
 
     def taken_and_clear(self, deviations: Deviations) -> tuple[Float, Bool]:
@@ -233,7 +233,7 @@ class RiskAssessor:
             find_taken(*inputs, self.wanted, part.start, taken[part])
             keep_clear(*inputs, self._obstacles, self._forbidden_flags, part.start, clear[part])
 
-        _in_threads(find, count)
+        in_threads(find, count)
         return taken, clear
 
     def _further(self, deviations: Deviations) -> Sequence[Deviations]:
@@ -264,7 +264,7 @@ def _fitted(n_arcs: int, errors: Deviations) -> Deviations:
     return replace(errors, roll_rad=errors.roll_rad[:, columns], stop_mm=errors.stop_mm[:, columns])
 
 
-def _in_threads(find: Callable[[slice], None], count: int) -> None:
+def in_threads(find: Callable[[slice], None], count: int) -> None:
     """Have parts of `count` numbers found at the same time: what is found does not depend on the parts."""
     bounds = np.linspace(0, count, THREADS + 1).astype(int).tolist()
     with ThreadPoolExecutor(THREADS) as pool:

@@ -145,11 +145,12 @@ def _set_turn(moves, t, r, sign):
 
 
 @inner_kernel
-def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls):
+def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls, needed):
     """Return the chance to first order that a needle stays clear along a path and ends in the goal.
 
     The path starts at a tip (4, 4), behind a scope tip; without any of its `count` arcs it is the tubes that
-    end in the goal.  `rolls` (A + 1, 6) is scratch: errors of each roll, and of the curvature.
+    end in the goal.  `rolls` (A + 1, 6) is scratch: errors of each roll, and of the curvature.  A
+    chance below `needed` is of no use, and is returned as 0 as soon as that is known.
     """
     at, ahead = (tip[0, 3], tip[1, 3], tip[2, 3]), (tip[0, 2], tip[1, 2], tip[2, 2])
     about, _size = unit(cross(forward, ahead))
@@ -181,7 +182,11 @@ def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls):
                 clear = distance_bound(scene.obstacles.clearance, scene.obstacles.geometry, x, y, z)
             else:
                 clear = clearance_at(scene.around, point, False)
-            least = min(least, margin_of(clear - sizes.needle_radius, sums))
+            margin = margin_of(clear - sizes.needle_radius, sums)
+            if margin < least:
+                least = margin
+                if _below(least) < needed:
+                    return 0.0
         normal = normal_on_arc(pose, bend, length)
         pose = pose_on_arc(pose, bend, length)
         done += length
@@ -310,6 +315,25 @@ def _share_clear(scene, choices, c, frame, places, target, of_needle, best, star
     return (draws - failed) / draws
 
 
+@inner_kernel
+def _share(scene, blind, choices, c, frame, places, target, tip, planned, chances, scratch):
+    """Return the chance that the tubes of a choice are clear, and end in the goal where there is no needle.
+
+    Args:
+        chances (tuple of 3 floats): Of the needle and of the tubes to first order, and what both together
+            have to be better than.
+    """
+    of_needle, of_tubes, least = chances
+    rolls, start, pieces = scratch
+    if choices.tubes.shape[0] > 0:
+        clear = _share_clear(scene, choices, c, frame, places, target, of_needle, least, start, pieces)
+        return min(of_tubes, clear)
+    if scene.with_needle:
+        return of_tubes
+    base, forward = (frame[0, 3], frame[1, 3], frame[2, 3]), (frame[0, 2], frame[1, 2], frame[2, 2])
+    return of_tubes * path_chance(scene, blind, base, forward, tip, planned, 0, target, rolls, 0.0)
+
+
 @kernel(nogil=True)
 def find_places(places, measured, size, fallback, luck, likely, drawn):
     """Find where tips most likely are that were measured, and draw places where they may be.
@@ -393,6 +417,7 @@ def choose_tubes(
     for n in range(frames.shape[0]):
         frame = frames[n]
         base, forward = (frame[0, 3], frame[1, 3], frame[2, 3]), (frame[0, 2], frame[1, 2], frame[2, 2])
+        best, chosen, kind, taken, looked = 0.0, 0, PLANNED, 1, 0
         for c in range(count):
             tip = tips[c]
             for i in range(4):
@@ -405,68 +430,60 @@ def choose_tubes(
                 scene.around, known, base, forward, at, ahead, choices.exits[c], choices.lengths[c]
             )
             tubes[c], needles[c] = _below(margin), 0.0 if scene.with_needle else 1.0
-            if scene.with_needle and _path_through(scene.limits, tip, vias, 0, target, paths[DIRECT]):
-                straight[c] = paths[DIRECT, 0]
-                kinds[c] = DIRECT
-                needles[c] = path_chance(scene, known, base, forward, tip, paths[DIRECT], 1, target, rolls)
-                needles[c] *= _reach_chance(scene, known, base, forward, tip, target)
+            # Going on as planned comes first: whatever else there is has to be better.
+            least = best + BETTER if c > 0 else -1.0
+            if (
+                scene.with_needle
+                and tubes[c] > least
+                and _path_through(scene.limits, tip, vias, 0, target, paths[DIRECT])
+            ):
+                reached = _reach_chance(scene, known, base, forward, tip, target)
+                if tubes[c] * reached > least:
+                    straight[c] = paths[DIRECT, 0]
+                    kinds[c] = DIRECT
+                    needed = least / max(tubes[c] * reached, SMALL)
+                    needles[c] = reached * path_chance(
+                        scene, known, base, forward, tip, paths[DIRECT], 1, target, rolls, needed
+                    )
             order[c] = -needles[c] * tubes[c]
-        best, chosen, kind, taken, looked = 0.0, 0, PLANNED, 1, 0
-        # Going on as planned comes first: whatever else there is has to be better.
-        for place in range(count + 1):
-            if place == 0:
-                c = 0
-                accepted = _validated(environment, constants, choices, 0, frame, trace, end)
-                pierced = np.int64(trace[BRANCH]) if accepted else branch
-                if scene.with_needle:
-                    tip, direct = tips[0], needles[0]
-                    if direct > 0.0 and not _is_clear(scene, tip, straight[:1], 1, pierced):
-                        direct = 0.0
-                    size = planned.shape[0]
-                    needles[0], kinds[0] = 0.0, PLANNED
-                    paths[PLANNED, :size] = planned
-                    needles[0] = path_chance(scene, blind, base, forward, tip, planned, size, target, rolls)
-                    if size > 1 and _path_through(scene.limits, tip, vias, size - 1, target, paths[THROUGH]):
-                        through = path_chance(
-                            scene, known, base, forward, tip, paths[THROUGH], size, target, rolls
-                        )
-                        if through > needles[0] - TIE and _is_clear(
-                            scene, tip, paths[THROUGH], size, pierced
-                        ):
-                            needles[0], kinds[0] = through, THROUGH
-                    if direct > max(needles[0] - TIE, 0.0):
-                        needles[0], kinds[0] = direct, DIRECT
-                found[n, 2] = pierced
-                ranked = np.argsort(order)
-            else:
-                c = ranked[place - 1]
-                if needles[c] * tubes[c] <= best + BETTER or looked == LOOKED_AT:
-                    break
-                if c == 0:
-                    continue
-                if not _validated(environment, constants, choices, c, frame, trace, end):
-                    continue
-                pierced = np.int64(trace[BRANCH])
-                if scene.with_needle and not _is_clear(scene, tips[c], straight[c : c + 1], 1, pierced):
-                    continue
-            looked += place > 0
-            share = tubes[c]
-            if choices.tubes.shape[0] > 0:
-                clear = _share_clear(
-                    scene,
-                    choices,
-                    c,
-                    frame,
-                    drawn[n],
-                    target,
-                    needles[c],
-                    best + BETTER * (place > 0),
-                    start,
-                    pieces,
-                )
-                share = min(share, clear)
-            elif not scene.with_needle:
-                share *= path_chance(scene, blind, base, forward, tips[c], planned, 0, target, rolls)
+            if c > 0:
+                continue
+            accepted = _validated(environment, constants, choices, c, frame, trace, end)
+            found[n, 2] = np.int64(trace[BRANCH]) if accepted else branch
+            if scene.with_needle:
+                direct, size, pierced = needles[0], planned.shape[0], found[n, 2]
+                if direct > 0.0 and not _is_clear(scene, tip, straight[:1], 1, pierced):
+                    direct = 0.0
+                paths[PLANNED, :size] = planned
+                needles[0] = path_chance(scene, blind, base, forward, tip, planned, size, target, rolls, 0.0)
+                kinds[0] = PLANNED
+                if size > 1 and _path_through(scene.limits, tip, vias, size - 1, target, paths[THROUGH]):
+                    through = path_chance(
+                        scene, known, base, forward, tip, paths[THROUGH], size, target, rolls, 0.0
+                    )
+                    if through > needles[0] - TIE and _is_clear(scene, tip, paths[THROUGH], size, pierced):
+                        needles[0], kinds[0] = through, THROUGH
+                if direct > max(needles[0] - TIE, 0.0):
+                    needles[0], kinds[0] = direct, DIRECT
+            best = needles[0] * _share(
+                scene, blind, choices, c, frame, drawn[n], target, tip, planned, (needles[0], tubes[0], 0.0),
+                (rolls, start, pieces),
+            )  # fmt: skip
+            kind = kinds[0]
+        order[0] = 0.0
+        for c in np.argsort(order):
+            if needles[c] * tubes[c] <= best + BETTER or looked == LOOKED_AT:
+                break
+            if c == 0 or not _validated(environment, constants, choices, c, frame, trace, end):
+                continue
+            pierced = np.int64(trace[BRANCH])
+            if scene.with_needle and not _is_clear(scene, tips[c], straight[c : c + 1], 1, pierced):
+                continue
+            looked += 1
+            share = _share(
+                scene, blind, choices, c, frame, drawn[n], target, tips[c], planned,
+                (needles[c], tubes[c], best + BETTER), (rolls, start, pieces),
+            )  # fmt: skip
             if needles[c] * share > best:
                 best, chosen, kind = needles[c] * share, c, kinds[c]
                 found[n, 2] = pierced
@@ -519,7 +536,7 @@ def choose_needles(scene, sizes, tips, branches, targets, asides, found, chances
             normal = normal_on_arc(pose, bend, arcs[n, a, 0])
             pose = pose_on_arc(pose, bend, arcs[n, a, 0])
             vias[a, 0], vias[a, 1], vias[a, 2] = pose[0], pose[1], pose[2]
-        best = path_chance(scene, sizes, nowhere, nowhere, tip, paths[PLANNED], size, target, rolls)
+        best = path_chance(scene, sizes, nowhere, nowhere, tip, paths[PLANNED], size, target, rolls, 0.0)
         proved = 0
         for attempt in range(2 + asides):
             through = attempt == 0
@@ -533,7 +550,7 @@ def choose_needles(scene, sizes, tips, branches, targets, asides, found, chances
             if not _is_clear(scene, tip, path, count, branch):
                 continue
             proved += 1
-            chance = path_chance(scene, sizes, nowhere, nowhere, tip, path, count, target, rolls)
+            chance = path_chance(scene, sizes, nowhere, nowhere, tip, path, count, target, rolls, 0.0)
             # Beside the target nothing is gained where going on succeeds as often.
             if chance > best + (TIE if attempt > 1 else -TIE):
                 best, found[n, 1] = chance, count

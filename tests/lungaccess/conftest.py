@@ -51,6 +51,8 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no line break depend on the terminal of the test."""
     for console in (terminal.console, terminal.error_console):
         monkeypatch.setattr(console, "_width", 200)
+    # A command of a test before, in the same process, may have asked for JSON alone.
+    monkeypatch.setattr(terminal.console, "quiet", False)
 
 
 @pytest.fixture(scope="session")

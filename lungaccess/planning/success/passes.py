@@ -106,20 +106,20 @@ def _spread(
         same: The plan with all passes at the point of the best one.
     """
     reach_mm = goal_radius(request.lung, request.target.lps_mm, request.radius_mm)[0]
-    ways, wanted = list(_candidates(best, direct, reach_mm)), direct.evaluator.wanted
-    frames = np.array([with_tool_in_place(request.system, each.path).frames()[-1] for each in ways])
+    candidates, wanted = list(_candidates(best, direct, reach_mm)), direct.evaluator.wanted
+    frames = np.array([with_tool_in_place(request.system, each.path).frames()[-1] for each in candidates])
     enough = np.array([wanted is None or taken_at(wanted, each) >= wanted.least for each in frames])
     if rating.procedure.is_open_loop:
-        made = [with_devices(direct.evaluator.task, each, same.passes[0]) for each in ways]
+        made = [with_devices(direct.evaluator.task, each, same.passes[0]) for each in candidates]
         kept, known = _known_alone(request, rating, made, enough, draws)
-        ways, enough = [ways[n] for n in kept], enough[kept]
+        candidates, enough = [candidates[n] for n in kept], enough[kept]
     else:
         known = _known_beside(request, rating, same, frames, draws)
     first, *rest = _together(known, enough).tolist()
     # Passes with the same tubes follow each other: the tubes are moved no more often than they have to be.
-    tubes = [id(each.deployment) for each in ways]
+    tubes = [id(each.deployment) for each in candidates]
     rest.sort(key=lambda way: (tubes[way] != tubes[first], tubes.index(tubes[way])))
-    begun, *others = (make(ways[way]) for way in (first, *rest))
+    begun, *others = (make(candidates[way]) for way in (first, *rest))
     return begun.with_further(others)
 
 
@@ -137,9 +137,9 @@ def _known_alone(
     drawn = [each.draws(draws, seed) for each in assessors]
     wanted = assessors[0].wanted
 
-    def known(ways: list[int], numbers: Sequence[int]) -> _Known:
-        found = np.zeros((2, len(numbers), len(ways), draws))
-        for at, way in enumerate(ways):
+    def known(chosen: list[int], numbers: Sequence[int]) -> _Known:
+        found = np.zeros((2, len(numbers), len(chosen), draws))
+        for at, way in enumerate(chosen):
             plan, assessor = plans[way], assessors[way]
             errors = model_for(rating.errors, plan, request.lung)
             moved = plan.tube.lps_from_tip.tobytes() != lead_tubes
@@ -247,7 +247,7 @@ def _together(known: _Known, enough: Bool) -> Int:
     Args:
         enough ((W,) bool): Which ways take enough as planned: the first pass goes one of them.
     """
-    count, ways, _draws = known.taken.shape
+    count, candidates, _draws = known.taken.shape
     join = np.maximum if len(known.wanted.covered) else np.add
     chosen, best = np.zeros(count, dtype=np.int64), -1.0
     for _sweep in range(SWEEPS):
@@ -257,7 +257,7 @@ def _together(known: _Known, enough: Bool) -> Int:
             kept, taken = np.ones(known.clear.shape[2], dtype=bool), np.zeros(known.clear.shape[2])
             for n in others:
                 kept, taken = kept & known.clear[n, chosen[n]], join(taken, known.taken[n, chosen[n]])
-            for way in range(ways):
+            for way in range(candidates):
                 shares = known.share(kept & known.clear[one, way], join(taken, known.taken[one, way]), two)
                 allowed = enough[way] if one == 0 else enough if two == 0 else True
                 shares = np.where(allowed, shares, -1.0)

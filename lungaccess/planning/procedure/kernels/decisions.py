@@ -316,7 +316,7 @@ def _share_clear(scene, choices, c, frame, places, target, of_needle, best, star
 
 
 @inner_kernel
-def _share(scene, blind, choices, c, frame, places, target, tip, planned, chances, scratch):
+def _share(scene, untracked, choices, c, frame, places, target, tip, planned, chances, scratch):
     """Return the chance that the tubes of a choice are clear, and end in the goal where there is no needle.
 
     Args:
@@ -331,7 +331,7 @@ def _share(scene, blind, choices, c, frame, places, target, tip, planned, chance
     if scene.with_needle:
         return of_tubes
     base, forward = (frame[0, 3], frame[1, 3], frame[2, 3]), (frame[0, 2], frame[1, 2], frame[2, 2])
-    return of_tubes * path_chance(scene, blind, base, forward, tip, planned, 0, target, rolls, 0.0)
+    return of_tubes * path_chance(scene, untracked, base, forward, tip, planned, 0, target, rolls, 0.0)
 
 
 @kernel(nogil=True)
@@ -404,7 +404,7 @@ def choose_tubes(
         chances, arcs ((N,), (N, A, 3) float64): Receive the chance of the choice to first order, and the
             path.
     """
-    count, known, blind = choices.rotations.shape[0], sizes[0], sizes[1]
+    count, known, untracked = choices.rotations.shape[0], sizes[0], sizes[1]
     frames, drawn = placed
     tips, tubes = np.zeros((count, 4, 4)), np.zeros(count)
     needles, order = np.zeros(count), np.zeros(count)
@@ -455,7 +455,9 @@ def choose_tubes(
                 if direct > 0.0 and not _is_clear(scene, tip, straight[:1], 1, pierced):
                     direct = 0.0
                 paths[PLANNED, :size] = planned
-                needles[0] = path_chance(scene, blind, base, forward, tip, planned, size, target, rolls, 0.0)
+                needles[0] = path_chance(
+                    scene, untracked, base, forward, tip, planned, size, target, rolls, 0.0
+                )
                 kinds[0] = PLANNED
                 if size > 1 and _path_through(scene.limits, tip, vias, size - 1, target, paths[THROUGH]):
                     through = path_chance(
@@ -466,7 +468,7 @@ def choose_tubes(
                 if direct > max(needles[0] - TIE, 0.0):
                     needles[0], kinds[0] = direct, DIRECT
             best = needles[0] * _share(
-                scene, blind, choices, c, frame, drawn[n], target, tip, planned, (needles[0], tubes[0], 0.0),
+                scene, untracked, choices, c, frame, drawn[n], target, tip, planned, (needles[0], tubes[0], 0.0),
                 (rolls, start, pieces),
             )  # fmt: skip
             kind = kinds[0]
@@ -481,7 +483,7 @@ def choose_tubes(
                 continue
             looked += 1
             share = _share(
-                scene, blind, choices, c, frame, drawn[n], target, tips[c], planned,
+                scene, untracked, choices, c, frame, drawn[n], target, tips[c], planned,
                 (needles[c], tubes[c], best + BETTER), (rolls, start, pieces),
             )  # fmt: skip
             if needles[c] * share > best:

@@ -468,8 +468,8 @@ def choose_tubes(
                 if direct > max(needles[0] - TIE, 0.0):
                     needles[0], kinds[0] = direct, DIRECT
             best = needles[0] * _share(
-                scene, untracked, choices, c, frame, drawn[n], target, tip, planned, (needles[0], tubes[0], 0.0),
-                (rolls, start, pieces),
+                scene, untracked, choices, c, frame, drawn[n], target, tip, planned,
+                (needles[0], tubes[0], 0.0), (rolls, start, pieces),
             )  # fmt: skip
             kind = kinds[0]
         order[0] = 0.0

@@ -62,6 +62,7 @@ def _explain_tubes(
             main_reason += f"; nearer it is refused, mostly because {max(stopped, key=stopped.__getitem__)}"
     reasons = {
         **_scope_reasons(aimed.task, atlas),
+        **{f"tube: {why}": count for why, count in atlas.deployments.refused.items()},
         "tube: scope tips with a deployment that ends near the target": near,
         **{f"tube, aimed at the target: {why}": count for why, count in sorted(blocked.items())},
     }
@@ -121,6 +122,7 @@ def _reasons(arcs: DirectArcs, blocked: Counter[str]) -> dict[str, int]:
     """Count, stage by stage, what was ruled out and why."""
     atlas = arcs.atlas
     reasons = _scope_reasons(arcs.task, atlas)
+    reasons |= {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
     outside = atlas.deployments.count - len(arcs.in_workspace)
     reasons["needle: deployments whose workspace does not hold the target"] = outside
     for name, count in sorted(blocked.items()):
@@ -137,7 +139,7 @@ def _typically(task: Task, excess_mm: float) -> str:
 
 
 def _scope_reasons(task: Task, atlas: Atlas) -> dict[str, int]:
-    """Count scope tips, airways that are too narrow or end far off, deployments looked at and refused."""
+    """Count scope tips, airways that are too narrow or end far off, and the deployments looked at."""
     passable = atlas.motions.passages.passable
     away_mm = np.linalg.norm(task.lung.tree.points_lps - task.target.lps_mm, axis=1)
     nearest = f"the nearest {away_mm.min():.0f} mm from the target"
@@ -154,8 +156,7 @@ def _scope_reasons(task: Task, atlas: Atlas) -> dict[str, int]:
             f"scope: tree points beyond airways too narrow (mostly at generation {generation}, "
             f"{_typically(task, excess)})"
         ] = closed
-    reasons["tube: deployments looked at"] = atlas.deployments.candidates
-    return reasons | {f"tube: {why}": count for why, count in atlas.deployments.refused.items()}
+    return reasons | {"tube: deployments looked at": atlas.deployments.candidates}
 
 
 def _advice(arcs: DirectArcs, direct: bool, changes: tuple[Counterfactual, ...]) -> str:

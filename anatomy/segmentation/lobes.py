@@ -50,9 +50,8 @@ ROUNDS, RELAXATION = 120, np.float32(1.8)
 LEAST_SEEN = 0.5
 """Below this share a fissure's course is mostly inferred, which a warning says."""
 LEAST_ENDS, LEAST_CONFIDENCE = 10, 0.94
-"""Where an oblique fissure is not seen, lobes are inferred from at least so many ends of the airway in a
-lung, whose names have this mean probability: with less, as at 5 mm slices, names of phantoms are often
-wrong."""
+"""Where no oblique fissure is seen, lobes are inferred from at least so many ends of the airway in a lung,
+whose names have this mean probability: with less, as at 5 mm slices, names of phantoms are often wrong."""
 BAND_MM, BAND_GROWTH, BAND_UNSEEN_MM, WIDEST_SHARE = 3.0, 2.5, 6.0, 0.22
 """In 95 of 100 places of phantoms the true fissure lies within the first of a border that is seen.  To that
 come the second times the root of the way to there, both in mm, as a path strays by chance, and the third

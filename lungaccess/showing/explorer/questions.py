@@ -237,25 +237,9 @@ class ExportQuestion(_Question):
 
 
 QUESTIONS: Mapping[str, type[_Question]] = {
-    "look": LookQuestion,
-    "open": OpenQuestion,
-    "outline": OutlineQuestion,
-    "paint": PaintQuestion,
-    "patient": PatientQuestion,
-    "scene": SceneQuestion,
-    "image": ImageQuestion,
-    "slice": SliceQuestion,
-    "place": PlaceQuestion,
-    "prepare": PrepareQuestion,
-    "ready": ReadyQuestion,
-    "exits": ExitsQuestion,
-    "plan": PlanQuestion,
-    "reach": ReachQuestion,
-    "appraise": AppraiseQuestion,
-    "explain": ExplainQuestion,
-    "export": ExportQuestion,
+    each.__name__.removesuffix("Question").lower(): each for each in _Question.__subclasses__()
 }
-"""The questions by their name, which the key "ask" of a message states."""
+"""The questions by their name, as "look" for `LookQuestion`, which the key "ask" of a message states."""
 CANCEL = "cancel"
 """The message that ends what is being done for the question with the same number."""
 Question = Any

@@ -30,7 +30,6 @@ from lungaccess.showing.report.html.document import filled, scene_figure, slice_
 
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24
-MOST_FILES = 20
 DROPPED, DROPPED_BYTES = re.compile(r"[\w(][\w .()+-]{0,199}"), 1 << 20
 """Names that a dropped file and its folder may have, and how much of a file is in memory at a time."""
 MOST_WAITING_BYTES = 1 << 27
@@ -272,7 +271,8 @@ class Explorer:
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
         is_open = self._source.folder is not None and request.path == "/"
-        text = index_text() if is_open else page_text("explorer", OPENING)
+        parts = {"scene": scene_figure(more_notes=CLICKS), "slice_controls": slice_controls(more=REACH)}
+        text = filled(page_text("explorer", PAGE), parts) if is_open else page_text("explorer", OPENING)
         return web.Response(text=text, content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.StreamResponse:
@@ -389,7 +389,7 @@ class Explorer:
         """Return the name under which a file can be fetched; the oldest of too many files is removed."""
         ticket = secrets.token_urlsafe(TOKEN_BYTES)
         self._files[ticket] = file
-        while len(self._files) > MOST_FILES:
+        while len(self._files) > 20:
             _ticket, old = self._files.popitem(last=False)
             shutil.rmtree(old.parent, ignore_errors=True)
         return ticket
@@ -430,12 +430,6 @@ def asset_names(folder: str) -> frozenset[str]:
     """Return the names of modules and style sheets in one of `FOLDERS`."""
     entries = (resources.files(FOLDERS[folder]) / "page").iterdir()
     return frozenset(each.name for each in entries if Path(each.name).suffix in KINDS)
-
-
-def index_text() -> str:
-    """Return the page itself, with what it shares with the pages of reports."""
-    parts = {"scene": scene_figure(more_notes=CLICKS), "slice_controls": slice_controls(more=REACH)}
-    return filled(page_text("explorer", PAGE), parts)
 
 
 def page_text(folder: str, name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,7 +106,11 @@ def plan_trajectory(plan: Plan, speeds: Speeds | None = None, *, step_s: float =
     chosen = speeds or Speeds()
     parts = [np.asarray(plan.scope.states), _tube_waypoints(plan), _needle_waypoints(plan)]
     rows, stages = _joined([part for part in parts if len(part)])
-    most = _most_per_s(plan, chosen)
+    turn = np.radians(chosen.scope_deg_per_s)
+    tubes = [chosen.tube_mm_per_s, np.radians(chosen.tube_deg_per_s)] * len(plan.system.tubes.named)
+    # The curvature of the needle is commanded at once.
+    bends = [chosen.needle_mm_per_s, np.radians(chosen.needle_deg_per_s), np.inf]
+    most = np.array([chosen.scope_mm_per_s, turn, turn, *tubes, *bends])
     steps_s = (np.abs(np.diff(rows, axis=0)) / most).max(axis=1)
     kept = np.append(True, steps_s > SHORTEST_S)
     rows, at_s = rows[kept], np.append(0.0, np.cumsum(steps_s))[kept]
@@ -130,14 +134,6 @@ def _joint_names(plan: Plan) -> tuple[str, ...]:
     ]
     needle = ("needle_insertion_mm", "needle_roll_rad", "needle_curvature_per_mm")
     return ("scope_advance_mm", "scope_twist_rad", "scope_bend_rad", *tubes, *needle)
-
-
-def _most_per_s(plan: Plan, speeds: Speeds) -> Float:
-    """Return the speed of every joint; the curvature is commanded at once."""
-    turn = np.radians(speeds.scope_deg_per_s)
-    tubes = [speeds.tube_mm_per_s, np.radians(speeds.tube_deg_per_s)] * len(plan.system.tubes.named)
-    needle = [speeds.needle_mm_per_s, np.radians(speeds.needle_deg_per_s), np.inf]
-    return np.array([speeds.scope_mm_per_s, turn, turn, *tubes, *needle])
 
 
 def _tube_waypoints(plan: Plan) -> Float:
@@ -342,18 +338,14 @@ def _mapping(content: Mapping[str, Any], indent: str) -> Iterator[str]:
             yield from _mapping(value, indent + "  ")
         elif isinstance(value, Sequence) and value and isinstance(value[0], Mapping):
             yield f"{indent}{key}:"
-            yield from _listed(value, indent)
+            for item in value:
+                first, *others = _mapping(item, indent + "  ")
+                yield f"{indent}- {first.lstrip()}"
+                yield from others
         elif isinstance(value, Sequence) and not isinstance(value, str):
             yield f"{indent}{key}: [{', '.join(_scalar(each) for each in value)}]"
         else:
             yield f"{indent}{key}: {_scalar(value)}"
-
-
-def _listed(items: Iterable[Mapping[str, Any]], indent: str) -> Iterator[str]:
-    for item in items:
-        first, *others = _mapping(item, indent + "  ")
-        yield f"{indent}- {first.lstrip()}"
-        yield from others
 
 
 def _scalar(value: Any) -> str:

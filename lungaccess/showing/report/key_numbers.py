@@ -1,6 +1,5 @@
 """The key figures of a plan as labels and values."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -20,14 +19,22 @@ Row = tuple[str, str]
 
 def key_numbers(plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> list[tuple[str, list[Row]]]:
     """Return headed rows of a label and a value; distances are those of the appraisal, if there is one."""
-    distances = _clearance_rows(plan) if appraisal is None else _limit_rows(appraisal)
+    if appraisal is None:
+        distances = _clearance_rows(plan)
+    else:
+        near = [(each.what, each.comparison) for each in appraisal.limits[:SHOWN_LIMITS]]
+        distances = "Nearest to a limit", near
     return [*figures_of_plan(plan, lung), distances]
 
 
 def figures_of_plan(plan: Plan, lung: Lung) -> list[tuple[str, list[Row]]]:
     """Return headed rows of what the plan does and costs, without its limits."""
     costs = costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None))
-    passes = list(_pass_rows(plan))
+    passes = []
+    for number, (before, after) in enumerate(pairwise(plan.passes), 2):
+        back_mm, on_mm = redirection_mm(before, after)
+        tubes = "same tubes" if plan.same_tubes[number - 1] == plan.same_tubes[number - 2] else "tubes moved"
+        passes.append((f"pass {number}", f"back {back_mm:.1f}, on {on_mm:.1f} mm, {tubes}"))
     more = [("Further passes", passes)] if passes else []
     return [("Plan", _general_rows(plan, lung)), *_stage_rows(plan, lung), *more, ("Cost", costs)]
 
@@ -84,18 +91,6 @@ def _needle_rows(plan: Plan) -> list[tuple[str, list[Row]]]:
         ("accumulated turn", f"{np.degrees(needle.accumulated_turn_rad):.1f}°"),
     ]
     return [("Needle", rows)]
-
-
-def _pass_rows(plan: Plan) -> Iterator[Row]:
-    for number, (before, after) in enumerate(pairwise(plan.passes), 2):
-        back_mm, on_mm = redirection_mm(before, after)
-        tubes = "same tubes" if plan.same_tubes[number - 1] == plan.same_tubes[number - 2] else "tubes moved"
-        yield f"pass {number}", f"back {back_mm:.1f}, on {on_mm:.1f} mm, {tubes}"
-
-
-def _limit_rows(appraisal: Appraisal) -> tuple[str, list[Row]]:
-    rows = [(each.what, each.comparison) for each in appraisal.limits]
-    return "Nearest to a limit", rows[:SHOWN_LIMITS]
 
 
 def _clearance_rows(plan: Plan) -> tuple[str, list[Row]]:

@@ -64,7 +64,10 @@ def plane_view(lps: Float, name: str) -> View:
     centred = lps - lps.mean(axis=0)
     _, spread, axes = np.linalg.svd(centred, full_matrices=len(lps) < 3)
     if len(lps) < 3 or spread[1] < 0.02 * spread[0]:
-        normal = _normal_beside(axes[0])
+        # Of a line, the standard view that foreshortens it least.
+        beside = min(STANDARD, key=lambda standard: abs(float(axes[0] @ standard.towards_viewer)))
+        normal = beside.towards_viewer - (beside.towards_viewer @ axes[0]) * axes[0]
+        normal = normal / np.linalg.norm(normal)
     else:
         normal = axes[2]
     agreement = [float(normal @ view.towards_viewer) for view in STANDARD]
@@ -73,10 +76,3 @@ def plane_view(lps: Float, name: str) -> View:
     up = STANDARD[nearest].up - (STANDARD[nearest].up @ normal) * normal
     up = up / np.linalg.norm(up)
     return View(name=name, right=np.cross(up, normal), up=up)
-
-
-def _normal_beside(line: Float) -> Float:
-    """Return the view direction of the standard view that foreshortens a line least."""
-    view = min(STANDARD, key=lambda standard: abs(float(line @ standard.towards_viewer)))
-    normal = view.towards_viewer - (view.towards_viewer @ line) * line
-    return np.asarray(normal / np.linalg.norm(normal))

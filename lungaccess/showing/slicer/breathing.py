@@ -58,8 +58,6 @@ TISSUE = Mover(key="tissue", kind="GridTransform", suffix=".nrrd")
 DEVICES = Mover(key="devices", kind="LinearTransform", suffix=".tfm")
 MOVERS = (TISSUE, DEVICES)
 RIGID = ("tubes", "needle", "aim")
-OF_MASKS = ("start_region_proved", "start_region_tried")
-"""Holds in the phase of the masks alone, and does not move."""
 
 
 def write_breathing(plan: Plan, lung: Lung, items: Sequence[Item], folder: Path) -> tuple[str, ...]:
@@ -75,16 +73,13 @@ def write_breathing(plan: Plan, lung: Lung, items: Sequence[Item], folder: Path)
     _write_bundle(folder, DEVICES, phases, lambda phase, path: write_text(path, _affine(moving.pose(phase))))
     said = "window not computed" if plan.window is None else plan.window.words.partition(" (")[0]
     lines = _sequences(phases, int(np.flatnonzero(phases == masks)[0]), said)
-    movers = {item.file: mover.proxy for item in items if (mover := _mover(item)) is not None}
+    # The start region holds in the phase of the masks alone, and does not move.
+    moved = {
+        item.file: item.file.split(".")[0] for item in items if not item.file.startswith("start_region_")
+    }
+    movers = {file: (DEVICES if stem in RIGID else TISSUE).proxy for file, stem in moved.items()}
     write_text(folder / SCENE_FILE, scene(items, movers, lines))
     return (SCENE_FILE, *(mover.bundle for mover in MOVERS))
-
-
-def _mover(item: Item) -> Mover | None:
-    stem = item.file.split(".")[0]
-    if stem in OF_MASKS:
-        return None
-    return DEVICES if stem in RIGID else TISSUE
 
 
 def _write_field(moving: Moving, phase: float, path: Path) -> None:

@@ -56,11 +56,13 @@ def scene(
             "name": item.name,
             "selectable": "true",
             "references": f"display:{display};storage:{storage};{moved}",
-        }
+        } | ({"curveType": "linear", "locked": "1"} if item.kind == "MarkupsCurve" else {})
+        place = {"name": f"{item.name} storage", "fileName": item.file}
+        place |= {} if item.kind == "Segmentation" else {"coordinateSystem": "LPS"}
         lines += [
             element(_DISPLAY[item.kind], {"id": display, **_look(item)}),
-            element(_STORAGE[item.kind], {"id": storage, **_place(item)}),
-            element(item.kind, node | _own(item)),
+            element(_STORAGE[item.kind], {"id": storage, **place}),
+            element(item.kind, node),
         ]
     return "\n".join([*lines, "</MRML>", ""])
 
@@ -86,15 +88,6 @@ def _look(item: Item) -> dict[str, str]:
             "propertiesLabelVisibility": str(not fiducial).lower(),
         }
     return look
-
-
-def _place(item: Item) -> dict[str, str]:
-    place = {"name": f"{item.name} storage", "fileName": item.file}
-    return place if item.kind == "Segmentation" else place | {"coordinateSystem": "LPS"}
-
-
-def _own(item: Item) -> dict[str, str]:
-    return {"curveType": "linear", "locked": "1"} if item.kind == "MarkupsCurve" else {}
 
 
 def element(tag: str, attributes: Mapping[str, str]) -> str:

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.base.errors import SettingsError
-from anatomy.base.records import frozen_record
-from anatomy.base.typed import Bool, Float, Int
+from anatomy.base.typed import Bool, Float
 from anatomy.kernels.sight import follow_rays
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_arc, poses_on_pieces
@@ -61,7 +60,10 @@ def packed_plan(plan: Plan, lung: Lung, name: str, *, charts: bool = True) -> Pa
         },
         "scope": {**_scope(plan, lung), **(_around_tip(plan, lung) if charts else {})},
         "tubes": _tubes(plan),
-        "needle": _needle(plan),
+        "needle": {
+            "points": pack(plan.curves().needle.points_lps, "f4"),
+            "arc_length_mm": pack(plan.curves().needle.arc_length_mm, "f4"),
+        },
         "profile": profile(plan, lung) if charts else _margin(plan, lung),
         "costs": known_costs(plan.costs, has_map=lung.cost is not None),
         "objective": plan.objective,
@@ -111,14 +113,29 @@ def _scope(plan: Plan, lung: Lung) -> Packed:
 
 
 def _around_tip(plan: Plan, lung: Lung) -> Packed:
-    """Return what is free around the tip of the scope in each state."""
-    around = tip_sections(lung, shown_motion(plan).tips, plan.system.scope.radius_mm)
+    """Return what is free around the tip of the scope in each of its M states, mm.
+
+    "border" is the distance `(M, DIRECTIONS)` from the tip's axis to the first voxel that is no lumen, in the
+    plane across it, clockwise from the top of the picture; 0 where the axis itself is beyond the lumen, at
+    most `FARTHEST_MM`.  "gap_mm" is the least of them minus the radius of the scope, in the direction
+    "nearest".  "depth_gap_mm" is free all around the tip, not only in the plane, as the depth of the lumen
+    proves.
+    """
+    tips, radius_mm = shown_motion(plan).tips, plan.system.scope.radius_mm
+    axes, up, right = tips[:, :3, 3], tips[:, :3, 0], tips[:, :3, 1]
+    angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    rays = np.cos(angle)[None, :, None] * up[:, None] + np.sin(angle)[None, :, None] * right[:, None]
+    rays = rays.reshape(-1, 3)
+    starts = np.repeat(axes, DIRECTIONS, axis=0)
+    away, ends = np.zeros(len(rays)), np.zeros(len(rays), dtype=np.int64)
+    follow_rays(lung.labels, lung.geometry, LUMEN, starts, rays, FARTHEST_MM, away, ends)
+    border = away.reshape(-1, DIRECTIONS)
     return {
         "border_step_mm": MM_PER_STEP,
-        "border": pack(np.rint(around.border_mm / MM_PER_STEP).astype(np.uint16), "u2"),
-        "gap_mm": pack(around.gap_mm, "f4"),
-        "nearest": pack(around.nearest, "u1"),
-        "depth_gap_mm": pack(around.depth_gap_mm, "f4"),
+        "border": pack(np.rint(border / MM_PER_STEP).astype(np.uint16), "u2"),
+        "gap_mm": pack(border.min(axis=1) - radius_mm, "f4"),
+        "nearest": pack(border.argmin(axis=1), "u1"),
+        "depth_gap_mm": pack(lung.lumen_depth.lower_bound_mm(axes) - radius_mm, "f4"),
     }
 
 
@@ -169,11 +186,6 @@ def _insertions(inserted_mm: Sequence[float]) -> Float:
         count = max(int(np.ceil((end - begin) / TUBE_STEP_MM)), 1)
         parts.append(np.linspace(begin, end, count + 1)[1:])
     return np.unique(np.concatenate(parts))
-
-
-def _needle(plan: Plan) -> Packed:
-    needle = plan.curves().needle
-    return {"points": pack(needle.points_lps, "f4"), "arc_length_mm": pack(needle.arc_length_mm, "f4")}
 
 
 def profile(plan: Plan, lung: Lung) -> Packed:
@@ -279,41 +291,3 @@ def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
         for key, rate in rates.items()
     }
     return {"cost_mm": pack(begin_mm + lengths_mm, "f4"), "cost": so_far}
-
-
-@frozen_record
-class TipSections:
-    """Cross-sections at M poses of a tip, K directions each.
-
-    Args:
-        border_mm ((M, K) float64): Distance from the axis of the tip to the first voxel that is no lumen, in
-            its plane, clockwise from the top of the picture; 0 where the axis itself is beyond the lumen, at
-            most `FARTHEST_MM`.
-        gap_mm ((M,) float64): Least of them minus the radius of the scope: free on the side of `nearest`.
-        nearest ((M,) int64): Direction of the least.
-        depth_gap_mm ((M,) float64): What is free all around the tip, not only in the plane, and is proved:
-            the lower bound of the depth of the lumen minus the radius of the scope.
-    """
-
-    border_mm: Float
-    gap_mm: Float
-    nearest: Int
-    depth_gap_mm: Float
-
-
-def tip_sections(lung: Lung, lps_from_tip: Float, radius_mm: float) -> TipSections:
-    """Return the cross-sections at poses `(M, 4, 4)` of the tip of a scope of a radius."""
-    axes, up, right = lps_from_tip[:, :3, 3], lps_from_tip[:, :3, 0], lps_from_tip[:, :3, 1]
-    angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    rays = np.cos(angle)[None, :, None] * up[:, None] + np.sin(angle)[None, :, None] * right[:, None]
-    rays = rays.reshape(-1, 3)
-    starts = np.repeat(axes, DIRECTIONS, axis=0)
-    away, ends = np.zeros(len(rays)), np.zeros(len(rays), dtype=np.int64)
-    follow_rays(lung.labels, lung.geometry, LUMEN, starts, rays, FARTHEST_MM, away, ends)
-    border = away.reshape(-1, DIRECTIONS)
-    return TipSections(
-        border_mm=border,
-        gap_mm=border.min(axis=1) - radius_mm,
-        nearest=border.argmin(axis=1),
-        depth_gap_mm=lung.lumen_depth.lower_bound_mm(axes) - radius_mm,
-    )

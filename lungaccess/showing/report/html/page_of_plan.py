@@ -37,8 +37,6 @@ MODULES = (
     "motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "player.js", "devices.js",
     "device_page.js", "plan.js",
 )  # fmt: skip
-NO_REGION = "No safe start region"
-THICKER = "; seen from afar, devices are drawn thicker than they are"
 FOLLOW = '<label><input type="checkbox" id="follow" checked> follow the foremost tip</label>'
 """The box that tells whether the slices go with the devices, or with the cross."""
 
@@ -106,7 +104,7 @@ def plan_page(
         "phase_slices": breathing.slices_note(window),
         "limits": tables.limits_section(first),
         "summary": summary(plan, lung),
-        "scene": scene_figure(more_notes=THICKER),
+        "scene": scene_figure(more_notes="; seen from afar, devices are drawn thicker than they are"),
         "image_source": words.text(
             f"{image_source(lung, chosen.ct_name if chosen.ct is not None else '')}. "
             f"The page holds {image_words(data)}"
@@ -172,7 +170,7 @@ def start_region_of(plan: Plan, lung: Lung) -> StartRegion | str:
     try:
         return safe_start_region(plan, lung)
     except SettingsError as reason:
-        return f"{NO_REGION}: {reason.found}"
+        return f"No safe start region: {reason.found}"
 
 
 def page_data(

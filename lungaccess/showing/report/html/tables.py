@@ -18,7 +18,6 @@ from lungaccess.showing.report.html import words
 from lungaccess.showing.report.key_numbers import figures_of_plan
 from lungaccess.uncertainty.risk import RestingRow, RiskReport, Sensitivity, Share
 
-AXES_AGREE = "largest angle between the axes"
 STAGE_NAMES = {"scope": "Bronchoscope", "tube": "Tubes", "needle": "Needle", "exemption": "The pierced wall"}
 
 
@@ -66,7 +65,11 @@ def check_section(report: CheckReport) -> str:
 
 def _compares_record(finding: Finding) -> bool:
     """Tell whether a finding is about the plan's own statements, not about a limit of a device."""
-    return ".stated" in finding.name or "stated" in finding.detail or finding.detail == AXES_AGREE
+    return (
+        ".stated" in finding.name
+        or "stated" in finding.detail
+        or finding.detail == "largest angle between the axes"
+    )
 
 
 def _folded(summary: str, content: str) -> str:
@@ -130,7 +133,7 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
                 words.text(plan.tube.exit.branch),
                 words.text(plan.scope.generation),
                 words.number(plan.costs["inverse_clearance"], 4),
-                *([] if not breathe else [_window(plan)]),
+                *([] if not breathe else [percent(plan.window.share) if plan.window else "not computed"]),
             )
         )
     headings = (
@@ -140,10 +143,6 @@ def plans_section(found: Sequence[Alternative], appraisals: Sequence[Appraisal])
     )  # fmt: skip
     more = ("share of the breath in the window",) if breathe else ()
     return words.table("Plans to this target", (*headings, *more), rows, "plans")
-
-
-def _window(plan: Plan) -> str:
-    return "not computed" if plan.window is None else percent(plan.window.share)
 
 
 def plan_name(number: int, passes: int) -> str:

@@ -19,17 +19,18 @@ export function connectPointer(page) {
   };
   const nearestExit = (at) => leastOf([...page.exits.places.keys()], (n) => near(page.exits.places[n], at));
 
-  // Return what can be dragged at a place: the chosen exit or the tip of the scope, whichever is nearer.
+  // Return what can be dragged at a place: the chosen exit or the tip of the scope, whichever is nearer to the pointer.
+  // While lengths are measured nothing can, so that a press on a device measures from it.
   const handleAt = (at) => {
-    if (!scene.view) return null;
+    if (!scene.view || page.tools.measuring) return null;
     const { exits, tips, plan, state: { asked } } = page;
     const chosen = exits ? exits.numberOf(asked.exit) : -1;
-    const places = {
+    const handles = {
       exit: chosen >= 0 ? exits.places[chosen] : plan && exits && exits.count ? plan.exit_lps : null,
       tip: tips && (tips.place(asked.tip) || (plan && plan.scope_tip_lps)),
     };
-    const away = (kind) => (places[kind] ? near(places[kind], at) : Infinity), kind = leastOf(Object.keys(places), away);
-    return away(kind) <= HANDLE_PX ? kind : null;
+    const away = ([, point]) => near(point, at), found = leastOf(Object.entries(handles).filter(([, point]) => point), away);
+    return found && away(found) <= HANDLE_PX ? found[0] : null;
   };
 
   const dragTo = (at) => {

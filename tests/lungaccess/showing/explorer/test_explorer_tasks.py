@@ -113,11 +113,17 @@ def test_hand_the_plan_to_somebody_else_by_its_address(planned: Page, served: Se
 
 
 def test_measure_in_the_3d_view(planned: Page) -> None:
-    size = planned.run("const c = document.getElementById('scene'); return [c.clientWidth, c.clientHeight]")
+    """From the exit to the target: a press there else takes hold of a device, or chooses a target."""
+    asked, points = planned.state()["asked"], []
     planned.click("measure")
-    for share in (0.4, 0.6):
-        planned.press_at("scene", share * size[0], 0.5 * size[1])
-    assert "mm" in planned.text("scene-words")
+    for place in (planned.state()["plan"]["exit_lps"], planned.state()["target_lps"]):
+        x, y = planned.run("return window.lungaccessReport.project(arguments[0])", place)
+        points.append(planned.run("return window.lungaccessReport.pick(...arguments).point", x, y))
+        planned.press_at("scene", x, y)
+    stated = float(planned.text("scene-words").split(" mm")[0])
+    # A press is at whole pixels, at whose sides another depth may be hit.
+    assert stated == pytest.approx(np.linalg.norm(np.subtract(*points)), abs=1.0)
+    assert planned.state()["asked"] == asked
     planned.click("measure")
 
 

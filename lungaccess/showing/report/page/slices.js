@@ -274,7 +274,7 @@ export function scaleBar(pen, scale) {
 
 // Write a text in light letters with a dark rim, which are read on any ground.
 export function inscribe(pen, text, x, y, align, font, ink = INK, rim = "#000000", rimPx = 4) {
-  Object.assign(pen, { font: `${font} system-ui, sans-serif`, textAlign: align, textBaseline: "middle", lineWidth: rimPx, strokeStyle: rim, fillStyle: ink });
+  Object.assign(pen, { font: `${font} system-ui, sans-serif`, textAlign: align, textBaseline: "middle", lineJoin: "round", lineWidth: rimPx, strokeStyle: rim, fillStyle: ink });
   pen.strokeText(text, x, y);
   pen.fillText(text, x, y);
 }

@@ -86,8 +86,7 @@ class NavigationField:
     Args:
         goal: Number of the goal voxel.
         kind: "clearance": NF1 lowered where there is clearance (eq. 2); "plain": NF1.
-        metric: What a step counts: its length ("mm", right for any voxel size) or 1 ("voxels", the paper's).
-        clearance ((N,) float64): L1 distance to the wall in this metric.
+        clearance ((N,) float64): L1 distance to the wall.
         largest_clearance: C_max of eq. 2: half the largest clearance in the lumen.
         potential: (N,) float64.
     """
@@ -95,7 +94,6 @@ class NavigationField:
     lumen: Lumen
     goal: int
     kind: Kind
-    metric: Metric
     clearance: Float
     largest_clearance: float
     potential: Float
@@ -113,7 +111,10 @@ class NavigationField:
 def navigation_field(
     lumen: Lumen, goal: int, *, kind: Kind = "clearance", metric: Metric = "mm"
 ) -> NavigationField:
-    """Compute NF1, or the clearance-based NF1 [Rosell2012, eq. 2], from the number of the goal's voxel."""
+    """Compute NF1, or the clearance-based NF1 [Rosell2012, eq. 2], from the number of the goal's voxel.
+
+    A step counts its length ("mm", right for any voxel size) or 1 ("voxels", the paper's).
+    """
     if not 0 <= goal < lumen.count:
         raise TargetError(
             f"The lumen has no interior voxel {goal}", expected=f"a number from 0 to {lumen.count - 1}"
@@ -129,7 +130,6 @@ def navigation_field(
         lumen=lumen,
         goal=int(goal),
         kind=kind,
-        metric=metric,
         clearance=clearance,
         largest_clearance=most,
         potential=read_only(potential),

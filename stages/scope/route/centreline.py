@@ -98,14 +98,6 @@ class Centreline:
         offset = self.nodes_mm - np.asarray(point_mm, dtype=np.float64)
         return int(np.argmin(np.einsum("ij,ij->i", offset, offset)))
 
-    def moved(self, nodes_mm: ArrayLike, radius_mm: ArrayLike | None = None) -> "Centreline":
-        """Return the same graph with its nodes at other places, as after breathing or registration."""
-        return Centreline(
-            nodes_mm=np.asarray(nodes_mm, dtype=np.float64),
-            radius_mm=self.radius_mm if radius_mm is None else np.asarray(radius_mm, dtype=np.float64),
-            edges=self.edges,
-        )
-
     def require_inside(self, point_mm: Float, needed_mm: float, name: str) -> None:
         """Raise `TargetError` unless a point lies at least `needed_mm` deep in the lumen."""
         depth = float(self.depth_mm(point_mm)[0])

@@ -23,7 +23,17 @@ from anatomy.lobes import (
 from anatomy.segmentation.fissures import Cubic, fissureness
 from anatomy.segmentation.kernels.flooding import diffuse, flood
 from anatomy.segmentation.lobar_bronchi import Regions, lobes_of_branches
-from anatomy.segmentation.lobes import BAND_GROWTH, BAND_MM, BAND_UNSEEN_MM, WIDEST_SHARE, _bands, lobes_given
+from anatomy.segmentation.lobes import (
+    BAND_GROWTH,
+    BAND_MM,
+    BAND_UNSEEN_MM,
+    LEAST_CONFIDENCE,
+    LEAST_ENDS,
+    WIDEST_SHARE,
+    _bands,
+    _LungParts,
+    lobes_given,
+)
 
 SHAPE = (40, 50, 60)
 
@@ -200,3 +210,22 @@ def test_a_band_is_wider_where_its_fissure_is_not_seen_and_has_the_chances_of_a_
         assert found[60 + away, 15, 110] == found[59 - away, 15, 110] == beyond
     assert found.max() < 50 and found[found > 0].min() >= LEAST_CHANCE
     assert not _bands(np.full((9, 9, 9), LEFT_LOWER, dtype=np.uint8), near[:9, :9, :9], {}).any()
+
+
+@pytest.mark.parametrize(
+    ("ends", "confidence", "sure"),
+    [(LEAST_ENDS, 0.99, True), (LEAST_ENDS - 1, 0.99, False), (LEAST_ENDS, LEAST_CONFIDENCE - 0.01, False)],
+)
+def test_names_are_sure_with_as_many_ends_as_segments(ends: int, confidence: float, sure: bool) -> None:
+    """A trunk with so many ends in the lung, and more of them outside of it that do not count."""
+    count = 1 + ends + 5
+    inside = np.arange(count) <= ends
+    parts = _LungParts.__new__(_LungParts)
+    parts._inside = inside
+    parts._tree = SimpleNamespace(
+        n_branches=count,
+        branch_of_point=np.arange(count),
+        branch_parent=np.array([-1] + [0] * (count - 1)),
+        bronchi=SimpleNamespace(confidence=np.where(inside, confidence, 1.0)),
+    )  # type: ignore[assignment]
+    assert parts.has_sure_names == sure

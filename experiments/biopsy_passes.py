@@ -3,9 +3,10 @@
     python -m experiments.biopsy_passes [--quick] [--results FOLDER] [--procedure open-loop] [--tools core]
         [--errors breath-hold] [--nodules 60] [--lungs 8 Patient1] [--sizes 8]
 
-Nodules are drawn at peripheral targets: balls, and lumps whose radius varies by a quarter.  Of each, one pass
-at the centre, three passes at the same point, and three planned together are counted by the same draws, which
-no search saw.  In open loop, draws of another seed are counted voxel by voxel in every third nodule.
+Nodules are drawn at peripheral targets that a single arc reaches: balls, and lumps whose radius varies by a
+quarter.  Of each, one pass at the centre, three passes at the same point, and three planned together are
+counted by the same draws, which no search saw.  In open loop, draws of another seed are counted voxel by
+voxel in every third nodule.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from lungaccess.problem.tools import load_tool
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.statistics import share_of
+from stages.needle import direct_arcs, needle_environment
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,13 +106,29 @@ def cases(
 ) -> Iterator[tuple[str, float, Lung, la.Atlas]]:
     """Yield nodules drawn at peripheral places, lung by lung in turn: name, size, lung with it, and atlas."""
     there = [(name, lung, la.build_atlas(lung, la.load_system(SYSTEM))) for name, lung in lungs_of(names)]
-    places = [la.peripheral_targets(lung, nodules, SEED) for _name, lung, _atlas in there]
+    places = [reached_places(atlas, nodules) for _name, _lung, atlas in there]
     for number in range(nodules):
         size, solid = sizes[number % len(sizes)], number // len(sizes) % 2 == 0
         for (name, lung, atlas), centres in zip(there, places, strict=True):
+            if number >= len(centres):
+                continue
             rng = None if solid else np.random.default_rng(number)
             case = f"{name}, {size:g} mm {'ball' if solid else 'lump'} {number + 1}"
             yield case, size, with_nodule(lung, centres[number], size, rng), atlas
+
+
+def reached_places(atlas: la.Atlas, count: int) -> list[Float]:
+    """Return peripheral points that a single arc reaches that is proved clear."""
+    entries, system, found = atlas.deployments, la.load_system(SYSTEM), list[Float]()
+    environment = needle_environment(
+        atlas.lung, system.require_needle("A place"), system.margins, with_fissures=atlas.with_fissures
+    )
+    for target in la.peripheral_targets(atlas.lung, 10 * count, SEED):
+        near, _lengths = atlas.index.holding(environment, target)
+        at = entries.positions[near], entries.tangents[near], entries.branch[near]
+        if len(found) < count and (direct_arcs(environment, *at, target)[0] == 0).any():
+            found.append(target)
+    return found
 
 
 def main() -> None:

@@ -29,8 +29,6 @@ SCOPE_TIP, TUBE_TIP, NEEDLE_TIP, TARGET = (
 )  # fmt: skip
 """Names of the tracked poses; of the target only the place counts."""
 TRACKED = (SCOPE_TIP, TUBE_TIP, NEEDLE_TIP)
-SEARCHES = 10
-"""Deployments from which the needle's own search starts where no direct arc is clear: ten milliseconds."""
 ITERATIONS = 300
 """Of the needle's search from a tracked tip: more made no difference in simulated insertions."""
 UNKNOWN = Unknown(
@@ -178,7 +176,8 @@ class TrackedReplanner:
             lung=self._lung, system=self._device, target=self._target, method="replan", seed=plan.seed,
             objective=Objective.of(plan.objective),
         )  # fmt: skip
-        return ScopeReplanner(task, tries=0, searches=SEARCHES)
+        # Where no direct arc is clear, the needle's own search starts from ten deployments: ten milliseconds.
+        return ScopeReplanner(task, tries=0, searches=10)
 
     def _from_scope(self, pose: Float) -> RestOfPlan:
         return self._scope_replanner.replan(measured_pose(self._lung, pose, "scope"))

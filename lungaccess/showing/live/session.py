@@ -26,8 +26,6 @@ TIPS = {"ScopeTip": "scope", "TubeTip": "tubes", "NeedleTip": "needle"}
 PATHS = ("ScopePath", "TubePath", "NeedlePath")
 MOST_POINTS = 300
 """Points of a path that is sent: a message of 40 kB."""
-BREATH_S = 4.0
-"""One breath, out and in [assumption]."""
 
 
 @frozen_value
@@ -178,7 +176,8 @@ class LiveSession:
         messages = [pose_message(name, moves.tips(device)[row], now) for name, device in TIPS.items()]
         messages.append(text_message("Stage", f"{stage} {at_s:.1f} of {last:.1f} s", now))
         if self._moving is not None:
-            phase = 0.5 - 0.5 * np.cos(2.0 * np.pi * elapsed_s / BREATH_S)
+            # One breath, out and in, takes 4 s [assumption].
+            phase = 0.5 - 0.5 * np.cos(2.0 * np.pi * elapsed_s / 4.0)
             messages.append(text_message("Phase", f"{phase:.3f}", now))
             messages.append(pose_message("BreathingDevices", self._moving.pose(float(phase)), now))
         return messages

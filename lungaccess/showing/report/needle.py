@@ -83,7 +83,11 @@ def _whole_panel(
     _needle(axes, answer, query, view, points)
     drawing.target_mark(axes, view.project(query.target))
     if answer.obstruction is not None and answer.obstruction.place != "reach":
-        _blocked_mark(axes, view.project(answer.obstruction.point_lps))
+        uv = view.project(answer.obstruction.point_lps)
+        axes.plot(
+            uv[0], uv[1], marker="X", ms=10, mfc=BLOCKED, mec="white", mew=1.2, zorder=15, ls="none",
+            path_effects=drawing.halo(2.5),
+        )  # fmt: skip
     axes.set_xlim(limits[0])
     axes.set_ylim(limits[1])
     drawing.dress(axes, view, ticks=False)
@@ -140,13 +144,6 @@ def _tightest_arcs(query: Query, view: View, radius_mm: float, far_mm: float) ->
     return [
         start + radius_mm * (np.sin(turn) * forward + side * (1.0 - np.cos(turn)) * aside) for side in (1, -1)
     ]
-
-
-def _blocked_mark(axes: Axes, uv: Float) -> None:
-    axes.plot(
-        uv[0], uv[1], marker="X", ms=10, mfc=BLOCKED, mec="white", mew=1.2, zorder=15, ls="none",
-        path_effects=drawing.halo(2.5),
-    )  # fmt: skip
 
 
 def _legend(axes: Axes, answer: NeedleAnswer) -> None:

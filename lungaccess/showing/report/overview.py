@@ -99,15 +99,6 @@ def _heading(figure: Figure, plan: Plan, appraisal: Appraisal | None) -> None:
 
 
 def _legend(figure: Figure, layers: Layers, plan: Plan) -> None:
-    entries = _legend_entries(layers, plan)
-    figure.legend(
-        handles=entries, loc="lower left",
-        bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN), ncols=len(entries), fontsize=9, frameon=False,
-        handlelength=1.8, columnspacing=1.3,
-    )  # fmt: skip
-
-
-def _legend_entries(layers: Layers, plan: Plan) -> list[Line2D | Patch]:
     entries: list[Line2D | Patch] = [
         Line2D([], [], color=style.SCOPE, lw=4, label="bronchoscope"),
         Line2D([], [], color=style.TUBE, lw=4, label="tubes"),
@@ -126,7 +117,11 @@ def _legend_entries(layers: Layers, plan: Plan) -> list[Line2D | Patch]:
     entries += [Patch(color=style.VESSEL, label="vessel"), Patch(color="#C9C9C9", label="outside the lung")]
     if layers.has("fissure"):
         entries.append(Patch(color=style.FISSURE, alpha=0.6, label="fissure"))
-    return entries
+    figure.legend(
+        handles=entries, loc="lower left",
+        bbox_to_anchor=(0.2 / WIDTH_IN, 0.08 / HEIGHT_IN), ncols=len(entries), fontsize=9, frameon=False,
+        handlelength=1.8, columnspacing=1.3,
+    )  # fmt: skip
 
 
 CURVES = {
@@ -161,7 +156,10 @@ def clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:
     axes.axvline(0.0, color=style.FAINT_INK, lw=0.8, zorder=2)
     axes.set_xlim(along[0], along[-1])
     axes.set_ylim(0.0, min(highest, MOST_TOP_MM))
-    _label_clearance(axes)
+    drawing.title(axes, "Distance of the device's axis to each structure")
+    note = "mm beyond the tube tip (negative: along the tube)\nblue: pierced wall is exempt; dotted: exit"
+    drawing.graph(axes, note, "mm")
+    axes.legend(fontsize=8, loc="upper right", framealpha=0.92, ncols=2, borderpad=0.5, handlelength=2.4)
 
 
 def _required_line(axes: Axes, plan: Plan, tube_arc: Float, along: Float) -> None:
@@ -175,13 +173,6 @@ def _required_line(axes: Axes, plan: Plan, tube_arc: Float, along: Float) -> Non
     for start, stop, level in zip(places[:-1], places[1:], levels, strict=True):
         axes.fill_between([start, stop], 0.0, level, color=style.FORBIDDEN, lw=0, zorder=1)
     axes.stairs(levels, places, baseline=None, color=style.INK, lw=1.4, label="required", zorder=5)
-
-
-def _label_clearance(axes: Axes) -> None:
-    drawing.title(axes, "Distance of the device's axis to each structure")
-    note = "mm beyond the tube tip (negative: along the tube)\nblue: pierced wall is exempt; dotted: exit"
-    drawing.graph(axes, note, "mm")
-    axes.legend(fontsize=8, loc="upper right", framealpha=0.92, ncols=2, borderpad=0.5, handlelength=2.4)
 
 
 def text_panel(axes: Axes, plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> None:

@@ -27,8 +27,6 @@ BAR_IN = (14.1, 1.0, 0.15, 3.8)
 TEXT_IN = (14.2, 10.0)
 PIXEL_MM = 0.75
 CLEARANCE_MM = (0.0, 8.0)
-SMOOTH_VOXELS = 0.7
-"""Borders are drawn under a Gaussian of this width, which takes their steps."""
 
 COLOURS: dict[str, str] = {
     "direct arc": "#009E73",
@@ -107,7 +105,8 @@ def _between(reach: ReachMap, values: Float | Bool, lps: Float) -> Float:
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     places = np.moveaxis(reach.kinds.grid.ijk(lps), -1, 0)
-    smooth = gaussian_filter(values.astype(np.float64), SMOOTH_VOXELS, mode="constant")
+    # A Gaussian of this many voxels takes the steps of the borders.
+    smooth = gaussian_filter(values.astype(np.float64), 0.7, mode="constant")
     return np.asarray(map_coordinates(smooth, places, order=1, mode="constant"))
 
 

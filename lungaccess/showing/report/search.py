@@ -16,9 +16,6 @@ from anatomy.base.records import frozen_value
 from lungaccess.problem.goals import Goal
 from lungaccess.showing.report import drawing, style
 
-LABEL_LETTERS = 44
-"""The label of the vertical axis has no more letters on a line: as many fit beside it."""
-
 
 @style.plain_look
 def cost_over_time_png(history: Sequence[CostPoint], path: str | os.PathLike[str], goal: Goal) -> Path:
@@ -36,7 +33,8 @@ def cost_over_time_png(history: Sequence[CostPoint], path: str | os.PathLike[str
         _steps(axes, found, history[-1].elapsed_s, goal)
     else:
         axes.text(0.5, 0.5, "no plan was found", ha="center", va="center", transform=axes.transAxes)
-    drawing.graph(axes, "planning time (s)", textwrap.fill(goal.words_with_unit, LABEL_LETTERS))
+    # As many letters fit beside the vertical axis.
+    drawing.graph(axes, "planning time (s)", textwrap.fill(goal.words_with_unit, 44))
     drawing.title(axes, "Best plan over planning time")
     return style.save_png(figure, path)
 

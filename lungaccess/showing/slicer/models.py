@@ -31,18 +31,17 @@ _ALTERED = "SCT^49755003^Morphologically Altered Structure"
 
 TARGET_COLOUR = (0.17, 0.63, 0.17)
 
-MOST_TRIANGLES = 150_000
-"""Enough for the shape of the vessels; models are for display alone."""
 SIDES = 16
 """Corners of a ring around a device."""
 
 
-def structure_surface(lung: Lung, name: str, *, most: int = MOST_TRIANGLES) -> SurfaceMesh | None:
+def structure_surface(lung: Lung, name: str, *, most: int = 150_000) -> SurfaceMesh | None:
     """Return a surface of a structure with at most so many triangles, for display; None if there is nothing.
 
     Args:
         name: "lung", "airway" (lumen and wall), "vessel", "fissure" or "nodule".
-        most: Vertices are merged in ever larger cubes until no more triangles are left.
+        most: Vertices are merged in ever larger cubes until no more triangles are left; the usual number is
+            enough for the shape of the vessels.
     """
     volume = _mask(lung, name)
     if volume is None or not volume.array.any():

@@ -124,6 +124,9 @@ def packed_mesh(vertices: Float, faces: Int, look: Look) -> Packed:
         faces = faces[:, [0, 2, 1]]
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size = np.maximum(high - low, 1e-6)
+    # Small numbers: the first vertex against the face before, the others against the first.
+    first = faces[:, 0]
+    differences = [np.diff(first, prepend=0), faces[:, 1] - first, faces[:, 2] - first]
     return {
         "key": look.key,
         "name": look.name,
@@ -133,7 +136,7 @@ def packed_mesh(vertices: Float, faces: Int, look: Look) -> Packed:
         "low_lps": low.tolist(),
         "size_mm": size.tolist(),
         "vertices": pack(np.rint((vertices - low) / size * STEPS).astype(np.uint16), "u2"),
-        "faces": pack(_differences(faces), "i4"),
+        "faces": pack(np.stack(differences), "i4"),
     }
 
 
@@ -205,9 +208,3 @@ def smoothed(vertices: Float, faces: Int) -> Float:
         for factor in (SHRINK, GROW):
             moved = moved + factor * (links @ moved / degree - moved)
     return np.asarray(moved)
-
-
-def _differences(faces: Int) -> Int:
-    """Return small numbers: the first vertex against the face before, the others against the first."""
-    first = faces[:, 0]
-    return np.stack([np.diff(first, prepend=0), faces[:, 1] - first, faces[:, 2] - first])

@@ -21,8 +21,6 @@ AROUND_MM = 45.0
 HALF = 0.5
 NORMAL_MM = 0.7
 """Step of the differences from which the direction of the wall is taken: about a voxel."""
-FALL_OFF_MM2 = 520.0
-"""Square of the distance at which the light is half as bright: 23 mm."""
 DARK, BRIGHT = np.array([0.50, 0.16, 0.13]), np.array([0.98, 0.72, 0.64])
 """Colours of the wall with little and with much light."""
 
@@ -139,8 +137,8 @@ def view(lumen: SmoothLumen, lps_from_camera: Float, pixels: int) -> UInt8:
     eye = np.asarray(lps_from_camera[:3, 3])
     away = lumen.wall_distance(eye, rays)
     straight = np.clip(-(lumen.normals(eye + away[:, None] * rays) * rays).sum(axis=1), 0.0, 1.0)
-    # More light comes back from near, and from a wall seen face on.
-    light = (0.25 + 0.85 * straight) / (1.0 + away**2 / FALL_OFF_MM2)
+    # More light comes back from near, half as much from 23 mm, and from a wall seen face on.
+    light = (0.25 + 0.85 * straight) / (1.0 + away**2 / 520.0)
     picture: Array = np.zeros((pixels, pixels, 3))
     share = np.clip(1.15 * light, 0.0, 1.0)[:, None]
     picture[inside] = ((1.0 - share) * DARK + share * BRIGHT) * np.clip(1.5 * light, 0.0, 1.0)[:, None]

@@ -46,6 +46,8 @@ def page_data(explanation: Explanation, lung: Lung) -> dict[str, Any]:
     """Return what the scripts of the page draw, as plain JSON values."""
     target = explanation.target.lps_mm
     paths = list(_paths(explanation))
+    # The fine slices show no more of a path than what is within 60 mm of the target.
+    near = [points[np.linalg.norm(points - target, axis=1) <= 60.0] for _, points in paths]
     return {
         "page": "no plan",
         "patient": lung.name,
@@ -57,7 +59,7 @@ def page_data(explanation: Explanation, lung: Lung) -> dict[str, Any]:
             {"name": f"{each.place.kind}, {each.arcs} arcs", "lps": each.place.lps_mm.tolist()}
             for each in explanation.blocking
         ],
-        **page_image(lung, np.vstack([target, *(_near(points, target) for _, points in paths)])),
+        **page_image(lung, np.vstack([target, *near])),
     }
 
 
@@ -120,8 +122,3 @@ def _path(name: str, colour: str, radius_mm: float, curves: list[Float], shown: 
         "curves": [pack(curve, "f4") for curve in curves],
     }
     return packed, curves[-1]
-
-
-def _near(points: Float, target: Float) -> Float:
-    """Return the points of a path within 60 mm of the target: the fine slices show no more."""
-    return np.asarray(points[np.linalg.norm(points - target, axis=1) <= 60.0])

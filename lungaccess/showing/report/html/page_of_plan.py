@@ -250,7 +250,11 @@ def _aim_words(plan: Plan) -> str:
 
 def glance_section(plan: Plan, appraisal: Appraisal) -> str:
     """Return the numbers that decide about a plan: chance, length of the way, time, and the nearest limit."""
-    tiles = [_chance(appraisal.headline), _way(plan), _time(plan), *map(_limit, appraisal.limits[:1])]
+    others = {name.removesuffix("_s"): seconds for name, seconds in plan.timing.items()}
+    planning = others.pop("planning", None)
+    value = "not stated" if planning is None else f"{planning:.1f} s"
+    time = _tile("Planning time", None, value, ", ".join(f"{name} {s:.1f} s" for name, s in others.items()))
+    tiles = [_chance(appraisal.headline), _way(plan), time, *map(_limit, appraisal.limits[:1])]
     return f'<ul class="glance" aria-label="At a glance">{"".join(tiles)}</ul>'
 
 
@@ -285,14 +289,6 @@ def _way(plan: Plan) -> str:
     last = f"needle {needle:.0f}" if needle else "no needle: the tubes end at the target"
     note = f"from the carina: scope {scope:.0f}, tubes {tubes:.0f}, {last}"
     return _tile("Length of the way", None, f"{scope + tubes + needle:.0f} mm", note)
-
-
-def _time(plan: Plan) -> str:
-    """Return how long planning took, and what was prepared for it."""
-    others = {name.removesuffix("_s"): seconds for name, seconds in plan.timing.items()}
-    planning = others.pop("planning", None)
-    value = "not stated" if planning is None else f"{planning:.1f} s"
-    return _tile("Planning time", None, value, ", ".join(f"{name} {s:.1f} s" for name, s in others.items()))
 
 
 def _limit(limit: Limit) -> str:

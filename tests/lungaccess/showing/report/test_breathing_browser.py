@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from anatomy import structures
+from anatomy.grid import Grid
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.html import volumes
+from lungaccess.showing.report.html.deployment import device_points
 from lungaccess.uncertainty.breathing.moving import Moving
 from tests.lungaccess.showing.report import browser
 from tests.lungaccess.showing.report.scripts import CHOOSE, PICTURE
@@ -97,9 +98,11 @@ def test_the_lumen_breathes_in_the_slices(
     masks = moving.pulled_back(places, 0.0)
     assert len(places) > 50
     assert np.linalg.norm(masks - places, axis=1).min() > 0.3
-    # The voxels of the page are coarser: of the pixels in the phase of the masks 91 % are lumen.
-    assert share_of_lumen(masks, breathing_lung) > 0.85
-    assert share_of_lumen(places, breathing_lung) < 0.75
+    grids = volumes.page_grids(
+        breathing_lung.grid, np.concatenate([device_points(each) for each in breathing_plans])
+    )
+    assert share_of_lumen(masks, breathing_lung, grids) > 0.97
+    assert share_of_lumen(places, breathing_lung, grids) < 0.8
     page.run("window.lungaccessReport.breathe(1)")
 
 
@@ -117,10 +120,14 @@ def test_the_breath_plays_and_is_held(page: browser.Browser) -> None:
     page.run("window.lungaccessReport.breathe(1)")
 
 
-def share_of_lumen(places: np.ndarray, lung: Lung) -> float:
-    """Return which share of places lies in voxels of the lumen."""
-    index = np.rint(lung.grid.ijk(places)).astype(int)
-    return float(((lung.labels[tuple(index.T)] & structures.LUMEN) != 0).mean())
+def share_of_lumen(places: np.ndarray, lung: Lung, grids: tuple[Grid, Grid]) -> float:
+    """Return the share of places in lumen voxels of a page: the fine ones where it has them, else coarse."""
+    codes, found = volumes.label_codes(lung, (0, 0, 0), lung.grid.shape), np.zeros(len(places))
+    for grid in grids:
+        index = np.rint(grid.ijk(places)).astype(int)
+        inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
+        found[inside] = volumes.resampled(codes, grid, 0, 0)[tuple(index[inside].T)]
+    return float((found == volumes.CODES["lumen"]).mean())
 
 
 def pixels(page: browser.Browser, canvas: str, colour: tuple[int, int, int]) -> np.ndarray:

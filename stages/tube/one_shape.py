@@ -245,6 +245,10 @@ class Neighbourhood:
         deployed = deploy(mechanics, together(tubes, turned + BEND_RAD, inserted), step_rad=math.pi)
         return cls(mechanics, inserted, turned, np.array(deployed.final.tip_angles_rad))
 
+    def moved(self, shape: NearbyShape) -> "Neighbourhood":
+        """Return the neighbourhood of a shape nearby."""
+        return Neighbourhood(self._mechanics, shape.insertions_mm, shape.rotations_rad, shape.tip_angles_rad)
+
     def at(self, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
         """Return the shape of joint values `(n,)`, reached straight from that deployment; None if tubes snap.
 

@@ -41,6 +41,7 @@ from lungaccess.cli.examples import EXAMPLE_OF_ALL, EXAMPLES, EXIT_CODES, START_
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.plan_search import no_plan_record
 from lungaccess.cli.terminal import error_console
+from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.version import software_version
 
 _TOO_LARGE = AnatomyError(
@@ -213,8 +214,6 @@ def _interrupted() -> ExitCode:
 
 def _explain(error: LungaccessError, as_json: bool) -> ExitCode:
     """Print an error for people, also as JSON if that is asked for, and return its exit code."""
-    from lungaccess.plans.no_plan import NoPlan
-
     if isinstance(error, NoPlan):
         if as_json:
             terminal.show_json(no_plan_record(error))

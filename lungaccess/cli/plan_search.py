@@ -24,15 +24,12 @@ from lungaccess.plans.no_plan import NoPlan
 from stages.needle import Objective
 
 if TYPE_CHECKING:
-    from rich.panel import Panel
-
     from anatomy.lung import Lung
     from lungaccess.judging.advice import Advice
     from lungaccess.judging.appraisal import Appraisal, Headline
     from lungaccess.judging.checking import CheckReport, Finding
     from lungaccess.planning import ProgressEvent
     from lungaccess.planning.coupled import Atlas
-    from lungaccess.plans.no_plan import NoPlan
     from lungaccess.plans.plan import Plan
     from lungaccess.problem.errors import ErrorModel
     from lungaccess.problem.goals import Goal
@@ -184,10 +181,8 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
         with progress("making the page"):
             options = PageOptions(cost_over_time=job.out / HISTORY_FILE, advice=advice)
             plan_page(found, lung, job.out / PAGE_FILE, options)
-    if job.output.json:
-        terminal.show_json(record)
-    else:
-        terminal.say(f"Written to {job.out}: {', '.join(job.files)}")
+    job.output.tell(record)
+    terminal.say(f"Written to {job.out}: {', '.join(job.files)}")
     return ExitCode.of(appraisal.accepted)
 
 

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 
 from anatomy.base.checksums import canonical_sha256
 from anatomy.base.errors import PlanFileError, SettingsError
-from anatomy.base.files import DAMAGE, reason
+from anatomy.base.files import DAMAGE, reason, write_text
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.settings import parse, to_mapping
 from lungaccess.plans.record import Record
@@ -122,8 +122,6 @@ def plain(part: Record) -> Any:
 
 def save(plan: Record, path: str | os.PathLike[str]) -> None:
     """Write `plan` beside `path` under a temporary name, then put it in place."""
-    from anatomy.base.files import write_text
-
     write_text(os.fspath(path), to_json(plan))
 
 

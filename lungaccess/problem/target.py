@@ -10,7 +10,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.base.words import point_in_words
 from anatomy.grid import read_only
-from anatomy.io.frames import MOST_COORDINATE_MM
+from anatomy.io.frames import MOST_COORDINATE_MM, parse_point
 from anatomy.lung import Lung
 from anatomy.organ import Organ
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
@@ -85,7 +85,6 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
         return StatedTarget(lps_mm=read_named_point(saved).lps_mm, nodule=0, origin=f"point {saved}")
     if text and not set(text) & set(":,;[( "):
         return StatedTarget(lps_mm=None, nodule=0, origin=f"published {text}", name=text)
-    from anatomy.io.frames import parse_point
 
     return StatedTarget(lps_mm=parse_point(text), nodule=0, origin=f"point {text}")
 

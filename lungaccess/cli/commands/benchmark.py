@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.files import require_writable_folder
 from lungaccess.cli import terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
@@ -138,7 +139,6 @@ def run(
 
 
 def _write_answers(results: Path, folder: Path) -> list[Path]:
-    from anatomy.base.files import require_writable_folder
     from lungaccess.running.benchmark.synthetic.submission import submissions_of, write_submission
 
     require_writable_folder(folder)
@@ -189,11 +189,10 @@ def score(
         write_scores(scores, out)
     refusals = [each for each in scores if each.status == REFUSED]
     _show_sheet(scores, output)
-    if not output.json:
-        for each in refusals:
-            terminal.say(f"{each.query} is refused: {each.reason}")
-        if out is not None:
-            terminal.say(f"All scores are in {out}")
+    for each in refusals:
+        terminal.say(f"{each.query} is refused: {each.reason}")
+    if out is not None:
+        terminal.say(f"All scores are in {out}")
     return ExitCode.of(not refusals)
 
 
@@ -236,11 +235,9 @@ def _show_sheet(scores: list[Score], output: OutputOptions, *, by_family: bool =
     from lungaccess.running.benchmark.synthetic.scoring import HEADINGS, score_sheet
 
     lines = score_sheet(scores, by_family=by_family)
-    if output.json:
-        about = {"benchmark": NAME, "manifest_sha256": manifest_sha256()}
-        refused = {each.query: each.reason for each in scores if each.reason}
-        terminal.show_json({**about, "sheet": [asdict(line) for line in lines], "refused": refused})
-        return
+    about = {"benchmark": NAME, "manifest_sha256": manifest_sha256()}
+    refused = {each.query: each.reason for each in scores if each.reason}
+    output.tell({**about, "sheet": [asdict(line) for line in lines], "refused": refused})
     terminal.show_wide([terminal.table(f"Scores of {NAME}", HEADINGS, [line.cells() for line in lines])])
 
 

@@ -27,8 +27,6 @@ from lungaccess.cli.plan_search import check_tables, show_findings, show_headlin
 from lungaccess.cli.progress import progress
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from lungaccess.planning.procedure.insertion import InsertionStudy
     from lungaccess.uncertainty.breathing.moving import CarriedNeedle
 

@@ -21,8 +21,6 @@ from lungaccess.cli.result_folder import claim_folder, keep_earlier
 from lungaccess.plans.record import picked
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from lungaccess.planning.one_stage import TubeAnswer
     from lungaccess.problem.system import System
     from lungaccess.running.design.search import DesignFound
@@ -48,12 +46,10 @@ def presets(*, show: str | None = None, output: OutputOptions = OutputOptions())
     ordered = [system.name for system in presets_by_invasiveness()]
     names = (*ordered, *tube_preset_names(), *needle_preset_names()) if show is None else (show,)
     systems = {name: load_system(name) for name in names}
-    if output.json:
-        terminal.show_json({name: to_mapping(system) for name, system in systems.items()})
-    else:
-        terminal.console.print(_preset_table(systems))
-        warned = ((name, each) for name, system in systems.items() for each in system_warnings(system))
-        terminal.show_warnings(f"{name}: {each}" for name, each in warned)
+    output.tell({name: to_mapping(system) for name, system in systems.items()})
+    terminal.console.print(_preset_table(systems))
+    warned = ((name, each) for name, system in systems.items() for each in system_warnings(system))
+    terminal.show_warnings(f"{name}: {each}" for name, each in warned)
     return ExitCode.OK
 
 

@@ -29,6 +29,7 @@ from lungaccess.cli.options import (
 )
 from lungaccess.cli.plan_search import arcs_table, no_plan_record
 from lungaccess.cli.progress import progress
+from lungaccess.plans.no_plan import NoPlan
 from stages.needle import DEFAULT, Objective
 
 if TYPE_CHECKING:
@@ -82,7 +83,6 @@ def replan(
         followed = _Followed(plan, errors, placement, radius, record)
         return _decided(patient, poses, frame, followed, output)
     from lungaccess.planning.one_stage import replan_from_scope, replan_from_tube
-    from lungaccess.plans.no_plan import NoPlan
 
     Objective.of(objective)
     stated, device = target.stated(), system.load()

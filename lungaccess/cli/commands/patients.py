@@ -21,8 +21,6 @@ from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder, require_empty_folder
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from anatomy.segmentation.pipeline import Segmentation
     from anatomy.segmentation.scan_warnings import Quality
 
@@ -210,11 +208,9 @@ def info(
     if out is not None:
         claim_folder(out, ("tree.png", "motion.png", "organ.png"), force=force)
     lung = output.load_organ(patient, thick_slices=True, refuse=False)
-    if output.json:
-        terminal.show_json(anatomy_tables.organ_record(lung))
-    else:
-        terminal.show(anatomy_tables.anatomy_tables(lung, details=details))
-        terminal.show_warnings(lung.warnings)
+    output.tell(anatomy_tables.organ_record(lung))
+    terminal.show(anatomy_tables.anatomy_tables(lung, details=details))
+    terminal.show_warnings(lung.warnings)
     if out is not None:
         from anatomy.lung import Lung
         from lungaccess.showing.report import motion_png, organ_png, tree_png
@@ -223,12 +219,9 @@ def info(
             what, picture = "tree", tree_png(lung, out / "tree.png")
         else:
             what, picture = "organ", organ_png(lung, out / "organ.png")
-        if not output.json:
-            terminal.say(f"Picture of the {what}: {picture}")
+        terminal.say(f"Picture of the {what}: {picture}")
         if isinstance(lung, Lung) and lung.motion is not None:
-            picture = motion_png(lung, out / "motion.png")
-            if not output.json:
-                terminal.say(f"Picture of the breathing: {picture}")
+            terminal.say(f"Picture of the breathing: {motion_png(lung, out / 'motion.png')}")
     return ExitCode.OK
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.panel import Panel
 
 from anatomy.base.errors import AnatomyError
+from anatomy.base.files import write_text
 from anatomy.base.words import of_hundred
 from lungaccess.cli import terminal
 from lungaccess.cli.exit_code import ExitCode
@@ -35,17 +36,15 @@ from lungaccess.cli.plan_search import (
 )
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
+from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.goals import SUCCESS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from anatomy.lung import Lung
     from lungaccess.judging.appraisal import Appraisal
     from lungaccess.judging.explanation import Explanation
     from lungaccess.planning import Alternative
     from lungaccess.planning.coupled import Atlas
-    from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.system import System
 
 
@@ -95,7 +94,6 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
 
 
 def _first_reachable_nodule(lung: Lung, job: PlanJob) -> ExitCode:
-    from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import stated_target
 
     failure: NoPlan | None = None
@@ -154,7 +152,6 @@ def plan(
             there is no plan: the nearest miss, what blocks, which preset or change of device would do, what
             is proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is.
     """
-    from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.system import systems_with_tool
 
     stated = target.stated()
@@ -293,7 +290,6 @@ def alternatives(
         separation: The needles of every two plans lie somewhere at least so many mm from each other.
         out: Folder for plan-01.json and so on, and trade_off.svg.
     """
-    from anatomy.base.files import write_text
     from lungaccess.judging import answer_with_several
     from lungaccess.judging.appraisal import Appraiser
     from lungaccess.planning import with_front

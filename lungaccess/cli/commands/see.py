@@ -16,6 +16,7 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, ErrorOptions, PatientOfPlan, 
 from lungaccess.cli.plan_search import HISTORY_FILE, advised, steps_table
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import held, keep_earlier
+from lungaccess.plans.no_plan import NoPlan
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -95,7 +96,6 @@ def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple
     Of a patient that breathes they have their windows.
     """
     from lungaccess.judging import alternatives
-    from lungaccess.plans.no_plan import NoPlan
     from lungaccess.problem.target import Target
     from lungaccess.uncertainty.breathing.window import with_window
 

@@ -3,6 +3,7 @@
 from enum import IntEnum, StrEnum
 
 from anatomy.base.records import frozen_value
+from anatomy.base.settings import to_mapping
 from anatomy.base.words import of_hundred, plural, range_of_hundred
 from lungaccess.judging.checking import CheckReport
 from lungaccess.judging.checking.outcome import NEEDLE_LOAD
@@ -313,8 +314,6 @@ class Headline:
 
 def _errors(chance: Chance, estimate: Estimate | None) -> dict[str, object]:
     """Return the error model by its keys, or of what a plan states its name and sizes."""
-    from anatomy.base.settings import to_mapping
-
     if estimate is None or isinstance(estimate, Chance):
         return {"name": chance.errors, "sizes": chance.sizes}
     return {**to_mapping(estimate.model), "name": chance.errors}

@@ -27,7 +27,6 @@ from stages.tube.device import Tube
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
-    from lungaccess.plans.plan import Plan
     from lungaccess.problem.tools import Tool
 
 COST_TOLERANCE = 0.02

@@ -37,7 +37,7 @@ from lungaccess.problem.request import Request
 from lungaccess.problem.system import with_tool
 from lungaccess.problem.tools import load_tool
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
-from lungaccess.uncertainty.risk.breathing import model_for
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from lungaccess.uncertainty.risk.statistics import share_of
 from stages.needle import direct_arcs, needle_environment
 

@@ -195,7 +195,7 @@ class CurvatureError(_Term):
 
 @settings
 class BreathingError(_Term):
-    """Motion of the lung by breathing between scope and target, see `lungaccess.uncertainty.risk.breathing`.
+    """Motion of the lung by breathing between scope and target, see `uncertainty.risk.patient_errors`.
 
     Args:
         distribution: "lognormal": the logarithm of the patient's motion is normal, and the procedure is at
@@ -296,9 +296,9 @@ class ErrorModel:
         needle_insertion: Insertion at which each arc ends.
         target_position: Position of the target, along each axis.
         vessel_border: How far the vessels reach out of their masks, all of them alike; where it is 0, it is
-            what the patient's own segmentation states, see `lungaccess.uncertainty.risk.breathing.model_for`.
+            what the patient's own segmentation states, see `uncertainty.risk.patient_errors.model_for`.
         wall: What is known of the contact of shaft and wall, which errors of the distribution "resting" need;
-            see `lungaccess.uncertainty.risk.breathing`.
+            see `lungaccess.uncertainty.risk.patient_errors`.
         place: Other errors by the place of the scope's tip; of several that hold the last one counts.
 
     Raises:

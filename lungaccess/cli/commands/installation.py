@@ -300,7 +300,7 @@ def _entries(folder: Path) -> tuple[CacheEntry, ...]:
     from anatomy.base.cache_entries import cache_entries
     from anatomy.store import stored_format
     from lungaccess.planning.coupled.atlas import atlas_format
-    from lungaccess.uncertainty.risk.breathing import resting_format
+    from lungaccess.uncertainty.risk.patient_errors import resting_format
     from stages.tube import shapes_format
 
     formats = {

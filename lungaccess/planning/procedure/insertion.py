@@ -30,8 +30,8 @@ from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import NeedleSteering
 from lungaccess.uncertainty.risk import RiskAssessor, Share
-from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import deviated_pieces
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from stages.needle import (
     ArcPath,
     Failure,

@@ -53,8 +53,8 @@ from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from lungaccess.uncertainty.risk import RiskAssessor
 from lungaccess.uncertainty.risk.assessor import in_threads
-from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import deviated_starts, judging
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from stages.needle import ArcPath, Limits, NeedleEnvironment, Objective, Obstacles, needle_environment
 from stages.tube import tube_constants, tube_environment
 

@@ -27,7 +27,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.plans.tissue import goal_radius
 from lungaccess.problem.request import Request
 from lungaccess.uncertainty.risk.assessor import RiskAssessor, numbers_of_pass
-from lungaccess.uncertainty.risk.breathing import model_for
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from stages.needle import direct_arcs, direct_path, workspace_lengths
 from stages.tube import Deployment, SiteEnumerator
 

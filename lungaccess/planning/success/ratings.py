@@ -21,7 +21,7 @@ from lungaccess.problem.goals import SUCCESS, Goal
 from lungaccess.problem.procedures import Procedure, load_procedure
 from lungaccess.problem.request import Request
 from lungaccess.uncertainty.risk import RiskAssessor
-from lungaccess.uncertainty.risk.breathing import model_for
+from lungaccess.uncertainty.risk.patient_errors import model_for
 
 Scorer = Callable[[int, int, float], float]
 """Returns what a plan gains: the successes of so many draws of a batch, with errors of a factor times their

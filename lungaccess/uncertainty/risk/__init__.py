@@ -15,8 +15,8 @@ if TYPE_CHECKING:
         rare_touch,
     )
     from lungaccess.uncertainty.risk.assessor import STRUCTURES, RiskAssessor
-    from lungaccess.uncertainty.risk.breathing import RestingRow, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.deviations import Deviations
+    from lungaccess.uncertainty.risk.patient_errors import RestingRow, resting_rows, resting_tip
     from lungaccess.uncertainty.risk.statistics import Share
     from lungaccess.uncertainty.risk.tolerances import (
         LARGEST,

@@ -23,8 +23,8 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import BREATHING, CURVATURE, ErrorModel
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
-from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, Draws
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from lungaccess.uncertainty.risk.statistics import Z_95, Share, share_of
 
 RARE = 1e-3
@@ -321,7 +321,7 @@ def assess(
 
     Args:
         model: The preset `breath-hold` if None.  Where the patient's own breathing is known, it is that which
-            is drawn: `lungaccess.uncertainty.risk.breathing.model_for` says how.
+            is drawn: `lungaccess.uncertainty.risk.patient_errors.model_for` says how.
         seed: The same seed gives the same report.
         radius_mm: Radius of the goal; see `RiskAssessor`.
         each_kind: Whether success under errors of one kind only, sensitivities and rare touches are

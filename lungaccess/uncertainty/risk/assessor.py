@@ -17,11 +17,11 @@ from lungaccess.plans.kernels.tissue import Wanted
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.tissue import goal_radius, wanted_of
 from lungaccess.problem.errors import OF_NEEDLE, UNITS, ErrorModel
-from lungaccess.uncertainty.risk.breathing import PatientMotion
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, Deviations, Draws, judging, no_deviations
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_taken, follow_chains, keep_clear
+from lungaccess.uncertainty.risk.patient_errors import PatientMotion
 from lungaccess.uncertainty.risk.statistics import Share, share_of
 from stages.needle import Obstacles
 

@@ -26,10 +26,10 @@ from lungaccess.problem.errors import (
     VESSEL_BORDER,
     ErrorModel,
 )
-from lungaccess.uncertainty.risk.breathing import PatientMotion, phase
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES, Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import N_START, Judging, find_pieces, find_starts
+from lungaccess.uncertainty.risk.patient_errors import PatientMotion, phase
 from stages.tube import ConcentricTubes, Neighbourhood, pieces_of_arcs
 
 COLUMNS = (
@@ -385,7 +385,7 @@ class Draws:
         if distribution == RESTING:
             raise SettingsError(
                 f"Errors of {kind} are about the resting shaft of a plan, which is not known here",
-                expected="an error model of `lungaccess.uncertainty.risk.breathing.model_for`",
+                expected="an error model of `lungaccess.uncertainty.risk.patient_errors.model_for`",
             )
         # One number for all arcs of a patient: what is wrong with tissue or drive stays wrong.
         shared = (len(shape) > 1) and kind.startswith("needle")

@@ -17,8 +17,8 @@ from lungaccess.plans.tissue import goal_radius
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import BREATHING, CURVATURE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
-from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, Draws
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from lungaccess.uncertainty.risk.statistics import Share
 from stages.needle import ArcPath, Query, StartRegion, needle_environment, prove_starts, try_starts
 

@@ -30,8 +30,8 @@ from lungaccess.problem.errors import (
     ErrorModel,
     PositionError,
 )
-from lungaccess.uncertainty.risk.breathing import phase
 from lungaccess.uncertainty.risk.deviations import FIELD_OF, Deviations, Draws
+from lungaccess.uncertainty.risk.patient_errors import phase
 
 PRESETS = [load_errors(name) for name in error_preset_names()]
 MODELS = st.sampled_from([each for each in PRESETS if not each.rests])

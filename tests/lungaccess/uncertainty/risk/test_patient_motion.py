@@ -15,8 +15,8 @@ from anatomy.motion.motion import Motion
 from lungaccess.judging.checking.window import Breath
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import IN_WINDOW, ErrorModel
-from lungaccess.uncertainty.risk.breathing import BREATHS_LN, PatientMotion, model_for, phase
 from lungaccess.uncertainty.risk.deviations import Draws
+from lungaccess.uncertainty.risk.patient_errors import BREATHS_LN, PatientMotion, model_for, phase
 
 TARGET, TIP = np.array([20.0, 5.0, -30.0]), np.array([3.0, -4.0, 12.0])
 WINDOW = np.array([[0.1, 0.3], [0.6, 0.65]])

@@ -17,8 +17,8 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import NORMAL, RESTING, AngleError, ErrorModel, PositionError, with_known
 from lungaccess.uncertainty.risk import RestingRow, assess, breathing, resting_rows, resting_tip
-from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import Draws
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from stages.scope import RestingShape, TipSpread, WallContact, off_pose
 
 COUNT = 5

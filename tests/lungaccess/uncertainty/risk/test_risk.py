@@ -36,7 +36,6 @@ from lungaccess.problem.errors import (
 )
 from lungaccess.uncertainty.risk.assessment import assess
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
-from lungaccess.uncertainty.risk.breathing import model_for
 from lungaccess.uncertainty.risk.deviations import (
     Deviations,
     Draws,
@@ -46,6 +45,7 @@ from lungaccess.uncertainty.risk.deviations import (
 )
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES
+from lungaccess.uncertainty.risk.patient_errors import model_for
 from lungaccess.uncertainty.risk.statistics import Share
 from lungaccess.uncertainty.risk.tolerances import LARGEST, Tolerance, find_tolerances
 from stages.needle.path import arc_transform

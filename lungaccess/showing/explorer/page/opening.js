@@ -47,8 +47,7 @@ function open(path, values = {}) {
   byId("choices").replaceChildren();
   ask("open", { path, ...values }, (part) => {
     const { answer, accept, thick_slices: thick } = part;
-    if (answer === "link") byId("picture").src = part.address;
-    if (answer === "link") byId("picture").hidden = false;
+    if (answer === "link") Object.assign(byId("picture"), { src: part.address, hidden: false });
     if (answer === "begun") decide([part.words], []);
     if (answer === "opened") location.assign("/");
     if (answer === "segmented") decide([`The masks are in ${part.folder}: look at them.`, ...part.warnings], [
@@ -78,9 +77,8 @@ async function filesOf(entry) {
 // Open what is dropped: it is copied first, as a browser tells nobody where it lies.
 async function drop(event) {
   event.preventDefault();
-  if (busy) return;
-  const entry = event.dataTransfer.items[0] && event.dataTransfer.items[0].webkitGetAsEntry();
-  if (!entry) return;
+  const entry = event.dataTransfer.items[0]?.webkitGetAsEntry();
+  if (busy || !entry) return;
   busy = true;
   const files = await filesOf(entry), plain = (name) => name.replace(/[^\w.()+-]/g, "-").replace(/^[^\w(]/, "x").slice(-150);
   const folder = `${plain(entry.name)}-${Date.now().toString(36)}`;

@@ -60,9 +60,8 @@ export function connectPainting(page) {
       event.stopPropagation();
       const { points } = stroke, { right, up } = slice.plane;
       stroke = null;
-      if (value("tool") !== "join") {
-        send(points, cross(right, up));
-      } else if (other) {
+      if (value("tool") !== "join") send(points, cross(right, up));
+      else if (other) {
         send([other, points[0]], null);
         other = null;
       } else {

@@ -29,8 +29,8 @@ export class PlanPanel {
     byId("headline").className = `headline grade-${grade}`;
   }
 
-  clear(words) {
-    this.say(words);
+  clear(words, grade) {
+    this.say(words, grade);
     for (const id of ["plan-table", "details-table", "no-plan", "plan-actions", "command-box"]) byId(id).hidden = true;
     for (const id of ["advice", "limits"]) byId(id).replaceChildren();
     byId("estimate").textContent = "";
@@ -66,8 +66,7 @@ export class PlanPanel {
   }
 
   noPlan({ found, remedy, reasons }) {
-    this.clear("No plan was found.");
-    this.say("No plan was found.", "poor");
+    this.clear("No plan was found.", "poor");
     byId("no-plan").hidden = false;
     byId("no-plan-why").textContent = [found, remedy].filter(Boolean).join(" ");
     fillRows(byId("no-plan-reasons"), Object.entries(reasons).map(([name, count]) => [name, String(count)]));

@@ -55,9 +55,8 @@ export class WhatIfPanel {
       field.disabled = own === null;
       field.classList.toggle("changed", asked[key] !== null);
     }
-    const slider = byId("needle_radius_slider");
-    slider.disabled = byId("needle_radius_mm").disabled;
-    slider.value = byId("needle_radius_mm").value;
+    const { disabled, value } = byId("needle_radius_mm");
+    Object.assign(byId("needle_radius_slider"), { disabled, value });
     byId("fissures").value = asked.fissures === null ? "" : asked.fissures ? "yes" : "no";
     byId("fissures").classList.toggle("changed", asked.fissures !== null);
     byId("iterations").value = String(asked.iterations);

@@ -83,8 +83,7 @@ export class Compared {
   }
 
   row({ key, asked, plan, number, error }, n) {
-    const swatch = made("span", { className: "swatch" });
-    swatch.style.background = planStyle(number).colour;
+    const swatch = made("span", { className: "swatch", style: `background: ${planStyle(number).colour}` });
     const box = made("input", { type: "checkbox", checked: !this.hidden.has(key), ariaLabel: `Show plan ${n + 1}`, onchange: ({ target }) => {
       this.hidden[target.checked ? "delete" : "add"](key);
       this.page.redraw();

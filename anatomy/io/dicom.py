@@ -31,6 +31,7 @@ _UNIFORM_KEYS = ("Rows", "Columns", "PixelSpacing", "RescaleSlope", "RescaleInte
 _NEEDED_KEYS = ("ImagePositionPatient", "ImageOrientationPatient", *_UNIFORM_KEYS)
 _SERIES_KEYS = (
     "RescaleType", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "NumberOfFrames",
+    "PatientID",
 )  # fmt: skip
 
 MOST_NAMED = 5
@@ -42,7 +43,7 @@ class SeriesInfo:
     """One series of a folder: what a person needs to choose it, and its files (unsorted).
 
     `slice_mm` is the mean distance of its slices, and 0 where they state no places; `middle` is the file of
-    the slice in the middle.
+    the slice in the middle; `patient` is the identifier of the patient, which is not for showing.
     """
 
     uid: str
@@ -52,6 +53,7 @@ class SeriesInfo:
     paths: tuple[Path, ...]
     slice_mm: float
     middle: Path
+    patient: str
 
     @property
     def length_mm(self) -> float:
@@ -215,6 +217,7 @@ def _info(uid: str, files: Sequence[tuple[Path, FileDataset]]) -> SeriesInfo:
         paths=tuple(path for path, _ in files),
         slice_mm=float(np.ptp(along)) / max(len(files) - 1, 1),
         middle=files[int(np.argsort(along, kind="stable")[len(files) // 2])][0],
+        patient=str(first.get("PatientID", "")),
     )
 
 

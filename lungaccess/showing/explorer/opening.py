@@ -141,19 +141,21 @@ def _segmented(path: Path, question: OpenQuestion, folder: Path, turn: Turn) -> 
 
 
 def _series_parts(found: tuple[SeriesInfo, ...]) -> Iterator[Part]:
-    """Yield each series with its picture, and whether it is proposed."""
-    best = max(found, key=_fitness)
+    """Yield each series with its picture, and whether it is proposed; of several patients none is."""
+    patients = sorted({each.patient for each in found})
+    best = max(found, key=_fitness) if len(patients) == 1 else None
     for each in sorted(found, key=_fitness, reverse=True):
         try:
             picture = _bytes_of(each.picture_hu())
         except LungaccessError:
             picture = np.zeros((1, 1, 4), dtype=np.uint8)
+        whose = f", patient {patients.index(each.patient) + 1} of {len(patients)}" if best is None else ""
         slices = f"{len(each.paths)} slices, {each.slice_mm:.1f} mm apart, {each.length_mm:.0f} mm long"
         yield Part(
             {
                 "answer": "series", "uid": each.uid, "proposed": each is best,
                 "shape": list(picture.shape[:2]),
-                "words": f"{each.description or 'without a name'} ({each.modality}): {slices}",
+                "words": f"{each.description or 'without a name'} ({each.modality}){whose}: {slices}",
             },
             {"picture": picture},
         )  # fmt: skip

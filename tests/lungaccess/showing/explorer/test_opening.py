@@ -111,6 +111,25 @@ def test_of_several_series_the_thin_one_of_the_whole_chest_is_proposed(scanned: 
     with_client(source(scanned.parent), talk)
 
 
+def test_of_two_patients_in_a_folder_none_is_proposed(here: Path, small_phantom: Phantom) -> None:
+    (here / "disc").mkdir()
+    thin = thinned(small_phantom.ct, 8)
+    for number, patient in enumerate(("Doe^A", "Doe^B"), start=1):
+        write_series(here / "disc" / f"{number}", thin, number, PatientID=patient)
+
+    async def talk(client: Client, _explorer: Explorer) -> None:
+        found = [
+            each
+            for each, _ in await client.ask("open", path=str(here / "disc"))
+            if each["answer"] == "series"
+        ]
+        assert [each["proposed"] for each in found] == [False, False]
+        assert sorted(each["words"].partition(", patient ")[2][:6] for each in found) == ["1 of 2", "2 of 2"]
+        assert "Doe" not in json.dumps(found), "names are nobody's to see"
+
+    with_client(source(here), talk)
+
+
 def test_thick_slices_are_a_question_with_its_consequence(scanned: Path) -> None:
     async def talk(client: Client, _explorer: Explorer) -> None:
         found = [each for each, _ in await client.ask("open", path=str(scanned / "1"))]

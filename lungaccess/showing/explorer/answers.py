@@ -11,7 +11,6 @@ import numpy as np
 
 from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.kernel_clock import working_cpu_s
-from anatomy.base.settings import settings_toml
 from anatomy.base.typed import Float, Int
 from anatomy.base.words import plural
 from anatomy.grid import Volume
@@ -175,7 +174,7 @@ class Answers:
             {
                 "answer": "place", "lps_mm": place.lps_mm.tolist(), "tissue": place.tissue,
                 "lobe": self.lung.region_at(place.lps_mm), "distance_mm": dict(place.distance_mm),
-                "generation": place.generation, "may_be_target": place.may_be_target,
+                "may_be_target": place.may_be_target,
             }
         )  # fmt: skip
 
@@ -185,8 +184,7 @@ class Answers:
         motions, tree = atlas.motions, self.lung.tree
         yield Part(
             {
-                "answer": "prepared", "system": system.name, "system_toml": settings_toml(system),
-                "deployments": atlas.deployments.count, "scope_radius_mm": system.scope.radius_mm,
+                "answer": "prepared", "system": system.name, "deployments": atlas.deployments.count,
             },
             {
                 "tips": motions.tips[:, :6].astype(np.float32),
@@ -326,7 +324,6 @@ class Answers:
             {
                 "answer": "appraisal", "digest": found.digest, **appraisal.to_mapping(),
                 **appraisal_words(appraisal), "window": window or motion,
-                "breathing_known": window is not None,
                 "findings": len(appraisal.check.findings), "refusals": len(appraisal.check.refusals),
                 "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=ADVICE_S)],
             }

@@ -145,12 +145,10 @@ def explanation_part(
         )  # fmt: skip
     else:
         raise SettingsError("There is a plan to this target", remedy="Ask for it")
-    proved = made.verdict is not None and made.verdict.proved
     return Part(
         {
             "answer": "explanation",
             "headline": made.headline,
-            "proved_unreachable": proved,
             "sections": [
                 {
                     "title": each.title,

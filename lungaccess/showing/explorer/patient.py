@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.errors import LungaccessError
-from anatomy.base.typed import Float, Float32
+from anatomy.base.typed import Float32
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.segmentation.folder import STATE
@@ -40,30 +40,18 @@ def patient_facts(lung: Lung, source: PatientSource) -> dict[str, Any]:
     """Return name, warnings, targets and systems of a patient as plain values."""
     own = {system.name: system for _path, system in source.own}
     systems = own | {name: load_system(name) for name in preset_names()}
-    low, high = _box(lung)
     return {
         "patient": lung.name,
         "folder": str(source.patient),
         "warnings": list(lung.warnings),
-        "breath_hold": lung.breath_hold,
-        "breathing_known": lung.motion is not None,
-        "has_fissures": lung.has_fissures,
         "has_ct": source.ct is not None,
         "may_outline": source.ct is not None and (source.patient / STATE).is_file(),
-        "low_lps": low.tolist(),
-        "high_lps": high.tolist(),
         "carina_lps": np.asarray(lung.tree.carina_lps).tolist(),
         "targets": _targets(lung),
         "reach_colours": COLOURS,
         "first_system": source.system,
         "systems": [_system(system) for system in systems.values()],
     }
-
-
-def _box(lung: Lung) -> tuple[Float, Float]:
-    """Return the corners of the grid, LPS mm."""
-    corners = lung.grid.corners_lps
-    return corners.min(axis=0), corners.max(axis=0)
 
 
 def _targets(lung: Lung) -> list[dict[str, Any]]:
@@ -90,7 +78,6 @@ def _system(system: System) -> dict[str, Any]:
         "name": system.name,
         "description": system.description,
         "scope_diameter_mm": system.scope.outer_diameter_mm,
-        "channel_diameter_mm": system.scope.channel_diameter_mm,
         "needle_radius_mm": None if needle is None else needle.min_radius_of_curvature_mm,
         "needle_length_mm": None if needle is None else needle.max_length_mm,
         "margin_mm": system.margins.segmentation_margin_mm,
@@ -109,8 +96,8 @@ def scene_parts(lung: Lung, source: PatientSource) -> Iterator[dict[str, Any]]:
 
 def image_parts(lung: Lung, source: PatientSource, around_lps: ArrayLike) -> dict[str, Any]:
     """Return the fine voxels around a point; within the images, where the point lies beyond them."""
-    low, high = _box(lung)
-    around = np.clip(np.asarray(around_lps, dtype=np.float64), low, high)
+    corners = lung.grid.corners_lps
+    around = np.clip(np.asarray(around_lps, dtype=np.float64), corners.min(axis=0), corners.max(axis=0))
     return {"image": fine_image(lung, around[None], patient_ct(source.ct))}
 
 

@@ -7,7 +7,7 @@ import { coarser, facesFrom, nearnessOf, normalsOf } from "./surfaces.js";
 import { dot, eyeFromLps, minus, perspective, rgb } from "./vectors.js";
 
 export const VIEW_HALF_ANGLE = (15 * Math.PI) / 180;
-const RIM = 0.55, FAINT_GAIN = 1.5, DARK_GAIN = 2.3, DARK_FAINT_GAIN = 3, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
+const RIM = 0.55, FAINT_GAIN = 1.5, DARK_GAIN = 2.3, DARK_FAINT_GAIN = 2.8, HAZE = 0.6, FAR_DENSE = 0.55, NEAR_DENSE = 1.5;
 const INSIDE = "inside";
 const NO_CUT = [0, 0, 0, 0];
 // The light at the tip of the scope falls off with the distance, as on the wall.

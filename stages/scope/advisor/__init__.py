@@ -6,6 +6,7 @@ from anatomy.base.facade import lazy_exports
 
 if TYPE_CHECKING:
     from stages.scope.advisor.advisor import (
+        Advice,
         Advisor,
         PathSearch,
         PathSettings,
@@ -13,7 +14,13 @@ if TYPE_CHECKING:
         start_state,
         why_stopped,
     )
-    from stages.scope.advisor.best_motion import Candidates, Weights, evaluate_motions
+    from stages.scope.advisor.best_motion import (
+        Candidates,
+        Motion,
+        MotionEvaluation,
+        Weights,
+        evaluate_motions,
+    )
     from stages.scope.advisor.environment import ScopeEnvironment
     from stages.scope.advisor.kinematics import (
         ScopeModel,

@@ -1,4 +1,4 @@
-"""The advisor: the path of a scope to a goal [Rosell2012].
+"""The advisor: which motion leads on from wherever the scope is, and the path to the goal [Rosell2012].
 
 The path is that of Algorithm 2, with retreats where it is stuck.  The paper stops where no candidate is
 valid.  Here the look-ahead is first halved, down to a voxel; then the scope is pulled back along its path and
@@ -7,20 +7,20 @@ tries again with other weights and another look-ahead.  The path that comes near
 
 import math
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
-from anatomy.base.records import frozen_value
+from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.settings import impossible, quantity, settings, switch
 from anatomy.base.typed import Float
-from stages.scope.advisor.best_motion import Weights
+from stages.scope.advisor.best_motion import Candidates, Motion, MotionEvaluation, Weights, evaluate_motions
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kernels import motion as kernel
-from stages.scope.advisor.kinematics import ScopeModel, ScopeState, straight_state, tool_frames
+from stages.scope.advisor.kinematics import ScopeModel, ScopeState, straight_state, tip_frames, tool_frames
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import Goal, NavigationField, navigation_field
 from stages.scope.advisor.path import ScopePath
@@ -159,9 +159,32 @@ def _cut(states: Float, info: Float) -> tuple[Float, Float]:
     return states[:end], info[:end]
 
 
+Action = Literal["advance", "pull back", "arrived"]
+
 THINNER_STEP_MM = 0.25
 THINNEST_MM = 0.5
 """Radii of thinner scopes that are tried."""
+
+
+@frozen_record
+class Advice:
+    """What the user is advised to do.
+
+    Args:
+        action: "advance"; "pull back" where no motion leads on; "arrived" in the goal voxel.
+        motion: The best motion; None if the tip has arrived.
+        cost: Eq. 9 of the best motion; 0 if there is none.
+        candidates: All that were evaluated.
+        own: The evaluation of the user's own motion.
+        distance_mm: From the tip to the centre of the goal voxel, straight.
+    """
+
+    action: Action
+    motion: Motion | None
+    cost: float
+    candidates: Candidates
+    own: MotionEvaluation | None
+    distance_mm: float
 
 
 @frozen_value
@@ -199,6 +222,66 @@ class Advisor:
     def field(self) -> NavigationField:
         """The navigation field of the goal."""
         return self.environment.field
+
+    def advise(self, state: ScopeState, *, own: Motion | None = None) -> Advice:
+        """Return the best motion from any state whose tip is in the lumen, and evaluate the user's own one.
+
+        Where no candidate is valid the look-ahead is halved, down to the smallest voxel side (not in
+        reproduction); where none is valid even then, the advice is to pull back as the scope came.
+
+        Args:
+            own: A motion that the user is about to make, evaluated at its own advance, at most the
+                look-ahead.
+
+        Raises:
+            AnatomyError: If the tip is not in the lumen.
+        """
+        tip = tip_frames(self.environment.model, state.array)[0][:3, 3]
+        voxel = self.environment.lumen.voxel_at(tip)
+        if voxel < 0:
+            raise AnatomyError(
+                f"The tip of the scope is not in the lumen, at LPS {tip.round(1).tolist()}",
+                expected="a tip in the airways that hang together with the trachea",
+                remedy="Check the frame of the scope's position",
+            )
+        found = self._weigh(state)
+        choice: tuple[Action, Motion | None, float] = self._choose(found, state)
+        action, motion, cost = ("arrived", None, 0.0) if voxel == self.goal.voxel else choice
+        return Advice(
+            action=action,
+            motion=motion,
+            cost=cost,
+            candidates=found,
+            own=None if own is None else self._evaluate(state, own),
+            distance_mm=float(np.linalg.norm(tip - self.goal.centre_lps)),
+        )
+
+    def _weigh(self, state: ScopeState) -> Candidates:
+        """Return the candidates of the longest look-ahead at which one is valid, or of the least."""
+        look_ahead = self.options.look_ahead_mm
+        least = (
+            look_ahead
+            if self.environment.reproduction
+            else float(self.environment.lumen.grid.spacing_mm.min())
+        )
+        while True:
+            found, _ = evaluate_motions(self.environment, state, look_ahead, self.options.weights)
+            if found.best >= 0 or look_ahead <= least:
+                return found
+            look_ahead = max(0.5 * look_ahead, least)
+
+    def _choose(self, found: Candidates, state: ScopeState) -> tuple[Action, Motion, float]:
+        if found.best >= 0:
+            return "advance", found.motion(found.best), float(found.cost[found.best])
+        back = Motion(
+            advance_mm=-self.options.look_ahead_mm, twist_rad=state.twist_rad, bend_rad=state.bend_rad
+        )
+        return "pull back", back, 0.0
+
+    def _evaluate(self, state: ScopeState, own: Motion) -> MotionEvaluation | None:
+        most = self.options.look_ahead_mm
+        ahead = min(own.advance_mm, most) if own.advance_mm > 0.0 else most
+        return evaluate_motions(self.environment, state, ahead, self.options.weights, own=own)[1]
 
     def path(self, start: ScopeState, *, seed: int = 0) -> ScopePath:
         """Return the path from a state to the goal, or to the nearest point that was reached.

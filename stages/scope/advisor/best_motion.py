@@ -4,12 +4,13 @@ Where all valid candidates have the same potential, K_NF1 is 0 for all; the same
 adds nothing to K_alpha.  Among equals the first wins, in the order of the table.
 """
 
+import math
 from collections.abc import Iterator
 from typing import Annotated
 
 import numpy as np
 
-from anatomy.base.records import frozen_record
+from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.settings import impossible, quantity, settings
 from anatomy.base.typed import Float, Int
 from anatomy.grid import read_only
@@ -44,6 +45,15 @@ class Weights:
         return np.array([self.nf1, self.clearance, self.twist])
 
 
+@frozen_value
+class Motion:
+    """An advance, back if negative, and the twist alpha and bend beta when it is done."""
+
+    advance_mm: float
+    twist_rad: float
+    bend_rad: float
+
+
 @frozen_record
 class Candidates:
     """The candidates of a motion and what they cost; C = 121 rows, twist by twist.
@@ -71,6 +81,28 @@ class Candidates:
     cost: Float
     look_at_lps: Float
 
+    def motion(self, row: int) -> Motion:
+        """Return the motion of a row."""
+        return Motion(
+            advance_mm=self.advance_mm,
+            twist_rad=float(self.twist_rad[row]),
+            bend_rad=float(self.bend_rad[row]),
+        )
+
+
+@frozen_value
+class MotionEvaluation:
+    """The evaluation of the user's own motion beside the candidates.
+
+    Args:
+        verdict: One of `VERDICTS`.
+        cost: Eq. 9 with the extremes of the candidates, terms held to [0, 1]; infinity if the motion is not
+            valid.
+    """
+
+    verdict: str
+    cost: float
+
 
 def offsets(rng: np.random.Generator | None) -> Float:
     """Return the random shares (121, 2) of a spacing that move candidates, zeros without a generator."""
@@ -86,21 +118,33 @@ def evaluate_motions(
     weights: Weights,
     *,
     rng: np.random.Generator | None = None,
-) -> Candidates:
-    """Evaluate all candidates of a motion from a state (eqs. 3 to 9).
+    own: Motion | None = None,
+) -> tuple[Candidates, MotionEvaluation | None]:
+    """Evaluate all candidates from a state (eqs. 3 to 9), and the user's own motion if there is one.
 
     Args:
         state: Its tip lies in the lumen.
         advance_mm: Look-ahead of the candidates.
         rng (numpy Generator): Moves all candidates but the middle one at random within their spacing (fig.
             5b); they stay on the grid of eq. 3 if None.
+        own: A motion of the user, evaluated with the candidates' look-ahead.
     """
-    table = np.zeros((CANDIDATES, kernel.COLUMNS))
+    table = np.zeros((CANDIDATES + (own is not None), kernel.COLUMNS))
+    if own is not None:
+        table[CANDIDATES, kernel.TWIST], table[CANDIDATES, kernel.BEND] = own.twist_rad, own.bend_rad
     best = kernel.best_motion(
         environment.arrays, environment.scope, state.array, float(advance_mm), weights.array, offsets(rng),
         table,
     )  # fmt: skip
-    return _candidates(table, float(advance_mm), int(best))
+    mine = None
+    if own is not None:
+        row = table[CANDIDATES]
+        mine = MotionEvaluation(verdict=VERDICTS[int(row[kernel.VERDICT])], cost=float(row[kernel.COST]))
+        scope = environment.scope
+        in_range = scope.twist_low <= own.twist_rad <= scope.twist_high
+        if not (in_range and scope.bend_low <= own.bend_rad <= scope.bend_high):
+            mine = MotionEvaluation(verdict=VERDICTS[0], cost=math.inf)
+    return _candidates(table[:CANDIDATES], float(advance_mm), int(best)), mine
 
 
 def _candidates(table: Float, advance_mm: float, best: int) -> Candidates:

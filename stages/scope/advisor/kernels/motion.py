@@ -100,10 +100,10 @@ def evaluate_motion(lumen, scope, state, distance, alpha, beta, voxel, gradient,
 
 
 @inlined_kernel
-def fill_costs(scope, table, weights, alpha_now):
-    """Fill the costs of the valid rows (eqs. 4 and 7 to 9); their extremes normalise."""
+def fill_costs(scope, table, count, weights, alpha_now):
+    """Fill the costs of the valid rows (eqs. 4 and 7 to 9); the extremes of the first `count` normalise."""
     low_p, high_p, low_g, high_g = np.inf, -np.inf, np.inf, -np.inf
-    for n in range(table.shape[0]):
+    for n in range(count):
         if table[n, VERDICT] == VALID:
             low_p = min(low_p, table[n, POTENTIAL])
             high_p = max(high_p, table[n, POTENTIAL])
@@ -123,10 +123,10 @@ def fill_costs(scope, table, weights, alpha_now):
 
 
 @inlined_kernel
-def best_of(table):
+def best_of(table, count):
     """Return the row of least cost, on ties the first in the order twist by twist; -1 if none is valid."""
     best = -1
-    for n in range(table.shape[0]):
+    for n in range(count):
         if table[n, VERDICT] == VALID and (best < 0 or table[n, COST] < table[best, COST]):
             best = n
     return best
@@ -136,7 +136,8 @@ def best_of(table):
 def evaluate_candidates(lumen, scope, state, look_ahead, weights, offsets, table, gradient, scratch, joints):
     """Fill the table of all candidates (eq. 3) and return the best one, -1 if none is valid.
 
-    `offsets` (121, 2) are shares, from -0.5 to 0.5, of the spacing of twist and bend.
+    `offsets` (121, 2) are shares, from -0.5 to 0.5, of the spacing of twist and bend.  A row beyond the
+    candidates, if there is one, holds the twist and bend of a motion that is evaluated like them.
     """
     x, y, z = tip_of(state, scope.link, scope.links, state[12], state[13])
     voxel = voxel_of(lumen, x, y, z)
@@ -165,8 +166,13 @@ def evaluate_candidates(lumen, scope, state, look_ahead, weights, offsets, table
                 evaluate_motion(
                     lumen, scope, state, look_ahead, alpha, beta, voxel, gradient, table[n], scratch, joints
                 )
-    fill_costs(scope, table, weights, state[12])
-    return best_of(table)
+    for n in range(CANDIDATES, table.shape[0]):
+        alpha, beta = table[n, TWIST], table[n, BEND]
+        evaluate_motion(
+            lumen, scope, state, look_ahead, alpha, beta, voxel, gradient, table[n], scratch, joints
+        )
+    fill_costs(scope, table, CANDIDATES, weights, state[12])
+    return best_of(table, CANDIDATES)
 
 
 @kernel()
@@ -247,7 +253,7 @@ def compute_path(lumen, scope, weights, goal, steps, randomness, looks, states, 
                     moved = True
                 else:
                     table[best, VERDICT] = COLLIDES
-                    best = best_of(table)
+                    best = best_of(table, CANDIDATES)
             if moved:
                 info[count, 0] = table[best, COST]
                 info[count, 1] = look_ahead

@@ -10,8 +10,9 @@ import pytest
 from anatomy.base.errors import AnatomyError, SettingsError
 from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, PathSettings, start_state, why_stopped
+from stages.scope.advisor.best_motion import Motion
 from stages.scope.advisor.environment import ScopeEnvironment
-from stages.scope.advisor.kinematics import ScopeModel, advanced
+from stages.scope.advisor.kinematics import ScopeModel, advanced, straight_state
 from stages.scope.advisor.lumen import Lumen
 from stages.scope.advisor.nf1 import goal_at
 from stages.scope.advisor.path import ScopePath, camera_flight, instructions_along
@@ -101,6 +102,8 @@ def test_reproduction_obeys_equation_1_and_stops_where_the_paper_stops(forked: t
         assert advisor.environment.fits(path.states).all()
         assert (path.steps_mm[1:] == 1.0).all()
         assert path.potentials[path.nearest] == path.potentials.min()
+        if not path.reached:
+            assert advisor.advise(path.state(path.count - 1)).action == "pull back"
 
 
 def test_too_narrow_is_said_with_the_place_and_thinner_scopes_are_tried(forked: tuple[Lung, Lumen]) -> None:
@@ -122,6 +125,43 @@ def test_a_scope_that_does_not_fit_is_refused(forked: tuple[Lung, Lumen]) -> Non
     lung, lumen = forked
     with pytest.raises(AnatomyError, match="fits nowhere in the trachea"):
         start_state(lumen, lung.tree, ScopeModel(radius_mm=8.0))
+
+
+def test_best_motions_lead_on_or_end_with_a_word(forked: tuple[Lung, Lumen]) -> None:
+    advisor, path = path_to(forked, GOALS[0])
+    for number in range(path.count - 1):
+        advice = advisor.advise(path.state(number))
+        if advice.action == "advance":
+            assert advice.motion is not None
+            assert advice.motion.advance_mm <= 5.0
+            assert advice.cost == advice.candidates.cost.min()
+            assert 0.0 <= advice.cost <= 1.0
+        else:
+            assert advice.action == "pull back"
+            assert (advice.candidates.verdict != 3).all()
+    done = advisor.advise(path.state(path.count - 1))
+    assert (done.action, done.motion) == ("arrived", None)
+
+
+def test_the_users_own_motion_is_evaluated(forked: tuple[Lung, Lumen]) -> None:
+    advisor, path = path_to(forked, GOALS[1])
+    state = path.state(10)
+    advice = advisor.advise(state)
+    assert advice.motion is not None
+    own = advisor.advise(state, own=advice.motion).own
+    assert own is not None
+    assert (own.verdict, own.cost) == ("valid", advice.cost)
+    bent = Motion(advance_mm=5.0, twist_rad=0.0, bend_rad=math.radians(115.0))
+    wrong = advisor.advise(state, own=bent).own
+    assert wrong is not None
+    assert wrong.verdict in ("collides", "leads away")
+    assert wrong.cost == math.inf
+
+
+def test_a_tip_outside_the_lumen_gets_no_advice(forked: tuple[Lung, Lumen]) -> None:
+    advisor, _path = path_to(forked, GOALS[0])
+    with pytest.raises(AnatomyError, match="not in the lumen"):
+        advisor.advise(straight_state(np.array([30.0, 0.0, 30.0]), np.array([0.0, 0.0, -1.0])))
 
 
 def test_instructions_name_every_bifurcation(forked: tuple[Lung, Lumen]) -> None:

@@ -11,7 +11,7 @@ import pytest
 from anatomy.base.errors import SettingsError
 from anatomy.lung import Lung
 from stages.scope.advisor.advisor import Advisor, PathSettings, start_state
-from stages.scope.advisor.best_motion import CANDIDATES, Weights, evaluate_motions, offsets
+from stages.scope.advisor.best_motion import CANDIDATES, VERDICTS, Motion, Weights, evaluate_motions, offsets
 from stages.scope.advisor.environment import ScopeEnvironment
 from stages.scope.advisor.kinematics import ScopeModel, ScopeState, advanced, tool_frames
 from stages.scope.advisor.lumen import Lumen
@@ -111,7 +111,7 @@ def test_the_table_is_that_of_the_paper(
     for state in states:
         rng = None if seed is None else np.random.default_rng(seed)
         moved = offsets(None if seed is None else np.random.default_rng(seed))
-        found = evaluate_motions(environment, state, 5.0, WEIGHTS, rng=rng)
+        found, _ = evaluate_motions(environment, state, 5.0, WEIGHTS, rng=rng)
         expected = by_the_paper(environment, state, 5.0, moved)
         counted += np.bincount(expected["verdict"], minlength=4)
         np.testing.assert_array_equal(found.verdict, expected["verdict"])
@@ -135,7 +135,7 @@ def test_the_true_radius_only_takes_candidates_away(
     environment = environment_of(forked[1], reproduction=False, model=ScopeModel(radius_mm=2.0))
     valid = 0
     for state in states:
-        found = evaluate_motions(environment, state, 5.0, WEIGHTS)
+        found, _ = evaluate_motions(environment, state, 5.0, WEIGHTS)
         expected = by_the_paper(environment, state, 5.0, offsets(None))
         assert ((found.verdict == VALID) <= (expected["verdict"] == VALID)).all()
         np.testing.assert_array_equal(found.verdict == AWAY, expected["verdict"] == AWAY)
@@ -148,9 +148,9 @@ def test_random_offsets_stay_within_their_spacing_and_their_range(
     forked: tuple[Lung, Lumen], states: list[ScopeState]
 ) -> None:
     environment = environment_of(forked[1], reproduction=False)
-    plain = evaluate_motions(environment, states[1], 5.0, WEIGHTS)
-    moved = evaluate_motions(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
-    again = evaluate_motions(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
+    plain, _ = evaluate_motions(environment, states[1], 5.0, WEIGHTS)
+    moved, _ = evaluate_motions(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
+    again, _ = evaluate_motions(environment, states[1], 5.0, WEIGHTS, rng=np.random.default_rng(1))
     np.testing.assert_array_equal(moved.cost, again.cost)
     twist, bend = moved.twist_rad - plain.twist_rad, moved.bend_rad - plain.bend_rad
     assert np.abs(twist).max() <= math.radians(7.5) + 1e-12
@@ -165,11 +165,34 @@ def test_random_offsets_stay_within_their_spacing_and_their_range(
 def test_ties_and_ranges_of_nothing_are_defined(forked: tuple[Lung, Lumen], states: list[ScopeState]) -> None:
     stiff = ScopeModel(twist_low_deg=0.0, twist_high_deg=0.0, bend_low_deg=0.0, bend_high_deg=0.0)
     environment = environment_of(forked[1], reproduction=False, model=stiff)
-    found = evaluate_motions(environment, replace(states[0], bend_rad=0.0, twist_rad=0.0), 5.0, WEIGHTS)
+    found, _ = evaluate_motions(environment, replace(states[0], bend_rad=0.0, twist_rad=0.0), 5.0, WEIGHTS)
     valid = np.flatnonzero(found.verdict == VALID)
     assert len(valid) == 11, "bends other than 0 are out of range, the twists are all the same"
     assert (found.cost[valid] == 0.0).all(), "all equal in potential and clearance, no twist"
     assert found.best == valid[0]
+
+
+def test_ones_own_motion_costs_what_the_candidate_costs(
+    forked: tuple[Lung, Lumen], states: list[ScopeState]
+) -> None:
+    environment = environment_of(forked[1], reproduction=False)
+    table, _ = evaluate_motions(environment, states[2], 5.0, WEIGHTS)
+    verdicts = set()
+    for row in range(CANDIDATES):
+        if table.verdict[row] == OUT:
+            continue
+        again, own = evaluate_motions(environment, states[2], 5.0, WEIGHTS, own=table.motion(row))
+        assert own is not None
+        assert own.verdict == VERDICTS[table.verdict[row]]
+        assert own.cost == table.cost[row]
+        assert again.best == table.best
+        verdicts.add(own.verdict)
+    assert "valid" in verdicts
+    _, beyond = evaluate_motions(
+        environment, states[2], 5.0, WEIGHTS, own=Motion(advance_mm=5.0, twist_rad=2.0, bend_rad=0.0)
+    )
+    assert beyond is not None
+    assert (beyond.verdict, beyond.cost) == ("out of range", math.inf)
 
 
 def test_weights_add_up_to_one() -> None:

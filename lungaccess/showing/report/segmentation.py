@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 
 from anatomy.base.typed import Array, Float, Mask
 from anatomy.grid import Grid, Volume
+from anatomy.lobes import LEAST_CHANCE, UNKNOWN
 from anatomy.morphology import bounds
 from anatomy.segmentation.parts import Parts
 from lungaccess.showing.report import style
@@ -20,6 +21,7 @@ PANEL_IN = 3.1
 MARGIN_MM = 12.0
 LARGE_VESSEL, SMALL_VESSEL = "#D81B1B", "#F0A050"
 RIGHT, LEFT, NODULE, CENTRAL, WALL = "#E6C200", "#00B4D8", "#00FF5A", "#C77DFF", "#7BD0FF"
+FISSURE, NOT_KNOWN = "#B58CFF", "#FF8FB1"
 PLANES = (("sagittal", 0, (1, 2)), ("coronal", 1, (0, 2)), ("axial", 2, (0, 1)))
 """Name, normal, and the axes across and up, as LPS axes."""
 
@@ -52,8 +54,8 @@ def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[st
                 f"{name}, LPS {'xyz'[normal]} = {middle[normal]:.0f} mm", fontsize=8, color=style.INK
             )
     if parts is not None:
-        figure.legend(handles=_legend(), loc="lower center", ncol=8, fontsize=9, frameon=False)
-    figure.subplots_adjust(left=0.005, right=0.995, top=0.975, bottom=0.045, wspace=0.02, hspace=0.09)
+        figure.legend(handles=_legend(), loc="lower center", ncol=5, fontsize=9, frameon=False)
+    figure.subplots_adjust(left=0.005, right=0.995, top=0.975, bottom=0.065, wspace=0.02, hspace=0.09)
     return style.save_png(figure, path)
 
 
@@ -109,7 +111,11 @@ def _panel(axes: Axes, ct: Volume, parts: Parts | None, section: _Section, downw
 
 
 def _draw_parts(axes: Axes, parts: Parts, section: _Section) -> None:
+    fissures = parts.fissures
     for mask, colour, alpha in (
+        (fissures == UNKNOWN, NOT_KNOWN, 0.12),
+        ((fissures >= LEAST_CHANCE) & (fissures < UNKNOWN), FISSURE, 0.25),
+        ((fissures > 0) & (fissures < LEAST_CHANCE), FISSURE, 0.9),
         (parts.all_vessels, SMALL_VESSEL, 0.55),
         (parts.large_vessels, LARGE_VESSEL, 0.75),
         (parts.wall, WALL, 0.8),
@@ -137,6 +143,6 @@ def _legend() -> list[Line2D]:
     entries = (
         ("right lung", RIGHT), ("left lung", LEFT), ("airway lumen", style.SCOPE), ("airway wall", WALL),
         ("trachea and main bronchi", CENTRAL), ("large vessel", LARGE_VESSEL), ("vessel", SMALL_VESSEL),
-        ("nodule", NODULE),
+        ("nodule", NODULE), ("fissure, faint: its band", FISSURE), ("fissures not known", NOT_KNOWN),
     )  # fmt: skip
     return [Line2D([], [], color=colour, lw=3, label=label) for label, colour in entries]

@@ -16,7 +16,7 @@ from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.errors import NORMAL, RESTING, AngleError, ErrorModel, PositionError, with_known
-from lungaccess.uncertainty.risk import RestingRow, assess, breathing, resting_rows, resting_tip
+from lungaccess.uncertainty.risk import RestingRow, assess, patient_errors, resting_rows, resting_tip
 from lungaccess.uncertainty.risk.deviations import Draws
 from lungaccess.uncertainty.risk.patient_errors import model_for
 from stages.scope import RestingShape, TipSpread, WallContact, off_pose
@@ -96,17 +96,17 @@ def test_without_a_plan_nothing_is_drawn() -> None:
 def test_bias_and_spread_come_on_top_of_what_is_stated(
     monkeypatch: pytest.MonkeyPatch, toy_plan: Plan, toy_lung: Any
 ) -> None:
-    monkeypatch.setattr(breathing, "resting_tip", lambda *_: spread_of())
-    found = breathing.about_resting_tip(RESTED, toy_plan, toy_lung)
+    monkeypatch.setattr(patient_errors, "resting_tip", lambda *_: spread_of())
+    found = patient_errors.about_resting_tip(RESTED, toy_plan, toy_lung)
     assert found.wall is None and not found.rests
     assert found.scope_position.bias == (0.5, 0.0, 0.0)
     assert (found.scope_position.patient, found.scope_position.attempt) == (0.4, 0.5)
     # A tip turned farther than that fails all the same.
-    assert found.scope_direction.bias == (6.0, -breathing.MOST)
+    assert found.scope_direction.bias == (6.0, -patient_errors.MOST)
     assert (found.scope_direction.patient, found.scope_direction.attempt) == (1.0, 2.0)
     assert found.scope_position.source.startswith("assumption; ")
     assert found.scope_direction.source == "shaft at rest on the wall: [Wang2011]"
-    assert breathing.about_resting_tip(load_errors(), toy_plan, toy_lung) == load_errors()
+    assert patient_errors.about_resting_tip(load_errors(), toy_plan, toy_lung) == load_errors()
 
 
 def test_limits_that_are_exceeded_are_said() -> None:
@@ -132,13 +132,13 @@ def test_what_came_to_rest_in_a_lung_of_the_cache_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     made = spread_of(other=other)
-    monkeypatch.setattr(breathing, "spread_of_tip", lambda *_: made)
-    monkeypatch.setattr(breathing, "_SPREADS", {})
+    monkeypatch.setattr(patient_errors, "spread_of_tip", lambda *_: made)
+    monkeypatch.setattr(patient_errors, "_SPREADS", {})
     stored = replace(small_lung)
     object.__setattr__(stored, "folder", tmp_path / "lung")
     assert resting_tip(small_plan, stored, WallContact()) is made
-    monkeypatch.setattr(breathing, "spread_of_tip", lambda *_: pytest.fail("made again"))
-    monkeypatch.setattr(breathing, "_SPREADS", {})
+    monkeypatch.setattr(patient_errors, "spread_of_tip", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(patient_errors, "_SPREADS", {})
     again = resting_tip(small_plan, stored, WallContact())
     assert resting_rows(again, WallContact()) == resting_rows(made, WallContact())
     assert again.nominal.settled and np.array_equal(again.nominal.frames, made.nominal.frames)

@@ -1,4 +1,4 @@
-"""What a person corrected by hand, voxel by voxel, over whatever made the masks."""
+"""Corrections by hand are kept voxel by voxel, and stand over whatever made the masks."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,8 +14,8 @@ from anatomy.morphology import Window, bounds, grown_by_one, window
 from anatomy.patient import PatientImages
 
 AS_MADE, TISSUE, AIRWAY, VESSEL, FISSURE, NODULE = range(6)
-"""What a voxel of corrections says: nothing, that it is none of the others, or that it is lumen of an airway,
-vessel, fissure or nodule."""
+"""A voxel of corrections says nothing, that it is none of the others, or that it is lumen of an airway,
+vessel, fissure or nodule: one number a voxel, so that two corrections of it cannot contradict each other."""
 PAINTED: Mapping[str, int] = MappingProxyType(
     {"airway": AIRWAY, "vessel": VESSEL, "fissure": FISSURE, "nodule": NODULE}
 )

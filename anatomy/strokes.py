@@ -12,7 +12,7 @@ from anatomy.grid import Grid
 from anatomy.morphology import Window, bounds, window
 
 TOOLS = ("paint", "erase", "fill", "cut", "join")
-"""What a stroke does; `Stroke` says how."""
+"""A stroke does one of these; `Stroke` says how."""
 LONGEST_GAP_MM = 40.0
 """A gap in an airway is shorter: what lies farther apart is joined by painting."""
 AROUND_GAP_MM = 12.0

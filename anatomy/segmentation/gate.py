@@ -20,8 +20,8 @@ CUBE_MM = 4.0
 TOP_SHARE, BASE_SHARE = 0.1, 0.3
 """At these shares of the height the shoulders narrow the chest, and the diaphragm rises."""
 LEAST_BACK, LEAST_BASE = 0.24, 0.48
-"""Of the width of both lungs: so far behind and below the carina each reaches.  In healthy phantoms these are
-0.33 and 0.58 at least; with fluid at the back 0.13, and with the lower third gone 0.39."""
+"""Each lung reaches at least so far behind and below the carina, as shares of the width of both: in healthy
+phantoms it is 0.33 and 0.58 at least; with fluid at the back 0.13, and with the lower third gone 0.39."""
 FITS = 20
 """The midline settles after so many weighted fits, in which levels that lack a lobe count less and less."""
 SOLID_HU, SOLID_RADIUS_MM, LEAST_SOLID_ML = -200.0, 6.0, 10.0

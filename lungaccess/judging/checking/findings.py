@@ -1,4 +1,4 @@
-"""What the check found: one line for each thing it looked at, and how poses and directions are compared."""
+"""Findings hold what the check found, a line each; poses and directions are compared here, too."""
 
 import math
 from collections.abc import Sequence

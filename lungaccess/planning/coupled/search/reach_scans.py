@@ -176,7 +176,7 @@ class WindowReachScan(_PointByPoint):
 
 
 Scan = ReachScan | TubeReachScan | WindowReachScan
-"""What tells which of many points are reached, and how well."""
+"""A scan tells which of many points are reached, and how well."""
 
 
 def reach_scan(

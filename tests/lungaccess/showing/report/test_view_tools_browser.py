@@ -115,7 +115,8 @@ def test_two_clicks_measure(page: browser.Browser, plans: tuple[Plan, ...]) -> N
     length, along = (float(part.split(" mm")[0]) for part in words.split("; "))
     # Within the radii of what was hit: the needle is drawn thicker than it is, the target is a ball.
     assert length == pytest.approx(np.linalg.norm(ends[1] - ends[0]), abs=2.5)
-    assert length == pytest.approx(np.linalg.norm(np.subtract(*points)), abs=0.2)
+    # Words have a tenth of a millimetre; the picture holds depths to some micrometres.
+    assert length == pytest.approx(np.linalg.norm(np.subtract(*points)), abs=0.06)
     assert along == pytest.approx(
         np.linalg.norm(np.diff(needle[len(needle) // 5 :], axis=0), axis=1).sum(), abs=2.5
     )

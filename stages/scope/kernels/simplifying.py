@@ -73,18 +73,26 @@ def _look_at_section(walls, section, base, twist, bend, row, out):
 
 
 @inner_kernel
-def _look(walls, section, entry, group, counts, x, bounds, target, base, moved, out):
+def _look(walls, section, group, counts, x, bounds, target, first, bases, rows, moved, out):
     """Fill in the residuals (R + EQUATIONS,) of unknowns, those of the equations last.
 
-    group (K + 1,) : group of each leg and of the end; counts (K + 1,) : samples of each.
+    group (K + 1,) : group of each leg and of the end; counts (K + 1,) : samples of each; bases (K + 2, 12)
+    and rows (K + 1,) : frame and residual with which each begins, which are filled in, the first frame is
+    given.  With a `first` above -1 the legs before it are as in the last look at all; bases then stay.
     """
     legs = group.shape[0] - 1
     groups = group[legs] + 1
     advances = x.shape[0] - legs
-    base[:] = entry
-    row = 0
+    begin, base = max(first, 0), bases[legs + 1]
+    base[:] = bases[begin]
+    row = rows[begin]
     twist_before = bend_before = 0.0
-    for k in range(legs + 1):
+    if begin > 0:
+        twist_before, bend_before = x[group[begin - 1]], x[min(groups + begin - 1, advances - 1)]
+    for k in range(begin, legs + 1):
+        if first < 0:
+            bases[k] = base
+            rows[k] = row
         twist, bend = x[group[k]], x[min(groups + k, advances - 1)]
         advance = x[advances + k] if k < legs else 0.0
         # The twist is where the section is less bent: that moves it least.
@@ -132,11 +140,11 @@ def _look(walls, section, entry, group, counts, x, bounds, target, base, moved, 
 
 
 @inner_kernel
-def _step(slopes, residuals, scale, damping, matrix, right):
+def _step(slopes, begins, residuals, scale, damping, matrix, right):
     """Fill `right` with the step of the linearised problem and its multipliers; tell whether there is one.
 
-    slopes (n, R + EQUATIONS) : of the residuals, by unknowns.  Without damping the step is the shortest that
-    solves the equations.
+    slopes (n, R + EQUATIONS) : of the residuals, by unknowns, 0 before `begins` (n,).  Without damping the
+    step is the shortest that solves the equations.
     """
     n = slopes.shape[0]
     rows = slopes.shape[1] - EQUATIONS
@@ -144,11 +152,11 @@ def _step(slopes, residuals, scale, damping, matrix, right):
     for i in range(n):
         right[i] = 0.0
         if damping > 0.0:
-            for r in range(rows):
+            for r in range(begins[i], rows):
                 right[i] -= slopes[i, r] * residuals[r]
             for j in range(i + 1):
                 total = 0.0
-                for r in range(rows):
+                for r in range(max(begins[i], begins[j]), rows):
                     total += slopes[i, r] * slopes[j, r]
                 matrix[i, j] = total
                 matrix[j, i] = total
@@ -206,12 +214,21 @@ def fit_legs(walls, section, entry, target, group, counts, x, bounds, steps, gai
     for i in range(n):
         if bounds[i, 0] == bounds[i, 1]:
             scale[i] = FROZEN
-    base, moved = np.zeros(12), np.zeros(12)
+    bases, moved, rows = np.zeros((legs + 2, 12)), np.zeros(12), np.zeros(legs + 1, dtype=np.int64)
+    bases[0] = entry
+    # The first leg that each unknown moves: what lies before it has no slope.
+    firsts, begins = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    for k in range(legs, -1, -1):
+        firsts[group[k]] = k
+        firsts[min(groups + k, advances - 1)] = k
+        if k < legs:
+            firsts[advances + k] = k
     residuals, trial = np.zeros(total), np.zeros(total)
     slopes = np.zeros((n, total))
     matrix, right = np.zeros((n + EQUATIONS, n + EQUATIONS)), np.zeros(n + EQUATIONS)
     near = x.copy()
-    _look(walls, section, entry, group, counts, x, bounds, target, base, moved, residuals)
+    _look(walls, section, group, counts, x, bounds, target, -1, bases, rows, moved, residuals)
+    begins[:] = rows[firsts]
     merit = _merit(residuals)
     damping = FIRST_DAMPING
     # Newton's method on the equations alone converges in fewer steps from nearby.
@@ -223,27 +240,27 @@ def fit_legs(walls, section, entry, target, group, counts, x, bounds, steps, gai
                 if not bounds[i, 0] < x[i] < bounds[i, 1]:
                     x[i] = min(max(x[i], bounds[i, 0]), bounds[i, 1])
                     scale[i] = FROZEN
-            _look(walls, section, entry, group, counts, x, bounds, target, base, moved, residuals)
+            _look(walls, section, group, counts, x, bounds, target, -1, bases, rows, moved, residuals)
             if _off(residuals) < CLOSED:
                 break
         for i in range(n):
             near[:] = x
             near[i] += DIFFERENCE
-            _look(walls, section, entry, group, counts, near, bounds, target, base, moved, trial)
-            for r in range(total):
+            _look(walls, section, group, counts, near, bounds, target, firsts[i], bases, rows, moved, trial)
+            for r in range(begins[i], total):
                 slopes[i, r] = (trial[r] - residuals[r]) / DIFFERENCE
         if closing:
-            if not _step(slopes, residuals, scale, 0.0, matrix, right):
+            if not _step(slopes, begins, residuals, scale, 0.0, matrix, right):
                 return math.inf
             for i in range(n):
                 x[i] += right[i]
             continue
         before = merit
         while damping <= MOST_DAMPING:
-            if _step(slopes, residuals, scale, damping, matrix, right):
+            if _step(slopes, begins, residuals, scale, damping, matrix, right):
                 for i in range(n):
                     near[i] = x[i] + right[i]
-                _look(walls, section, entry, group, counts, near, bounds, target, base, moved, trial)
+                _look(walls, section, group, counts, near, bounds, target, -1, bases, rows, moved, trial)
                 if _merit(trial) < merit:
                     x[:] = near
                     residuals[:] = trial

@@ -65,8 +65,11 @@ function nearestPoint({ places }, point) {
   return found;
 }
 
-// Return where a point is in the picture, in pixels of the page from its upper left; null behind the camera.
-export function project({ canvas, view: { eye, clip } }, point) {
+// Return where a point is in the picture, in pixels of the page from its upper left; null behind the camera and before
+// the first picture.
+export function project({ canvas, view }, point) {
+  if (!view) return null;
+  const { eye, clip } = view;
   const at = (row) => eye[row] * point[0] + eye[4 + row] * point[1] + eye[8 + row] * point[2] + eye[12 + row];
   const z = -at(2);
   if (z <= 0) return null;

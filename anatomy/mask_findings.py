@@ -43,7 +43,9 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     ml = images.grid.voxel_volume_mm3 / 1000.0
     lung, lumen, vessels = images.lung.array, images.lumen.array, images.vessels.array
     fissures = None if images.fissures is None else images.fissures.array
-    yield from _of_lungs(lung, {"vessels": vessels, "fissures": fissures}, images.grid, tree)
+    # A band says itself where fissures are not known; an inferred oblique fissure may begin below the apex.
+    everywhere = fissures if images.fissure_band is None else None
+    yield from _of_lungs(lung, {"vessels": vessels, "fissures": everywhere}, images.grid, tree)
     yield "lungs_l", _count(lung) * ml / 1000.0
     yield "lumen_ml", _count(lumen) * ml
     yield "lumen_holes", tree.report.cavity_voxels / _count(lumen)

@@ -1,7 +1,8 @@
 """Package facades: a package names its public API once, and imports a name when it is first used.
 
 The `__init__` of a package imports its public names for type checkers alone, under `if TYPE_CHECKING:`, each
-as itself, or a stub `__init__.pyi` beside it does.  `lazy_exports` reads that when a name is first asked for.
+as itself, or a stub `__init__.pyi` beside it does.  `lazy_exports` reads that when a name is first asked for;
+of another facade a star stands for all its names.
 Importing the package therefore loads none of its modules, and the names stand in one place.
 """
 
@@ -23,8 +24,13 @@ def public_names(file: str) -> dict[str, str]:
     for node in body:
         if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
             body = node.body
-    imports = [each for each in body if isinstance(each, ast.ImportFrom) and each.module]
-    return {alias.name: str(each.module) for each in imports for alias in each.names}
+    found: dict[str, str] = {}
+    for each in body:
+        if isinstance(each, ast.ImportFrom) and each.module and each.names[0].name == "*":
+            found |= public_names(str(import_module(each.module).__file__))
+        elif isinstance(each, ast.ImportFrom) and each.module:
+            found |= {alias.name: each.module for alias in each.names}
+    return found
 
 
 def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from anatomy.base.words import percent
 from anatomy.plausibility import ACCEPTED, DOUBTFUL, FITS, REFUSED
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.plans.record import picked
 
 VERDICTS = (REFUSED, ACCEPTED, DOUBTFUL, FITS)
@@ -41,21 +41,15 @@ MOTION_WORDS = {
 if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
-    from anatomy.airway_tree import Repair
-    from anatomy.lung import Lung
-    from anatomy.organ import Organ
 
-
-def is_lung(organ: Organ) -> TypeIs[Lung]:
+def is_lung(organ: lazy.Organ) -> TypeIs[lazy.Lung]:
     """Tell whether an organ is a lung; a liver has neither tree nor lobes."""
-    from anatomy.lung import Lung
 
-    return isinstance(organ, Lung)
+    return isinstance(organ, lazy.Lung)
 
 
-def organ_record(lung: Organ) -> dict[str, Any]:
+def organ_record(lung: lazy.Organ) -> dict[str, Any]:
     """Return what was understood of a patient; a liver has neither tree nor lobes."""
-    from lungaccess.problem.nodules import nodules_of
 
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
@@ -87,7 +81,7 @@ def organ_record(lung: Organ) -> dict[str, Any]:
                     else {}
                 ),
             }
-            for each in nodules_of(lung)
+            for each in lazy.nodules_of(lung)
         ],
         "sources": dict(lung.sources),
         "warnings": list(lung.warnings),
@@ -95,7 +89,7 @@ def organ_record(lung: Organ) -> dict[str, Any]:
     }
 
 
-def checks_table(lung: Organ) -> Table:
+def checks_table(lung: lazy.Organ) -> Table:
     """Return what the checks of the masks found that is not usual, and how many found nothing."""
     ordered = sorted(lung.findings, key=lambda each: VERDICTS.index(each.verdict))
     rows = [(each.verdict, each.name, each.found) for each in ordered if each.verdict != FITS]
@@ -105,7 +99,7 @@ def checks_table(lung: Organ) -> Table:
     return terminal.table("Plausibility of the masks", ("verdict", "check", "found"), rows)
 
 
-def _breathing(lung: Organ) -> dict[str, Any]:
+def _breathing(lung: lazy.Organ) -> dict[str, Any]:
     """Return what is known of the breathing, as plain values; nothing where nothing is."""
     motion = lung.motion if is_lung(lung) else None
     if motion is None:
@@ -114,7 +108,7 @@ def _breathing(lung: Organ) -> dict[str, Any]:
     return {"breathing": {**stated, **motion.figures}}
 
 
-def _airways(lung: Lung) -> dict[str, Any]:
+def _airways(lung: lazy.Lung) -> dict[str, Any]:
     tree, report = lung.tree, lung.tree.report
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
@@ -141,17 +135,16 @@ def _airways(lung: Lung) -> dict[str, Any]:
     }
 
 
-def lobe_voxels(lung: Lung) -> dict[str, int]:
+def lobe_voxels(lung: lazy.Lung) -> dict[str, int]:
     """Return how many voxels each lobe has; empty if the patient came without lobes."""
-    from anatomy.lobes import LOBES
 
     if lung.lobes is None:
         return {}
-    counts = np.bincount(lung.lobes.array.ravel(order="K"), minlength=len(LOBES) + 1)
-    return {name: int(counts[number]) for number, name in LOBES.items() if counts[number]}
+    counts = np.bincount(lung.lobes.array.ravel(order="K"), minlength=len(lazy.LOBES) + 1)
+    return {name: int(counts[number]) for number, name in lazy.LOBES.items() if counts[number]}
 
 
-def structure_voxels(lung: Organ) -> dict[str, int]:
+def structure_voxels(lung: lazy.Organ) -> dict[str, int]:
     """Return how many voxels each structure has that is there."""
     from anatomy import structures
 
@@ -167,7 +160,7 @@ def structure_voxels(lung: Organ) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
-def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
+def anatomy_tables(lung: lazy.Organ, *, details: bool = False) -> list[Table]:
     """Return what was understood of a patient: structures, airway tree by generation, sources.
 
     With `details` every repair of the airway tree has a line; they are counted else.
@@ -190,10 +183,9 @@ def anatomy_tables(lung: Organ, *, details: bool = False) -> list[Table]:
     return [each for each in made if each.row_count]
 
 
-def _nodule_table(lung: Organ) -> Table:
-    from lungaccess.problem.nodules import nodules_of
+def _nodule_table(lung: lazy.Organ) -> Table:
 
-    found = nodules_of(lung)
+    found = lazy.nodules_of(lung)
     labelled = bool(found) and found[0].is_label
     rows = [
         (
@@ -212,7 +204,7 @@ def _nodule_table(lung: Organ) -> Table:
     return terminal.table("Nodules, for --nodule", headings, rows)
 
 
-def _bronchus_rows(lung: Lung) -> list[terminal.Row]:
+def _bronchus_rows(lung: lazy.Lung) -> list[terminal.Row]:
     """Return the named bronchi in the order of the tree, with what is measured of each."""
     tree, named = lung.tree, lung.tree.bronchi
     return [
@@ -228,7 +220,7 @@ def _bronchus_rows(lung: Lung) -> list[terminal.Row]:
     ]
 
 
-def _tree_tables(lung: Lung, details: bool) -> list[Table]:
+def _tree_tables(lung: lazy.Lung, details: bool) -> list[Table]:
     repairs = [
         (kind, ", ".join(f"{c:.1f}" for c in each.position_lps), f"{each.length_mm:.1f}")
         for kind, each in (_repairs(lung) if details else ())
@@ -248,7 +240,7 @@ def _tree_tables(lung: Lung, details: bool) -> list[Table]:
     ]
 
 
-def _motion_tables(lung: Lung) -> list[Table]:
+def _motion_tables(lung: lazy.Lung) -> list[Table]:
     motion = lung.motion
     if motion is None:
         return []
@@ -262,7 +254,7 @@ def _motion_tables(lung: Lung) -> list[Table]:
     return [terminal.table("Breathing", ("", ""), rows)]
 
 
-def _patient_rows(lung: Organ) -> list[terminal.Row]:
+def _patient_rows(lung: lazy.Organ) -> list[terminal.Row]:
     rows: list[terminal.Row] = [("working grid", lung.grid.describe())]
     if not is_lung(lung):
         return rows
@@ -284,19 +276,18 @@ def _patient_rows(lung: Organ) -> list[terminal.Row]:
     return rows
 
 
-def _fissures(lung: Lung) -> str:
+def _fissures(lung: lazy.Lung) -> str:
     """Return what is known of the fissures, in words."""
-    from anatomy.lobes import UNKNOWN
 
     if lung.fissure_band is None or not lung.has_fissures:
         return "known" if lung.has_fissures else "not known"
-    counts = np.bincount(lung.fissure_band.array.ravel(order="K"), minlength=UNKNOWN + 1)
+    counts = np.bincount(lung.fissure_band.array.ravel(order="K"), minlength=lazy.UNKNOWN + 1)
     ml = lung.grid.voxel_volume_mm3 / 1000.0
-    rest = f"; not known in {counts[UNKNOWN] * ml:.0f} ml" if counts[UNKNOWN] else ""
+    rest = f"; not known in {counts[lazy.UNKNOWN] * ml:.0f} ml" if counts[lazy.UNKNOWN] else ""
     return f"within a band of {counts[1:50].sum() * ml:.0f} ml with 95 %{rest}"
 
 
-def _repairs(lung: Lung) -> list[tuple[str, Repair]]:
+def _repairs(lung: lazy.Lung) -> list[tuple[str, lazy.Repair]]:
     report = lung.tree.report
     return [
         *(("gap bridged", each) for each in report.gaps_bridged),
@@ -306,13 +297,13 @@ def _repairs(lung: Lung) -> list[tuple[str, Repair]]:
     ]
 
 
-def _volume_rows(lung: Organ) -> list[terminal.Row]:
+def _volume_rows(lung: lazy.Organ) -> list[terminal.Row]:
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     counts = structure_voxels(lung) | (lobe_voxels(lung) if is_lung(lung) else {})
     return [(name, f"{count * ml:.1f}", f"{count}") for name, count in counts.items()]
 
 
-def _generation_rows(lung: Lung) -> list[terminal.Row]:
+def _generation_rows(lung: lazy.Lung) -> list[terminal.Row]:
     tree = lung.tree
     rows: list[terminal.Row] = []
     for generation in range(int(tree.generation.max()) + 1):

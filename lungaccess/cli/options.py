@@ -14,7 +14,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
 from anatomy.base.records import frozen_value
 from anatomy.plausibility import require_known_checks
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.numbers import Count, NotNegative, Probability, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from lungaccess.problem.goals import SUCCESS, WINDOW
@@ -22,16 +22,6 @@ from lungaccess.problem.request import ATLAS, AUTO, Request, StatedPlace, goal_o
 from stages.needle import DEFAULT, NEEDLE_PLANNERS, OUR_PLANNERS, TERMS
 
 if TYPE_CHECKING:
-    from anatomy.base.typed import Float
-    from anatomy.lung import Lung
-    from anatomy.organ import Organ
-    from lungaccess.planning.coupled.atlas import Atlas
-    from lungaccess.plans.plan import Plan
-    from lungaccess.problem.errors import ErrorModel
-    from lungaccess.problem.procedures import Procedure
-    from lungaccess.problem.system import System
-    from lungaccess.problem.target import StatedTarget, Target
-
     GoalText = str
     ObjectiveText = str
     OurPlannerName = str
@@ -106,12 +96,11 @@ class CacheOptions(OutputOptions):
 
     cache: Path | None = None
 
-    def open_atlas(self, lung: Lung, system: System) -> Atlas:
+    def open_atlas(self, lung: lazy.Lung, system: lazy.System) -> lazy.Atlas:
         """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
-        from lungaccess.planning.coupled import open_atlas
 
         with progress("enumerating what scope and tubes can do") as shown:
-            return open_atlas(lung, system, cache=self.cache, progress=shown.share)
+            return lazy.open_atlas(lung, system, cache=self.cache, progress=shown.share)
 
 
 @Parameter(name="*")
@@ -129,28 +118,25 @@ class PatientOptions(CacheOptions):
     def __post_init__(self) -> None:
         require_known_checks(self.accept)
 
-    def load(self, patient: Path, *, thick_slices: bool = False) -> Lung:
+    def load(self, patient: Path, *, thick_slices: bool = False) -> lazy.Lung:
         """Return a patient's lung; see `load_lung`."""
         return load_lung(patient, self.cache, thick_slices, self.accept)
 
-    def load_plan(self, plan: Path, patient: Path) -> tuple[Plan, Lung]:
+    def load_plan(self, plan: Path, patient: Path) -> tuple[lazy.Plan, lazy.Lung]:
         """Return a plan and the lung that it was made for; PlanFileError if it was made for another."""
-        from lungaccess.plans.plan import Plan
 
-        stored, lung = Plan.load(plan), self.load(patient)
+        stored, lung = lazy.Plan.load(plan), self.load(patient)
         stored.require_lung(lung)
         return stored, lung
 
-    def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> Organ:
+    def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> lazy.Organ:
         """Return a patient's lung or a liver of Med-RAD, and show what is being done; see `load_lung`."""
-        from anatomy.io.liver import is_liver
-        from lungaccess.problem.patients import load_organ
 
         accept = self.accept if refuse else None
-        if not is_liver(patient):
+        if not lazy.is_liver(patient):
             return load_lung(patient, self.cache, thick_slices, accept)
         with progress(f"reading {patient}"):
-            return load_organ(patient, accept=accept)
+            return lazy.load_organ(patient, accept=accept)
 
 
 @Parameter(name="*")
@@ -168,11 +154,10 @@ class TargetOptions:
     target: str | None = None
     nodule: Annotated[Whole | None, Parameter(metavar="[INT]")] = None
 
-    def stated(self) -> StatedTarget:
+    def stated(self) -> lazy.StatedTarget:
         """Return what the user states, before any patient is read; errors as of `stated_target`."""
-        from lungaccess.problem.target import stated_target
 
-        return stated_target(self.target, self.nodule)
+        return lazy.stated_target(self.target, self.nodule)
 
 
 @Parameter(name="*")
@@ -209,13 +194,11 @@ class PlaceOptions:
         return StatedPlace(kind="scope tip", lps_mm=point, within_mm=self.scope_tip_within)
 
 
-def _point(text: str) -> Float:
+def _point(text: str) -> lazy.Float:
     """Return a point that a user states, or has saved in 3D Slicer, LPS mm."""
-    from anatomy.io.frames import parse_point
-    from anatomy.io.markups import parse_reference, read_named_point
 
-    saved = parse_reference(text)
-    return parse_point(text) if saved is None else read_named_point(saved).lps_mm
+    saved = lazy.parse_reference(text)
+    return lazy.parse_point(text) if saved is None else lazy.read_named_point(saved).lps_mm
 
 
 @Parameter(name="*")
@@ -232,9 +215,8 @@ class SystemOptions:
     system: str = DEFAULT_SYSTEM
     allow_fissures: bool | None = None
 
-    def load(self) -> System:
+    def load(self) -> lazy.System:
         """Return the system, its rule about fissures replaced if stated; SettingsError if it is "auto"."""
-        from lungaccess.problem.system import load_system
 
         if self.system == AUTO:
             raise SettingsError(
@@ -242,14 +224,13 @@ class SystemOptions:
                 expected="the name of a preset or the path of a .toml file",
                 remedy=f"`lungaccess plan --system {AUTO}` says which preset reaches a target",
             )
-        return load_system(self.system, fissures_allowed=self.allow_fissures)
+        return lazy.load_system(self.system, fissures_allowed=self.allow_fissures)
 
-    def candidates(self) -> tuple[System, ...]:
+    def candidates(self) -> tuple[lazy.System, ...]:
         """Return the systems to try, the least invasive first: one, or all presets if it is to be chosen."""
-        from lungaccess.problem.preset_order import presets_by_invasiveness
 
         if self.system == AUTO:
-            return presets_by_invasiveness(fissures_allowed=self.allow_fissures)
+            return lazy.presets_by_invasiveness(fissures_allowed=self.allow_fissures)
         return (self.load(),)
 
 
@@ -287,12 +268,10 @@ class ErrorOptions:
     known: Annotated[tuple[str, ...], Parameter(consume_multiple=1)] = ()
     procedure: str | None = None
 
-    def load(self) -> ErrorModel:
+    def load(self) -> lazy.ErrorModel:
         """Return the error model, the default one if none is given."""
-        from lungaccess.problem.error_files import load_errors
-        from lungaccess.problem.errors import with_known
 
-        model = load_errors() if self.errors is None else load_errors(self.errors)
+        model = lazy.load_errors() if self.errors is None else lazy.load_errors(self.errors)
         for stated in self.known:
             kind, _equals, size = stated.partition("=")
             try:
@@ -302,18 +281,17 @@ class ErrorOptions:
                     f"--known is {stated!r}",
                     expected="a kind of error and its size, such as scope_direction=0.5",
                 ) from None
-            model = with_known(model, kind.replace("-", "_"), known)
+            model = lazy.with_known(model, kind.replace("-", "_"), known)
         return model
 
-    def given(self) -> ErrorModel | None:
+    def given(self) -> lazy.ErrorModel | None:
         """Return the error model, None if none is given: then a plan's own chance of success is shown."""
         return None if self.errors is None and not self.known else self.load()
 
-    def given_procedure(self) -> Procedure | None:
+    def given_procedure(self) -> lazy.Procedure | None:
         """Return the procedure, None if none is given."""
-        from lungaccess.problem.procedures import load_procedure
 
-        return None if self.procedure is None else load_procedure(self.procedure)
+        return None if self.procedure is None else lazy.load_procedure(self.procedure)
 
 
 @Parameter(name="*")
@@ -383,18 +361,16 @@ class SearchOptions(BudgetOptions):
 
     def asked(
         self,
-        systems: tuple[System, ...],
-        errors: ErrorModel | None = None,
-        procedure: Procedure | None = None,
+        systems: tuple[lazy.System, ...],
+        errors: lazy.ErrorModel | None = None,
+        procedure: lazy.Procedure | None = None,
         place: StatedPlace | None = None,
     ) -> Asked:
         """Return all of a request but patient and target; SettingsError if anything in it is wrong."""
-        from anatomy.machine_code.ahead import usable_cores
-        from lungaccess.planning.searches import planners, unknown_method
 
-        if self.method not in planners():
-            raise unknown_method(self.method)
-        processes = self.processes or (usable_cores() if goal_of(self.goal) is SUCCESS else 1)
+        if self.method not in lazy.planners():
+            raise lazy.unknown_method(self.method)
+        processes = self.processes or (lazy.usable_cores() if goal_of(self.goal) is SUCCESS else 1)
         return Asked(
             systems=systems,
             fields={
@@ -412,10 +388,10 @@ class SearchOptions(BudgetOptions):
 class Asked:
     """All of a request but patient and target, by the names of `Request.of`."""
 
-    systems: tuple[System, ...]
+    systems: tuple[lazy.System, ...]
     fields: dict[str, Any]
 
-    def request(self, lung: Lung, target: Target) -> Request:
+    def request(self, lung: lazy.Lung, target: lazy.Target) -> Request:
         """Return the request for a target in a lung; errors as `Request`."""
         require_map(lung, self.fields["goal"])
         return Request.of(lung, self.systems, target, **self.fields)
@@ -448,7 +424,7 @@ def require_picture(path: Path) -> None:
     require_writable_folder(path.parent)
 
 
-def require_map(lung: Lung, objective: str) -> None:
+def require_map(lung: lazy.Lung, objective: str) -> None:
     """Raise SettingsError if a stated objective weighs a cost map that the patient does not have."""
     weighed = goal_of(objective).objective
     if objective != DEFAULT and weighed is not None and weighed.weighs_map and lung.cost is None:
@@ -461,18 +437,17 @@ def require_map(lung: Lung, objective: str) -> None:
 
 def load_lung(
     patient: Path, cache: Path | None, thick_slices: bool, accept: tuple[str, ...] | None = ()
-) -> Lung:
+) -> lazy.Lung:
     """Return a patient's lung, and show what is being done meanwhile; None as `accept` refuses no masks.
 
     Raises:
         AnatomyError: If the masks fail a check that `accept` does not name.
         SettingsError: If the masks were made from thick slices, unless `thick_slices` accepts them.
     """
-    from anatomy.io.own_masks import require_thin_slices
     from lungaccess.problem.patients import load_patient
 
     if not thick_slices:
-        require_thin_slices(patient)
+        lazy.require_thin_slices(patient)
     with progress(f"reading {patient}") as shown:
         return load_patient(
             patient, cache=cache, progress=lambda step: shown.step(step, STEP_SHARES.get(step)), accept=accept

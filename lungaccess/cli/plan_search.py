@@ -7,7 +7,7 @@ import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.panel import Panel
 from rich.table import Table
@@ -16,28 +16,12 @@ from rich.text import Text
 from anatomy.base.files import write_text
 from anatomy.base.records import frozen_value
 from anatomy.base.words import of_hundred
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.options import Asked, CacheOptions
 from lungaccess.cli.progress import SearchDisplay, progress
 from lungaccess.plans.no_plan import NoPlan
 from stages.needle import Objective
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.judging.advice import Advice
-    from lungaccess.judging.appraisal import Appraisal, Headline
-    from lungaccess.judging.checking import CheckReport, Finding
-    from lungaccess.planning import ProgressEvent
-    from lungaccess.planning.coupled import Atlas
-    from lungaccess.plans.plan import Plan
-    from lungaccess.problem.errors import ErrorModel
-    from lungaccess.problem.goals import Goal
-    from lungaccess.problem.procedures import Procedure
-    from lungaccess.problem.request import Request
-    from lungaccess.problem.system import System
-    from lungaccess.problem.target import StatedTarget
-    from lungaccess.showing.report import CostPoint
 
 PLAN_FILE, HISTORY_FILE = "plan.json", "cost_over_time.csv"
 """The plan, saved as soon as there is one and again when there is a better one; how its cost fell."""
@@ -54,20 +38,19 @@ RESULTS = (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *PICTURES, "no_plan.*", "plan-
 class CostHistory:
     """Collects how plans become better while a search runs; its clock is that of the planner."""
 
-    def __init__(self, display: SearchDisplay, goal: Goal) -> None:
-        from lungaccess.showing.report import CostPoint
+    def __init__(self, display: SearchDisplay, goal: lazy.Goal) -> None:
 
-        self._point, self._goal, self._display, self._iteration = CostPoint, goal, display, 0
+        self._point, self._goal, self._display, self._iteration = lazy.CostPoint, goal, display, 0
         self._best: float | None = None
-        self.points: list[CostPoint] = []
+        self.points: list[lazy.CostPoint] = []
 
-    def on_progress(self, event: ProgressEvent) -> None:
+    def on_progress(self, event: lazy.ProgressEvent) -> None:
         """Take over what the planner says about itself."""
         self._iteration = event.iteration
         self._append(event.elapsed_s)
         self._display.update(event.message or event.phase, event.elapsed_s, event.iteration, self._best)
 
-    def on_plan(self, found: Plan) -> None:
+    def on_plan(self, found: lazy.Plan) -> None:
         """Take over a better plan, or the first clear one, of which the goal may not be known yet."""
         self._best, self._iteration = self._goal.value(found), found.iterations
         elapsed_s = float(found.timing["planning_s"])
@@ -83,7 +66,7 @@ class PlanJob:
     """What to plan and where to, and what to do with the plan; with a guide a page is made, too."""
 
     asked: Asked
-    target: StatedTarget
+    target: lazy.StatedTarget
     out: Path
     output: CacheOptions
     pictures: bool = True
@@ -96,28 +79,27 @@ class PlanJob:
         return (PLAN_FILE, SUMMARY_FILE, HISTORY_FILE, *(PICTURES if self.pictures else ()), *page)
 
 
-def run_search(request: Request, job: PlanJob, display: SearchDisplay) -> tuple[Plan, list[CostPoint]]:
+def run_search(
+    request: lazy.Request, job: PlanJob, display: SearchDisplay
+) -> tuple[lazy.Plan, list[lazy.CostPoint]]:
     """Search until the budget is spent; return the best plan and the history of its cost, or raise NoPlan.
 
     The first plan is saved as soon as it is found, and the best one at the end, whatever happens after.  An
     interruption from the keyboard ends the search early; the best plan so far is kept.
     """
-    from lungaccess.judging import answer
-    from lungaccess.planning import atlas_event
-    from lungaccess.planning.coupled import open_atlas
 
     history = CostHistory(display, request.goal)
 
-    def atlas_of(system: System) -> Atlas:
+    def atlas_of(system: lazy.System) -> lazy.Atlas:
         def on_share(share: float) -> None:
-            history.on_progress(atlas_event(share))
+            history.on_progress(lazy.atlas_event(share))
 
-        return open_atlas(request.lung, system, cache=job.output.cache, progress=on_share)
+        return lazy.open_atlas(request.lung, system, cache=job.output.cache, progress=on_share)
 
-    best: Plan | None = None
+    best: lazy.Plan | None = None
     with display:
         try:
-            for found in answer(
+            for found in lazy.answer(
                 request, atlas_of=atlas_of, counterfactuals=False, on_progress=history.on_progress
             ):
                 if best is None:
@@ -134,7 +116,7 @@ def run_search(request: Request, job: PlanJob, display: SearchDisplay) -> tuple[
     return best, history.points
 
 
-def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
+def plan_and_report(lung: lazy.Lung, job: PlanJob) -> ExitCode:
     """Search, appraise, show headline, limits and plan, draw it, return the exit code; NoPlan without a plan.
 
     What is known is saved and shown before anything slower begins: the first plan, then the best one with its
@@ -145,15 +127,12 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
     display = SearchDisplay(limits.time_s, limits.iterations, goal.words)
     best, history = run_search(request, job, display)
     # After the search: the first plan does not wait for these.
-    from lungaccess.judging.appraisal import appraise, plan_record
-    from lungaccess.showing.report import cost_over_time_csv, cost_over_time_png, overview_png, tree_png
-    from lungaccess.uncertainty.breathing.window import with_window
 
-    found = best if best.window is not None else with_window(best, lung)
+    found = best if best.window is not None else lazy.with_window(best, lung)
     if found is not best:
         found.save(job.out / PLAN_FILE)
     with progress("checking the plan and its chance"):
-        appraisal = appraise(
+        appraisal = lazy.appraise(
             found,
             lung,
             errors=None if found.chance else request.errors,
@@ -163,59 +142,58 @@ def plan_and_report(lung: Lung, job: PlanJob) -> ExitCode:
         )
     with progress("looking for what would help"):
         advice = advised(found, lung, request.errors, request.procedure, job.output.cache, appraisal)
-    record = plan_record(found, lung, appraisal, job.out, job.files, [each.to_mapping() for each in advice])
+    record = lazy.plan_record(
+        found, lung, appraisal, job.out, job.files, [each.to_mapping() for each in advice]
+    )
     write_text(job.out / SUMMARY_FILE, terminal.json_text(record))
     if not job.output.json:
         if job.guide is not None:
             terminal.console.print(job.guide)
         show_plan(found, lung, appraisal, advice)
-    cost_over_time_csv(history, job.out / HISTORY_FILE)
+    lazy.cost_over_time_csv(history, job.out / HISTORY_FILE)
     if job.pictures:
         with progress("drawing the plan"):
-            overview_png(found, lung, job.out / "overview.png", appraisal)
-            tree_png(lung, job.out / "tree.png")
-            cost_over_time_png(history, job.out / "cost_over_time.png", goal)
+            lazy.overview_png(found, lung, job.out / "overview.png", appraisal)
+            lazy.tree_png(lung, job.out / "tree.png")
+            lazy.cost_over_time_png(history, job.out / "cost_over_time.png", goal)
     if job.guide is not None:
-        from lungaccess.showing.report.html import PageOptions, plan_page
-
         with progress("making the page"):
-            options = PageOptions(cost_over_time=job.out / HISTORY_FILE, advice=advice)
-            plan_page(found, lung, job.out / PAGE_FILE, options)
+            options = lazy.PageOptions(cost_over_time=job.out / HISTORY_FILE, advice=advice)
+            lazy.plan_page(found, lung, job.out / PAGE_FILE, options)
     job.output.tell(record)
     terminal.say(f"Written to {job.out}: {', '.join(job.files)}")
     return ExitCode.of(appraisal.accepted)
 
 
 def advised(
-    plan: Plan,
-    lung: Lung,
-    errors: ErrorModel | None,
-    procedure: Procedure | None,
+    plan: lazy.Plan,
+    lung: lazy.Lung,
+    errors: lazy.ErrorModel | None,
+    procedure: lazy.Procedure | None,
     cache: Path | None,
-    appraisal: Appraisal | None = None,
-) -> tuple[Advice, ...]:
+    appraisal: lazy.Appraisal | None = None,
+) -> tuple[lazy.Advice, ...]:
     """Return what would lift the chance of a plan, with the presets whose atlases the cache holds."""
-    from lungaccess.judging.advice import advise
-    from lungaccess.judging.appraisal import appraise
-    from lungaccess.planning.coupled import atlas_is_kept, open_atlas
-    from lungaccess.problem.preset_order import presets_by_invasiveness
 
-    def kept_atlas(system: System) -> Atlas | None:
-        return open_atlas(lung, system, cache=cache) if atlas_is_kept(lung, system, cache=cache) else None
+    def kept_atlas(system: lazy.System) -> lazy.Atlas | None:
+        is_kept = lazy.atlas_is_kept(lung, system, cache=cache)
+        return lazy.open_atlas(lung, system, cache=cache) if is_kept else None
 
-    known = appraisal or appraise(plan, lung, errors=errors, procedure=procedure)
-    return advise(
+    known = appraisal or lazy.appraise(plan, lung, errors=errors, procedure=procedure)
+    return lazy.advise(
         plan, lung, known, errors=errors, procedure=procedure, atlas_of=kept_atlas,
-        systems=presets_by_invasiveness(tool=plan.system.tool),
+        systems=lazy.presets_by_invasiveness(tool=plan.system.tool),
     )  # fmt: skip
 
 
-def system_of(plan: Plan, systems: Sequence[System]) -> System:
+def system_of(plan: lazy.Plan, systems: Sequence[lazy.System]) -> lazy.System:
     """Return the one of several systems by whose name a plan goes; the first if there is none."""
     return {each.name: each for each in systems}.get(plan.system.name, systems[0])
 
 
-def show_plan(plan: Plan, lung: Lung, appraisal: Appraisal, advice: Sequence[Advice] = ()) -> None:
+def show_plan(
+    plan: lazy.Plan, lung: lazy.Lung, appraisal: lazy.Appraisal, advice: Sequence[lazy.Advice] = ()
+) -> None:
     """Print a plan, its limits and what would lift its chance; the headline comes last, where it is seen."""
     terminal.show(plan_tables(plan, lung))
     terminal.show_warnings(lung.warnings)
@@ -236,10 +214,9 @@ MARKS = {True: Text("ok", "green"), False: Text("refused", "bold red"), None: Te
 
 def no_plan_record(failure: NoPlan) -> dict[str, Any]:
     """Return why there is no plan."""
-    from lungaccess.plans.version import made_by
 
     return {
-        **made_by(),
+        **lazy.made_by(),
         "found": False,
         "accepted": False,
         "why": failure.found,
@@ -249,9 +226,8 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
     }
 
 
-def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
+def plan_tables(plan: lazy.Plan, lung: lazy.Lung) -> list[Table]:
     """Return the stages of a plan and its costs."""
-    from lungaccess.plans.costs import costs_in_words, known_costs
 
     what = "the tubes beyond the lumen" if plan.needle is None else "the needle"
     return [
@@ -260,32 +236,29 @@ def plan_tables(plan: Plan, lung: Lung) -> list[Table]:
         terminal.table(
             f"Costs of {what} (made small: {Objective.of(plan.objective).words})",
             ("cost", "value"),
-            costs_in_words(known_costs(plan.costs, has_map=lung.cost is not None)),
+            lazy.costs_in_words(lazy.known_costs(plan.costs, has_map=lung.cost is not None)),
         ),
     ]
 
 
-def steps_table(plan: Plan, lung: Lung) -> Table:
+def steps_table(plan: lazy.Plan, lung: lazy.Lung) -> Table:
     """Return step by step what hands do with the bronchoscope."""
-    from lungaccess.plans.scope_steps import handle_words, scope_steps, steps_note
 
-    steps = scope_steps(plan, lung)
+    steps = lazy.scope_steps(plan, lung)
     rows = [(str(number), one.text) for number, one in enumerate(steps, start=1)]
     rows += [
         (f"pass {number}", f"{said[:1].upper()}{said[1:]}.")
         for number, said in enumerate(plan.redirections, 2)
     ]
     made = terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows)
-    made.caption = f"{handle_words(plan)} {steps_note(plan, lung)}"
+    made.caption = f"{lazy.handle_words(plan)} {lazy.steps_note(plan, lung)}"
     made.caption_justify = "left"
     return made
 
 
-def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
-    from lungaccess.plans.view import view_words
-    from lungaccess.problem.nodules import target_words
+def _stage_rows(plan: lazy.Plan, lung: lazy.Lung) -> list[terminal.Row]:
 
-    scope, tube, place = plan.scope, plan.tube, target_words(lung, plan.target_lps)
+    scope, tube, place = plan.scope, plan.tube, lazy.target_words(lung, plan.target_lps)
     way = plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"
     return [
         (
@@ -300,7 +273,7 @@ def _stage_rows(plan: Plan, lung: Lung) -> list[terminal.Row]:
         ),
         ("needle", way + (f": {place}" if place else "")),
         *((f"pass {number}", said) for number, said in enumerate(plan.redirections, 2)),
-        *((("ultrasound", view),) if (view := view_words(plan, lung)) else ()),
+        *((("ultrasound", view),) if (view := lazy.view_words(plan, lung)) else ()),
     ]
 
 
@@ -314,7 +287,7 @@ def arcs_table(arcs: Iterable[Sequence[float]]) -> Table:
     return terminal.table("arcs of the needle", headings, rows)
 
 
-def show_findings(appraisal: Appraisal) -> None:
+def show_findings(appraisal: lazy.Appraisal) -> None:
     """Print what the check refuses, if anything, and the limits."""
     for finding in (*appraisal.check.refusals, *appraisal.check.unchecked):
         terminal.say(f"{finding}")
@@ -322,7 +295,7 @@ def show_findings(appraisal: Appraisal) -> None:
         terminal.show([limits_table(appraisal)])
 
 
-def show_headline(headline: Headline) -> None:
+def show_headline(headline: lazy.Headline) -> None:
     """Print the headline in a panel whose colour, mark and title follow the worse of its two parts."""
     style = GRADE_STYLES[headline.grade.key]
     parts = [(headline.grade.mark, f"bold {style}"), (f" {headline.text}", "bold")]
@@ -333,7 +306,7 @@ def show_headline(headline: Headline) -> None:
     )
 
 
-def show_advice(advice: Sequence[Advice], appraisal: Appraisal) -> None:
+def show_advice(advice: Sequence[lazy.Advice], appraisal: lazy.Appraisal) -> None:
     """Print what lifts the chance of success most, as it was tried, each with its command."""
     success = appraisal.headline.success
     if not advice or success is None:
@@ -354,21 +327,20 @@ def command_with(options: Sequence[str]) -> str:
     return shlex.join(["lungaccess", *kept, *options])
 
 
-def limits_table(appraisal: Appraisal) -> Table:
+def limits_table(appraisal: lazy.Appraisal) -> Table:
     """Return the limits that the plan comes nearest to; broken ones come first."""
-    from lungaccess.judging.appraisal import LIMITS_TITLE, SHOWN_LIMITS
 
     rows = [
         (each.what, each.found_words, each.bound_words, each.used_words if each.ok else "BROKEN")
-        for each in appraisal.limits[:SHOWN_LIMITS]
+        for each in appraisal.limits[: lazy.SHOWN_LIMITS]
     ]
-    made = terminal.table(LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows)
+    made = terminal.table(lazy.LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows)
     made.caption = "`lungaccess check PLAN PATIENT --all` lists every finding."
     made.caption_justify = "left"
     return made
 
 
-def check_tables(report: CheckReport) -> list[Table]:
+def check_tables(report: lazy.CheckReport) -> list[Table]:
     """Return all findings of an independent check by stage."""
     stages = dict.fromkeys(finding.stage for finding in report.findings)
     return [
@@ -376,7 +348,7 @@ def check_tables(report: CheckReport) -> list[Table]:
     ]
 
 
-def _findings_table(stage: str, findings: list[Finding]) -> Table:
+def _findings_table(stage: str, findings: list[lazy.Finding]) -> Table:
     made = terminal.bare_table(f"Independent check: {stage}")
     made.add_column("")
     made.add_column("what", no_wrap=True)

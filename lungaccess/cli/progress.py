@@ -6,6 +6,7 @@ from typing import Self
 from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TaskID, TextColumn
 from rich.text import Text
 
+from lungaccess.cli import lazy
 from lungaccess.cli.terminal import progress_console, safe
 
 LEAST_SHARE = 0.02
@@ -63,13 +64,11 @@ class _Shown:
     """Whether this process has said that kernels are compiled."""
 
     def __enter__(self) -> Self:
-        from anatomy.base.kernel_clock import watching_compilations
-        from anatomy.machine_code.ahead import first_compilation
 
         self._interrupted_words: str | None = None
-        self._compilations = watching_compilations(self._compiling)
+        self._compilations = lazy.watching_compilations(self._compiling)
         self._compilations.__enter__()
-        first_compilation.tell = self._compiling
+        lazy.first_compilation.tell = self._compiling
         self._progress.start()
         return self
 

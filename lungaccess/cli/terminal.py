@@ -1,5 +1,7 @@
 """How the command line shows things: tables, JSON, and short panels for errors."""
 
+from __future__ import annotations
+
 import codecs
 import io
 import json
@@ -8,17 +10,14 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from rich.console import Console
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from anatomy.base.errors import LungaccessError
-    from lungaccess.plans.no_plan import NoPlan
-
+from lungaccess.cli import lazy
 
 _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff]")
 """A terminal obeys or hides these instead of showing them; the new line and the tab are not among them."""
@@ -194,7 +193,7 @@ def show_wide(tables: Iterable[Table]) -> None:
         console.print()
 
 
-def show_error(error: "LungaccessError", title: str = "bad input") -> None:
+def show_error(error: lazy.LungaccessError, title: str = "bad input") -> None:
     """Print what was found, what was expected and what to do, in a short panel on standard error."""
     parts = [(error.found.rstrip(".") + ".", "")]
     if error.expected:
@@ -204,7 +203,7 @@ def show_error(error: "LungaccessError", title: str = "bad input") -> None:
     error_console.print(Panel(styled(*parts), title=title, title_align="left", border_style="red"))
 
 
-def show_no_plan(failure: "NoPlan") -> None:
+def show_no_plan(failure: lazy.NoPlan) -> None:
     """Print why no plan was found: the counted reasons, and what would help."""
     console.print(Panel(failure.found, title="no plan", title_align="left", border_style="yellow"))
     show_reasons(failure)
@@ -212,7 +211,7 @@ def show_no_plan(failure: "NoPlan") -> None:
         console.print(styled(("\nWhat would help:", "bold"), (f" {failure.advice}", "")))
 
 
-def show_reasons(failure: "NoPlan") -> None:
+def show_reasons(failure: lazy.NoPlan) -> None:
     """Print the counted reasons, and why each of several systems failed."""
     if failure.attempts:
         console.print(table("Systems that were tried", ("system", "outcome"), failure.attempts.items()))

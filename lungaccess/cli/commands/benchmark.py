@@ -5,27 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.files import require_writable_folder
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, CountOrNone, Processes, SamplesOrNone, Seconds
 from lungaccess.cli.options import CacheOptions, OutputOptions, PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import claim_folder
-
-if TYPE_CHECKING:
-    from anatomy.liver import LiverImages
-    from anatomy.organ import Organ
-    from anatomy.patient import PatientImages
-    from lungaccess.problem.system import System
-    from lungaccess.running.benchmark.runs import BenchmarkRow, Pose
-    from lungaccess.running.benchmark.synthetic.scoring import Score
 
 NAME = "synthetic-v1"
 synthetic = App(
@@ -68,11 +60,10 @@ def make(
         ct: Also the CTs, about 25 MB each; no rule needs them.
         tips: Also the scope tips, from which a planner without a bronchoscope of its own can start.
     """
-    from lungaccess.running.benchmark.synthetic.cases import write_benchmark
 
     claim_folder(out, ())
     with progress("making synthetic patients") as shown:
-        made = write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
+        made = lazy.write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
     output.tell({"folder": str(out), "phantoms": [each.name for each in made]})
     terminal.say(
         f"Written to {out}: {len(made)} phantoms, their queries in case.json, the rules in benchmark.json"
@@ -115,16 +106,14 @@ def run(
         scheduler: Address of a running dask scheduler; this machine if not given.
         workers: How many processes on this machine.
     """
-    from lungaccess.running.benchmark.synthetic.submission import benchmark_study
-    from lungaccess.running.study.driver import run_study
 
     devices_asked = {"systems": names_of(devices)} if devices is not None else {}
-    study = benchmark_study(
+    study = lazy.benchmark_study(
         folder, names_of(methods), phantoms=names_of(phantoms), targets=targets, iterations=iterations,
         time_s=time_s, **devices_asked,
     )  # fmt: skip
     with progress(NAME) as shown:
-        done = run_study(
+        done = lazy.run_study(
             study, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
         )
     written = [] if answers is None else _write_answers(out, answers)
@@ -139,13 +128,12 @@ def run(
 
 
 def _write_answers(results: Path, folder: Path) -> list[Path]:
-    from lungaccess.running.benchmark.synthetic.submission import submissions_of, write_submission
 
     require_writable_folder(folder)
     written = []
-    for each in submissions_of(results):
+    for each in lazy.submissions_of(results):
         written.append(folder / f"{each.planner}.json")
-        write_submission(each, written[-1])
+        lazy.write_submission(each, written[-1])
     return written
 
 
@@ -171,23 +159,20 @@ def score(
         only_answered: Leave out queries without an answer, which otherwise count as not solved.
         out: File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
     """
-    from lungaccess.running.benchmark.runs import require_table_file
-    from lungaccess.running.benchmark.synthetic.scoring import REFUSED, score_submission, write_scores
-    from lungaccess.running.benchmark.synthetic.submission import read_submission
 
     if out is not None:
-        require_table_file(out)
-    handed_in = read_submission(submission)
+        lazy.require_table_file(out)
+    handed_in = lazy.read_submission(submission)
     with progress(f"scoring {handed_in.planner}") as shown:
         scores = list(
-            score_submission(
+            lazy.score_submission(
                 handed_in, folder, cache=output.cache, samples=samples, certify_boxes=certify,
                 only_answered=only_answered, progress=shown.step,
             )
         )  # fmt: skip
     if out is not None:
-        write_scores(scores, out)
-    refusals = [each for each in scores if each.status == REFUSED]
+        lazy.write_scores(scores, out)
+    refusals = [each for each in scores if each.status == lazy.REFUSED]
     _show_sheet(scores, output)
     for each in refusals:
         terminal.say(f"{each.query} is refused: {each.reason}")
@@ -210,13 +195,12 @@ def sheet(
         csv: Also write the sheet as a .csv or .json file.
         brief: One line a planner, without families and devices.
     """
-    from lungaccess.running.benchmark.synthetic.scoring import read_scores, score_sheet, write_sheet
 
     if not scores:
         raise SettingsError("No scores were given", expected="one or more files", remedy="Name scores.json")
-    rows = [each for path in scores for each in read_scores(path)]
+    rows = [each for path in scores for each in lazy.read_scores(path)]
     if csv is not None:
-        write_sheet(score_sheet(rows, by_family=not brief), csv)
+        lazy.write_sheet(lazy.score_sheet(rows, by_family=not brief), csv)
     _show_sheet(rows, output, by_family=not brief)
     return ExitCode.OK
 
@@ -224,21 +208,18 @@ def sheet(
 @synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} schema"))
 def schema() -> ExitCode:
     """Print the JSON Schema of a submission."""
-    from lungaccess.running.benchmark.synthetic.submission import submission_schema
 
-    terminal.show_json(submission_schema())
+    terminal.show_json(lazy.submission_schema())
     return ExitCode.OK
 
 
-def _show_sheet(scores: list[Score], output: OutputOptions, *, by_family: bool = True) -> None:
-    from lungaccess.running.benchmark.synthetic.cases import manifest_sha256
-    from lungaccess.running.benchmark.synthetic.scoring import HEADINGS, score_sheet
+def _show_sheet(scores: list[lazy.Score], output: OutputOptions, *, by_family: bool = True) -> None:
 
-    lines = score_sheet(scores, by_family=by_family)
-    about = {"benchmark": NAME, "manifest_sha256": manifest_sha256()}
+    lines = lazy.score_sheet(scores, by_family=by_family)
+    about = {"benchmark": NAME, "manifest_sha256": lazy.manifest_sha256()}
     refused = {each.query: each.reason for each in scores if each.reason}
     output.tell({**about, "sheet": [asdict(line) for line in lines], "refused": refused})
-    terminal.show_wide([terminal.table(f"Scores of {NAME}", HEADINGS, [line.cells() for line in lines])])
+    terminal.show_wide([terminal.table(f"Scores of {NAME}", lazy.HEADINGS, [line.cells() for line in lines])])
 
 
 Rules = Literal["ours", "unc"]
@@ -282,19 +263,17 @@ def med_rad(
         peer: JSON file of another planner's recorded results, shown beside.
         out: File for all runs: .csv, or .json, which holds the arcs of the paths, too.
     """
-    from lungaccess.running.benchmark.published import read_peer
-    from lungaccess.running.benchmark.runs import require_table_file, summary_rows, write_rows
 
     names = _planners(planners)
     device = system.load()
     radii = _radii(radius, rules, device)
-    recorded = None if peer is None else read_peer(peer)
+    recorded = None if peer is None else lazy.read_peer(peer)
     if out is not None:
-        require_table_file(out)
+        lazy.require_table_file(out)
     rows = list(_rows(folder, rules, device, radii, names, range(seeds), budget, output))
     if out is not None:
-        write_rows(rows, out)
-    headings, lines = summary_rows(rows, recorded)
+        lazy.write_rows(rows, out)
+    headings, lines = lazy.summary_rows(rows, recorded)
     output.tell(
         {
             "rules": rules,
@@ -318,70 +297,65 @@ def med_rad(
 def _rows(
     folder: Path,
     rules: Rules,
-    device: System,
+    device: lazy.System,
     radii: tuple[float, ...],
     planners: tuple[str, ...],
     seeds: range,
     budget_s: float,
     output: PatientOptions,
-) -> Iterator[BenchmarkRow]:
+) -> Iterator[lazy.BenchmarkRow]:
     """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
-    from lungaccess.running.benchmark.published import patients_of, published_queries, why_no_query
-    from lungaccess.running.benchmark.runs import BenchmarkRow, run_query
 
-    paths = list(patients_of(folder))
+    paths = list(lazy.patients_of(folder))
     for path in paths:
         try:
             pose, patient = _posing(path, rules, device, output)
         except LungaccessError as error:
             if len(paths) == 1:
                 raise
-            yield BenchmarkRow(patient=path.name, reason=f"not read: {error.found}")
+            yield lazy.BenchmarkRow(patient=path.name, reason=f"not read: {error.found}")
             continue
-        if why_no_query(patient):
-            yield BenchmarkRow(patient=path.name, reason=why_no_query(patient))
-        asked = [(query, mm) for query in published_queries(patient, path.name) for mm in radii]
+        if lazy.why_no_query(patient):
+            yield lazy.BenchmarkRow(patient=path.name, reason=lazy.why_no_query(patient))
+        asked = [(query, mm) for query in lazy.published_queries(patient, path.name) for mm in radii]
         with progress(f"{path.name}: {len(asked)} queries") as shown:
             for number, (query, mm) in enumerate(asked):
                 shown.step(f"{path.name}, start {query.start}, R = {mm:g} mm", number / len(asked))
-                yield from run_query(*pose(query, mm), query, mm, planners, seeds, budget_s)
+                yield from lazy.run_query(*pose(query, mm), query, mm, planners, seeds, budget_s)
 
 
 def _posing(
-    path: Path, rules: Rules, device: System, output: PatientOptions
-) -> tuple[Pose, Organ | PatientImages | LiverImages]:
-    from lungaccess.running.benchmark.runs import posed_by_unc, posed_in_lung
+    path: Path, rules: Rules, device: lazy.System, output: PatientOptions
+) -> tuple[lazy.Pose, lazy.Organ | lazy.PatientImages | lazy.LiverImages]:
 
     if rules == "ours":
         lung = output.load_organ(path)
-        return posed_in_lung(lung, device), lung
-    from anatomy.io.liver import is_liver, load_liver
+        return lazy.posed_in_lung(lung, device), lung
     from anatomy.io.patients import load_patient
 
     with progress(f"reading {path}"):
-        images = load_liver(path) if is_liver(path) else load_patient(path)
-    return posed_by_unc(images), images
+        images = lazy.load_liver(path) if lazy.is_liver(path) else load_patient(path)
+    return lazy.posed_by_unc(images), images
 
 
 def _planners(text: str) -> tuple[str, ...]:
-    from stages.needle import NEEDLE_PLANNERS, OMPL_PLANNERS, has_ompl, require_planner
 
     names = tuple(name.strip() for name in text.split(",") if name.strip())
-    if text == DEFAULT_PLANNERS and not has_ompl():
-        names = tuple(name for name in names if name not in OMPL_PLANNERS)
+    if text == DEFAULT_PLANNERS and not lazy.has_ompl():
+        names = tuple(name for name in names if name not in lazy.OMPL_PLANNERS)
         terminal.progress_console.print("The planners of OMPL are left out: OMPL is not installed.")
     for name in names:
-        require_planner(name)
+        lazy.require_planner(name)
     if not names:
         raise SettingsError(
             "--planners names no planner",
-            expected=", ".join(NEEDLE_PLANNERS),
+            expected=", ".join(lazy.NEEDLE_PLANNERS),
             remedy="Name one or more, such as --planners rrt",
         )
     return names
 
 
-def _radii(text: str | None, rules: Rules, device: System) -> tuple[float, ...]:
+def _radii(text: str | None, rules: Rules, device: lazy.System) -> tuple[float, ...]:
     if text is None and rules == "ours":
         return (device.require_needle("The benchmark of needles").min_radius_of_curvature_mm,)
     try:

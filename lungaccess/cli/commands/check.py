@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 from rich.table import Table
@@ -12,7 +12,7 @@ from rich.table import Table
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_suffix, require_writable_folder
 from anatomy.base.words import of_hundred, percent, range_of_hundred
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Hertz, NotNegative, Positive, Samples, Seed
 from lungaccess.cli.options import (
@@ -25,10 +25,6 @@ from lungaccess.cli.options import (
 )
 from lungaccess.cli.plan_search import check_tables, show_findings, show_headline
 from lungaccess.cli.progress import progress
-
-if TYPE_CHECKING:
-    from lungaccess.planning.procedure.insertion import InsertionStudy
-    from lungaccess.uncertainty.breathing.moving import CarriedNeedle
 
 
 def check(
@@ -52,7 +48,6 @@ def check(
         out: Where the plan with the edited needle goes if it is accepted.
         everything: List every finding, not only the nearest limits.
     """
-    from lungaccess.judging.appraisal import appraise
 
     if curve is not None:
         if system or errors.errors or errors.procedure:
@@ -68,14 +63,12 @@ def check(
             expected="an edited curve",
             remedy="Add --curve scene.mrml#needle",
         )
-    from lungaccess.plans.plan import Plan
-    from lungaccess.problem.system import load_system
 
-    stored, model = Plan.load(plan), errors.given()
-    device = None if system is None else load_system(system)
+    stored, model = lazy.Plan.load(plan), errors.given()
+    device = None if system is None else lazy.load_system(system)
     followed = errors.given_procedure()
     lung = output.load(patient, thick_slices=True)
-    appraisal = appraise(stored, lung, errors=model, procedure=followed, system=device)
+    appraisal = lazy.appraise(stored, lung, errors=model, procedure=followed, system=device)
     output.tell({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
     show_headline(appraisal.headline)
     show_findings(appraisal)
@@ -87,27 +80,23 @@ def check(
 def _check_curve(
     plan: Path, patient: Path, text: str, out: Path | None, output: PatientOptions, *, everything: bool
 ) -> ExitCode:
-    from anatomy.io.markups import parse_reference, read_named_curve
-    from lungaccess.judging.appraisal import Headline
-    from lungaccess.plans.plan import Plan
-    from lungaccess.showing.slicer import check_curve
 
-    saved = parse_reference(text)
+    saved = lazy.parse_reference(text)
     if saved is None:
         raise SettingsError(
             f"--curve is {text!r}",
             expected="a file of 3D Slicer and the name of a curve in it",
             remedy="Write --curve scene.mrml#needle",
         )
-    stored, curve = Plan.load(plan), read_named_curve(saved)
+    stored, curve = lazy.Plan.load(plan), lazy.read_named_curve(saved)
     lung = output.load(patient, thick_slices=True)
-    edited = check_curve(stored, lung, curve)
+    edited = lazy.check_curve(stored, lung, curve)
     report = edited.report
     if out is not None and report.accepted:
         edited.plan.save(out)
     output.tell({"device": edited.device, "edited": edited.words, **report.to_mapping()})
     terminal.say(edited.words)
-    show_headline(Headline.of(report, None))
+    show_headline(lazy.Headline.of(report, None))
     for finding in (*report.refusals, *report.unchecked):
         terminal.say(f"{finding}")
     if everything:
@@ -140,24 +129,18 @@ def window(
     """
     from dataclasses import asdict, replace
 
-    from lungaccess.plans.file import plain
-    from lungaccess.uncertainty.breathing.moving import carried_needle
-    from lungaccess.uncertainty.breathing.window import breathing_window
-
     for file, suffix in ((out, ".json"), (picture, ".png")):
         if file is not None:
             require_suffix(file, suffix)
     stored, lung = output.load_plan(plan, patient)
-    found = breathing_window(stored, lung, tolerance_mm=tolerance)
-    in_place = carried_needle(stored, lung, found) if tissue_carries_needle else None
+    found = lazy.breathing_window(stored, lung, tolerance_mm=tolerance)
+    in_place = lazy.carried_needle(stored, lung, found) if tissue_carries_needle else None
     if out is not None:
         replace(stored, window=found).save(out)
     if picture is not None:
-        from lungaccess.showing.report import window_png
-
-        window_png(found, picture)
+        lazy.window_png(found, picture)
     told = {} if in_place is None else {"needle_in_tissue_not_proved": asdict(in_place)}
-    output.tell({**plain(found), "share": found.share, "words": found.words, **told})
+    output.tell({**lazy.plain(found), "share": found.share, "words": found.words, **told})
     terminal.say(found.words)
     rows = [(f"{of_hundred(a, up=True)} to {percent(b)}", percent(b - a)) for a, b in found.phases.tolist()]
     rows += [("not decided", percent(found.undecided_share))]
@@ -168,7 +151,7 @@ def window(
     return ExitCode.of(len(found.phases) > 0)
 
 
-def _in_place(needle: CarriedNeedle) -> Table:
+def _in_place(needle: lazy.CarriedNeedle) -> Table:
     rows = [
         ("its end to the moving target", f"{needle.end_miss_mm:.1f} mm"),
         ("shift of its begin from the tubes", f"{needle.shift_at_tubes_mm:.1f} mm"),
@@ -217,18 +200,12 @@ def insert(
         film: WebP file for a film of the first needle, blindly and tracked.
         picture: PNG file for the true paths and tip errors of all.
     """
-    from lungaccess.judging.checking import check
-    from lungaccess.planning.procedure import insert_plan
-    from lungaccess.plans.plan import Plan
-    from lungaccess.problem.error_files import load_errors
-    from lungaccess.problem.procedures import NeedleSteering
-    from lungaccess.showing.report.insertion import insertion_webp, insertions_png
 
-    passes = Plan.load(plan).passes
+    passes = lazy.Plan.load(plan).passes
     if not 1 <= number <= len(passes):
         raise SettingsError(f"--pass is {number}", expected=f"a pass of the plan, 1 to {len(passes)}")
     stored = passes[number - 1]
-    steering = NeedleSteering(
+    steering = lazy.NeedleSteering(
         closed_loop=True, measure_every_mm=speed / rate, replan_every_mm=replan_every, position_mm=noise,
         direction_deg=tilt, target_mm=noise, latency_mm=latency * speed, lost_share=lost,
     )  # fmt: skip
@@ -241,17 +218,17 @@ def insert(
     if picture is not None:
         require_picture(picture)
     lung = output.load(patient)
-    model = None if errors is None else load_errors(errors)
+    model = None if errors is None else lazy.load_errors(errors)
     with progress("inserting needles"):
-        found = insert_plan(
+        found = lazy.insert_plan(
             stored, lung, steering, errors=model, samples=samples, seed=seed, tolerance_mm=tolerance
         )
-    accepted = check(stored, lung).accepted
+    accepted = lazy.check(stored, lung).accepted
     files = []
     if film is not None:
-        files.append(str(insertion_webp(found, lung, film)))
+        files.append(str(lazy.insertion_webp(found, lung, film)))
     if picture is not None:
-        files.append(str(insertions_png(found, lung, picture)))
+        files.append(str(lazy.insertions_png(found, lung, picture)))
     record = found.to_mapping()
     output.tell({**record, "plan_accepted": accepted, "files": files})
     if not accepted:
@@ -262,7 +239,7 @@ def insert(
     return ExitCode.of(accepted)
 
 
-def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
+def _table(found: lazy.InsertionStudy, record: dict[str, Any]) -> Table:
     columns = [record["open_loop"], record["closed_loop"]]
     hits = [", ".join(f"{name} {n}" for name, n in each["hits"].items()) or "none" for each in columns]
     reached = [each["reached"] for each in columns]
@@ -288,7 +265,7 @@ def _table(found: InsertionStudy, record: dict[str, Any]) -> Table:
     return made
 
 
-def _known(found: InsertionStudy) -> str:
+def _known(found: lazy.InsertionStudy) -> str:
     """Return by how much the believed factor of the curvature differs from the true one, in words."""
     bent = [run for run in found.closed_loop.insertions if run.factor > 0.0]
     off = [abs(run.believed_factor / run.factor - 1.0) for run in bent]

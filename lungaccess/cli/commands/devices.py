@@ -6,12 +6,12 @@ import math
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 from rich.table import Table
 
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.commands.exchange import template_text
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Angle, NotNegative, Processes
@@ -19,12 +19,6 @@ from lungaccess.cli.options import DEFAULT_SYSTEM, CacheOptions, OutputOptions, 
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import claim_folder, keep_earlier
 from lungaccess.plans.record import picked
-
-if TYPE_CHECKING:
-    from lungaccess.planning.one_stage import TubeAnswer
-    from lungaccess.problem.system import System
-    from lungaccess.running.design.search import DesignFound
-    from stages.tube import DesignProposal, SequenceComparison, TubeShapes
 
 
 def presets(*, show: str | None = None, output: OutputOptions = OutputOptions()) -> ExitCode:
@@ -35,25 +29,21 @@ def presets(*, show: str | None = None, output: OutputOptions = OutputOptions())
     Args:
         show: Print the TOML file of this system: edit it, and hand it over with --system FILE.
     """
-    from anatomy.base.settings import to_mapping
-    from lungaccess.problem.channel import system_warnings
-    from lungaccess.problem.preset_order import presets_by_invasiveness
-    from lungaccess.problem.system import load_system, needle_preset_names, preset_text, tube_preset_names
 
     if show is not None and not output.json:
-        terminal.console.file.write(preset_text(show))
+        terminal.console.file.write(lazy.preset_text(show))
         return ExitCode.OK
-    ordered = [system.name for system in presets_by_invasiveness()]
-    names = (*ordered, *tube_preset_names(), *needle_preset_names()) if show is None else (show,)
-    systems = {name: load_system(name) for name in names}
-    output.tell({name: to_mapping(system) for name, system in systems.items()})
+    ordered = [system.name for system in lazy.presets_by_invasiveness()]
+    names = (*ordered, *lazy.tube_preset_names(), *lazy.needle_preset_names()) if show is None else (show,)
+    systems = {name: lazy.load_system(name) for name in names}
+    output.tell({name: lazy.to_mapping(system) for name, system in systems.items()})
     terminal.console.print(_preset_table(systems))
-    warned = ((name, each) for name, system in systems.items() for each in system_warnings(system))
+    warned = ((name, each) for name, system in systems.items() for each in lazy.system_warnings(system))
     terminal.show_warnings(f"{name}: {each}" for name, each in warned)
     return ExitCode.OK
 
 
-def _preset_table(systems: Mapping[str, System]) -> Table:
+def _preset_table(systems: Mapping[str, lazy.System]) -> Table:
     rows = [
         (
             name,
@@ -93,11 +83,10 @@ def tubes(
         propose: Compare sequences to the same place, and look for designs that sweep less.
         out: PNG file for the picture.
     """
-    from lungaccess.planning.one_stage import deploy_tubes, load_tubes
 
     require_picture(out)
-    answer = deploy_tubes(
-        load_tubes(system),
+    answer = lazy.deploy_tubes(
+        lazy.load_tubes(system),
         outer,
         inner,
         rotation_rad=math.radians(rotate),
@@ -113,7 +102,7 @@ def tubes(
     return ExitCode.of(answer.acceptable)
 
 
-def _show_verdict(answer: TubeAnswer, propose: bool) -> None:
+def _show_verdict(answer: lazy.TubeAnswer, propose: bool) -> None:
     """Print whether the device allows the deployment, why not, and what to try."""
     if answer.acceptable:
         limits = "" if answer.system is None else " and within the limits of the system"
@@ -126,21 +115,20 @@ def _show_verdict(answer: TubeAnswer, propose: bool) -> None:
         terminal.say("Less of the outer tube sweeps less; --propose compares sequences and other designs.")
 
 
-def _show_tables(answer: TubeAnswer, propose: bool) -> None:
+def _show_tables(answer: lazy.TubeAnswer, propose: bool) -> None:
     terminal.show([terminal.table(f"Tubes of {answer.name}", ("", "", "limit"), _tubes_rows(answer))])
     if not propose:
         return
-    from lungaccess.planning.one_stage import compare_sequences, design_choices
 
-    comparison = compare_sequences(answer)
+    comparison = lazy.compare_sequences(answer)
     terminal.show([_sequence_table(comparison)])
     for name, why in comparison.refused.items():
         terminal.say(f"{name}: refused. {why}\n")
     if answer.system is not None:
-        terminal.show([_design_table(*design_choices(answer))])
+        terminal.show([_design_table(*lazy.design_choices(answer))])
 
 
-def _tubes_rows(answer: TubeAnswer) -> list[terminal.Row]:
+def _tubes_rows(answer: lazy.TubeAnswer) -> list[terminal.Row]:
     limits = None if answer.system is None else answer.system.tubes
     tip, final, deployed = answer.final.base_from_tip, answer.final, answer.deployed
     turned = math.degrees(math.acos(max(-1.0, min(1.0, float(tip[2, 2])))))
@@ -181,7 +169,7 @@ def _numbers(values: object, digits: int) -> str:
     return ", ".join(f"{value + 0.0:.{digits}f}" for value in np.round(np.asarray(values), digits))
 
 
-def _sequence_table(comparison: SequenceComparison) -> Table:
+def _sequence_table(comparison: lazy.SequenceComparison) -> Table:
     rows = [
         (
             each.sequence.name,
@@ -195,7 +183,7 @@ def _sequence_table(comparison: SequenceComparison) -> Table:
     return terminal.table("Sequences to the same place", headings, rows)
 
 
-def _design_table(present: DesignProposal, choices: tuple[DesignProposal, ...]) -> Table:
+def _design_table(present: lazy.DesignProposal, choices: tuple[lazy.DesignProposal, ...]) -> Table:
     rows = [
         (
             name,
@@ -218,12 +206,11 @@ def _design_table(present: DesignProposal, choices: tuple[DesignProposal, ...]) 
     )
 
 
-def _show_json(answer: TubeAnswer, propose: bool) -> None:
-    from lungaccess.planning.one_stage import compare_sequences, design_choices, tubes_record
+def _show_json(answer: lazy.TubeAnswer, propose: bool) -> None:
 
-    written = tubes_record(answer)
+    written = lazy.tubes_record(answer)
     if propose:
-        comparison = compare_sequences(answer)
+        comparison = lazy.compare_sequences(answer)
         written["sequences"] = [
             {"name": each.sequence.name}
             | picked(each, "lateral_sweep_mm follow_the_leader_error_mm least_determinant")
@@ -231,22 +218,20 @@ def _show_json(answer: TubeAnswer, propose: bool) -> None:
         ]
         written["refused_sequences"] = comparison.refused
         if answer.system is not None:
-            written["proposals"] = [_proposal(each) for each in design_choices(answer)[1]]
+            written["proposals"] = [_proposal(each) for each in lazy.design_choices(answer)[1]]
     terminal.show_json(written)
 
 
-def _proposal(proposal: DesignProposal) -> dict[str, object]:
-    from anatomy.base.settings import to_mapping
+def _proposal(proposal: lazy.DesignProposal) -> dict[str, object]:
 
     return {
         **picked(proposal, "lateral_sweep_mm tip_offset_mm tip_angle_rad"),
-        "outer": to_mapping(proposal.tubes.outer),
-        "inner": to_mapping(proposal.tubes.inner),
+        "outer": lazy.to_mapping(proposal.tubes.outer),
+        "inner": lazy.to_mapping(proposal.tubes.inner),
     }
 
 
-def _draw(answer: TubeAnswer, out: Path) -> None:
-    from lungaccess.showing.report import tubes_png
+def _draw(answer: lazy.TubeAnswer, out: Path) -> None:
 
     keep_earlier(out)
     deployed = answer.deployed
@@ -263,7 +248,7 @@ def _draw(answer: TubeAnswer, out: Path) -> None:
     if answer.snap is not None:
         out_mm = ", ".join(f"{length:.1f}" for length in reversed(answer.snap.insertions_mm.tolist()))
         notes += ["SNAPS during deployment, at insertions", f"of {out_mm} mm (outer, inner)"]
-    tubes_png(
+    lazy.tubes_png(
         answer.final,
         out,
         deployed=deployed,
@@ -285,13 +270,12 @@ def shapes(
             innermost first.
         out: CSV file for a table of all shapes.
     """
-    from lungaccess.planning.one_stage import design_shapes, load_tubes, save_shapes, shapes_record
 
-    device = load_tubes(system)
-    found = design_shapes(device, cache=output.cache)
+    device = lazy.load_tubes(system)
+    found = lazy.design_shapes(device, cache=output.cache)
     if out is not None:
-        save_shapes(found, out)
-    output.tell(shapes_record(device.name, found))
+        lazy.save_shapes(found, out)
+    output.tell(lazy.shapes_record(device.name, found))
     terminal.show(
         [terminal.table(f"Shapes of {device.name}", ("", "", "limit"), _shapes_rows(device.name, found))]
     )
@@ -300,10 +284,9 @@ def shapes(
     return ExitCode.of(found.count > 0)
 
 
-def _shapes_rows(name: str, found: TubeShapes) -> list[terminal.Row]:
-    from lungaccess.planning.one_stage import shapes_record
+def _shapes_rows(name: str, found: lazy.TubeShapes) -> list[terminal.Row]:
 
-    record = shapes_record(name, found)
+    record = lazy.shapes_record(name, found)
     turns = record["relative_rotations"]
     turned = f"{turns} relative rotations" if turns > 1 else "no relative rotation"
     grid = f"insertions every {record['stop_mm']:g} mm, {turned}"
@@ -350,28 +333,24 @@ def design(
         scheduler: Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
         workers: How many processes on this machine; as many as it has cores if not given.
     """
-    from anatomy.base.settings import settings_toml
-    from lungaccess.running.design.search import run_design
-    from lungaccess.running.design.settings import design_of, read_design
-    from lungaccess.showing.report import front_png
 
-    asked = read_design(design) if design else design_of(tomllib.loads(template_text("design")))
+    asked = lazy.read_design(design) if design else lazy.design_of(tomllib.loads(template_text("design")))
     claim_folder(out, ())
     with progress(asked.study.name) as shown:
-        found = run_design(
+        found = lazy.run_design(
             asked, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
         )
     best = found.front[0]
     values = {each.system.name: each.values for each in found.counted}
-    front_png(found.criteria, values, [each.system.name for each in found.front], out / "front.png")
+    lazy.front_png(found.criteria, values, [each.system.name for each in found.front], out / "front.png")
     output.tell(found.record())
     _show(asked.study.name, found)
-    terminal.console.print(settings_toml(best.system), soft_wrap=True)
+    terminal.console.print(lazy.settings_toml(best.system), soft_wrap=True)
     terminal.say(f"Written to {out}: device.toml, the device above; front/, design.json, front.png")
     return ExitCode.of(any(best.reached))
 
 
-def _show(title: str, found: DesignFound) -> None:
+def _show(title: str, found: lazy.DesignFound) -> None:
     devices = found.record()["devices"]
     first = found.counted[0].system.name
     numbers = {each.system.name: f"{n}" for n, each in enumerate(found.front, start=1)}

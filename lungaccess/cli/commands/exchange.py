@@ -6,14 +6,14 @@ import contextlib
 from dataclasses import asdict
 from importlib import import_module, resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 from rich.table import Table
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import write_text
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.commands.see import shown_ct
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Hertz, Port, Seconds
@@ -21,9 +21,6 @@ from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, 
 from lungaccess.cli.plan_search import show_headline
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder, require_new_file
-
-if TYPE_CHECKING:
-    from lungaccess.showing.live import Answer, LiveCounts
 
 
 def export(
@@ -58,10 +55,6 @@ def export(
             expected="a folder for 3D Slicer, for the motion in time, for models, or for DICOM",
             remedy="Add --slicer DIR",
         )
-    from lungaccess.judging.appraisal import appraise
-    from lungaccess.showing.live import plan_trajectory, write_trajectory
-    from lungaccess.showing.model_files import export_models
-    from lungaccess.showing.slicer import export_slicer
 
     for folder in (slicer, trajectory, models, dicom):
         if folder is not None:
@@ -69,19 +62,17 @@ def export(
     stored, lung = output.load_plan(plan, patient)
     written: dict[Path, tuple[str, ...]] = {}
     with progress("checking the plan") as shown:
-        appraisal = appraise(stored, lung)
+        appraisal = lazy.appraise(stored, lung)
         if slicer is not None:
-            written[slicer] = export_slicer(stored, lung, slicer, progress=shown.step).files
+            written[slicer] = lazy.export_slicer(stored, lung, slicer, progress=shown.step).files
         if trajectory is not None and appraisal.accepted:
-            written[trajectory] = write_trajectory(plan_trajectory(stored), trajectory)
+            written[trajectory] = lazy.write_trajectory(lazy.plan_trajectory(stored), trajectory)
         if models is not None and appraisal.accepted:
             shown.step("writing models")
-            written[models] = export_models(stored, lung, models)
+            written[models] = lazy.export_models(stored, lung, models)
         if dicom is not None and appraisal.accepted:
-            from lungaccess.showing.dicom_files import export_dicom
-
             shown.step("writing DICOM")
-            written[dicom] = export_dicom(
+            written[dicom] = lazy.export_dicom(
                 stored, lung, dicom, shown_ct(ct, patient), appraisal, anonymise=anonymise
             )
     folders = [{"folder": str(folder), "files": list(files)} for folder, files in written.items()]
@@ -119,25 +110,20 @@ def stream(
         loop: Begin the motion again when it has ended.
         seconds: End after so long; until Ctrl-C if not given.
     """
-    from lungaccess.judging.appraisal import Headline
-    from lungaccess.judging.checking import check
-    from lungaccess.planning.procedure import Policy
-    from lungaccess.plans.plan import Plan
-    from lungaccess.showing.live import Link, LiveSession
 
-    stored = Plan.load(plan)
-    with Link(host, port, connects=connect) as link:
+    stored = lazy.Plan.load(plan)
+    with lazy.Link(host, port, connects=connect) as link:
         lung = output.load(patient)
         stored.require_lung(lung)
-        report = check(stored, lung)
+        report = lazy.check(stored, lung)
         if not report.accepted:
             output.tell({"accepted": False, **report.to_mapping()})
-            show_headline(Headline.of(report, None))
+            show_headline(lazy.Headline.of(report, None))
             return ExitCode.NEGATIVE
         followed = errors.given_procedure()
-        session = LiveSession(
+        session = lazy.LiveSession(
             stored, lung, link, rate_hz=rate, loop=loop, on_answer=None if output.json else _say,
-            policy=None if followed is None else Policy(stored, lung, errors.load(), followed),
+            policy=None if followed is None else lazy.Policy(stored, lung, errors.load(), followed),
         )  # fmt: skip
         if not output.json:
             done = "Connecting to" if connect else "Listening at"
@@ -150,11 +136,11 @@ def stream(
     return ExitCode.OK
 
 
-def _say(answer: Answer) -> None:
+def _say(answer: lazy.Answer) -> None:
     terminal.say(f"{answer.name}: {answer.words} ({1e3 * answer.processor_s:.1f} ms)")
 
 
-def _table(counts: LiveCounts) -> Table:
+def _table(counts: lazy.LiveCounts) -> Table:
     link = counts.link
     rows = [
         ("rounds", f"{counts.ticks}, of which {counts.overrun} took too long"),
@@ -257,12 +243,11 @@ def template_text(kind: Kind) -> str:
 
 def schema_text(kind: Kind) -> str:
     """Return the JSON Schema of the files of a kind; SettingsError if its files have no keys."""
-    from lungaccess.plans.file import schema_of
 
     if kind not in SCHEMAS:
         raise SettingsError(f"Files of the kind {kind} have no keys", expected=f"one of {', '.join(SCHEMAS)}")
     module, name = SCHEMAS[kind].split(":")
-    schema = schema_of(getattr(import_module(module), name))
+    schema = lazy.schema_of(getattr(import_module(module), name))
     schema["properties"] |= FURTHER.get(kind, {})
     schema["properties"].pop("folder", None)  # A study is told where its file lies.
     if kind == "design":

@@ -9,24 +9,20 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
 from anatomy.base.cache import cache_limit_bytes, default_cache, parse_size, size_in_words
 from anatomy.machine_code.ahead import usable_cores
 from anatomy.machine_code.sources import kernel_digest
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative
 from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
 from lungaccess.plans.record import picked
-
-if TYPE_CHECKING:
-    from anatomy.base.cache_entries import CacheEntry
-    from lungaccess.judging.selftest import Failure, Outcome
 
 
 def doctor(*, cache: Path | None = None, output: OutputOptions = OutputOptions()) -> ExitCode:
@@ -171,11 +167,11 @@ def kernel_cache() -> dict[str, Any]:
     which new code is kept, if it can be written.  The size is that of all code there, also of other sources.
     numba is not imported for it, so that the answer comes at once, and also where numba is broken.
     """
-    from anatomy.machine_code import folders
-    from anatomy.machine_code.sources import Sources, kernel_modules
 
-    sources = Sources()
-    modules = kernel_modules(sources=sources)
+    from anatomy.machine_code import folders
+
+    sources = lazy.Sources()
+    modules = lazy.kernel_modules(sources=sources)
     names = [folders.module_folder(each, sources.stamp(each) or "") for each in modules]
     places = folders.code_folders()
     files = [file for place in places for file in place.rglob("*.code")]
@@ -213,16 +209,15 @@ def selftest(
     Args:
         kind: Kinds of proofs, as the table names them; all of them if not given.
     """
-    from lungaccess.judging.selftest import self_test
 
     with progress("proofs") as shown:
-        outcomes = self_test(kind, progress=shown.step)
+        outcomes = lazy.self_test(kind, progress=shown.step)
     output.tell([{**asdict(each), "held": each.held} for each in outcomes])
     _show_selftest(outcomes)
     return ExitCode.of(all(each.held for each in outcomes))
 
 
-def _show_selftest(outcomes: tuple[Outcome, ...]) -> None:
+def _show_selftest(outcomes: tuple[lazy.Outcome, ...]) -> None:
     rows = [
         (
             each.kind,
@@ -240,7 +235,7 @@ def _show_selftest(outcomes: tuple[Outcome, ...]) -> None:
             terminal.console.print(f"{each.kind}, seed {failure.seed}: {failure.said}", style="bold red")
 
 
-def _verdict(failures: tuple[Failure, ...]) -> str:
+def _verdict(failures: tuple[lazy.Failure, ...]) -> str:
     return f"NO, in {len(failures)}" if failures else "yes"
 
 
@@ -282,11 +277,10 @@ def prune(
         older_than: Days without use after which something goes.
         max_size: What may stay, such as 2GB; LUNGACCESS_CACHE_LIMIT if not given.
     """
-    from anatomy.base.cache_entries import overdue
 
     most = cache_limit_bytes() if max_size is None else parse_size(max_size, "--max-size")
     found = _entries(output.cache or default_cache())
-    return _remove(overdue(found, most_bytes=most, older_than_days=older_than), output)
+    return _remove(lazy.overdue(found, most_bytes=most, older_than_days=older_than), output)
 
 
 @cache.command(help_epilogue=epilogue("cache clear"))
@@ -296,28 +290,22 @@ def clear(*, output: CacheOptions = CacheOptions()) -> ExitCode:
     return _remove([each for each in entries if each.kind != "unfinished" or each.abandoned], output)
 
 
-def _entries(folder: Path) -> tuple[CacheEntry, ...]:
-    from anatomy.base.cache_entries import cache_entries
-    from anatomy.store import stored_format
-    from lungaccess.planning.coupled.atlas import atlas_format
-    from lungaccess.uncertainty.risk.patient_errors import resting_format
-    from stages.tube import shapes_format
+def _entries(folder: Path) -> tuple[lazy.CacheEntry, ...]:
 
     formats = {
-        "anatomy": stored_format(),
-        "atlas": atlas_format(),
-        "resting": resting_format(),
-        "shapes": shapes_format(),
+        "anatomy": lazy.stored_format(),
+        "atlas": lazy.atlas_format(),
+        "resting": lazy.resting_format(),
+        "shapes": lazy.shapes_format(),
     }
-    return cache_entries(folder, formats)
+    return lazy.cache_entries(folder, formats)
 
 
-def _remove(entries: Iterable[CacheEntry], output: CacheOptions) -> ExitCode:
-    from anatomy.base.cache_entries import remove_entry
+def _remove(entries: Iterable[lazy.CacheEntry], output: CacheOptions) -> ExitCode:
 
     gone = []
     for entry in entries:
-        remove_entry(entry)
+        lazy.remove_entry(entry)
         gone.append(entry)
     size = sum(entry.size_bytes for entry in gone)
     output.tell({"removed": [_record(entry) for entry in gone], "size_bytes": size})
@@ -327,14 +315,14 @@ def _remove(entries: Iterable[CacheEntry], output: CacheOptions) -> ExitCode:
     return ExitCode.OK
 
 
-def _row(entry: CacheEntry) -> terminal.Row:
+def _row(entry: lazy.CacheEntry) -> terminal.Row:
     used = "today" if entry.days_unused < 1.0 else f"{entry.days_unused:.0f} days ago"
     kind = entry.kind if entry.current else f"old {entry.kind}"
     pictures = size_in_words(entry.pictures_bytes) if entry.pictures_bytes else ""
     return kind, entry.patient, size_in_words(entry.size_bytes), pictures, used, entry.path.name[:12]
 
 
-def _record(entry: CacheEntry) -> dict[str, object]:
+def _record(entry: lazy.CacheEntry) -> dict[str, object]:
     return {
         "path": str(entry.path),
         **picked(entry, "kind patient size_bytes pictures_bytes"),

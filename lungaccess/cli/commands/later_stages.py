@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from rich.table import Table
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.words import of_hundred
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Positive, Seed
 from lungaccess.cli.options import (
@@ -31,14 +31,6 @@ from lungaccess.cli.plan_search import arcs_table, no_plan_record
 from lungaccess.cli.progress import progress
 from lungaccess.plans.no_plan import NoPlan
 from stages.needle import DEFAULT, Objective
-
-if TYPE_CHECKING:
-    from anatomy.base.typed import Float
-    from anatomy.organ import Organ
-    from lungaccess.planning.one_stage import NeedleAnswer, RestOfPlan
-    from lungaccess.planning.procedure import Decision
-    from lungaccess.plans.parts import TubeDeployment
-    from lungaccess.plans.plan import Plan
 
 
 def replan(
@@ -82,7 +74,6 @@ def replan(
         poses = {"scope": scope, "tubes": tube, "needle": needle}
         followed = _Followed(plan, errors, placement, radius, record)
         return _decided(patient, poses, frame, followed, output)
-    from lungaccess.planning.one_stage import replan_from_scope, replan_from_tube
 
     Objective.of(objective)
     stated, device = target.stated(), system.load()
@@ -91,7 +82,7 @@ def replan(
     if of_plan is not None:
         of_plan.require_lung(lung)
     require_map(lung, objective)
-    aim, ask = stated.resolve(lung), replan_from_tube if scope is None else replan_from_scope
+    aim, ask = stated.resolve(lung), lazy.replan_from_tube if scope is None else lazy.replan_from_scope
     try:
         with progress("planning the rest"):
             found = ask(lung, device, pose, aim, objective=objective, seed=seed)
@@ -122,8 +113,6 @@ def _decided(
     followed: _Followed,
     output: PatientOptions,
 ) -> ExitCode:
-    from lungaccess.planning.procedure import Measurements, Policy, ProcedureRecord
-    from lungaccess.plans.plan import Plan
 
     procedure = followed.errors.given_procedure()
     if followed.plan is None or procedure is None:
@@ -133,15 +122,15 @@ def _decided(
             remedy="For instance --plan plan.json --procedure measured-tip",
         )
     poses = {name: [_pose(text, name, frame)[0]] for name, text in stated.items() if text is not None}
-    plan, lung = Plan.load(followed.plan), output.load(patient)
+    plan, lung = lazy.Plan.load(followed.plan), output.load(patient)
     kept = followed.record
     if kept is not None and kept.exists():
-        record = ProcedureRecord.load(kept, plan, lung)
+        record = lazy.ProcedureRecord.load(kept, plan, lung)
     else:
-        policy = Policy(plan, lung, followed.errors.load(), procedure, radius_mm=followed.radius)
-        record = ProcedureRecord(policy)
+        policy = lazy.Policy(plan, lung, followed.errors.load(), procedure, radius_mm=followed.radius)
+        record = lazy.ProcedureRecord(policy)
     with progress("asking the policy"):
-        decision = record.decide(Measurements.of(**poses, placements=followed.placement))  # type: ignore[arg-type]
+        decision = record.decide(lazy.Measurements.of(**poses, placements=followed.placement))  # type: ignore[arg-type]
     if kept is not None:
         record.save(kept)
     output.tell(decision.record())
@@ -149,7 +138,7 @@ def _decided(
     return ExitCode.OK if decision.goes_on else ExitCode.NEGATIVE
 
 
-def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[Float, Plan | None]:
+def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[lazy.Float, lazy.Plan | None]:
     given = scope if tube is None else tube
     if given is None or (scope is not None and tube is not None):
         raise SettingsError(
@@ -160,23 +149,19 @@ def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[
     return _pose(given, "scope" if tube is None else "tubes", frame)
 
 
-def _pose(given: str, stage: str, frame: FrameOfPose) -> tuple[Float, Plan | None]:
+def _pose(given: str, stage: str, frame: FrameOfPose) -> tuple[lazy.Float, lazy.Plan | None]:
     """Return a pose as it is stated, and the plan that it is of if it is one of a plan."""
-    from anatomy.io.frames import read_pose
-    from anatomy.io.markups import parse_reference, read_named_pose
-    from lungaccess.plans.plan import Plan
 
-    saved = parse_reference(given)
+    saved = lazy.parse_reference(given)
     if saved is not None:
-        return read_named_pose(saved), None
+        return lazy.read_named_pose(saved), None
     if not given.endswith(".json"):
-        return read_pose(given, frame), None
-    plan = Plan.load(given)
+        return lazy.read_pose(given, frame), None
+    plan = lazy.Plan.load(given)
     return (plan.scope.lps_from_scope_tip if stage == "scope" else plan.tube.lps_from_tip), plan
 
 
-def _replan_tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
-    from lungaccess.plans.costs import costs_in_words, known_costs
+def _replan_tables(found: lazy.RestOfPlan, *, has_map: bool) -> list[Table]:
 
     tube, needle = found.tube, found.needle
     rows = [] if tube is None else tube_rows(tube)
@@ -190,7 +175,7 @@ def _replan_tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
         (f"least clearance of the {name}", f"{min(each.values()):.2f} mm")
         for name, each in found.clearance_mm.items()
     ]
-    rows += costs_in_words(known_costs(found.costs, has_map=has_map))
+    rows += lazy.costs_in_words(lazy.known_costs(found.costs, has_map=has_map))
     tables = [terminal.table("the rest, proved", ("", ""), rows)]
     if needle is not None:
         arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in needle.arcs]
@@ -198,7 +183,7 @@ def _replan_tables(found: RestOfPlan, *, has_map: bool) -> list[Table]:
     return tables
 
 
-def tube_rows(tube: TubeDeployment) -> list[tuple[str, str]]:
+def tube_rows(tube: lazy.TubeDeployment) -> list[tuple[str, str]]:
     """Return how tubes are to be turned and inserted."""
     turned = tube.shape.relative_rotations_rad
     middle = [("middle tube", f"{tube.middle_insertion_mm:.1f} mm")] if tube.middle_insertion_mm else []
@@ -216,7 +201,7 @@ def tube_rows(tube: TubeDeployment) -> list[tuple[str, str]]:
     ]
 
 
-def decision_tables(decision: Decision) -> list[Table]:
+def decision_tables(decision: lazy.Decision) -> list[Table]:
     """Return what a policy says is to be done next."""
 
     rows = [("estimated chance of success so", f"{of_hundred(decision.chance)} of 100")]
@@ -256,8 +241,6 @@ def needle(
             or a weighted sum such as length=1,cost-map=0.5.
         out: PNG file for a picture of start, path or blocked place, and target.
     """
-    from anatomy.lung import Lung
-    from lungaccess.planning.one_stage import plan_needle
 
     if out is not None:
         require_picture(out)
@@ -267,7 +250,7 @@ def needle(
     limit_s = budget.time_s
     pose, aim = _start_pose(lung, start, frame), stated.resolve(lung)
     with progress("searching" if limit_s is None else f"searching, at most {limit_s:g} s"):
-        answer = plan_needle(
+        answer = lazy.plan_needle(
             lung,
             device,
             pose,
@@ -279,30 +262,24 @@ def needle(
             time_s=limit_s,
         )
     checked = None
-    if answer.path is not None and isinstance(lung, Lung):
-        from lungaccess.judging.checking import check_needle_alone
-
-        checked = check_needle_alone(
+    if answer.path is not None and isinstance(lung, lazy.Lung):
+        checked = lazy.check_needle_alone(
             lung, device, pose, answer.path.arcs, aim.lps_mm, branches=answer.branches, at_wall=answer.at_wall
         )
     output.tell(answer.record() | {"check": checked and checked.to_mapping()})
-    terminal.show(_needle_tables(answer, is_lung=isinstance(lung, Lung)))
+    terminal.show(_needle_tables(answer, is_lung=isinstance(lung, lazy.Lung)))
     if checked is not None:
         verdict = "accepts" if checked.accepted else "REFUSES"
         terminal.say("\n".join([f"The independent check {verdict} the path.", *map(str, checked.refusals)]))
     elif answer.path is not None:
         terminal.say("The independent check reads lungs alone: this path was not checked.")
     if out is not None:
-        from lungaccess.showing.report import needle_png
-
-        needle_png(answer, lung, out)
+        lazy.needle_png(answer, lung, out)
         terminal.say(f"Written to {out}")
     return ExitCode.of(answer.path is not None and (checked is None or checked.accepted))
 
 
-def _needle_tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
-    from lungaccess.planning.one_stage import obstruction_rows
-    from lungaccess.plans.costs import costs_in_words
+def _needle_tables(answer: lazy.NeedleAnswer, *, is_lung: bool) -> list[Table]:
 
     words = {
         "path": "a path, proved clear",
@@ -316,7 +293,7 @@ def _needle_tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
         rows.append((how, pierced) if is_lung else ("enters through", "the surface of the organ"))
     path = answer.path
     if answer.obstruction is not None:
-        rows += obstruction_rows(answer.obstruction, answer.proved, answer.lobe)
+        rows += lazy.obstruction_rows(answer.obstruction, answer.proved, answer.lobe)
     if (passage := answer.open_passage) is not None:
         rows += [
             ("open at a resolution of", f"{passage.cell_mm:.2g} mm and a slope of {passage.slope_cell:.2g}"),
@@ -334,22 +311,20 @@ def _needle_tables(answer: NeedleAnswer, *, is_lung: bool) -> list[Table]:
         ("largest angle from the start", f"{np.degrees(path.max_angle_from_start_rad()):.1f} deg"),
         ("turning in all", f"{np.degrees(path.accumulated_turn_rad):.1f} deg"),
     ]
-    rows += costs_in_words(answer.known_costs)
+    rows += lazy.costs_in_words(answer.known_costs)
     return [terminal.table("needle", ("", ""), rows), arcs_table(path.arcs)]
 
 
-def _start_pose(lung: Organ, start: str, frame: FrameOfPose) -> Float:
+def _start_pose(lung: lazy.Organ, start: str, frame: FrameOfPose) -> lazy.Float:
     """Return a pose by its number among those of the patient, from a plan, or from a file of numbers."""
-    from anatomy.io.frames import read_pose
-    from lungaccess.plans.plan import Plan
 
     if start.endswith(".json"):
-        return Plan.load(start).tube.lps_from_tip
+        return lazy.Plan.load(start).tube.lps_from_tip
     names = [name.lower() for name in lung.start_names]
     if start.lower() in names:
         return lung.starts[names.index(start.lower())]
     if not start.isdecimal():
-        return read_pose(start, frame)
+        return lazy.read_pose(start, frame)
     number = int(start)
     if not 1 <= number <= len(lung.starts):
         raise SettingsError(

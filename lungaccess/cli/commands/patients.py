@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from rich.table import Table
@@ -13,16 +13,12 @@ from anatomy.io.ct_cases import ct_case
 from anatomy.io.frames import parse_point
 from anatomy.segmentation.box import VOXEL_MM
 from anatomy.segmentation.vessels import LARGE_RADIUS_MM
-from lungaccess.cli import anatomy_tables, terminal
+from lungaccess.cli import anatomy_tables, lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Seed
 from lungaccess.cli.options import OutputOptions, PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder, require_empty_folder
-
-if TYPE_CHECKING:
-    from anatomy.segmentation.pipeline import Segmentation
-    from anatomy.segmentation.scan_warnings import Quality
 
 
 def segment(
@@ -94,9 +90,6 @@ def segment(
             refusing.
         json: Print JSON, the content of quality.json, instead of tables.
     """
-    from anatomy.segmentation.pipeline import memory_estimate_gib, read_ct
-    from anatomy.segmentation.request import Given, SegmentationRequest
-    from lungaccess.showing.report.segmented import REFUSED_PICTURE, segment_with_pictures
 
     for point in (target, seed, *nodule):
         if point is not None:
@@ -106,12 +99,12 @@ def segment(
         ct, airway, lungs, name = case.ct, airway or case.airway, lungs or case.lungs, name or case.out
     claim_folder(out, ())
     with progress(f"reading {ct}") as shown:
-        volume, sources = read_ct(ct, series)
-        estimate = f"{memory_estimate_gib(volume.grid, voxel_mm):.1f} GiB"
+        volume, sources = lazy.read_ct(ct, series)
+        estimate = f"{lazy.memory_estimate_gib(volume.grid, voxel_mm):.1f} GiB"
         terminal.progress_console.print(
             f"{volume.grid.describe()}; up to about {estimate} of memory", highlight=False
         )
-        request = SegmentationRequest(
+        request = lazy.SegmentationRequest(
             ct=volume,
             out=out,
             name=name,
@@ -125,7 +118,7 @@ def segment(
             seed_lps=None if seed is None else parse_point(seed),
             voxel_mm=voxel_mm,
             force=force,
-            given=Given(
+            given=lazy.Given(
                 lungs=lungs,
                 airway=airway,
                 airway_wall=airway_wall,
@@ -141,10 +134,10 @@ def segment(
             ),
         )
         try:
-            made = segment_with_pictures(request, shown.step, pictures=pictures)
+            made = lazy.segment_with_pictures(request, shown.step, pictures=pictures)
         except AnatomyError:
             if pictures:
-                found = out / REFUSED_PICTURE
+                found = out / lazy.REFUSED_PICTURE
                 terminal.progress_console.print(f"{found} shows what was found", highlight=False)
             raise
     output.tell(made.record)
@@ -154,7 +147,7 @@ def segment(
     return ExitCode.OK
 
 
-def _tables(result: Segmentation, quality: Quality) -> list[Table]:
+def _tables(result: lazy.Segmentation, quality: lazy.Quality) -> list[Table]:
     volumes = [(name, f"{volume:.3f}") for name, volume in quality.volumes_l.items() if volume]
     tree = quality.tree
     airway = [("ends", f"{quality.ends}")]
@@ -183,7 +176,7 @@ def _tables(result: Segmentation, quality: Quality) -> list[Table]:
     return [each for each in made if each.row_count]
 
 
-def _written(result: Segmentation) -> str:
+def _written(result: lazy.Segmentation) -> str:
     words = f"Written to {result.folder}: patient.toml, its masks, quality.json, segmentation.json."
     if result.kept_description:
         words += " patient.toml was edited by hand and is kept as it was."
@@ -212,16 +205,13 @@ def info(
     terminal.show(anatomy_tables.anatomy_tables(lung, details=details))
     terminal.show_warnings(lung.warnings)
     if out is not None:
-        from anatomy.lung import Lung
-        from lungaccess.showing.report import motion_png, organ_png, tree_png
-
-        if isinstance(lung, Lung):
-            what, picture = "tree", tree_png(lung, out / "tree.png")
+        if isinstance(lung, lazy.Lung):
+            what, picture = "tree", lazy.tree_png(lung, out / "tree.png")
         else:
-            what, picture = "organ", organ_png(lung, out / "organ.png")
+            what, picture = "organ", lazy.organ_png(lung, out / "organ.png")
         terminal.say(f"Picture of the {what}: {picture}")
-        if isinstance(lung, Lung) and lung.motion is not None:
-            terminal.say(f"Picture of the breathing: {motion_png(lung, out / 'motion.png')}")
+        if isinstance(lung, lazy.Lung) and lung.motion is not None:
+            terminal.say(f"Picture of the breathing: {lazy.motion_png(lung, out / 'motion.png')}")
     return ExitCode.OK
 
 
@@ -244,13 +234,12 @@ def phantom(
         spacing: Edge of the voxels, mm; 1 for the adult, 1.25 for the small patient.
         breathing: Also motion.nrrd, how the lungs breathe; the masks show end-inhale.
     """
-    from anatomy.phantom import make_phantom, write_phantom
 
     require_empty_folder(out, force=force)
     with progress("making a synthetic patient"):
-        made = make_phantom(seed=seed, spacing_mm=spacing, size=size)
+        made = lazy.make_phantom(seed=seed, spacing_mm=spacing, size=size)
     with progress(f"writing {out}"):
-        write_phantom(made, out, breathing=breathing)
+        lazy.write_phantom(made, out, breathing=breathing)
     nodules = [
         {"lps_mm": nodule.centre_lps.tolist(), "radius_mm": float(nodule.radius_mm)}
         for nodule in made.nodules

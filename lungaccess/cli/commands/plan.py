@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.panel import Panel
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.files import write_text
 from anatomy.base.words import of_hundred
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative, Seconds, Seed
 from lungaccess.cli.options import (
@@ -39,14 +39,6 @@ from lungaccess.cli.result_folder import Force, claim_folder
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.goals import SUCCESS
 
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.judging.appraisal import Appraisal
-    from lungaccess.judging.explanation import Explanation
-    from lungaccess.planning import Alternative
-    from lungaccess.planning.coupled import Atlas
-    from lungaccess.problem.system import System
-
 
 def demo(
     *,
@@ -66,13 +58,12 @@ def demo(
         seed: Seed of the patient and of the search.
     """
     from lungaccess.cli.anatomy_tables import anatomy_tables
-    from lungaccess.problem.target import stated_target
 
     search = SearchOptions(budget=budget, seed=seed)
     claim_folder(out, RESULTS, force=force)
     with progress("making a synthetic patient") as shown:
         lung = demo_lung(seed, output.cache, shown.step)
-    target, systems = stated_target(None, 1), SystemOptions().candidates()
+    target, systems = lazy.stated_target(None, 1), SystemOptions().candidates()
     if not output.json:
         terminal.show(anatomy_tables(lung)[1:3])
     guide = what_to_look_at(out)
@@ -80,26 +71,23 @@ def demo(
     return _first_reachable_nodule(lung, job)
 
 
-def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> Lung:
+def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> lazy.Lung:
     """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
 
     An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
     """
-    from anatomy.phantom import make_phantom
-    from anatomy.store import open_lung
 
     # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
-    images = make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
-    return open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
+    images = lazy.make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
+    return lazy.open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
 
 
-def _first_reachable_nodule(lung: Lung, job: PlanJob) -> ExitCode:
-    from lungaccess.problem.target import stated_target
+def _first_reachable_nodule(lung: lazy.Lung, job: PlanJob) -> ExitCode:
 
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
-            return plan_and_report(lung, replace(job, target=stated_target(None, number)))
+            return plan_and_report(lung, replace(job, target=lazy.stated_target(None, number)))
         except NoPlan as error:
             terminal.progress_console.print(f"Nodule {number} cannot be reached; trying the next one.")
             failure = error
@@ -152,10 +140,9 @@ def plan(
             there is no plan: the nearest miss, what blocks, which preset or change of device would do, what
             is proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is.
     """
-    from lungaccess.problem.system import systems_with_tool
 
     stated = target.stated()
-    systems = systems_with_tool(system.candidates(), tool)
+    systems = lazy.systems_with_tool(system.candidates(), tool)
     asked = search.asked(systems, errors.given(), errors.given_procedure(), through.stated())
     claim_folder(out, RESULTS, force=force)
     lung = output.load(patient, thick_slices=thick_slices)
@@ -176,75 +163,71 @@ def plan(
 
 
 def explain_and_report(
-    lung: Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None
+    lung: lazy.Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None
 ) -> dict[str, Any]:
     """Explain a `NoPlan`, write and show what was learned, and return it as plain values.
 
     Plans of other systems are searched by `cost`; the time is that of `explain_no_plan` if None.
     """
-    from lungaccess.judging.explanation import explanation_record, save_explanation
 
     explanation = _explained(lung, job, failure, cost, time_s)
-    written = save_explanation(explanation, job.out)
+    written = lazy.save_explanation(explanation, job.out)
     if not job.output.json:
         show_explanation(explanation)
     if job.pictures:
         written = (*written, *_drawn(lung, job, explanation))
-    record = explanation_record(explanation)
+    record = lazy.explanation_record(explanation)
     record |= {"folder": str(job.out), "files": list(written)}
     if not job.output.json:
         terminal.say(f"Written to {job.out}: {', '.join(written)}")
     return record
 
 
-def _explained(lung: Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None) -> Explanation:
-    from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan
-    from lungaccess.planning.coupled import atlas_is_kept, open_atlas
+def _explained(
+    lung: lazy.Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None
+) -> lazy.Explanation:
 
     system, cache = job.asked.systems[0], job.output.cache
 
-    def atlas_of(other: System, on_share: Callable[[float], None]) -> Atlas:
+    def atlas_of(other: lazy.System, on_share: Callable[[float], None]) -> lazy.Atlas:
         def tell(share: float) -> None:
             on_share(share)
             shown.step(f"atlas of {other.name}", share)
 
-        return open_atlas(lung, other, cache=cache, progress=tell)
+        return lazy.open_atlas(lung, other, cache=cache, progress=tell)
 
     with progress("no plan: looking for what would help") as shown:
-        return explain_no_plan(
+        return lazy.explain_no_plan(
             lung,
             system,
             job.target.resolve(lung),
             failure,
-            atlas=open_atlas(lung, system, cache=cache, progress=shown.share),
+            atlas=lazy.open_atlas(lung, system, cache=cache, progress=shown.share),
             objective=cost,
             seed=job.asked.fields["seed"],
-            time_s=DEFAULT_TIME_S if time_s is None else time_s,
+            time_s=lazy.DEFAULT_TIME_S if time_s is None else time_s,
             atlas_of=atlas_of,
-            is_kept=lambda other: atlas_is_kept(lung, other, cache=cache),
+            is_kept=lambda other: lazy.atlas_is_kept(lung, other, cache=cache),
             on_part=shown.step,
         )
 
 
-def _drawn(lung: Lung, job: PlanJob, explanation: Explanation) -> tuple[str, ...]:
-    from lungaccess.showing.report import no_plan_png
-    from lungaccess.showing.report.html import no_plan_page
+def _drawn(lung: lazy.Lung, job: PlanJob, explanation: lazy.Explanation) -> tuple[str, ...]:
 
     with progress("drawing why there is no plan"):
-        no_plan_png(explanation, lung, job.out / PICTURE)
+        lazy.no_plan_png(explanation, lung, job.out / PICTURE)
     with progress("making the page"):
-        no_plan_page(explanation, lung, job.out / PAGE)
+        lazy.no_plan_page(explanation, lung, job.out / PAGE)
     return PICTURE, PAGE
 
 
-def show_explanation(explanation: Explanation) -> None:
+def show_explanation(explanation: lazy.Explanation) -> None:
     """Print the headline, then what was learned, the most useful first, then the counted reasons."""
-    from lungaccess.judging.explanation import sections
 
     terminal.console.print(
         Panel(explanation.headline, title="no plan", title_align="left", border_style="yellow")
     )
-    terminal.show(terminal.table(each.title, each.headings, each.rows) for each in sections(explanation))
+    terminal.show(terminal.table(each.title, each.headings, each.rows) for each in lazy.sections(explanation))
     terminal.show_reasons(explanation.failure)
     if explanation.ran_out_of_time:
         terminal.say(
@@ -290,11 +273,6 @@ def alternatives(
         separation: The needles of every two plans lie somewhere at least so many mm from each other.
         out: Folder for plan-01.json and so on, and trade_off.svg.
     """
-    from lungaccess.judging import answer_with_several
-    from lungaccess.judging.appraisal import Appraiser
-    from lungaccess.planning import with_front
-    from lungaccess.planning.coupled import open_atlas
-    from lungaccess.showing.report.html import trade_off_svg
 
     stated, systems = target.stated(), system.candidates()
     asked = search.asked(systems, errors.given(), errors.given_procedure())
@@ -303,21 +281,21 @@ def alternatives(
     request = asked.request(lung, stated.resolve(lung))
     with progress("searching") as shown:
 
-        def atlas_of(device: System) -> Atlas:
-            return open_atlas(lung, device, cache=output.cache, progress=shown.share)
+        def atlas_of(device: lazy.System) -> lazy.Atlas:
+            return lazy.open_atlas(lung, device, cache=output.cache, progress=shown.share)
 
-        found = answer_with_several(request, count=count, separation_mm=separation, atlas_of=atlas_of)
+        found = lazy.answer_with_several(request, count=count, separation_mm=separation, atlas_of=atlas_of)
     chosen, by_success = system_of(found[0].plan, systems), request.goal is SUCCESS
     given = (None, None) if by_success else (request.errors, request.procedure)
-    appraiser = Appraiser(lung, given[0], procedure=given[1])
+    appraiser = lazy.Appraiser(lung, given[0], procedure=given[1])
     appraisals = []
     with progress("checking") as shown:
         for number, each in enumerate(found, start=1):
             each.plan.save(out / f"plan-{number:02d}.json")
             appraisals.append(appraiser.appraise(each.plan, chosen, target_lps=request.target.lps_mm))
             shown.share(number / len(found))
-    found = with_front([each.plan for each in found], [each.headline.chance for each in appraisals])
-    if drawing := trade_off_svg(found):
+    found = lazy.with_front([each.plan for each in found], [each.headline.chance for each in appraisals])
+    if drawing := lazy.trade_off_svg(found):
         write_text(out / TRADE_OFF, drawing)
     refused = sum(not each.accepted for each in appraisals)
     output.tell(_records(found, appraisals, out, lung.cost is not None))
@@ -328,7 +306,7 @@ def alternatives(
     return ExitCode.of(not refused)
 
 
-def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal]) -> None:
+def _show(lung: lazy.Lung, found: tuple[lazy.Alternative, ...], appraisals: list[lazy.Appraisal]) -> None:
 
     best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
     terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")
@@ -346,16 +324,15 @@ def _show(lung: Lung, found: tuple[Alternative, ...], appraisals: list[Appraisal
         terminal.say(WINDOW_NOTE)
 
 
-def _success(appraisal: Appraisal) -> float:
+def _success(appraisal: lazy.Appraisal) -> float:
     """Return the estimated chance; of a refused plan less than of any other."""
     success = appraisal.headline.success
     return -1.0 if success is None else success.value
 
 
 def _records(
-    found: tuple[Alternative, ...], appraisals: list[Appraisal], out: Path, has_map: bool
+    found: tuple[lazy.Alternative, ...], appraisals: list[lazy.Appraisal], out: Path, has_map: bool
 ) -> list[dict[str, object]]:
-    from lungaccess.plans.costs import known_costs
 
     return [
         {
@@ -364,13 +341,13 @@ def _records(
             "on_front": bool(each.on_front),
             "branch": int(each.plan.tube.exit.branch),
             "generation": int(each.plan.scope.generation),
-            "criteria": known_costs(each.criteria, has_map=has_map),
+            "criteria": lazy.known_costs(each.criteria, has_map=has_map),
         }
         for number, (each, appraisal) in enumerate(zip(found, appraisals, strict=True), start=1)
     ]
 
 
-def _row(number: int, each: Alternative, appraisal: Appraisal, has_map: bool) -> tuple[str, ...]:
+def _row(number: int, each: lazy.Alternative, appraisal: lazy.Appraisal, has_map: bool) -> tuple[str, ...]:
     success = appraisal.headline.success
     return (
         f"{number:02d}",

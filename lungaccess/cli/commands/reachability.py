@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
+from rich.table import Table
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder, write_json
 from anatomy.base.words import of_hundred, percent
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, CountOrNone, Seconds, Spacing
 from lungaccess.cli.options import (
@@ -25,11 +26,6 @@ from lungaccess.cli.options import (
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
 from lungaccess.plans.record import picked
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from lungaccess.planning.reachability import OpenPlace, ReachMap, ReachVerdict, RegionReach
 
 
 def reach(
@@ -56,12 +52,10 @@ def reach(
         out: Folder for the volumes, the pictures and reach.json.
         page: HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
     """
-    from lungaccess.planning.reachability.reach_map import compare_reach
-    from lungaccess.problem.system import load_system
-    from lungaccess.showing.report import reach_png
 
-    names = [system.system, *(name.strip() for name in (compare or "").split(",") if name.strip())]
-    systems = [load_system(name, fissures_allowed=system.allow_fissures) for name in dict.fromkeys(names)]
+    others = (name.strip() for name in (compare or "").split(",") if name.strip())
+    names = dict.fromkeys([system.system, *others])
+    systems = [lazy.load_system(name, fissures_allowed=system.allow_fissures) for name in names]
     asked = stated_phases(phases)
     if asked is not None and search:
         raise SettingsError(
@@ -72,19 +66,17 @@ def reach(
         require_writable_folder(page.parent)
     lung = output.load(patient)
     with progress("scanning") as shown:
-        maps = compare_reach(
+        maps = lazy.compare_reach(
             lung, systems, spacing_mm=spacing, trees=search, phases=asked, work=folder, progress=shown.step
         )
     stems = _stems(maps)
     for stem, each in zip(stems, maps, strict=True):
         each.save(folder, stem)
-        reach_png(each, lung, folder / f"{stem}.png")
+        lazy.reach_png(each, lung, folder / f"{stem}.png")
     written = [record(each) for each in maps]
     write_json(folder / "reach.json", written)
     if page is not None:
-        from lungaccess.showing.report.html import reach_page
-
-        reach_page(maps, lung, page)
+        lazy.reach_page(maps, lung, page)
     output.tell(written)
     terminal.show([_region_table(each) for each in maps])
     if len(maps) > 1:
@@ -97,7 +89,7 @@ def reach(
     return ExitCode.OK
 
 
-def _stems(maps: tuple[ReachMap, ...]) -> list[str]:
+def _stems(maps: tuple[lazy.ReachMap, ...]) -> list[str]:
     """Return a file name for each map, without what a file name may not hold."""
     if len(maps) == 1:
         return ["reach"]
@@ -105,9 +97,8 @@ def _stems(maps: tuple[ReachMap, ...]) -> list[str]:
     return [f"reach-{n}-{name}" for n, name in enumerate(plain, start=1)]
 
 
-def record(reach: ReachMap) -> dict[str, object]:
+def record(reach: lazy.ReachMap) -> dict[str, object]:
     """Return the figures of a map as plain values."""
-    from lungaccess.planning.reachability import KINDS, NOT_COUNTED
 
     system, needle = reach.system, reach.system.needle
     return {
@@ -118,7 +109,7 @@ def record(reach: ReachMap) -> dict[str, object]:
         "needle_radius_of_curvature_mm": None if needle is None else needle.min_radius_of_curvature_mm,
         "fissures_are_obstacles": reach.with_fissures,
         "spacing_mm": float(reach.kinds.grid.spacing_mm[0]),
-        "labels": {"not counted": NOT_COUNTED, **KINDS},
+        "labels": {"not counted": lazy.NOT_COUNTED, **lazy.KINDS},
         "deployments": reach.entries,
         "lungs_are_separate": reach.regions.lungs_are_separate,
         "regions": [_plain(row) for row in reach.by_region()],
@@ -129,38 +120,36 @@ def record(reach: ReachMap) -> dict[str, object]:
     }
 
 
-def _plain(row: RegionReach) -> dict[str, object]:
-    from lungaccess.planning.reachability import KINDS, STATES
+def _plain(row: lazy.RegionReach) -> dict[str, object]:
 
     return {
         "name": row.name,
         "volume_ml": row.volume_ml,
-        "states_ml": {state: row.state_ml(state) for state in STATES},
-        "shares": dict(zip(KINDS, row.shares, strict=True)),
+        "states_ml": {state: row.state_ml(state) for state in lazy.STATES},
+        "shares": dict(zip(lazy.KINDS, row.shares, strict=True)),
         "median_cost": row.median_cost if row.reached else None,
         "median_clearance_mm": row.median_clearance_mm if row.reached else None,
     }
 
 
-def _region_table(reach: ReachMap) -> Table:
-    from lungaccess.planning.reachability import STATES
+def _region_table(reach: lazy.ReachMap) -> Table:
 
     rows = [
         (
             row.name,
             f"{row.volume_ml:.0f}",
-            *(f"{row.state_ml(state):.0f} ({percent(row.share(state))})" for state in STATES),
+            *(f"{row.state_ml(state):.0f} ({percent(row.share(state))})" for state in lazy.STATES),
             f"{row.median_cost:.2f}",
             f"{row.median_clearance_mm:.2f}",
         )
         for row in (*reach.by_region(), *reach.by_segment())
     ]
-    headings = ("", "mL", *(f"{state}, mL" for state in STATES), "median cost", "median clearance, mm")
+    headings = ("", "mL", *(f"{state}, mL" for state in lazy.STATES), "median cost", "median clearance, mm")
     during = "" if reach.phases is None else ", phases {:g} to {:g}".format(*reach.phases)
     return terminal.table(f"{reach.system.name} in {reach.patient_name}{during}", headings, rows)
 
 
-def _comparison_table(maps: tuple[ReachMap, ...]) -> Table:
+def _comparison_table(maps: tuple[lazy.ReachMap, ...]) -> Table:
     first = maps[0]
     rows = [
         (
@@ -202,8 +191,6 @@ def certify(
         time_s: Seconds to look at them, after the preparation; the same time need not give the same answer.
         out: PNG file that shows what is ruled out and what is open.
     """
-    from lungaccess.planning.reachability import MOST_BOXES, UnreachableProof
-    from lungaccess.plans.version import made_by
 
     if out is not None:
         require_picture(out)
@@ -212,19 +199,17 @@ def certify(
     lung = output.load(patient)
     point = stated.centre_lps(lung)
     with progress("proving") as shown:
-        proof = UnreachableProof(lung, device, with_fissures=not device.fissures_allowed)
+        proof = lazy.UnreachableProof(lung, device, with_fissures=not device.fissures_allowed)
         verdict = proof.prove(
             point,
-            most_boxes=most_boxes or MOST_BOXES,
+            most_boxes=most_boxes or lazy.MOST_BOXES,
             time_s=time_s,
             progress=lambda share: shown.step("proving", share),
         )
     if out is not None:
-        from lungaccess.showing.report.open_places import open_places_png
-
-        open_places_png(lung, proof, verdict, point, out)
+        lazy.open_places_png(lung, proof, verdict, point, out)
     asked = {"patient": lung.name, "system": device.name, "target_lps_mm": point.tolist()}
-    output.tell(asked | made_by() | _as_json(verdict))
+    output.tell(asked | lazy.made_by() | _as_json(verdict))
     rows = [
         ("system", device.name),
         ("outcome", "proved unreachable" if verdict.proved else "not proved: it may be reachable or not"),
@@ -244,7 +229,7 @@ def certify(
     return ExitCode.of(verdict.proved)
 
 
-def _as_json(verdict: ReachVerdict) -> dict[str, object]:
+def _as_json(verdict: lazy.ReachVerdict) -> dict[str, object]:
     return {
         "proved_unreachable": verdict.proved,
         **picked(verdict, "boxes share_ruled_out finished rests_on"),
@@ -265,10 +250,9 @@ def _percent(share: float) -> str:
     return "all but a millionth of a percent"
 
 
-def _words(place: OpenPlace) -> str:
-    from anatomy.display import point
+def _words(place: lazy.OpenPlace) -> str:
 
     return (
-        f"branch {place.name}, generation {place.generation}, from {point(place.tip_lps)} (LPS mm): "
+        f"branch {place.name}, generation {place.generation}, from {lazy.point(place.tip_lps)} (LPS mm): "
         f"{100.0 * place.share:.2g} % of the space"
     )

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from anatomy.base.words import of_hundred, percent, range_of_hundred
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative, Positive, Probability, Processes, Samples, SamplesOrNone, Seed
 from lungaccess.cli.options import ErrorOptions, PatientOfPlan, PatientOptions, PlanFile, ToolText
@@ -18,10 +18,6 @@ from lungaccess.uncertainty.risk.statistics import Share
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-    from lungaccess.planning.procedure import ProcedureReport
-    from lungaccess.uncertainty.risk import RestingRow, RiskReport, Tolerance
-    from stages.needle import StartRegion
 
 
 def risk(
@@ -46,26 +42,18 @@ def risk(
         seed: Seed of the random numbers.
         processes: How many processes share procedures that measure; one on Windows.
     """
-    from lungaccess.judging.appraisal import Headline
-    from lungaccess.planning.procedure import simulate_procedure
     from lungaccess.planning.procedure.simulation import DEFAULT_SAMPLES as PROCEDURES
-    from lungaccess.problem.procedures import Procedure
-    from lungaccess.problem.system import with_tool
-    from lungaccess.problem.tools import load_tool
-    from lungaccess.uncertainty.risk import assess, find_tolerances, resting_rows, resting_tip
-    from lungaccess.uncertainty.risk.assessment import DEFAULT_SAMPLES
-    from stages.scope import WallContact
 
-    model, followed = errors.load(), errors.given_procedure() or Procedure()
-    tool_given = None if tool is None else load_tool(tool)
+    model, followed = errors.load(), errors.given_procedure() or lazy.Procedure()
+    tool_given = None if tool is None else lazy.load_tool(tool)
     stored, lung = output.load_plan(plan, patient)
-    stored = replace(stored, system=with_tool(stored.system, tool_given))
+    stored = replace(stored, system=lazy.with_tool(stored.system, tool_given))
     with progress("bringing the scope to rest on the wall"):
-        wall = model.wall or WallContact()
-        rested = resting_rows(resting_tip(stored, lung, wall), wall)
+        wall = model.wall or lazy.WallContact()
+        rested = lazy.resting_rows(lazy.resting_tip(stored, lung, wall), wall)
     if not followed.is_open_loop:
         with progress(f"simulating procedures '{followed.name}'"):
-            found = simulate_procedure(
+            found = lazy.simulate_procedure(
                 stored,
                 lung,
                 errors=model,
@@ -76,25 +64,25 @@ def risk(
                 processes=processes,
             )
         output.tell(procedure_record(found) | resting_record(rested))
-        terminal.say(Headline.of(None, found).chance_text)
+        terminal.say(lazy.Headline.of(None, found).chance_text)
         terminal.show([*procedure_tables(found), _resting_table(rested)])
         return ExitCode.OK
-    samples = samples or DEFAULT_SAMPLES
+    samples = samples or lazy.DEFAULT_SAMPLES
     with progress("deviating the plan"):
-        report = assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
+        report = lazy.assess(stored, lung, model=model, samples=samples, seed=seed, radius_mm=radius)
     with progress("looking for the largest errors"):
-        kept = find_tolerances(
+        kept = lazy.find_tolerances(
             stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius
         )
     output.tell(record(report, kept) | resting_record(rested))
-    terminal.say(Headline.of(None, report).chance_text)
+    terminal.say(lazy.Headline.of(None, report).chance_text)
     terminal.show(
         [_outcome_table(report), _sensitivity_table(report), _tolerance_table(kept), _resting_table(rested)]
     )
     return ExitCode.OK
 
 
-def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]:
+def record(report: lazy.RiskReport, kept: tuple[lazy.Tolerance, ...]) -> dict[str, object]:
     """Return a report and tolerances as plain values."""
     return _estimate_record(report) | {
         "reaches": report.reaches.to_mapping(),
@@ -117,12 +105,12 @@ def record(report: RiskReport, kept: tuple[Tolerance, ...]) -> dict[str, object]
     }
 
 
-def resting_record(rows: Sequence[RestingRow]) -> dict[str, object]:
+def resting_record(rows: Sequence[lazy.RestingRow]) -> dict[str, object]:
     """Return what the shaft at rest on the wall does to a plan, as plain values."""
     return {"resting_scope": [asdict(each) for each in rows]}
 
 
-def _resting_table(rows: Sequence[RestingRow]) -> Table:
+def _resting_table(rows: Sequence[lazy.RestingRow]) -> Table:
     shown = [
         (each.name, f"{each.value:.2f} {each.unit}", "" if each.limit is None else each.words)
         for each in rows
@@ -130,7 +118,7 @@ def _resting_table(rows: Sequence[RestingRow]) -> Table:
     return terminal.table("The scope left to itself rests on the wall", ("", "found", "limit"), shown)
 
 
-def _outcome_table(report: RiskReport) -> Table:
+def _outcome_table(report: lazy.RiskReport) -> Table:
     rows = [
         share_row("succeeds", report.succeeds),
         share_row(report.tissue or f"ends within {report.radius_mm:.2f} mm", report.reaches),
@@ -149,12 +137,12 @@ def _outcome_table(report: RiskReport) -> Table:
     return terminal.table(title, ("", "%", "95 % interval"), rows)
 
 
-def _goal_words(report: RiskReport | ProcedureReport) -> str:
+def _goal_words(report: lazy.RiskReport | lazy.ProcedureReport) -> str:
     goal = report.tissue or f"goal {report.radius_mm:.2f} mm"
     return f"{goal}: {report.radius_origin}"
 
 
-def _sensitivity_table(report: RiskReport) -> Table:
+def _sensitivity_table(report: lazy.RiskReport) -> Table:
     rows = [
         (
             each.kind.replace("_", " "),
@@ -169,7 +157,7 @@ def _sensitivity_table(report: RiskReport) -> Table:
     return terminal.table("What decides: each kind alone, and drawn anew among all others", headings, rows)
 
 
-def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:
+def _tolerance_table(kept: tuple[lazy.Tolerance, ...]) -> Table:
     rows = [
         (
             each.kind.replace("_", " "),
@@ -188,11 +176,10 @@ def _tolerance_table(kept: tuple[Tolerance, ...]) -> Table:
     return terminal.table("Tolerance", headings, rows)
 
 
-def _largest(tolerance: Tolerance) -> str:
-    from lungaccess.uncertainty.risk import LARGEST
+def _largest(tolerance: lazy.Tolerance) -> str:
 
     size = tolerance.largest
-    more = "at least " if size >= LARGEST[tolerance.unit] else ""
+    more = "at least " if size >= lazy.LARGEST[tolerance.unit] else ""
     return f"{more}{size:.2f}"
 
 
@@ -201,15 +188,13 @@ def share_row(name: str, share: Share, *, fails: bool = False) -> terminal.Row:
     return name, of_hundred(share.value, up=fails), range_of_hundred(share.interval)
 
 
-def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
+def _estimate_record(report: lazy.RiskReport | lazy.ProcedureReport) -> dict[str, object]:
     """Return what estimates of single plans and of procedures have in common."""
-    from anatomy.base.settings import to_mapping
-    from lungaccess.planning.success.estimate import chance_of
 
     return {
-        "errors": {**to_mapping(report.model), "name": report.model.label},
+        "errors": {**lazy.to_mapping(report.model), "name": report.model.label},
         **picked(report, "samples seed"),
-        "counts_as_success": chance_of(report).success_words,
+        "counts_as_success": lazy.chance_of(report).success_words,
         **picked(report, "radius_mm radius_origin"),
         "succeeds": report.succeeds.to_mapping(),
         "touches": {name: share.to_mapping() for name, share in report.touches.items()},
@@ -217,12 +202,11 @@ def _estimate_record(report: RiskReport | ProcedureReport) -> dict[str, object]:
     }
 
 
-def procedure_record(report: ProcedureReport) -> dict[str, object]:
+def procedure_record(report: lazy.ProcedureReport) -> dict[str, object]:
     """Return a report as plain values."""
-    from anatomy.base.settings import to_mapping
 
     return _estimate_record(report) | {
-        "procedure": to_mapping(report.procedure),
+        "procedure": lazy.to_mapping(report.procedure),
         "ends": {name: share.to_mapping() for name, share in report.ends.items()},
         "placements": report.placements,
         "stages": [
@@ -237,7 +221,7 @@ def procedure_record(report: ProcedureReport) -> dict[str, object]:
     }
 
 
-def procedure_tables(report: ProcedureReport) -> list[Table]:
+def procedure_tables(report: lazy.ProcedureReport) -> list[Table]:
     """Return how procedures ended, and what each stage corrected."""
     rows = [share_row("success", report.succeeds)]
     rows += [share_row(name, share, fails=True) for name, share in report.failures]
@@ -291,19 +275,17 @@ def start_region(
         scope: Whether poses of the scope's tip are tried as well, which takes some seconds.
         seed: Seed of the search.
     """
-    from lungaccess.planning.one_stage import safe_scope_region
-    from lungaccess.uncertainty.risk import safe_start_region
 
     stored, lung = output.load_plan(plan, patient)
     with progress("trying start poses"):
-        region = safe_start_region(
+        region = lazy.safe_start_region(
             stored, lung, radius_mm=radius, offset_mm=distance, tilt_deg=tilt, poses=poses,
             iterations=iterations, seed=seed,
         )  # fmt: skip
     of_scope = None
     if scope:
         with progress("trying poses of the scope"):
-            of_scope = safe_scope_region(stored, lung, seed=seed)
+            of_scope = lazy.safe_scope_region(stored, lung, seed=seed)
     told = {} if of_scope is None else {"scope": of_scope.record()}
     output.tell({**region.record(), **told})
     terminal.say(f"{region.words}.")
@@ -315,7 +297,7 @@ def start_region(
     return ExitCode.OK
 
 
-def _proved_table(region: StartRegion) -> Table:
+def _proved_table(region: lazy.StartRegion) -> Table:
     import numpy as np
 
     proved = region.proved
@@ -334,7 +316,7 @@ def _proved_table(region: StartRegion) -> Table:
     )
 
 
-def _tried_table(region: StartRegion) -> Table:
+def _tried_table(region: lazy.StartRegion) -> Table:
     import numpy as np
 
     tried, shares = region.tried, region.tried.table()

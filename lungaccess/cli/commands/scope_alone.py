@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from anatomy.base.files import write_json
 from anatomy.io.frames import Frame, parse_point
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, NotNegative, Positive, Seed
 from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions, TargetOptions
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
-
-if TYPE_CHECKING:
-    from lungaccess.planning import TourAnswer
-    from lungaccess.planning.one_stage import ScopeAdvice
-    from stages.scope.route import Route
-    from stages.scope.tour import Itinerary
 
 
 def advise(
@@ -43,23 +37,21 @@ def advise(
         seed: Seed of the random numbers.
         out: Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer.
     """
-    from lungaccess.planning.one_stage import ADVICE_FILE, CAMERA_FILE, advise_scope, save_advice
-    from lungaccess.problem.system import load_system
 
     stated = target.stated()
-    claim_folder(out, (ADVICE_FILE, CAMERA_FILE), force=force)
-    device = load_system(system)
+    claim_folder(out, (lazy.ADVICE_FILE, lazy.CAMERA_FILE), force=force)
+    device = lazy.load_system(system)
     lung = output.load(patient)
     with progress("steering the scope"):
-        advice = advise_scope(lung, device, stated.centre_lps(lung), lesion_radius, seed=seed)
-    save_advice(advice, out)
+        advice = lazy.advise_scope(lung, device, stated.centre_lps(lung), lesion_radius, seed=seed)
+    lazy.save_advice(advice, out)
     output.tell(advice.as_json())
     _show_advise(advice)
-    terminal.say(f"Written to {out}: {ADVICE_FILE}, {CAMERA_FILE}")
+    terminal.say(f"Written to {out}: {lazy.ADVICE_FILE}, {lazy.CAMERA_FILE}")
     return ExitCode.of(advice.path.reached)
 
 
-def _show_advise(advice: ScopeAdvice) -> None:
+def _show_advise(advice: lazy.ScopeAdvice) -> None:
     path = advice.path
     rows = [("insertion", f"{path.length_mm:.0f} mm"), ("retreats", f"{path.retreats}")]
     if path.reached:
@@ -123,32 +115,28 @@ def tour(
         per_lesion: Time that each lesion takes besides, s.
         out: Folder for tour.json and tour.png.
     """
-    from lungaccess.planning import lesions_of, plan_tour, read_lesions, tour_record
-    from lungaccess.problem.system import load_system
-    from lungaccess.showing.report.tour import tour_png
-    from stages.scope.tour import Resistances
 
-    stated = None if targets is None else read_lesions(targets)
+    stated = None if targets is None else lazy.read_lesions(targets)
     claim_folder(out, ("tour.json", "tour.png"), force=force)
-    device = load_system(system)
+    device = lazy.load_system(system)
     lung, atlas = output.load(patient), None
-    lesions = lesions_of(lung) if stated is None else stated
+    lesions = lazy.lesions_of(lung) if stated is None else stated
     if require_plan:
         atlas = output.open_atlas(lung, device)
     with progress("planning the tour"):
-        answer = plan_tour(
+        answer = lazy.plan_tour(
             lung,
             lesions,
-            weights=Resistances(beta=beta),
+            weights=lazy.Resistances(beta=beta),
             reading=reading,
             closed=closed,
             tissue_weight=tissue_weight,
             atlas=atlas,
             iterations=iterations,
         )
-    write_json(out / "tour.json", tour_record(answer))
-    tour_png(answer, lung, out / "tour.png")
-    output.tell(tour_record(answer))
+    write_json(out / "tour.json", lazy.tour_record(answer))
+    lazy.tour_png(answer, lung, out / "tour.png")
+    output.tell(lazy.tour_record(answer))
     _show_tour(answer, speed, per_lesion)
     terminal.say(f"Written to {out}: tour.json, tour.png")
     for number, why in answer.left_out.items():
@@ -156,7 +144,7 @@ def tour(
     return ExitCode.of(not answer.left_out)
 
 
-def _show_tour(answer: TourAnswer, speed: float, per_lesion: float) -> None:
+def _show_tour(answer: lazy.TourAnswer, speed: float, per_lesion: float) -> None:
     rows = [_summary("shortest", answer.shortest, answer, speed, per_lesion)]
     if answer.least_resistance is not None:
         rows.append(_summary("least resistance", answer.least_resistance, answer, speed, per_lesion))
@@ -197,7 +185,7 @@ def _show_tour(answer: TourAnswer, speed: float, per_lesion: float) -> None:
 
 
 def _summary(
-    name: str, tour: Itinerary, answer: TourAnswer, speed: float, per_lesion: float
+    name: str, tour: lazy.Itinerary, answer: lazy.TourAnswer, speed: float, per_lesion: float
 ) -> tuple[str, ...]:
     seconds = tour.seconds(speed, per_lesion)
     saved = 100.0 * (1.0 - tour.length_mm / answer.one_by_one_mm)
@@ -248,11 +236,8 @@ def route(
         pixel: Size of a pixel of a drawing, mm.
         out: Folder for route.json and route.png.
     """
-    from lungaccess.planning.one_stage import open_source, route_record, widest_end
-    from lungaccess.showing.report.route import route_png
-    from stages.scope.route import RouteLimits, plan_route
 
-    limits = RouteLimits(
+    limits = lazy.RouteLimits(
         max_curvature_per_mm=curvature,
         device_radius_mm=radius,
         wall_margin_mm=margin,
@@ -264,18 +249,18 @@ def route(
     claim_folder(out, ("route.json", "route.png"), force=force)
     with progress("route") as shown:
         shown.step("reading the tubes")
-        opened = open_source(
+        opened = lazy.open_source(
             source, lumen=lumen, frame=frame, pixel_mm=pixel, cache=output.cache, accept=output.accept
         )
         shown.step("planning")
         end = opened.place(goal, limits.needed_mm)
-        first = widest_end(opened.centreline) if start is None else opened.place(start, limits.needed_mm)
-        found = plan_route(
+        first = lazy.widest_end(opened.centreline) if start is None else opened.place(start, limits.needed_mm)
+        found = lazy.plan_route(
             opened.centreline, first, end, limits, repair=repair, seed=seed, require_proof=False
         )
-    written = route_record(opened, found)
+    written = lazy.route_record(opened, found)
     write_json(out / "route.json", written)
-    route_png(opened.name, opened.centreline, found, out / "route.png")
+    lazy.route_png(opened.name, opened.centreline, found, out / "route.png")
     if output.json:
         terminal.show_json(written)
         return ExitCode.of(found.proved)
@@ -285,7 +270,7 @@ def route(
     return _verdict(found)
 
 
-def _rows(found: Route, written: dict[str, object]) -> list[terminal.Row]:
+def _rows(found: lazy.Route, written: dict[str, object]) -> list[terminal.Row]:
     limits = found.limits
     return [
         ("length", f"{written['length_mm']:.1f} mm", ""),
@@ -298,12 +283,11 @@ def _rows(found: Route, written: dict[str, object]) -> list[terminal.Row]:
     ]  # fmt: skip
 
 
-def _verdict(found: Route) -> ExitCode:
-    from stages.scope.route import NoRouteError, require_proved
+def _verdict(found: lazy.Route) -> ExitCode:
 
     try:
-        require_proved(found)
-    except NoRouteError as error:
+        lazy.require_proved(found)
+    except lazy.NoRouteError as error:
         terminal.show_error(error)
         return ExitCode.NEGATIVE
     return ExitCode.OK

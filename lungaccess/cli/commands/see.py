@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, Port, SamplesOrNone, Seed
 from lungaccess.cli.options import DEFAULT_SYSTEM, ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
@@ -17,11 +17,6 @@ from lungaccess.cli.plan_search import HISTORY_FILE, advised, steps_table
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import held, keep_earlier
 from lungaccess.plans.no_plan import NoPlan
-
-if TYPE_CHECKING:
-    from anatomy.lung import Lung
-    from lungaccess.plans.plan import Plan
-    from lungaccess.showing.report.html.volumes import CtFile
 
 
 def report(
@@ -52,8 +47,6 @@ def report(
         seed: Seed of that estimate; 0 if not given.
         instructions: Whether instructions for the scope are listed step by step.
     """
-    from lungaccess.judging.appraisal import appraise
-    from lungaccess.showing.report.html import PageOptions, bronchoscopy_webp, plan_page
 
     page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
@@ -63,10 +56,10 @@ def report(
     stored, lung = output.load_plan(plan, patient)
     image = shown_ct(ct, patient)
     with progress("making the page"):
-        appraisal = appraise(
+        appraisal = lazy.appraise(
             stored, lung, errors=model, procedure=followed, draws=samples, seed=seed, each_kind=True
         )
-        options = PageOptions(
+        options = lazy.PageOptions(
             alternatives=_others(stored, lung, alternatives, output) if alternatives else (),
             ct=None if image is None else image.read(),
             ct_name="" if image is None else image.path.name,
@@ -79,9 +72,9 @@ def report(
             appraisal=appraisal,
             advice=advised(stored, lung, model, followed, output.cache, appraisal),
         )
-        plan_page(stored, lung, page, options)
+        lazy.plan_page(stored, lung, page, options)
         if movie is not None:
-            bronchoscopy_webp(stored, lung, movie)
+            lazy.bronchoscopy_webp(stored, lung, movie)
     files = [str(file) for file in (page, movie) if file is not None]
     output.tell({"files": files, "page_bytes": page.stat().st_size})
     written = ", ".join(files)
@@ -90,22 +83,19 @@ def report(
     return ExitCode.OK
 
 
-def _others(plan: Plan, lung: Lung, count: int, output: PatientOptions) -> tuple[Plan, ...]:
+def _others(plan: lazy.Plan, lung: lazy.Lung, count: int, output: PatientOptions) -> tuple[lazy.Plan, ...]:
     """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it.
 
     Of a patient that breathes they have their windows.
     """
-    from lungaccess.judging import alternatives
-    from lungaccess.problem.target import Target
-    from lungaccess.uncertainty.breathing.window import with_window
 
-    target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
+    target = lazy.Target(lps_mm=plan.target_lps, origin=plan.target_origin)
     atlas = output.open_atlas(lung, plan.system)
     try:
-        found = alternatives(lung, plan.system, target, goal=plan.objective, count=count, atlas=atlas)
+        found = lazy.alternatives(lung, plan.system, target, goal=plan.objective, count=count, atlas=atlas)
     except NoPlan:
         return ()
-    return tuple(with_window(each.plan, lung) for each in found)
+    return tuple(lazy.with_window(each.plan, lung) for each in found)
 
 
 def view(
@@ -139,10 +129,7 @@ def view(
     import asyncio
     import webbrowser
 
-    from anatomy.io.patients import is_ct
     from lungaccess.cli.commands.patients import segment
-    from lungaccess.problem import load_system, shipped_names
-    from lungaccess.showing.report.segmented import patient_folder
 
     try:
         from lungaccess.showing.explorer import Address, Explorer, PatientSource
@@ -152,9 +139,9 @@ def view(
             expected="the extra `view`",
             remedy="pip install 'lungaccess[view]'",
         ) from error
-    first = load_system(system)
-    if patient is not None and is_ct(patient):
-        made = out or patient_folder(patient, series)
+    first = lazy.load_system(system)
+    if patient is not None and lazy.is_ct(patient):
+        made = out or lazy.patient_folder(patient, series)
         terminal.console.quiet |= output.json  # Only the address is printed then.
         segment(patient, out=made, series=series, thick_slices=thick_slices, accept=output.accept)
         held.close()  # The explorer writes into the folder, too, when a nodule is added.
@@ -171,7 +158,7 @@ def view(
     if patient is not None:
         output.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
         patient = patient.resolve()
-    own = () if system in shipped_names() else ((Path(system).resolve(), first),)
+    own = () if system in lazy.shipped_names() else ((Path(system).resolve(), first),)
     source = PatientSource(
         folder=patient, system=first.name, own=own, cache=output.cache,
         ct=shown, accept=output.accept,
@@ -189,11 +176,10 @@ def view(
 
 def steps(plan: PlanFile, patient: PatientOfPlan, *, output: PatientOptions = PatientOptions()) -> ExitCode:
     """Print step by step how the bronchoscope of a plan moves; with --json also every state, for motors."""
-    from lungaccess.plans.scope_steps import motion_record
 
     stored, lung = output.load_plan(plan, patient)
     if output.json:
-        terminal.show_json(motion_record(stored, lung))
+        terminal.show_json(lazy.motion_record(stored, lung))
     else:
         terminal.show([steps_table(stored, lung)])
     return ExitCode.OK
@@ -208,15 +194,14 @@ CtOption = Annotated[
 ]
 
 
-def shown_ct(stated: Path | None, patient: Path) -> CtFile | None:
+def shown_ct(stated: Path | None, patient: Path) -> lazy.CtFile | None:
     """Return the CT that was stated, else the patient's; without one, a warning says where it was looked for.
 
     Raises:
         FileError: If the record of the patient's segmentation is damaged.
     """
-    from lungaccess.showing.report.html.volumes import CtFile, find_ct
 
-    found = find_ct(patient) if stated is None else CtFile(path=stated)
+    found = lazy.find_ct(patient) if stated is None else lazy.CtFile(path=stated)
     if found is None or found.path.exists() or stated is not None:
         return found
     terminal.progress_console.print(

@@ -2,24 +2,19 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import App, Parameter
+from rich.table import Table
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.words import of_hundred
-from lungaccess.cli import terminal
+from lungaccess.cli import lazy, terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Processes
 from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from lungaccess.running.study.tables import Group
-
 
 study = App(
     name="study",
@@ -47,17 +42,13 @@ def run(
         scheduler: Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
         workers: How many processes on this machine; as many as it has cores if not given.
     """
-    from lungaccess.plans.version import software_kernels
-    from lungaccess.running.study.driver import run_study
-    from lungaccess.running.study.settings import read_study
-    from lungaccess.running.study.tables import summarise
 
-    asked = read_study(study)
+    asked = lazy.read_study(study)
     with progress(asked.name) as shown:
-        done = run_study(
+        done = lazy.run_study(
             asked, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
         )
-    groups = summarise(out)
+    groups = lazy.summarise(out)
     output.tell(asdict(done) | {"results": str(out), "groups": [asdict(group) for group in groups]})
     terminal.show([_table(asked.name, groups)])
     terminal.console.print(
@@ -67,7 +58,8 @@ def run(
     if done.other_kernels:
         terminal.console.print(
             f"{done.other_kernels} of the stored runs were made with other kernels than those here, "
-            f"{software_kernels()}, or do not say with which. For runs of one kind, write to another file.",
+            f"{lazy.software_kernels()}, or do not say with which. For runs of one kind, write to another "
+            "file.",
             style="yellow",
         )
     if done.failed:
@@ -82,9 +74,8 @@ def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     Args:
         results: Results file.
     """
-    from lungaccess.running.study.tables import summarise
 
-    groups = summarise(results)
+    groups = lazy.summarise(results)
     output.tell([asdict(group) for group in groups])
     terminal.show([_table(str(results), groups)])
     return ExitCode.OK
@@ -105,7 +96,6 @@ def export(
         csv: Folder for runs.csv, progress.csv, findings.csv, rejections.csv and plans.csv.
         parquet: Folder for the same as Parquet.
     """
-    from lungaccess.running.study.tables import export_csv, export_parquet
 
     if csv is None and parquet is None:
         raise SettingsError(
@@ -113,8 +103,8 @@ def export(
             expected="--csv FOLDER or --parquet FOLDER",
             remedy="Add one of them",
         )
-    written = [] if csv is None else export_csv(results, csv)
-    written += [] if parquet is None else export_parquet(results, parquet)
+    written = [] if csv is None else lazy.export_csv(results, csv)
+    written += [] if parquet is None else lazy.export_parquet(results, parquet)
     output.tell({"written": [str(path) for path in written]})
     for path in written:
         terminal.say(f"Written to {path}")
@@ -128,9 +118,8 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
     Args:
         first, second: Results files.
     """
-    from lungaccess.running.study.tables import differences
 
-    found = differences(first, second)
+    found = lazy.differences(first, second)
     output.tell(found)
     for each in found:
         terminal.say(each)
@@ -138,7 +127,7 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
     return ExitCode.of(not found)
 
 
-def _table(title: str, groups: "list[Group]") -> "Table":
+def _table(title: str, groups: "list[lazy.Group]") -> Table:
     headings = (
         "case", "planner", "runs", "failed", "solved, %", "accepted, %", "first, s", "run, s", "cost",
         "succeeds, %",
@@ -147,7 +136,7 @@ def _table(title: str, groups: "list[Group]") -> "Table":
     return terminal.table(title, headings[:columns], [_row(group)[:columns] for group in groups])
 
 
-def _row(group: "Group") -> tuple[str, ...]:
+def _row(group: "lazy.Group") -> tuple[str, ...]:
     return (
         group.case,
         group.planner,

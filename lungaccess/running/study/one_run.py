@@ -1,16 +1,17 @@
 """Make one run: in this process, or in one of its own with `python -m lungaccess.running.study.one_run`.
 
-That command reads a run as JSON on standard input and writes its answer as JSON on standard output.
+That command reads a pickled run from standard input and writes its pickled answer to standard output.
 """
 
 import contextlib
 import hashlib
 import json
+import pickle
 import subprocess
 import sys
 import threading
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -205,25 +206,27 @@ def _atlas(patient: Patient, system: System, cache: Path | None, *spacing: Any) 
 def _in_own_process(run: Run, cache: Path | None) -> Answer:
     """Make a run in a fresh process, as a library with one seed a process needs."""
     words = [sys.executable, "-m", "lungaccess.running.study.one_run", *([str(cache)] if cache else [])]
-    done = subprocess.run(words, input=run.to_json(), capture_output=True, encoding="utf-8", errors="replace")
+    done = subprocess.run(words, input=pickle.dumps(run), capture_output=True)
     if done.returncode != 0:
         raise StudyError(
-            f"The process of a run ended with code {done.returncode}: {done.stderr.strip()[-500:]}",
+            f"The process of a run ended with code {done.returncode}: "
+            f"{done.stderr.decode(errors='replace').strip()[-500:]}",
             expected="a process that ends with 0",
             remedy="Start the study again; it goes on from what is stored",
         )
-    return Answer.from_mapping(json.loads(done.stdout))
+    made: Answer = pickle.loads(done.stdout)
+    return made
 
 
 def main(words: list[str]) -> int:
     """Make the run on standard input; an error goes to standard error."""
     end_with_parent()
     try:
-        made = _here(Run.from_json(sys.stdin.read()), Path(words[0]) if words else None)
+        made = _here(pickle.load(sys.stdin.buffer), Path(words[0]) if words else None)
     except LungaccessError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    sys.stdout.write(json.dumps(asdict(made)))
+    sys.stdout.buffer.write(pickle.dumps(made))
     return 0
 
 

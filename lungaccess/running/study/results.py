@@ -339,17 +339,12 @@ def problem_row(problem: Problem, experiment: int) -> Statement:
         "lung": problem.patient.key,
         "system": problem.system.name,
         "fissures_allowed": problem.system.fissures_allowed,
-        "objective": problem.objective,
-        "target": problem.target,
-        "origin": problem.origin,
         "x_lps_mm": x,
         "y_lps_mm": y,
         "z_lps_mm": z,
-        "start": problem.start,
-        "iterations": problem.iterations,
-        "time_s": problem.time_s,
     }
-    return _insert("problems", row)
+    same = ("objective", "target", "origin", "start", "iterations", "time_s")
+    return _insert("problems", row | {name: getattr(problem, name) for name in same})
 
 
 def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> Statement:

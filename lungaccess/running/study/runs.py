@@ -1,8 +1,7 @@
 """The runs of a study: every case, target and start with every planner and seed, each with its key."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -62,13 +61,7 @@ def patient_of(case: Case, folder: Path, cache: Path | None = None) -> Patient:
     else:
         place = str((folder / case.anatomy).resolve())
         sources = input_hashes(Path(place))
-    return Patient(
-        anatomy=place,
-        seed=made.seed,
-        size=made.size,
-        spacing_mm=made.spacing_mm,
-        sources=tuple(sorted(sources.items())),
-    )
+    return Patient(anatomy=place, **vars(made), sources=tuple(sorted(sources.items())))
 
 
 def open_patient(patient: Patient, cache: Path | None = None) -> Lung:
@@ -157,26 +150,21 @@ class Problem:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what the answers depend on, as plain JSON types; where the patient lies does not."""
+        plain = {
+            item.name: getattr(self, item.name)
+            for item in fields(self)
+            if item.name not in OF_THEIR_OWN_CLASS
+        }
+        counted = {"errors": self.errors, "procedure": self.procedure} if self.errors is not None else {}
         return {
-            **self.plain(),
+            **plain,
             "target_lps": list(self.target_lps),
             "lung": self.patient.key,
             "system": system_fingerprint(self.system),
             "version": software_version(),
             "format": RUN_FORMAT,
-            **self.counted(),
+            **{name: to_mapping(each) for name, each in counted.items()},
         }
-
-    def counted(self) -> dict[str, Any]:
-        """Return errors and procedure as plain JSON types; nothing where no chance is counted."""
-        if self.errors is None:
-            return {}
-        return {"errors": to_mapping(self.errors), "procedure": to_mapping(self.procedure)}
-
-    def plain(self) -> dict[str, Any]:
-        """Return the fields that are plain values."""
-        names = (item.name for item in fields(self) if item.name not in OF_THEIR_OWN_CLASS)
-        return {name: getattr(self, name) for name in names}
 
     @cached_property
     def key(self) -> str:
@@ -203,34 +191,6 @@ class Run:
         """Hash (hex) of all that the answer depends on."""
         planner = to_mapping(self.planner)
         return canonical_sha256({"problem": self.problem.key, "planner": planner, "seed": self.seed})
-
-    def to_json(self) -> str:
-        """Return the run as JSON, for another process."""
-        values = self.problem.plain() | {
-            "patient": asdict(self.problem.patient),
-            "system": to_mapping(self.problem.system),
-            **self.problem.counted(),
-        }
-        return json.dumps({"problem": values, "planner": to_mapping(self.planner), "seed": self.seed})
-
-    @staticmethod
-    def from_json(text: str) -> "Run":
-        """Return the run that `to_json` wrote."""
-        from anatomy.base.settings import parse
-
-        values = json.loads(text)
-        problem = values["problem"]
-        patient = problem["patient"]
-        problem |= {
-            "target_lps": tuple(problem["target_lps"]),
-            "patient": Patient(**patient | {"sources": tuple(map(tuple, patient["sources"]))}),
-            "system": parse(System, problem["system"], "run"),
-        }
-        for name, cls in (("errors", ErrorModel), ("procedure", Procedure)):
-            if name in problem:
-                problem[name] = parse(cls, problem[name], "run")
-        planner = parse(PlannerChoice, values["planner"], "run")
-        return Run(problem=Problem(**problem), planner=planner, seed=values["seed"])
 
 
 def runs_of(
@@ -268,12 +228,8 @@ def runs_of(
                 target_lps=point,
                 origin=origin,
                 start=0,
-                rotations=study.atlas.rotations,
-                stop_spacing_mm=study.atlas.stop_spacing_mm,
-                site_spacing_mm=study.atlas.site_spacing_mm,
-                iterations=study.budget.iterations,
-                time_s=study.budget.time_s,
-                first_plan=study.budget.first_plan,
+                **vars(study.atlas),
+                **vars(study.budget),
                 **counted,
             )
             for planner in study.planner:
@@ -381,9 +337,3 @@ class Answer:
     def solved(self) -> bool:
         """Whether there is a plan or path."""
         return self.outcome in (PLAN, PATH)
-
-    @staticmethod
-    def from_mapping(values: Mapping[str, Any]) -> "Answer":
-        """Return the answer that `dataclasses.asdict` made plain."""
-        made = tuple(Improvement(**each) for each in values["improvements"])
-        return Answer(**{**values, "improvements": made, "findings": tuple(values["findings"])})

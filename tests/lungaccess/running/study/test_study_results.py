@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sqlite3
 import subprocess
 import sys
@@ -177,14 +178,13 @@ def test_a_locked_file_is_named(path: Path, runs: list[Run], monkeypatch: pytest
 
 
 FULL_DISK = """
-import resource, sys
+import pickle, resource, sys
 from dataclasses import replace
 from pathlib import Path
 from anatomy.base.errors import FileError
 from lungaccess.running.study.results import ResultsFile
-from lungaccess.running.study.runs import Run
 from tests.lungaccess.running.study.toys import toy_answer
-path, how, run = Path(sys.argv[1]), sys.argv[2], Run.from_json(sys.stdin.read())
+path, how, run = Path(sys.argv[1]), sys.argv[2], pickle.load(sys.stdin.buffer)
 stored = 0
 with ResultsFile(path, create=True) as results:
     if how == "pages":
@@ -206,12 +206,11 @@ with ResultsFile(path, create=True) as results:
 def test_a_full_disk_is_an_error_and_loses_nothing(path: Path, runs: list[Run], how: str) -> None:
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, str(path), how],
-        input=runs[0].to_json(),
+        input=pickle.dumps(runs[0]),
         capture_output=True,
-        text=True,
         check=True,
     )
-    stored, words = done.stdout.split(" ", 1)
+    stored, words = done.stdout.decode().split(" ", 1)
     assert 0 < int(stored) < 100
     assert "cannot be written" in words
     assert "goes on from there" in words
@@ -224,13 +223,12 @@ def test_a_full_disk_is_an_error_and_loses_nothing(path: Path, runs: list[Run], 
 
 
 TWO_PROCESSES = """
-import sys
+import pickle, sys
 from dataclasses import replace
 from pathlib import Path
 from lungaccess.running.study.results import ResultsFile
-from lungaccess.running.study.runs import Run
 from tests.lungaccess.running.study.toys import toy_answer
-run = Run.from_json(sys.stdin.read())
+run = pickle.load(sys.stdin.buffer)
 sys.stdin.close()
 with ResultsFile(Path(sys.argv[1]), create=True) as results:
     print(sum(results.add(made, toy_answer(made)) for made in (replace(run, seed=n) for n in range(60))))
@@ -244,9 +242,8 @@ def test_two_processes_share_a_new_file(path: Path, runs: list[Run]) -> None:
     def work() -> None:
         done = subprocess.run(
             [sys.executable, "-c", TWO_PROCESSES, str(path)],
-            input=runs[0].to_json(),
+            input=pickle.dumps(runs[0]),
             capture_output=True,
-            text=True,
             check=False,
         )
         added.append(int(done.stdout) if done.returncode == 0 else -1000)

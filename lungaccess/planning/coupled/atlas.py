@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -96,6 +96,14 @@ def motions_of(lung: Lung, system: System, spacing_mm: float = TIP_SPACING_MM) -
     )
 
 
+class AtlasGrid(TypedDict, total=False):
+    """How densely deployments are enumerated; see `build_atlas`."""
+
+    rotations: int
+    stop_spacing_mm: float
+    site_spacing_mm: float
+
+
 def build_atlas(
     lung: Lung,
     system: System,
@@ -180,12 +188,10 @@ def open_atlas(
     lung: Lung,
     system: System,
     *,
-    rotations: int = DEFAULT_ROTATIONS,
-    stop_spacing_mm: float = DEFAULT_STOP_MM,
-    site_spacing_mm: float = TIP_SPACING_MM,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[float], None] | None = None,
     before: Atlas | None = None,
+    **grid: Unpack[AtlasGrid],
 ) -> Atlas:
     """Return the atlas from the cache, or make and keep it.
 
@@ -194,43 +200,21 @@ def open_atlas(
     `anatomy.kept_records.kept_record`.
     """
     prover_of(lung, system.scope)  # Here: the first plan does not wait for it.
-    depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
+    depends_on = _depends_on(lung, system, **grid)
 
     def make() -> _StoredAtlas:
-        made = build_atlas(
-            lung,
-            system,
-            rotations=rotations,
-            stop_spacing_mm=stop_spacing_mm,
-            site_spacing_mm=site_spacing_mm,
-            progress=progress,
-            before=before,
-        )
+        made = build_atlas(lung, system, progress=progress, before=before, **grid)
         return _StoredAtlas(**{each.name: getattr(made, each.name) for each in fields(_StoredAtlas)})
 
+    what = "atlas", atlas_format(), depends_on, _StoredAtlas
     in_use = () if lung.folder is None else (lung.folder,)
-    stored = kept_record(
-        "atlas",
-        atlas_format(),
-        depends_on,
-        _StoredAtlas,
-        make=make,
-        cache=cache,
-        name=lung.name,
-        in_use=in_use,
-    )
+    stored = kept_record(*what, make=make, cache=cache, name=lung.name, in_use=in_use)
     index = StartIndex(stored.deployments.positions, stored.deployments.tangents)
     return Atlas(lung=lung, system=system, index=index, **vars(stored))
 
 
 def atlas_is_kept(
-    lung: Lung,
-    system: System,
-    *,
-    rotations: int = DEFAULT_ROTATIONS,
-    stop_spacing_mm: float = DEFAULT_STOP_MM,
-    site_spacing_mm: float = TIP_SPACING_MM,
-    cache: str | os.PathLike[str] | None = None,
+    lung: Lung, system: System, *, cache: str | os.PathLike[str] | None = None, **grid: Unpack[AtlasGrid]
 ) -> bool:
     """Tell whether `open_atlas` finds an atlas in the cache; the file is not read, so it may be damaged.
 
@@ -238,13 +222,10 @@ def atlas_is_kept(
     """
     if not shapes_at_hand(system.tubes):
         return False
-    depends_on = _depends_on(lung, system, rotations, stop_spacing_mm, site_spacing_mm)
-    return record_path("atlas", atlas_format(), depends_on, cache).is_file()
+    return record_path("atlas", atlas_format(), _depends_on(lung, system, **grid), cache).is_file()
 
 
-def _depends_on(
-    lung: Lung, system: System, rotations: int, stop_spacing_mm: float, site_spacing_mm: float
-) -> dict[str, Any]:
+def _depends_on(lung: Lung, system: System, **grid: Unpack[AtlasGrid]) -> dict[str, Any]:
     return {
         "lung": lung.key,
         "scope": to_mapping(system.scope),
@@ -253,9 +234,9 @@ def _depends_on(
         "margins": to_mapping(system.margins),
         "shapes": shapes_digest(system.tubes),
         "with_fissures": fissures_are_obstacles(lung, system),
-        "rotations": rotations,
-        "stop_mm": stop_spacing_mm,
-        "site_mm": site_spacing_mm,
+        "rotations": grid.get("rotations", DEFAULT_ROTATIONS),
+        "stop_mm": grid.get("stop_spacing_mm", DEFAULT_STOP_MM),
+        "site_mm": grid.get("site_spacing_mm", TIP_SPACING_MM),
     }
 
 

@@ -219,11 +219,13 @@ class TubeValidator:
         wall_run_mm = self._wall_run_mm(shape, made, exit_mm)
         if wall_run_mm > self._system.tubes.max_wall_run_mm:
             return REASONS[kernels.LONG_WALL_RUN]
+        # The frame of the tip is carried along the tubes without turning.
+        unturned = arc_transform(0.0, -float(made.arcs[-1, kernels.DIRECTION]), 0.0)
         return Deployment(
             rotation_rad=rotation_rad,
             outer_mm=float(made.insertions_mm[-1]),
             inner_mm=float(made.insertions_mm[0]),
-            lps_from_tip=tip_of(shape, made),
+            lps_from_tip=shape.frames()[-1] @ unturned,
             branch=branch,
             exit_mm=exit_mm,
             wall_angle_rad=angle,
@@ -318,11 +320,6 @@ def pieces_of(made: TubeShape) -> list[tuple[float, float, float]]:
     lengths, radii = made.arcs[:, kernels.LENGTH], made.arcs[:, kernels.RADIUS]
     ends = np.cumsum(lengths)
     return list(zip((ends - lengths).tolist(), ends.tolist(), radii.tolist(), strict=True))
-
-
-def tip_of(path: ArcPath, made: TubeShape) -> Float:
-    """Return the frame `(4, 4)` at the end of a shape's path, carried there without turning."""
-    return np.asarray(path.frames()[-1] @ arc_transform(0.0, -float(made.arcs[-1, kernels.DIRECTION]), 0.0))
 
 
 def frame_at(path: ArcPath, at_mm: float) -> Float:

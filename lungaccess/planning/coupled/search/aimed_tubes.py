@@ -162,7 +162,8 @@ class AimedFromPose:
         found, why = aiming.aim(
             task.target.lps_mm, row, np.ones(1, dtype=np.bool_), np.zeros(count, dtype=np.int64), starts
         )
-        self.reasons = {f"tube, aimed at the target: {name}": n for name, n in reasons_of(why).items()}
+        reasons = reasons_of(why)
+        self.reasons = {f"tube, aimed at the target: {name}": n for name, n in reasons.items()}
         for n in np.argsort(found[:, COST], kind="stable").tolist():
             if not np.isfinite(found[n, COST]):
                 break
@@ -172,7 +173,7 @@ class AimedFromPose:
             path = tubes_in_tissue(frame, made)
             if self._evaluator.proves(made, path):
                 return made, path
-        stopped = {name: n for name, n in reasons_of(why).items() if name != NO_SOLUTION}
+        stopped = {name: n for name, n in reasons.items() if name != NO_SOLUTION}
         if stopped:
             self.why = max(stopped, key=stopped.__getitem__)
         return None
@@ -239,9 +240,8 @@ class AimedTubes:
         ends = np.array([self.evaluator.aim(tip) for tip in tips[:, :3]]).reshape(-1, 3)
         return self._aiming.aim(ends, tips, allowed, np.arange(len(tips)), starts)
 
-    def reasons(self, blockers: Int) -> dict[str, int]:
-        """Return how many attempts (N,) each reason refused, in words."""
-        return reasons_of(blockers)
+    reasons = staticmethod(reasons_of)
+    """Returns how many attempts (N,) each reason refused, in words."""
 
     def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
         """Return for entries (E,) why they are refused, 0 if not, their estimated costs, and the least."""

@@ -17,7 +17,6 @@ from lungaccess.planning.coupled.kernels.local_search import sample_deployments
 from lungaccess.planning.coupled.search.base import (
     ESTIMATE_SLACK,
     DirectSearch,
-    Incumbent,
     ParallelSearch,
     SearchSettings,
     Step,
@@ -28,7 +27,6 @@ from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArc
 from lungaccess.planning.coupled.search.local_search import LocalSearch, LocalSearchRun, TubeChoice
 from lungaccess.planning.coupled.search.needle_planner import PLANNER, NamedNeedlePlanner, needle_searches
 from lungaccess.plans.candidate import Candidate
-from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
 from stages.needle import Needle, successive_halving
 from stages.tube import many_shapes, shapes_of
@@ -39,15 +37,9 @@ class LocalSearchRounds:
 
     phase = "local search"
 
-    def __init__(
-        self,
-        local_search: LocalSearch,
-        evaluator: CandidateEvaluator,
-        incumbent: Incumbent,
-        settings: SearchSettings,
-    ) -> None:
-        self._local_search, self._evaluator = local_search, evaluator
-        self._incumbent, self._settings = incumbent, settings
+    def __init__(self, search: "AtlasSearch", local_search: LocalSearch) -> None:
+        self._local_search, self._evaluator = local_search, search.evaluator
+        self._incumbent, self._settings = search.incumbent, search.settings
 
     def halve(self, runs: list[LocalSearchRun]) -> Iterator[Step]:
         """Advance runs by successive halving: after each rung the better half goes on."""
@@ -137,7 +129,7 @@ class AtlasSearch(ParallelSearch):
             return
         settings, number = self.settings, self.share[0]
         local_search = LocalSearch(self.evaluator, self._rng)
-        rounds = LocalSearchRounds(local_search, self.evaluator, self.incumbent, settings)
+        rounds = LocalSearchRounds(self, local_search)
         starts = self._starts(local_search)
         sampled = self._sampled(local_search)
         searched = needle_searches(
@@ -219,31 +211,18 @@ class LocalSampling:
         self._local_search = local_search
         self._evaluator, self._rng = arcs.evaluator, rng
         entries, motions = arcs.atlas.deployments, arcs.atlas.motions
-        numbers, self._pose_of = np.unique(entries.site[chosen], return_inverse=True)
+        numbers, pose_of = np.unique(entries.site[chosen], return_inverse=True)
         self._motions, self._numbers = motions, numbers
-        self._poses = np.ascontiguousarray(motions.tips[numbers])
-        self._rotations = np.array(entries.rotation_rad[chosen])
-        self._shapes = many_shapes(shapes_of(arcs.task.system.tubes), entries.shape[chosen])
+        shapes = many_shapes(shapes_of(arcs.task.system.tubes), entries.shape[chosen])
+        poses, rotations = np.ascontiguousarray(motions.tips[numbers]), np.array(entries.rotation_rad[chosen])
+        self._around = poses, pose_of, rotations, shapes, SPREADS, local_search.target, TRIES
 
     def sample(self, cost_limit: float) -> Candidate | None:
         """Return the cheapest of TRIES samples if its estimated cost is below a limit."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
         search, best = self._local_search, TubeChoice.empty(self._local_search.design)
-        cost = sample_deployments(
-            search.tube(TubeChoice.empty(search.design)),
-            search.needle,
-            self._poses,
-            self._pose_of,
-            self._rotations,
-            self._shapes,
-            SPREADS,
-            search.target,
-            TRIES,
-            cost_limit,
-            state,
-            best.x,
-            best.shape,
-        )
+        tube = search.tube(TubeChoice.empty(search.design))
+        cost = sample_deployments(tube, search.needle, *self._around, cost_limit, state, best.x, best.shape)
         if not cost < cost_limit:
             return None
         tip = self._motions.tip(int(self._numbers[int(best.x[SCOPE_POSE])]))

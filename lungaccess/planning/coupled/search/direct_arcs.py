@@ -77,24 +77,21 @@ class DirectArcs:
         A blocker is 0 for an arc that is proved clear, -1 where no arc keeps the needle's limits, else a
         voxel label.
         """
-        entries = self.atlas.deployments
         found = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen)), np.zeros(len(chosen))
         for rows, aim in self._by_aim(chosen):
-            at = chosen[rows]
-            parts = direct_arcs(
-                environment or self.evaluator.environment,
-                entries.positions[at],
-                entries.tangents[at],
-                entries.branch[at],
-                aim,
-            )
+            starts = self._starts(chosen[rows])
+            parts = direct_arcs(environment or self.evaluator.environment, *starts, aim)
             for whole, part in zip(found, parts, strict=True):
                 whole[rows] = part
         return found
 
-    def reasons(self, blockers: Int) -> dict[str, int]:
-        """Return how many arcs `(N,)` each blocker stops, by its name."""
-        return blocker_counts(blockers)
+    def _starts(self, chosen: Int) -> tuple[Float, Float, Int]:
+        """Return where the tubes of deployments end, in which direction, and the branches they pierce."""
+        entries = self.atlas.deployments
+        return entries.positions[chosen], entries.tangents[chosen], entries.branch[chosen]
+
+    reasons = staticmethod(blocker_counts)
+    """Returns how many arcs `(N,)` each blocker stops, by its name."""
 
     def clear(self) -> Int:
         """Return the deployments (C,) with a clear arc, the shortest first."""
@@ -173,23 +170,13 @@ class DirectArcs:
             - costs ((N,) float64) - Estimated costs, infinite where a lower bound was enough.
             - best - Cost of the cheapest clear arc, or `best`.
         """
-        entries = self.atlas.deployments
+        arrays = self.evaluator.needle_arrays
         blockers, costs = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen))
         for rows, aim in self._by_aim(chosen):
             at = chosen[rows]
             stopped, cost = np.zeros(len(at), dtype=np.int64), np.zeros(len(at))
-            best = evaluate_arcs(
-                self.evaluator.needle_arrays,
-                entries.positions[at],
-                entries.tangents[at],
-                entries.branch[at],
-                self.before(at),
-                tuple(aim.tolist()),
-                slack,
-                best,
-                stopped,
-                cost,
-            )
+            starts, goal = (*self._starts(at), self.before(at)), tuple(aim.tolist())
+            best = evaluate_arcs(arrays, *starts, goal, slack, best, stopped, cost)
             blockers[rows], costs[rows] = stopped, cost
         return blockers, costs, best
 

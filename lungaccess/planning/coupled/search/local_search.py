@@ -103,19 +103,15 @@ class LocalSearchRun:
 
 
 class LocalSearch:
-    """Improves candidates of one task; `needle` is as the kernels take it, see `kernels.candidate`."""
+    """Improves candidates of one task; `needle` and `tube` are as kernels take them: `kernels.candidate`."""
 
     def __init__(self, evaluator: CandidateEvaluator, rng: np.random.Generator) -> None:
         self._evaluator, self._rng = evaluator, rng
         self.design = design_arrays(evaluator.task.system.tubes)
-        self._tube = tube_arguments(evaluator, self.design)
+        self.tube = tube_arguments(evaluator, self.design)
         self.needle = evaluator.needle_arrays
         x, y, z = evaluator.task.target.lps_mm.tolist()
         self.target = (x, y, z)
-
-    def tube(self, choice: TubeChoice) -> TubeArguments:
-        """Return the tubes for the kernels, with the shape of a choice."""
-        return self._tube(choice)
 
     def begin(self, candidate: Candidate | None) -> LocalSearchRun | None:
         """Return a run from a candidate; None without one, or if its needle has too many arcs."""
@@ -136,18 +132,9 @@ class LocalSearch:
     def advance(self, run: LocalSearchRun, tries: int) -> None:
         """Evaluate so many variations of a run's choice, and keep the best."""
         state: UInt64 = self._rng.integers(2**64, size=1, dtype=np.uint64)
-        run.count, run.cost = improve(
-            self.tube(run.choice),
-            self.needle,
-            run.poses.tips,
-            run.poses.proved,
-            run.choice.x,
-            run.vias,
-            run.count,
-            run.goal,
-            tries,
-            state,
-        )
+        choice, poses = run.choice, run.poses
+        about = self.tube(choice), self.needle, poses.tips, poses.proved, choice.x, run.vias
+        run.count, run.cost = improve(*about, run.count, run.goal, tries, state)
 
     def perturb(self, run: LocalSearchRun) -> None:
         """Move a run some distance away at random, and leave out some of its via points."""

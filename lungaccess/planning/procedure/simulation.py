@@ -18,7 +18,6 @@ from lungaccess.planning.procedure.spread import as_measured
 from lungaccess.planning.procedure.truth import (
     ARCS,
     Attempt,
-    Steered,
     as_pieces,
     ends_of,
     fitted_to,
@@ -255,13 +254,9 @@ class _Run:
         back = np.flatnonzero(~done)
         if len(back):
             # Tubes that were drawn back again may have stayed in the airway: nothing came of it.
-            alone = self.assessor.follow(
-                went.starts[back],
-                np.ascontiguousarray(tubes[back]),
-                n_tube,
-                errors.target_mm[back],
-                errors.border_mm[back],
-            ).touched
+            starts, own = went.starts[back], np.ascontiguousarray(tubes[back])
+            moved = errors.target_mm[back], errors.border_mm[back]
+            alone = self.assessor.follow(starts, own, n_tube, *moved).touched
             touched[back] = alone & ~kernel.STAYS_INSIDE
         found.touched[at] |= touched
         found.miss_mm[at[done]], found.taken[at[done]] = outcomes.miss_mm[done], outcomes.taken[done]
@@ -280,7 +275,7 @@ class _Run:
         found: Found,
     ) -> Float:
         """Return the true arcs of needles that are measured on their way, and note where they stopped."""
-        made: list[Float] = []
+        policy, steering, made = self._policy, self._policy.procedure.needle, list[Float]()
         for n in range(len(at)):
             if not done[n]:
                 made.append(np.zeros((0, 3)))
@@ -288,11 +283,13 @@ class _Run:
             path = ArcPath(lps_from_start=chosen.tips[n], arcs=chosen.arcs[n, : chosen.found[n, 1]])
             key = (_MEASURING, int(went.rows[n]), *self._number)
             errors = rows_of(went.errors, np.array([n]))
-            attempt = Attempt(errors=errors, target_lps=self._policy.plan.goal_lps + errors.target_mm[0])
-            one = steered(
-                self._policy, path, int(chosen.found[n, 2]), true_tips[n], targets[n], attempt,
-                self._policy.doubt_of(chosen.frames[n], chosen.tips[n]),
-                np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key)),
+            attempt = Attempt(errors=errors, target_lps=policy.plan.goal_lps + errors.target_mm[0])
+            branch = int(chosen.found[n, 2])
+            query = Query(lps_from_start=path.lps_from_start, target=targets[n], branch=branch)
+            unknown = unknown_of(policy.errors, steering, policy.doubt_of(chosen.frames[n], chosen.tips[n]))
+            one = insert_needle(
+                policy.environment, query, path, PolicyReplanner(policy, query, path), attempt, true_tips[n],
+                steering, unknown, np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key)),
             )  # fmt: skip
             made.append(one.arcs)
             went.stopped[n] = one.stopped is not None
@@ -403,26 +400,3 @@ class PolicyReplanner(Replanner):
         replanner = Replanner(self._policy.environment, query, rest, settings=allowed)
         replanner.curvature_share = self.curvature_share
         return replanner.replan(lps_from_tip, target, way.inserted_mm)
-
-
-def steered(
-    policy: Policy,
-    path: ArcPath,
-    branch: int,
-    true_tip: Float,
-    target: Float,
-    attempt: Attempt,
-    doubt: Float,
-    rng: np.random.Generator,
-) -> Steered:
-    """Return what comes of a needle that begins with a path and is measured on its way.
-
-    It truly starts at `true_tip` (4, 4); `doubt` (6, 6) is the covariance of where it is taken to start, see
-    `stages.needle.Unknown`.
-    """
-    steering = policy.procedure.needle
-    query = Query(lps_from_start=path.lps_from_start, target=target, branch=branch)
-    return insert_needle(
-        policy.environment, query, path, PolicyReplanner(policy, query, path), attempt, true_tip, steering,
-        unknown_of(policy.errors, steering, doubt), rng,
-    )  # fmt: skip

@@ -118,16 +118,9 @@ class Spread:
         What deviated tubes meet of the airway that they leave is not in it.
         """
         margin = self._found[:, [kernel.OF_TUBE, kernel.OF_NEEDLE]].min(axis=1)
-        return np.asarray(self.goal_chances * self.reach_chances * _below(margin))
-
-    @cached_property
-    def reach_chances(self) -> Float:
-        """The chance of each that the target lies within the needle's bending from the true tip of the tubes.
-
-        It is 1 where the needle is not planned again from there.
-        """
-        reach = self._found[:, kernel.REACH]
-        return _below(reach) if self._replanned else np.ones(len(reach))
+        # The chance that the target lies within the needle's bending from where the tubes truly end.
+        reached = _below(self._found[:, kernel.REACH]) if self._replanned else 1.0
+        return np.asarray(self.goal_chances * reached * _below(margin))
 
     @cached_property
     def goal_chances(self) -> Float:

@@ -40,10 +40,6 @@ class Attempt:
     errors: Deviations
     target_lps: Float
 
-    def roll_rad(self, number: int) -> float:
-        """Return the error of the angle of the needle's arc with a number."""
-        return float(self.errors.roll_rad[0, number % ARCS])
-
 
 def fitted_to(n_arcs: int, errors: Deviations) -> Deviations:
     """Return errors of needles with a number of arcs, from those of needles with ARCS arcs."""
@@ -127,7 +123,7 @@ class SteeredTruth:
 
     def roll(self) -> None:
         """Turn the bevel: it does not end where it should."""
-        self._lag = self._attempt.roll_rad(self._rolls)
+        self._lag = float(self._attempt.errors.roll_rad[0, self._rolls % ARCS])
         self._rolls += 1
 
     def bend(self, frame: Float, curvature: float, inserted_mm: float) -> tuple[float, float]:

@@ -276,6 +276,10 @@ def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] |
     return open_shapes(tubes_of(device), limits, needle=needle, cache=cache)
 
 
+COSTS = ("lateral_sweep_mm", "follow_the_leader_error_mm", "strain", "arc_error_mm")
+"""What is told of every shape of a design beside its tip, in this order."""
+
+
 def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:
     """Return what a design can do as plain JSON types: mm, rad."""
     tips = shapes.scope_from_tip
@@ -285,10 +289,7 @@ def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:
         "tip_aside_mm": aside,
         "tip_ahead_mm": tips[:, 2, 3],
         "tip_turned_rad": turned,
-        "lateral_sweep_mm": shapes.lateral_sweep_mm,
-        "follow_the_leader_error_mm": shapes.follow_the_leader_error_mm,
-        "strain": shapes.strain,
-        "arc_error_mm": shapes.arc_error_mm,
+        **{cost: getattr(shapes, cost) for cost in COSTS},
     }
     return {
         "name": name,
@@ -315,11 +316,7 @@ def save_shapes(shapes: TubeShapes, path: Path) -> None:
         **{f"rotation_{i + 1}_rad": shapes.rotations_rad[:, i] for i in range(n)},
         **{f"tip_{axis}_mm": shapes.scope_from_tip[:, i, 3] for i, axis in enumerate("xyz")},
         **{f"tangent_{axis}": shapes.scope_from_tip[:, i, 2] for i, axis in enumerate("xyz")},
-        "least_determinant": shapes.least_determinant,
-        "lateral_sweep_mm": shapes.lateral_sweep_mm,
-        "follow_the_leader_error_mm": shapes.follow_the_leader_error_mm,
-        "strain": shapes.strain,
-        "arc_error_mm": shapes.arc_error_mm,
+        **{cost: getattr(shapes, cost) for cost in ("least_determinant", *COSTS)},
     }
     table = np.stack(list(columns.values()), axis=1)
     with atomic_write(path) as temporary:

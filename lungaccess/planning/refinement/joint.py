@@ -8,14 +8,7 @@ from anatomy import poses
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from lungaccess.planning.refinement.layout import joints_of
-from lungaccess.planning.refinement.problem import (
-    ARC_COUNTS,
-    Problem,
-    Weights,
-    aimed,
-    path_of,
-    program_weights,
-)
+from lungaccess.planning.refinement.problem import ARC_COUNTS, Problem, aimed, path_of, program_weights
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
@@ -47,18 +40,13 @@ def refine(task: Task, candidate: Candidate, *, iterations: int = ITERATIONS) ->
         Cheaper than the one given by BETTER or more, or None; always None for an objective that the program
         cannot express: see `program_weights`.
     """
+    from lungaccess.planning.refinement.program import program
+
     weights = program_weights(task)
     if len(candidate.path.arcs) > ARC_COUNTS[-1] or weights is None:
         return None
-    return _refined(CandidateEvaluator(task), candidate, weights, iterations)
-
-
-def _refined(
-    evaluator: CandidateEvaluator, candidate: Candidate, weights: Weights, iterations: int
-) -> Candidate | None:
-    """Solve for everything, then for the needle alone from tubes that are proved."""
-    from lungaccess.planning.refinement.program import program
-
+    # First everything is solved for, then the needle alone from tubes that are proved.
+    evaluator = CandidateEvaluator(task)
     problem = Problem(evaluator, candidate, weights)
     reconstruction = Reconstruction(evaluator, problem)
     limit = evaluator.cost(candidate) * (1.0 - BETTER)

@@ -60,11 +60,7 @@ class Layout:
         """Places of the variables: mm, rad, curvatures as shares of the greatest."""
         a = self.arcs
         return {
-            "site": 0,
-            "rotation": 1,
-            "outer": 2,
-            "inner": 3,
-            "exit": 4,
+            **{name: n for n, name in enumerate(("site", "rotation", "outer", "inner", "exit"))},
             "lengths": slice(5, 5 + a),
             "bend_x": slice(5 + a, 5 + 2 * a),
             "bend_y": slice(5 + 2 * a, 5 + 3 * a),

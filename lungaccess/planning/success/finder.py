@@ -82,6 +82,7 @@ class ContestFinder:
 
     def __init__(self, request: Request, task: Task, atlas: Atlas, counterfactuals: bool) -> None:
         self._request, self._task, self._atlas = request, task, atlas
+        self._plan_of = partial(searches.plan_of, request, task, atlas)
         self._counterfactuals = counterfactuals
         self._rating = rating_of(request) or FunctionRating(request)
         self._search = searches.search_of(request, task, atlas)
@@ -102,7 +103,7 @@ class ContestFinder:
         if first is None:
             return
         self._leader = first
-        yield Turn(iteration=0, phase="search", make=partial(self._unstated, first))
+        yield Turn(iteration=0, phase="search", make=partial(self._plan_of, first.candidate, 0))
         of_cost = yield from self._by_cost(first)
         entries = [] if self._direct is None else ranked(self._rating, self._direct).tolist()
         pool = (made for made in map(self._entry, entries) if made)
@@ -171,7 +172,7 @@ class ContestFinder:
     def _plan(self, candidate: Candidate) -> Plan:
         """Return a plan with the devices of a candidate, a whole one for a rating that may ask for all."""
         if isinstance(self._rating, FunctionRating) or self._model is None:
-            self._model = searches.plan_of(self._request, self._task, self._atlas, candidate, 0, 0.0)
+            self._model = self._plan_of(candidate, 0, 0.0)
             return self._model
         made = with_devices(self._task, candidate, self._model)
         return searches.with_aim(made, self._request) if self._request.is_for_window else made
@@ -265,17 +266,11 @@ class ContestFinder:
         self._shown = replace(plan, timing=dict(plan.timing) | {"planning_s": elapsed_s})
         return self._shown
 
-    def _unstated(self, contender: Contender, elapsed_s: float) -> Plan:
-        return searches.plan_of(self._request, self._task, self._atlas, contender.candidate, 0, elapsed_s)
-
     def _stated(
         self, contender: Contender, iteration: int, elapsed_s: float, most: int | None = None
     ) -> Plan:
         """Return the whole plan of a contender with what it states of the goal."""
-
-        def make(candidate: Candidate) -> Plan:
-            return searches.plan_of(self._request, self._task, self._atlas, candidate, iteration, elapsed_s)
-
+        make = partial(self._plan_of, iteration=iteration, elapsed_s=elapsed_s)
         made, rating, direct = make(contender.candidate), self._rating, self._direct
         if self._request.passes > 1 and isinstance(rating, ChanceRating):
             ways = direct or direct_candidates(self._task, self._atlas)

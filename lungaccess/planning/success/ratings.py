@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from anatomy.base.records import frozen_value
-from anatomy.base.typed import Bool, Float, Int
+from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.planning.procedure import Policy, simulated
 from lungaccess.planning.procedure.spread import Spread
@@ -132,12 +132,6 @@ class ChanceRating:
             return simulated(policy, draws, self.seed_of(batch), processes).succeeds.count
 
         return counted
-
-    def clear(self, plan: Plan, draws: int, seed: int) -> Bool:
-        """Return in which draws `(N,)` of open loop a plan touches nothing forbidden."""
-        assessor = RiskAssessor(plan, self._lung, radius_mm=self._given_mm)
-        errors = assessor.draws(draws, seed).deviations(model_for(self.errors, plan, self._lung))
-        return assessor.touches_nothing(assessor.outcomes(errors).touched)
 
     def seed_of(self, batch: int) -> int:
         """Return the seed of a batch of draws."""

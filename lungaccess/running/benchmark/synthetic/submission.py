@@ -237,14 +237,7 @@ def answer_of_plan(query: BenchmarkQuery, plan: Plan, *, first_cpu_s: float, cpu
             inner_insertion_mm=plan.tube.inner_insertion_mm,
             lps_from_tip=_pose(plan.tube.lps_from_tip),
         ),
-        needle=NeedleAnswer(
-            arcs=tuple(
-                ArcAnswer(
-                    length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm
-                )
-                for arc in needle.arcs
-            )
-        ),
+        needle=NeedleAnswer(arcs=tuple(ArcAnswer(**vars(arc)) for arc in needle.arcs)),
         first_cpu_s=first_cpu_s,
         cpu_s=cpu_s,
     )
@@ -282,10 +275,7 @@ def motions_of_answer(query: BenchmarkQuery, answer: SubmittedAnswer, tips: Publ
         lateral_sweep_mm=shape.lateral_sweep_mm,
         follow_the_leader_error_mm=shape.follow_the_leader_error_mm,
         lps_from_tube_tip=np.array(tubes.lps_from_tip, dtype=np.float64),
-        arcs=tuple(
-            NeedleArc(length_mm=arc.length_mm, roll_rad=arc.roll_rad, curvature_per_mm=arc.curvature_per_mm)
-            for arc in needle.arcs
-        ),
+        arcs=tuple(NeedleArc(**vars(arc)) for arc in needle.arcs),
     )
 
 

@@ -40,6 +40,8 @@ def kept_record(
 ) -> T:
     """Return the record from the cache, or make and keep it; what was used least recently makes room for it.
 
+    Raises FileError if the file cannot be written, and SettingsError if the limit of the cache is no size.
+
     Args:
         kind: What it is, one of `anatomy.base.cache_entries`; the file is named after it.
         version: Another one where `make` returns something else for the same `depends_on`, plain values, as
@@ -47,10 +49,6 @@ def kept_record(
         cls: Class of the record, of arrays, plain values, and records of such.
         name: Whose it is; empty if it belongs to no patient.
         in_use: What has to stay in the cache as well.
-
-    Raises:
-        FileError: If the file cannot be written.
-        SettingsError: If the limit of the cache is no size.
     """
     path = record_path(kind, version, depends_on, cache)
     stored = _stored(path, cls) if path.exists() else None

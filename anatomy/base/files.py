@@ -69,9 +69,7 @@ def read_text(path: str | Path) -> str:
 def read_toml(path: str | Path, *, remedy: str, expected: str = "text in TOML syntax") -> dict[str, Any]:
     """Read a TOML file; `expected` and `remedy` are for the message.
 
-    Raises:
-        SettingsError: If it is not TOML.
-        FileError: If it cannot be read, or is no text.
+    Raises SettingsError if it is not TOML, and FileError if it cannot be read, or is no text.
     """
     content = read_text(path)
     try:
@@ -157,11 +155,9 @@ def require_suffix(path: str | Path, suffix: str) -> None:
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Give a temporary name beside `path`, and rename it to `path` when the block succeeds.
 
-    The temporary name ends like `path`, because writers choose the format by the ending.  When the
-    block raises, `path` keeps its old contents and the temporary file is removed.
-
-    Raises:
-        FileError: If the folder is missing or not writable, or the disk is full.
+    The temporary name ends like `path`, because writers choose the format by the ending.  When the block
+    raises, `path` keeps its old contents and the temporary file is removed.  Raises FileError if the folder
+    is missing or not writable, or the disk is full.
 
     Examples:
         >>> import tempfile

@@ -103,12 +103,9 @@ def parse(cls: type[T], mapping: Mapping[str, object], where: str, remedy: str =
     """Build settings, of a class made by `settings`, from plain values, as read from TOML or JSON.
 
     `where` says where the values come from, such as a file name, and `remedy` what the user can do about a
-    wrong one.
-
-    Raises:
-        SettingsError: For a missing or unknown key, a wrong type, a number that is not finite or outside its
-            range, or values that contradict each other. The message names the key path, the value and what is
-            allowed.
+    wrong one.  Raises SettingsError for a missing or unknown key, a wrong type, a number that is not finite
+    or outside its range, or values that contradict each other. The message names the key path, the value and
+    what is allowed.
     """
     try:
         return TypeAdapter(cls).validate_python(mapping)

@@ -21,10 +21,8 @@ LOCK, CONTENT = "lock", "content"
 def filled_folder(parent: Path) -> Iterator[Path]:
     """Make a folder under a lock, which the system takes back when this process ends, however it ends.
 
-    What is left of the folder at the end of the block is removed.
-
-    Raises:
-        OSError: If the folder cannot be made.
+    What is left of the folder at the end of the block is removed.  Raises OSError if the folder cannot be
+    made.
     """
     while True:
         # The name is known before the folder is made: an interrupt between the two leaves nothing behind.
@@ -73,9 +71,7 @@ def sole_writer(results: Path, folder: Path, name: str = LOCK) -> Iterator[None]
 def locked(folder: Path, name: str = LOCK) -> Iterator[bool]:
     """Hold a lock of a folder; yield whether there is one: some file systems have none.
 
-    Raises:
-        BlockingIOError: If another process holds it.
-        FileNotFoundError: If there is no such folder.
+    Raises BlockingIOError if another process holds it, and FileNotFoundError if there is no such folder.
     """
     lock, there = FileLock(folder / name), True
     try:

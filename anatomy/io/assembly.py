@@ -119,11 +119,9 @@ MAY_BE_EMPTY = ("fissures", "nodules")
 def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any) -> PatientImages:
     """Make the `PatientImages` of masks that were read, after checking that none is missing or empty.
 
-    Messages name the patient's folder, `where`.  Of the further fields `warnings` and `sources` are added to.
-
-    Raises:
-        AnatomyError: If lumen, vessels or lung is missing, or a mask is empty.  An empty mask of fissures or
-            nodules only causes a warning.
+    Messages name the patient's folder, `where`.  Of the further fields `warnings` and `sources` are added
+    to.  Raises AnatomyError if lumen, vessels or lung is missing, or a mask is empty.  An empty mask of
+    fissures or nodules only causes a warning.
     """
     masks = with_contents(with_lobes(masks))
     missing = [words for role, words in LUNG_ROLES.items() if role not in masks.masks]

@@ -331,10 +331,8 @@ def _edges(piece: VtkPiece, path: str | Path) -> Int:
 def write_centerlines(path: str | Path, tree: AirwayTree) -> None:
     """Write a tree as .vtp in LPS mm, one polyline a branch, with `Radius`, `Generation` and `Branch`.
 
-    Every branch after the first begins with the point it hangs on.  No digit is lost.
-
-    Raises:
-        FileError: If the name does not end in .vtp, or the file cannot be written.
+    Every branch after the first begins with the point it hangs on.  No digit is lost.  Raises FileError if
+    the name does not end in .vtp, or the file cannot be written.
     """
     require_suffix(path, ".vtp")
     lines = []

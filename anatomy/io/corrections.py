@@ -36,11 +36,7 @@ def corrected(images: PatientImages, path: Path) -> PatientImages:
 
 
 def read_corrections(file: Path) -> Volume:
-    """Read corrections.
-
-    Raises:
-        FileError, FrameError: If the file cannot be read, or holds other values.
-    """
+    """Read corrections; FileError or FrameError if the file cannot be read, or holds other values."""
     volume = read_volume(file)
     values = np.asarray(volume.array)
     if not np.isin(np.unique(values), range(NODULE + 1)).all():

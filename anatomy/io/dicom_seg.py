@@ -219,11 +219,8 @@ def read_segments(path: Path) -> Volume:
 def read_segment_masks(path: Path, parts: Sequence[tuple[str, Sequence[int]]]) -> tuple[Grid, list[Mask]]:
     """Read a mask for each role and numbers of segments; without numbers, of those that mean the role.
 
-    A file with one segment is a mask by itself.
-
-    Raises:
-        AnatomyError: If no segment has a number, or several segments are there and none means the role.
-        FileError, SettingsError: As `read_segments`.
+    A file with one segment is a mask by itself.  Raises AnatomyError if no segment has a number, or several
+    segments are there and none means the role, and FileError or SettingsError as `read_segments`.
     """
     with _opened(path) as found:
         volumes = [found.mask(_numbers(path, found.roles, found.names, *part)) for part in parts]

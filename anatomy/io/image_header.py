@@ -69,11 +69,8 @@ class ImageHeader:
 def image_shape(sizes: tuple[int, ...], itemsize: int, path: Path, stored_bytes: int) -> tuple[int, int, int]:
     """Return the shape of an image of three dimensions that a file of `stored_bytes` can hold.
 
-    `itemsize` is the number of bytes of a voxel.
-
-    Raises:
-        FileError: If there are not three positive sizes, or the file is too short for them, or they are
-            absurd.
+    `itemsize` is the number of bytes of a voxel.  Raises FileError if there are not three positive sizes, or
+    the file is too short for them, or they are absurd.
     """
     if len(sizes) != 3 or min(sizes) < 1:
         raise FileError(

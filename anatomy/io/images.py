@@ -221,9 +221,7 @@ def write_image(image: SimpleITK.Image, path: Path, components: int = 1) -> None
     """Write an image of ITK with so many numbers a voxel, all of it or nothing.
 
     ITK says nothing where the disk is full: what was written is read through once, up to its checksum.
-
-    Raises:
-        FileError: If the folder cannot be written to, or the disk is full.
+    Raises FileError if the folder cannot be written to, or the disk is full.
     """
     import SimpleITK
 

@@ -21,10 +21,7 @@ def input_hashes(path: str | Path) -> dict[str, str]:
     """Return the SHA-256 of every file a patient may be read from, by its path in the patient's folder.
 
     `path` is what `anatomy.io.load_patient` takes.  Which file was stated as the label map is told apart by
-    an entry of its own.
-
-    Raises:
-        FileError: If there is nothing at `path`, or a file cannot be read.
+    an entry of its own.  Raises FileError if there is nothing at `path`, or a file cannot be read.
     """
     path = Path(path)
     if path.is_dir() and (path / DESCRIPTION).is_file():

@@ -138,10 +138,8 @@ def _only(found: list[Kind], reference: Reference, what: str, names: Iterable[st
 def read_markups(path: str | Path) -> tuple[Markup, ...]:
     """Return all lists of points and curves of a `.mrk.json`, a scene `.mrml` or a bundle `.mrb`.
 
-    Raises:
-        FileError: If it is none of these, or damaged.
-        FrameError: If the frame of its points is not stated or not one of a rigid body, or a transform moves
-            them that is not hardened.
+    Raises FileError if it is none of these, or damaged, and FrameError if the frame of its points is not
+    stated or not one of a rigid body, or a transform moves them that is not hardened.
     """
     path = require_file(path)
     kind = path.suffix.lower()

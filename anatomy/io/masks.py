@@ -198,11 +198,9 @@ def read_masks(
     """Read all files, each once, and unite the parts of every role on one grid.
 
     The grid is that of the first file, of the lumen if there is one, continued as far as the files of the
-    roles in `extent` reach.  A file on another grid is placed by its own header, and a statement says how.
-
-    Raises:
-        AnatomyError, FileError, FrameError: As `read_mask`; or if a file of the lungs or lumen lies far from
-            the others.
+    roles in `extent` reach. A file on another grid is placed by its own header, and a statement says how.
+    Raises AnatomyError, FileError or FrameError as `read_mask`; or if a file of the lungs or lumen lies far
+    from the others.
     """
     paths = list(dict.fromkeys(source.path for source in sources))
     names: dict[str, list[str]] = {}

@@ -39,11 +39,9 @@ def load_med_rad(folder: Path) -> PatientImages:
     """Read a lung of Med-RAD.
 
     `pleuralBoundary` is, despite its name, a filled mask of both lungs; the respiratory part has lobes
-    instead.  The collection does not tell the airway wall from the lumen, and does not state the breath hold.
-
-    Raises:
-        FrameError: If a start or target lies outside the images: its numbers are not RAS, or of another
-            patient.
+    instead.  The collection does not tell the airway wall from the lumen, and does not state the breath
+    hold.  Raises FrameError if a start or target lies outside the images: its numbers are not RAS, or of
+    another patient.
     """
     sources = lung_sources(folder)
     require_roles(folder, sources)
@@ -109,11 +107,8 @@ def text_poses(folder: Path, grid: Grid) -> tuple[dict[str, Any], dict[str, str]
     """Read the files whose names end in `start1` and the like as poses, and `target` and the like as points.
 
     A name that holds both, such as `target1_start2.txt`, is a start.  Returned are fields of `PatientImages`,
-    starts `(4, 4)` and targets `(3,)` LPS mm and their names, and the SHA-256 of the files.
-
-    Raises:
-        FileError: If a file holds no pose or point.
-        FrameError: If a position lies outside `grid`.
+    starts `(4, 4)` and targets `(3,)` LPS mm and their names, and the SHA-256 of the files.  Raises FileError
+    if a file holds no pose or point, and FrameError if a position lies outside `grid`.
     """
     texts = sorted(
         folder.glob("*.[tT][xX][tT]"),

@@ -28,12 +28,9 @@ _PLAIN = {
 def open_metaimage(path: Path, components: int = 1) -> tuple[image_header.ImageHeader, Iterator[bytes]]:
     """Read the header of a file, and return it with the bytes of the voxels; the frame is LPS by definition.
 
-    `components` is how many numbers a voxel must have.
-
-    Raises:
-        FileError: If it is no MetaImage of three dimensions, or its data lie elsewhere than in one plain file
-            beside it.
-        FrameError: If its axes are not perpendicular.
+    `components` is how many numbers a voxel must have.  Raises FileError if it is no MetaImage of three
+    dimensions, or its data lie elsewhere than in one plain file beside it, and FrameError if its axes are not
+    perpendicular.
     """
     fields, offset = _text(path)
     _require_plain(fields, path)

@@ -164,10 +164,8 @@ def _require_frame(keys: MotionFile, path: Path) -> str:
 def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
     """Return the places `(N, 3)` LPS mm at end-exhale and at end-inhale that a CSV of six columns states.
 
-    Lines that begin with a letter or # are headings.
-
-    Raises:
-        FileError: If a line does not hold six finite numbers.
+    Lines that begin with a letter or # are headings.  Raises FileError if a line does not hold six finite
+    numbers.
     """
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
@@ -265,11 +263,8 @@ def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
     """Return a displacement field `(ni, nj, nk, 3)` LPS mm from end-exhale to end-inhale: a B-spline.
 
     CTs are compared by correlation; two masks by the distance to their borders, which tells nothing of the
-    motion inside but what the border implies.
-
-    Raises:
-        AnatomyError: If an image is constant, or one is a mask and the other is not, or nothing is found.
-        FileError, FrameError: As `anatomy.io.read_volume`.
+    motion inside but what the border implies.  Raises AnatomyError if an image is constant, or one is a mask
+    and the other is not, or nothing is found, and FileError or FrameError as `anatomy.io.read_volume`.
     """
     import SimpleITK
 

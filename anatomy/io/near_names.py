@@ -33,10 +33,8 @@ def require_single(
     """Refuse images that stand twice for one mask, and say which one is read of two that hold the same.
 
     Another image of the folder with the name of a `chosen` one, in other letters or with another ending, is
-    its double.  `others` are further pairs: an image that is read, and one that stands for the same mask.
-
-    Raises:
-        AnatomyError: If the two of a pair differ.
+    its double. `others` are further pairs: an image that is read, and one that stands for the same mask.
+    Raises AnatomyError if the two of a pair differ.
     """
     paths = list(dict.fromkeys(chosen))
     doubles = [

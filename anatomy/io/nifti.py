@@ -63,11 +63,9 @@ def open_nifti(
     """Read everything before the voxels, and return it with the bytes of the voxels.
 
     The frame is assumed if the file states none (both transform codes 0).  A displacement field of three
-    components has five dimensions (ni, nj, nk, 1, 3).
-
-    Raises:
-        FileError: If it is no NIfTI image of three dimensions with plain numbers.
-        FrameError: If no frame is stated and none given, or the axes are not perpendicular.
+    components has five dimensions (ni, nj, nk, 1, 3).  Raises FileError if it is no NIfTI image of three
+    dimensions with plain numbers, and FrameError if no frame is stated and none given, or the axes are not
+    perpendicular.
     """
     stream = pieces(path)
     start = _at_least(b"", _HEADER_BYTES, stream)

@@ -55,13 +55,9 @@ def open_nrrd(
     """Read the header of a file, and return it with the bytes of the voxels.
 
     `components` is how many numbers a voxel must have; those of a displacement field stand on the first axis
-    or on the last, which has no direction.
-
-    Raises:
-        FileError: If it is no NRRD file of three dimensions, or its data lie in another file or in an unknown
-            encoding.
-        FrameError: If it states no frame and none is given, its axes are not perpendicular, or vectors may
-            not be LPS.
+    or on the last, which has no direction.  Raises FileError if it is no NRRD file of three dimensions, or
+    its data lie in another file or in an unknown encoding, and FrameError if it states no frame and none is
+    given, its axes are not perpendicular, or vectors may not be LPS.
     """
     fields, keys, offset = _text(path)
     dtype = _dtype(fields, path)

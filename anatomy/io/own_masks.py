@@ -98,10 +98,8 @@ def load_own_masks(description: Path) -> PatientImages:
     """Read the masks that a `patient.toml` names; paths are relative to its folder.
 
     `file#label` takes one label of a label map, by its value or its stored name, and `file#1,2` several.
-
-    Raises:
-        SettingsError: If the file is no TOML, a key is unknown or missing, or a value is not allowed.
-        AnatomyError, FileError, FrameError, GridMismatchError: As `load_patient`.
+    Raises SettingsError if the file is no TOML, a key is unknown or missing, or a value is not allowed, and
+    AnatomyError, FileError, FrameError or GridMismatchError as `load_patient`.
     """
     keys = _read_description(description)
     folder = description.parent

@@ -29,13 +29,10 @@ _LAST_LABEL_OF_TOTAL_1 = 104
 def stored_names(path: Path) -> dict[int, str]:
     """Read the label names stored with a file: in its header, else in a side-car beside it.
 
-    Side-cars are `<stem>.json` and `<stem>_labels.json`, and for all label maps of a folder `labels.json`
-    and `dataset.json`; they map names to values or values to names, directly or under the key "labels".
-    A side-car of the folder counts only for files that hold no other values than it names, because a
-    CT may lie beside the label map.
-
-    Raises:
-        FileError: If a side-car is no JSON object.
+    Side-cars are `<stem>.json` and `<stem>_labels.json`, and for all label maps of a folder `labels.json` and
+    `dataset.json`; they map names to values or values to names, directly or under the key "labels". A
+    side-car of the folder counts only for files that hold no other values than it names, because a CT may lie
+    beside the label map.  Raises FileError if a side-car is no JSON object.
     """
     names = dict(read_labels(path))
     stem = image_stem(path)
@@ -83,10 +80,8 @@ def _sidecar_names(path: Path) -> dict[int, str]:
 def published_names(stem: str, values: set[float], path: Path) -> tuple[dict[int, str], str]:
     """Name the labels of a TotalSegmentator file that stores no names, and say which table was used.
 
-    Of a file whose name begins with "total" the task total is meant; `values` are those that occur.
-
-    Raises:
-        AnatomyError: If the values fit no published table, or more than one.
+    Of a file whose name begins with "total" the task total is meant; `values` are those that occur.  Raises
+    AnatomyError if the values fit no published table, or more than one.
     """
     if stem.startswith("total") and max(values, default=0) > _LAST_LABEL_OF_TOTAL_1:
         table, title = TOTAL_LOBES, "task total, version 2"
@@ -132,10 +127,8 @@ def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> Patien
     """Read the masks of tasks lung_vessels and total from one folder.
 
     It holds one mask a structure (`lung_airways.nii.gz`, ...), or label maps whose labels are named in the
-    header or a side-car, or both.  `label_map` is read as one even if it names no labels.
-
-    Raises:
-        AnatomyError: If a structure is missing or empty, or labels cannot be told apart.
+    header or a side-car, or both.  `label_map` is read as one even if it names no labels.  Raises
+    AnatomyError if a structure is missing or empty, or labels cannot be told apart.
     """
     sources, statements = mask_sources(folder, label_map)
     masks = read_masks(sources)

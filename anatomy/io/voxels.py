@@ -20,10 +20,8 @@ _MAGIC_GZIP = b"\x1f\x8b"
 def pieces(path: Path, offset: int = 0, *, compressed: bool | None = None) -> Iterator[bytes]:
     """Yield the bytes of a plain or compressed file from an offset on, in pieces of a few MiB.
 
-    Whether they are compressed is found out at the beginning of the file if it is not stated.
-
-    Raises:
-        FileError: At the end of a compressed file whose checksum is wrong or that was cut short.
+    Whether they are compressed is found out at the beginning of the file if it is not stated.  Raises
+    FileError at the end of a compressed file whose checksum is wrong or that was cut short.
     """
     with path.open("rb") as stream:
         packed = stream.read(2) == _MAGIC_GZIP if compressed is None else compressed
@@ -71,10 +69,8 @@ def require_whole(header: ImageHeader, stream: Iterator[bytes], path: Path) -> N
 def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Array:
     """Read the voxels `(ni, nj, nk)`, or the vectors `(ni, nj, nk, components)`, in their own type.
 
-    They are float32 where the header scales.
-
-    Raises:
-        FileError: If there are fewer or many more bytes than the header says, or they are damaged.
+    They are float32 where the header scales.  Raises FileError if there are fewer or many more bytes than the
+    header says, or they are damaged.
     """
     # The index that runs fastest comes first.
     n = (header.components,) if header.components > 1 else ()

@@ -30,12 +30,9 @@ At = Callable[[Float], Float]
 def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm: float) -> Motion:
     """Bring what was read to the masks, and test it.
 
-    `labels` are those of `anatomy.structures` on `grid`; `middle_x_mm` is x of the carina.
-
-    Raises:
-        AnatomyError: If the motion folds tissue, leads to the head on inhalation or the lungs away from the
-            other lungs, or too few landmarks lie in a lung.
-        FrameError: If a field does not cover the lungs.
+    `labels` are those of `anatomy.structures` on `grid`; `middle_x_mm` is x of the carina.  Raises
+    AnatomyError if the motion folds tissue, leads to the head on inhalation or the lungs away from the other
+    lungs, or too few landmarks lie in a lung, and FrameError if a field does not cover the lungs.
     """
     # Places `(N, 3)` LPS mm spread over the lungs.
     steps = np.maximum(np.rint(SAMPLE_MM / grid.spacing_mm).astype(int), 1)
@@ -309,10 +306,7 @@ def fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
     """Fit a thin-plate spline with the smoothness by which each half of the pairs predicts the other.
 
     Places in the masks `(N, 3)` LPS mm have displacements `(N, 3)` mm; `lung` says whose they are, for
-    messages.
-
-    Raises:
-        AnatomyError: If there are too few pairs, or they lie in a plane.
+    messages.  Raises AnatomyError if there are too few pairs, or they lie in a plane.
     """
     if len(points) < LEAST_PAIRS:
         raise AnatomyError(

@@ -174,10 +174,8 @@ def place_nodules(
     """Choose 3 to 6 nodules among the points of a territory.
 
     They keep clear of the tubes with centres `(M, 3)` LPS mm and radii `(M,)`, and of bullae.  The surface of
-    a nodule is at least 5 mm and its centre at most 30 mm (times `scale`) from the pleura.
-
-    Raises:
-        AnatomyError: If three do not fit.
+    a nodule is at least 5 mm and its centre at most 30 mm (times `scale`) from the pleura.  Raises
+    AnatomyError if three do not fit.
     """
     from scipy.spatial import cKDTree
 

@@ -56,11 +56,8 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
     """Segment lumen and wall of the airways [Fu2018, III-A.2] [Aykac2003].
 
     `lungs` are both lungs, with a seed in the trachea and the rough central airway, on the grid of the CT in
-    Hounsfield units.
-
-    Raises:
-        AnatomyError: If there is no air at the seed.
-        GridMismatchError: If `lungs` lie on another grid.
+    Hounsfield units.  Raises AnatomyError if there is no air at the seed, and GridMismatchError if `lungs`
+    lie on another grid.
     """
     from scipy import ndimage
 

@@ -45,9 +45,7 @@ def central_airways(ct: CoarseCt, outside: Mask, seed_lps: Float | None = None) 
 
     An image with much noise is smoothed if nothing else helps.  `outside` `(Ni, Nj, Nk)` is air around the
     patient, and a point in the trachea `seed_lps` `(3,)` LPS mm takes the place of the automatic search.
-
-    Raises:
-        AnatomyError: If there is no column of air like a trachea, or the point does not lie in air.
+    Raises AnatomyError if there is no column of air like a trachea, or the point does not lie in air.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -23,11 +23,9 @@ def cost_map(
 
     Obstacles are all voxels outside the lungs, which are filled, the lumen and wall of the airways, and the
     large vessels.  They are grown by `total_radius_mm`, the radius of the needle and a safety margin, see
-    `inflation_voxels`.  By default they are not: the planners keep their clearance by a proved distance.
-
-    Raises:
-        GridMismatchError: If a mask has another shape.
-        SettingsError: If the radius is negative or not finite.
+    `inflation_voxels`. By default they are not: the planners keep their clearance by a proved distance.
+    Raises GridMismatchError if a mask has another shape, and SettingsError if the radius is negative or not
+    finite.
     """
     parts = {
         "vesselness": vessels.vesselness,

@@ -44,12 +44,9 @@ class SegmentationFolder:
     name, so that a run that was killed at any moment leaves no made file that looks corrected.
 
     No input may lie where an image is written or looked for.  With `force` files of others may lie there;
-    masks then count as corrections.
-
-    Raises:
-        AnatomyError: If the folder holds corrections made for another CT.
-        FileError: If the folder cannot be written to, its record is damaged, or it holds inputs or files of
-            others.
+    masks then count as corrections.  Raises AnatomyError if the folder holds corrections made for another CT,
+    and FileError if the folder cannot be written to, its record is damaged, or it holds inputs or files of
+    others.
     """
 
     def __init__(
@@ -254,10 +251,8 @@ def key_of(step: str, **parts: Any) -> str:
 def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
     """Place an image whose voxels coincide with those of `grid`, but which may cover another box.
 
-    Its voxels may be stored in another order; those of `grid` are in that of `canonical`.
-
-    Raises:
-        GridMismatchError: If the voxels do not coincide.
+    Its voxels may be stored in another order; those of `grid` are in that of `canonical`.  Raises
+    GridMismatchError if the voxels do not coincide.
     """
     volume = canonical(volume)
     if volume.grid.is_close(grid):

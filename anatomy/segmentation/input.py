@@ -52,11 +52,9 @@ def has_thick_slices(ct: Volume) -> bool:
 def require_chest_ct(ct: Volume, *, thick_slices: bool = False) -> tuple[str, ...]:
     """Refuse images that cannot be a CT of the chest in Hounsfield units; return warnings.
 
-    Slices of more than 3 mm are accepted with `thick_slices` alone.
-
-    Raises:
-        AnatomyError: If a voxel is not a number, the values are no Hounsfield units, air or tissue are
-            missing, the image is too small, or its slices are too thick.
+    Slices of more than 3 mm are accepted with `thick_slices` alone.  Raises AnatomyError if a voxel is not a
+    number, the values are no Hounsfield units, air or tissue are missing, the image is too small, or its
+    slices are too thick.
     """
     _require_numbers(ct.array)
     _require_hounsfield(ct.array)

@@ -37,11 +37,9 @@ def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
     """Return the left and the right lung of a label map or mask.
 
     The values may be 1 right, 2 left (lungmask, and our own files); those of lobes, see `lobe_numbers`; or
-    one value for both lungs, which are then told apart by their shape.  One lung alone is the
-    left one if its value is 2, else the right one.
-
-    Raises:
-        AnatomyError: If there is no lung, other values occur, or they are on the wrong side.
+    one value for both lungs, which are then told apart by their shape.  One lung alone is the left one if its
+    value is 2, else the right one.  Raises AnatomyError if there is no lung, other values occur, or they are
+    on the wrong side.
     """
     values = {float(v) for v in np.unique(volume.array)} - {0.0}
     if not values:
@@ -81,10 +79,8 @@ def lobe_numbers(volume: Volume, name: str) -> UInt8:
     """Return lobes by the numbers of `anatomy.lobes.LOBES`.
 
     Labels are 1 to 5 by one of `NUMBERINGS`, or 10 to 14 of TotalSegmentator's task total.  Which one it is,
-    is told by where the lobes lie: right ones on the right, and upper ones above lower ones.
-
-    Raises:
-        AnatomyError: If other values occur, or the lobes lie as in none of these.
+    is told by where the lobes lie: right ones on the right, and upper ones above lower ones.  Raises
+    AnatomyError if other values occur, or the lobes lie as in none of these.
     """
     values = sorted({int(v) for v in np.unique(volume.array)} - {0})
     first = FIRST_OF_TOTAL if values and values[0] >= FIRST_OF_TOTAL else 1

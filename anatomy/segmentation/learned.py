@@ -94,11 +94,8 @@ def read_network(path: Path) -> Network:
 def learned_airway(ct: Volume, network: Network) -> Mask:
     """Return the largest piece of what a network takes for airway, `(ni, nj, nk)`.
 
-    The CT has Hounsfield units, in the order of voxels of `canonical`.
-
-    Raises:
-        SettingsError: If onnxruntime is missing, or the network does not take a CT.
-        AnatomyError: If it finds no airway.
+    The CT has Hounsfield units, in the order of voxels of `canonical`.  Raises SettingsError if onnxruntime
+    is missing, or the network does not take a CT, and AnatomyError if it finds no airway.
     """
     how = network.settings
     scaled = (ct.array.astype(np.float32) - np.float32(how.low_hu)) / np.float32(how.high_hu - how.low_hu)

@@ -175,10 +175,7 @@ def coarse_lung_ex_vivo(
     The background is grown from the edge of the image until the lung is encountered [Fu2018, III-A.1]: the
     threshold lies halfway between the air around and the lung.  Returned are the HU above which nothing is
     lung, the airway, the sides (1 right lung, 2 left lung, one lung alone 1), and warnings.  A point in the
-    main bronchus or trachea may be given, LPS mm.
-
-    Raises:
-        AnatomyError: If there is no lung or no airway.
+    main bronchus or trachea may be given, LPS mm.  Raises AnatomyError if there is no lung or no airway.
     """
     background = _background(ct)
     tissue = (ct.hu < GREATEST_LUNG_HU) & ~background

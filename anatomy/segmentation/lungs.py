@@ -68,10 +68,8 @@ def segment_lungs(
     """Segment both lungs of a CT in Hounsfield units by region growing and closing.
 
     With `ex_vivo` the image shows an inflated lung in air, not a patient.  A point in the trachea, ex vivo in
-    the main bronchus, `(3,)` LPS mm, is found by itself if it is not given.
-
-    Raises:
-        AnatomyError: If there is no trachea or no lung.
+    the main bronchus, `(3,)` LPS mm, is found by itself if it is not given.  Raises AnatomyError if there is
+    no trachea or no lung.
     """
     tell = progress or (lambda _step: None)
     tell("lungs: coarse image")

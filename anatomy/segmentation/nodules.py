@@ -30,11 +30,9 @@ def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
     true}, ...]}, ...]}`, one annotation a radiologist and nodule, as the LIDC-IDRI database has them
     [Armato2011].  `ij` are columns and rows of the DICOM slice at `z_mm` (LPS); a contour runs through the
     first pixels outside the nodule, and one with `"inclusion": false` cuts a hole.  A voxel belongs to a
-    nodule if at least half of those who outlined this nodule have it inside.
-
-    Raises:
-        FileError: If the file has another form, or holds no contour.
-        GridMismatchError: If a contour lies outside the image, or the slices of the image are not axial.
+    nodule if at least half of those who outlined this nodule have it inside.  Raises FileError if the file
+    has another form, or holds no contour, and GridMismatchError if a contour lies outside the image, or the
+    slices of the image are not axial.
     """
     annotations = _annotations(Path(path))
     _require_axial(grid)

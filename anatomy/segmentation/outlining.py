@@ -48,11 +48,9 @@ SURFACE_STEPS, BELOW_WEIGHT = 30, 0.15
 def outline_nodule(ct: Volume, lungs: Mask, point_lps: ArrayLike) -> Mask:
     """Outline the nodule at a point `(3,)` LPS mm; return its voxels `(ni, nj, nk)` on those of the CT.
 
-    `lungs` `(ni, nj, nk)` are both lungs, which may leave the nodule out.
-
-    Raises:
-        AnatomyError: If there is no lung around the point, nothing there is denser than lung, or what is
-            there cannot be told from a vessel or the chest wall.
+    `lungs` `(ni, nj, nk)` are both lungs, which may leave the nodule out.  Raises AnatomyError if there is no
+    lung around the point, nothing there is denser than lung, or what is there cannot be told from a vessel or
+    the chest wall.
     """
     point = np.asarray(point_lps, dtype=np.float64)
     for voxel_mm, reach_mm, radius_mm in CUBES:

@@ -54,11 +54,8 @@ class ScaleSpace:
         """Cut the box around the lung, where responses are wanted, out of a CT in any memory order.
 
         The CT in Hounsfield units and the lung are `(ni, nj, nk)`; 0 threads are all processors that this
-        process may use.
-
-        Raises:
-            GridMismatchError: If the shapes differ.
-            AnatomyError: If the lung is empty, or the CT is not of a real type.
+        process may use.  Raises GridMismatchError if the shapes differ, and AnatomyError if the lung is
+        empty, or the CT is not of a real type.
         """
         import edt
 
@@ -363,10 +360,8 @@ def vesselness(hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, thread
     """Return the greatest response over the scales that apply at each voxel [Fu2018, eqs. 3-5].
 
     The CT `hu` in Hounsfield units and the lungs with their vessels, whose depth decides which scales apply,
-    are `(ni, nj, nk)`.  So is what is returned, in [0, 1] and 0 outside the lung.
-
-    Raises:
-        GridMismatchError, AnatomyError: If the shapes differ; if the lung is empty.
+    are `(ni, nj, nk)`.  So is what is returned, in [0, 1] and 0 outside the lung.  Raises GridMismatchError
+    or AnatomyError if the shapes differ; if the lung is empty.
     """
     space = ScaleSpace.of(hu, lung, spacing_mm, threads=threads)
     best = np.zeros(space.hu.shape, dtype=np.float32)

@@ -248,10 +248,8 @@ class Trunk:
 def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
     """Return the trachea of a tree that is pruned; its first node is the root.
 
-    `lps_from_mm` (3, 3) turns the directions of the tree's own frame into LPS.
-
-    Raises:
-        AnatomyError: If nothing is like a trachea: the message says what is there instead.
+    `lps_from_mm` (3, 3) turns the directions of the tree's own frame into LPS.  Raises AnatomyError if
+    nothing is like a trachea: the message says what is there instead.
     """
     trunks = [follow_trunk(tree, end) for end in tree.ends()]
     # A trachea is about twelve radii long; of one that the image cuts, a quarter is enough to know it by.

@@ -35,8 +35,10 @@ PAD_VOXELS = 2
 SINGLE_FIELDS = ("airway", "vessel", "pleura", "fissure")
 """The clearance fields that are made of a structure; the others are made of these."""
 
-CUT = ("nodules", "nodule_labels", "cost", "lobes")
+CUT = ("nodules", "nodule_labels", "cost", "lobes", "fissure_band")
 """The images that a lung holds as they were read, cut to its box."""
+AS_READ = ("name", "kind", "starts", "targets_lps", "start_names", "target_names", "sources")
+"""What an organ holds as it was read."""
 
 
 def lung_key(sources: Mapping[str, str]) -> str:
@@ -150,9 +152,10 @@ def build_lung(
         motion = prepare_motion(images.motion, labels, box.grid, float(tree.carina_lps[0]))
         warnings += motion.warnings
         motion = replace(motion, nodes=keep("motion.nodes", motion.nodes))
+    taken: dict[str, Any] = {name: _cut_volume(images, name, box, keep, reused) for name in CUT}
+    taken |= {name: getattr(images, name) for name in AS_READ}
     return Lung(
-        name=images.name,
-        kind=images.kind,
+        **taken,
         key=key or lung_key(images.sources),
         grid=box.grid,
         labels=labels,
@@ -161,19 +164,9 @@ def build_lung(
         ),
         lumen_depth=_lumen_depth(lumen, keep, reused),
         tree=tree,
-        nodules=_cut_volume(images, "nodules", box, keep, reused),
-        nodule_labels=_cut_volume(images, "nodule_labels", box, keep, reused),
-        cost=_cut_volume(images, "cost", box, keep, reused),
-        lobes=_cut_volume(images, "lobes", box, keep, reused),
-        fissure_band=_cut_volume(images, "fissure_band", box, keep, reused),
         motion=motion,
-        starts=images.starts,
-        targets_lps=images.targets_lps,
-        start_names=images.start_names,
-        target_names=images.target_names,
         breath_hold=images.breath_hold,
         vessel_border_mm=images.vessel_border_mm,
-        sources=images.sources,
         warnings=(*warnings, *warnings_of_findings(findings)),
         findings=findings,
     )

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Mask
-from anatomy.build import WorkingBox, clearance_fields, lung_key
+from anatomy.build import AS_READ, WorkingBox, clearance_fields, lung_key
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import voxels_in
 from anatomy.organ import Organ
@@ -51,10 +52,7 @@ class LiverImages:
 
 
 def build_liver(images: LiverImages) -> Organ:
-    """Make the `Organ` of a liver.
-
-    What is not inside is an obstacle, and so are the vessels.
-    """
+    """Make the `Organ` of a liver: what is not inside is an obstacle, and so are the vessels."""
     inside = images.inside
     box = WorkingBox(inside, images.grid)
     labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
@@ -62,21 +60,16 @@ def build_liver(images: LiverImages) -> Organ:
     close_border(labels)
     labels[box.cut(images.vessels)] |= VESSEL
     nodules = images.nodules
+    taken: dict[str, Any] = {name: getattr(images, name) for name in AS_READ}
     return Organ(
-        name=images.name,
-        kind=images.kind,
+        **taken,
         key=lung_key(images.sources),
         grid=box.grid,
         labels=labels,
         fields=clearance_fields(labels, box.grid),
         nodules=None if nodules is None else Volume(grid=box.grid, array=box.cut(nodules.array)),
         cost=None,
-        starts=images.starts,
-        targets_lps=images.targets_lps,
-        start_names=images.start_names,
-        target_names=images.target_names,
         breath_hold=None,
-        sources=images.sources,
         warnings=images.warnings,
     )
 

@@ -19,9 +19,14 @@ def canonical(volume: Volume) -> Volume:
     order, flipped = towards_lps(volume.grid.lps_from_ijk[:3, :3])
     if order == (0, 1, 2) and not any(flipped):
         return volume
-    reversed_axes = tuple(axis for axis in range(3) if flipped[axis])
-    array = np.flip(np.transpose(volume.array, order), axis=reversed_axes)
-    return _rounded(Volume(grid=turned_grid(volume.grid, order, flipped), array=np.asfortranarray(array)))
+    array = np.flip(np.transpose(volume.array, order), axis=tuple(np.flatnonzero(flipped)))
+    matrix = volume.grid.lps_from_ijk.copy()
+    matrix[:3, :3] = matrix[:3, list(order)] * np.where(flipped, -1.0, 1.0)
+    last = np.zeros(3)
+    last[list(order)] = np.where(flipped, np.array(array.shape) - 1, 0)
+    matrix[:3, 3] = volume.grid.lps(last)
+    grid = Grid(shape=array.shape, lps_from_ijk=matrix)
+    return _rounded(Volume(grid=grid, array=np.asfortranarray(array)))
 
 
 def _rounded(volume: Volume) -> Volume:
@@ -41,17 +46,3 @@ def towards_lps(axes: Float) -> tuple[tuple[int, int, int], tuple[bool, bool, bo
     x, y, z = (int(c) for c in columns)
     against = [bool(cosines[row, column] < 0) for row, column in enumerate((x, y, z))]
     return (x, y, z), (against[0], against[1], against[2])
-
-
-def turned_grid(grid: Grid, order: tuple[int, int, int], flipped: tuple[bool, bool, bool]) -> Grid:
-    """Return the grid after its axes were put into another order and some of them turned around."""
-    matrix = grid.lps_from_ijk.copy()
-    shape = [grid.shape[axis] for axis in order]
-    columns = grid.lps_from_ijk[:3, list(order)]
-    last = np.zeros(3)
-    for axis in range(3):
-        if flipped[axis]:
-            last[order[axis]] = shape[axis] - 1
-    matrix[:3, :3] = columns * np.where(flipped, -1.0, 1.0)
-    matrix[:3, 3] = grid.lps(last)
-    return Grid(shape=(shape[0], shape[1], shape[2]), lps_from_ijk=matrix)

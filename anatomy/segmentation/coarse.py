@@ -8,7 +8,6 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Float32, Int, Mask
 from anatomy.grid import Grid, Volume
 from anatomy.morphology import bounds
-from anatomy.segmentation.canonical import towards_lps, turned_grid
 
 COARSE_MM = 1.5
 """Blocks of voxels come as near to this size as whole numbers of voxels allow."""
@@ -19,41 +18,28 @@ nothing."""
 
 @frozen_record
 class CoarseCt:
-    """Means over blocks of a CT's voxels; axis 0 runs most nearly to the left, 1 to the back, 2 up.
+    """Means over blocks of the voxels of a CT in the order of `canonical`: to the left, the back, and up.
 
     Args:
         hu ((Ni, Nj, Nk) float32): Hounsfield units, not below -1200; contiguous along axis 0.
         fine_shape, step: Shape of the CT, and voxels in a block, along its axes.
-        order, flipped: Axis of the CT that each axis here follows, and whether against it.
     """
 
     hu: Float32
     grid: Grid
     fine_shape: tuple[int, int, int]
     step: tuple[int, int, int]
-    order: tuple[int, int, int]
-    flipped: tuple[bool, bool, bool]
 
     @classmethod
     def of(cls, ct: Volume) -> Self:
         """Average the blocks of a CT; blocks at the end may hold fewer voxels."""
         step = tuple(max(1, round(COARSE_MM / float(s))) for s in ct.grid.spacing_mm)
         blocks = _block_means(ct.array, step)
-        order, flipped = towards_lps(ct.grid.lps_from_ijk[:3, :3])
         matrix = ct.grid.lps_from_ijk.copy()
         matrix[:3, :3] = matrix[:3, :3] * step
         matrix[:3, 3] = ct.grid.lps((np.asarray(step) - 1) / 2)
-        made = cls(
-            hu=blocks,
-            grid=turned_grid(Grid(shape=blocks.shape, lps_from_ijk=matrix), order, flipped),
-            fine_shape=ct.grid.shape,
-            step=(step[0], step[1], step[2]),
-            order=order,
-            flipped=flipped,
-        )
-        turned = np.flip(np.transpose(blocks, order), axis=made._reversed_axes())
-        object.__setattr__(made, "hu", np.asfortranarray(turned))
-        return made
+        grid = Grid(shape=blocks.shape, lps_from_ijk=matrix)
+        return cls(hu=blocks, grid=grid, fine_shape=ct.grid.shape, step=(step[0], step[1], step[2]))
 
     @property
     def spacing_mm(self) -> tuple[float, float, float]:
@@ -69,7 +55,7 @@ class CoarseCt:
     def to_ct(self, blocks: Array, low: Int, high: Int) -> Array:
         """Return the values of the blocks that the CT's voxels `low <= ijk < high` lie in."""
         # Transposed, so that the last pass, over the most voxels, copies whole planes.
-        values = np.ascontiguousarray(self._turned_back(blocks).T)
+        values = np.ascontiguousarray(blocks.T)
         for axis in range(3):
             index = np.arange(low[axis], high[axis]) // self.step[axis]
             values = np.take(values, index, axis=2 - axis)
@@ -77,33 +63,20 @@ class CoarseCt:
 
     def box_in_ct(self, mask: Mask, pad_mm: float) -> tuple[Int, Int]:
         """Return `low` and `high` of the CT's voxels around a mask of blocks, wider by `pad_mm`."""
-        low, high = bounds(self._turned_back(mask))
+        low, high = bounds(mask)
         step = np.asarray(self.step)
-        size = np.asarray(self.spacing_mm)[list(np.argsort(self.order))] / step
-        pad = np.ceil(pad_mm / size).astype(np.int64)
+        pad = np.ceil(pad_mm / (np.asarray(self.spacing_mm) / step)).astype(np.int64)
         return np.maximum(low * step - pad, 0), np.minimum(high * step + pad, self.fine_shape)
 
     def ct_voxel(self, block: Int) -> Int:
         """Return the voxel of the CT in the middle of a block."""
-        place = np.asarray(block, dtype=np.int64).copy()
-        for axis in range(3):
-            if self.flipped[axis]:
-                place[axis] = self.hu.shape[axis] - 1 - place[axis]
-        native = place[list(np.argsort(self.order))]
-        middle = native * self.step + np.asarray(self.step) // 2
+        middle = np.asarray(block) * self.step + np.asarray(self.step) // 2
         return np.asarray(np.minimum(middle, np.asarray(self.fine_shape) - 1), dtype=np.int64)
 
     def block(self, lps: Float) -> tuple[int, int, int] | None:
         """Return the block that a point lies in, or None outside the CT."""
         i, j, k = (int(n) for n in self.grid.voxels(lps))
         return (i, j, k) if bool(self.grid.contains(lps)) else None
-
-    def _turned_back(self, blocks: Array) -> Array:
-        unflipped: Array = np.flip(blocks, axis=self._reversed_axes())
-        return np.transpose(unflipped, np.argsort(self.order))
-
-    def _reversed_axes(self) -> tuple[int, ...]:
-        return tuple(axis for axis in range(3) if self.flipped[axis])
 
 
 def _block_means(values: Array, step: tuple[int, ...]) -> Float32:

@@ -11,7 +11,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Float32, Int, Int32, Mask
 from anatomy.grid import Grid, Volume, freeze_arrays
-from anatomy.morphology import bounds, closed, grown_by_one, largest_piece, window, without_holes
+from anatomy.morphology import bounds, closed, grown_by_one, largest_piece, near, window, without_holes
 from anatomy.segmentation.central_airway import CentralAirway, central_airways
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.input import GREATEST_OFFSET_HU, Scale, air_in_hu, air_offset_hu, offset_around_hu
@@ -123,7 +123,7 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
     seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
     coarse, _, scale, airways = in_hounsfield(CoarseCt.of(ct), seed)
     ct, airway = scale.image(ct), next(airways)
-    main = _on_ct(coarse, _with_wall(coarse, airway.main))
+    main = _on_ct(coarse, near(airway.main, WALL_MM, coarse.spacing_mm))
     sides = [_filled(side, ct.grid) & ~main for side in (left, right)]
     _part(sides[1], sides[0])
     return Lungs(
@@ -258,29 +258,19 @@ def _fine_lung(
         return lung
     low, high = coarse.box_in_ct(side, 2.0 * CLOSING_MM)
     box = window(low, high)
-    near = coarse.to_ct(side if notch is None else grown_by_one(side), low, high)
+    beside = coarse.to_ct(side if notch is None else grown_by_one(side), low, high)
     airways = coarse.to_ct(airway.grown, low, high)
     region = np.asfortranarray(ct.array[box] < threshold)
-    region &= near & ~airways
+    region &= beside & ~airways
     if notch is not None:
         region |= coarse.to_ct(notch, low, high)
     region = largest_piece(region)
     filled = without_holes(closed(region, CLOSING_MM, ct.grid.spacing_mm))
-    filled &= ~coarse.to_ct(_with_wall(coarse, airway.main), low, high)
+    filled &= ~coarse.to_ct(near(airway.main, WALL_MM, coarse.spacing_mm), low, high)
     if gas is not None and gas.any():
         filled &= ~coarse.to_ct(gas, low, high)
     lung[box] = largest_piece(filled)
     return lung
-
-
-def _with_wall(coarse: CoarseCt, main: Mask) -> Mask:
-    """Grow the main airways by the thickness of their wall."""
-    import edt
-
-    box = window(*bounds(main, 3))
-    grown = np.zeros(main.shape, dtype=np.bool_, order="F")
-    grown[box] = edt.edt(np.asfortranarray(~main[box]), anisotropy=coarse.spacing_mm) <= WALL_MM
-    return grown
 
 
 def _part(right: Mask, left: Mask) -> None:

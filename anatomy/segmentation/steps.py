@@ -17,17 +17,11 @@ from anatomy.io.mask_values import require_label_values
 from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
 from anatomy.morphology import near
 from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
+from anatomy.segmentation import folder as folders
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.central_airway import without_top
-from anatomy.segmentation.folder import (
-    IMAGES,
-    Description,
-    SegmentationFolder,
-    digest_of,
-    grid_digest,
-    key_of,
-)
+from anatomy.segmentation.folder import IMAGES, Description, SegmentationFolder
 from anatomy.segmentation.gate import plausibility
 from anatomy.segmentation.input import Scale, slice_mm
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
@@ -105,9 +99,10 @@ class Steps:
         self._ct = self._box.image(lungs.scale.image(self._ct))
         airway = self._airway(lungs)
         tree = self._tree_of(airway["airway"])
-        self._require_plausible(lungs, airway, tree)
+        begun = Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree)
+        self._require_plausible(lungs, airway, begun)
         if self._begun is not None and self.recomputed:
-            self._begun(Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree))
+            self._begun(begun)
         nodule = self._nodule(lungs)
         if nodule.any():
             volume_ml = float(np.count_nonzero(nodule)) * self.grid.voxel_volume_mm3 / 1000.0
@@ -117,7 +112,6 @@ class Steps:
         vessels = self._vessels(lungs, airway, nodule)
         lobes = self._lobes(lungs, airway, vessels, tree)
         cost = self._cost(lungs, airway, nodule, vessels)
-        begun = Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree)
         return replace(
             begun,
             nodule=nodule,
@@ -219,12 +213,12 @@ class Steps:
             self._tree = (lumen, tree_or_error(Volume(grid=self._folder.grid, array=lumen)))
         return self._tree[1]
 
-    def _require_plausible(self, lungs: Lungs, airway: Images, tree: AirwayTree | AnatomyError) -> None:
+    def _require_plausible(self, lungs: Lungs, airway: Images, begun: Parts) -> None:
         """Refuse lungs and airway that cannot be those of a patient, unless that is accepted by name."""
         if self._request.ex_vivo:
             return
         self._tell("checking lungs and airway")
-        failed, warnings = plausibility(self._ct, lungs, tree, slice_mm(self._request.ct))
+        failed, warnings = plausibility(self._ct, lungs, begun.tree, slice_mm(self._request.ct))
         lungs_on_ct = self._box.on_ct(lungs.mask)
         if self.from_elsewhere:
             on_ct = {"lungs": lungs_on_ct} | {name: self._box.on_ct(mask) for name, mask in airway.items()}
@@ -238,8 +232,7 @@ class Steps:
             self.accepted = require_plausible(failed, self._request.accept)
         except AnatomyError as error:
             self._description.set_aside()
-            shown = Parts.begun(self._ct, lungs, airway["airway"], airway["airway_wall"], tree)
-            raise RefusedError(error, shown) from None
+            raise RefusedError(error, begun) from None
 
     def _nodule(self, lungs: Lungs) -> Mask:
         given, grid = self._request.given, self._folder.grid
@@ -249,7 +242,7 @@ class Steps:
         made_of: dict[str, Any] = (
             {"points": points, "ct": self._ct_digest, "of": ("lungs",)} if points else {}
         )
-        key = self._key("nodule", sources=("nodule",), grid=grid_digest(grid), files=files, **made_of)
+        key = self._key("nodule", sources=("nodule",), grid=folders.grid_digest(grid), files=files, **made_of)
 
         def compute() -> tuple[Images, dict[str, Any]]:
             corrected = self._source_mask("nodule")
@@ -352,13 +345,16 @@ class Steps:
     ) -> str:
         """Return the key of a step: its settings, the images before it, and what replaces its own."""
         replaced = {
-            name: [digest_of(self._sources[name].array), grid_digest(self._sources[name].grid)]
+            name: [
+                folders.digest_of(self._sources[name].array),
+                folders.grid_digest(self._sources[name].grid),
+            ]
             for name in sources
             if name in self._sources
         }
         before = {name: self._digests[name] for name in of}
-        place = grid_digest(self._folder.grid)
-        return key_of(step, version=VERSION, replaced=replaced, before=before, place=place, **others)
+        place = folders.grid_digest(self._folder.grid)
+        return folders.key_of(step, version=VERSION, replaced=replaced, before=before, place=place, **others)
 
     def _work_in(self, box: Box) -> None:
         """Have all further images lie on the voxels of a box."""

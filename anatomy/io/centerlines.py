@@ -70,9 +70,8 @@ class _Reader:
         if compressor not in ("", "vtkZLibDataCompressor"):
             raise ValueError(f"it is compressed by {compressor}; save it with zlib or without compression")
         self.compressed = bool(compressor)
-        order = "<" if self.root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
-        self.order = order
-        self.header = np.dtype(order + _HEADER_TYPES[self.root.get("header_type", "UInt32")])
+        self.order = "<" if self.root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
+        self.header = np.dtype(self.order + _HEADER_TYPES[self.root.get("header_type", "UInt32")])
 
     def file(self) -> VtkFile:
         kind = self.root.get("type", "")
@@ -128,33 +127,30 @@ class _Reader:
         return values if width == 1 else values.reshape(-1, width)
 
     def payload(self, element: Element, form: str) -> bytes:
-        """Return the bytes of an array, decoded and decompressed."""
+        """Return the bytes of an array, decoded and decompressed.
+
+        In base64 header and data are coded together or one after the other, each up to its padding.
+        """
+        stream, coded = (element.text or "").strip().encode(), True
         if form == "appended":
-            stream = self.appended[max(int(element.get("offset", "0")), 0) :]
-            base64_coded = self.encoding == "base64"
-        else:
-            stream = (element.text or "").strip().encode()
-            base64_coded = True
-        blocks = _Base64(stream) if base64_coded else _Raw(stream)
-        return self.inflate(blocks) if self.compressed else self.plain(blocks)
-
-    def plain(self, stream: _Raw) -> bytes:
+            stream, coded = (
+                self.appended[max(int(element.get("offset", "0")), 0) :],
+                self.encoding == "base64",
+            )
+        if coded:
+            coded_text = stream.partition(b"<")[0].translate(None, b" \t\r\n")
+            parts = re.findall(rb"[^=]+=*", coded_text)
+            stream = b"".join(base64.b64decode(part, validate=True) for part in parts)
         size = self.header.itemsize
-        count = int(np.frombuffer(stream.peek(size), self.header)[0])
-        return stream.take(size, count)
-
-    def inflate(self, stream: _Raw) -> bytes:
-        size = self.header.itemsize
-        blocks = int(np.frombuffer(stream.peek(size), self.header)[0])
-        if blocks == 0:
+        count = int(np.frombuffer(_taken(stream, 0, size), self.header)[0])
+        if not self.compressed:
+            return _taken(stream, size, count)
+        if count == 0:
             return b""
-        head = np.frombuffer(stream.peek((3 + blocks) * size), self.header)
-        stream.skip((3 + blocks) * size)
-        sizes = head[3:].tolist()
-        packed = stream.take(0, sum(sizes))
-        at, block_bytes, out = 0, int(head[1]), []
-        for packed_bytes in sizes:
-            out.append(self.inflated(packed[at : at + packed_bytes], block_bytes))
+        head = np.frombuffer(_taken(stream, 0, (3 + count) * size), self.header).tolist()
+        at, out = (3 + count) * size, []
+        for packed_bytes in head[3:]:
+            out.append(self.inflated(_taken(stream, at, packed_bytes), head[1]))
             at += packed_bytes
         return b"".join(out)
 
@@ -170,41 +166,8 @@ class _Reader:
         return block
 
 
-class _Raw:
-    """A stream of plain bytes."""
-
-    def __init__(self, stream: bytes) -> None:
-        self.stream = stream
-        self.at = 0
-
-    def peek(self, count: int) -> bytes:
-        return self.take(0, count)
-
-    def skip(self, count: int) -> None:
-        self.at += count
-
-    def take(self, skip: int, count: int) -> bytes:
-        found = self.stream[self.at + skip : self.at + skip + count]
-        if len(found) < count:
-            raise ValueError(f"an array ends after {len(found)} of {count} bytes")
-        return found
-
-
-class _Base64(_Raw):
-    """A stream of base64 text, in which header and data are coded together or one after the other."""
-
-    def take(self, skip: int, count: int) -> bytes:
-        coded = -(-skip // 3) * 4
-        if skip and self.stream[self.at : self.at + coded].rstrip().endswith(b"="):
-            return _decode(self.stream[self.at + coded :], count)
-        return _decode(self.stream[self.at :], skip + count)[skip:]
-
-    def skip(self, count: int) -> None:
-        self.at += -(-count // 3) * 4
-
-
-def _decode(text: bytes, count: int) -> bytes:
-    found = base64.b64decode(text[: -(-count // 3) * 4], validate=True)[:count]
+def _taken(stream: bytes, at: int, count: int) -> bytes:
+    found = stream[at : at + count]
     if len(found) < count:
         raise ValueError(f"an array ends after {len(found)} of {count} bytes")
     return found

@@ -14,6 +14,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.grid import Volume
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL
 from experiments.support.cost_map.inflation import (
+    grown_by_voxels,
     inflated_environment,
     inflation_voxels,
     largest_step_mm,
@@ -62,6 +63,15 @@ class TestAsPrinted:
 
     def test_a_multiple_of_the_voxel_size_is_not_rounded_up(self) -> None:
         assert inflation_voxels([0.1, 0.3, 0.7], 2.1).tolist() == [21, 7, 3]
+
+    def test_grows_by_whole_voxels(self) -> None:
+        """ceil(1.5 / (0.7, 0.8, 1.0)) = (3, 2, 2) voxels."""
+        mask = np.zeros((15, 14, 13), dtype=bool)
+        mask[7, 6, 5] = True
+        grown = grown_by_voxels(mask, inflation_voxels([0.7, 0.8, 1.0], 1.5))
+        assert np.argwhere(grown).min(axis=0).tolist() == [4, 4, 3]
+        assert np.argwhere(grown).max(axis=0).tolist() == [10, 8, 7]
+        assert not grown[10, 8, 7]
 
     def test_step(self) -> None:
         assert largest_step_mm([1.0, 1.0, 1.0], 1.5) == pytest.approx(2 * math.sqrt(4 - 2.25))

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.errors import SettingsError
-from anatomy.base.typed import Int
+from anatomy.base.typed import Int, Mask
 from anatomy.grid import Volume, read_only
-from anatomy.segmentation.cost_map import grown_by_voxels, inflation_voxels
 from anatomy.structures import OUTSIDE
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels.proof import Obstacles
@@ -26,6 +25,32 @@ from stages.needle.path import ArcPath, blocker_on_path
 
 LEAST_STEP_MM = 1e-3
 """Shorter steps are no steps."""
+ROUNDING = 1e-6
+"""Relative: quotients and squared distances are whole numbers and fractions of small ones."""
+
+
+def inflation_voxels(spacing_mm: ArrayLike, total_radius_mm: float) -> Int:
+    """Return by how many voxels obstacles grow along i, j and k: `ceil(r_total / s_i)` [Fu2018, sec. IV-B].
+
+    It stands for growing by a radius and proves nothing.  An ellipsoid of voxels is no ball, and the printed
+    step bound `2 sqrt(min(a_i s_i)^2 - r_total^2)` takes the tip for the centre of its voxel, although it may
+    be half a diagonal nearer to the obstacle.  Maps grown so are for comparison with the paper alone.
+
+    The spacing `(3,)` is that along i, j, k; the total radius is that of the needle and the safety margin.
+    """
+    quotient = total_radius_mm / np.asarray(spacing_mm, dtype=np.float64)
+    return np.ceil(quotient * (1.0 - ROUNDING)).astype(np.int64)
+
+
+def grown_by_voxels(mask: Mask, axes: Int) -> Mask:
+    """Return the voxels within an ellipsoid of semi-axes `axes`, in voxels, about a voxel of `mask`."""
+    import edt
+
+    if not mask.any():
+        return mask
+    sides = tuple(float(1.0 / a) for a in axes)
+    distance = edt.edt(np.asfortranarray(~mask), anisotropy=sides, order="F", black_border=False, parallel=1)
+    return np.asarray(distance <= 1.0 + ROUNDING)
 
 
 def largest_step_mm(spacing_mm: ArrayLike, total_radius_mm: float) -> float:

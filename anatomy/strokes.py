@@ -120,17 +120,12 @@ def _cut(box: Window, brush: Mask, structure: Mask) -> tuple[Window, Mask]:
     """Return the brush within a structure, and the parts that do not hang on its largest one without it."""
     from scipy.ndimage import label
 
-    low, high = bounds(structure)
-    whole = window(low, high)
-    left = structure[whole].copy()
-    cut = np.zeros_like(left)
-    shared = tuple(slice(max(a.start, w.start), min(a.stop, w.stop)) for a, w in zip(box, whole, strict=True))
-    inner = tuple(slice(s.start - w.start, s.stop - w.start) for s, w in zip(shared, whole, strict=True))
-    of_brush = tuple(slice(s.start - a.start, s.stop - a.start) for s, a in zip(shared, box, strict=True))
-    if all(axis.start < axis.stop for axis in shared):
-        cut[inner] = left[inner] & brush[of_brush]
+    cut = np.zeros_like(structure)
+    cut[box] = brush & structure[box]
+    whole = window(*bounds(structure))
+    cut, left = cut[whole], structure[whole]
     before = label(left)[0]
-    left &= ~cut
+    left = left & ~cut
     parts, _count = label(left)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0

@@ -218,7 +218,9 @@ def _allowed(cls: type, loc: Sequence[int | str]) -> str:
         for item in said
         if isinstance(item, bound)
     ]
-    noun = _NOUNS.get(kind) or ("a list" if typing.get_origin(kind) is tuple else "a table")
+    of = typing.get_origin(kind)
+    choice = f"one of {', '.join(map(repr, items))}" if of is typing.Literal else "a table"
+    noun = _NOUNS.get(kind) or ("a list" if of is tuple else choice)
     return f"{noun} {' and '.join(bounds)}".strip() + (f" ({meaning})" if meaning else "")
 
 

@@ -7,11 +7,13 @@ References:
     [Horsfield1971], [Weibel1963]
 """
 
+import re
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from anatomy.base.records import frozen_record, frozen_value
+from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int, UInt8
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.branching import STEP_MM, GrowthRule, Sprouts, bent_line, grow, limit_turn
@@ -29,64 +31,56 @@ STUMP_SHARE, STUMP_DIAMETER_MM = 0.45, 7.0
 """An operation leaves this share and diameter of a lobar bronchus."""
 
 
-@frozen_value
-class Bronchus:
-    """One named bronchus of an adult; `direction` is LPS of any length, `segment` marks segmental ones."""
+class Bronchus(NamedTuple):
+    """One named bronchus of an adult; `direction` is LPS of any length."""
 
     name: str
     parent: str
     direction: tuple[float, float, float]
     length_mm: float
     lobe: int = 0
-    segment: bool = False
 
-
-_Direction = tuple[float, float, float]
-
-
-def _stem(name: str, parent: str, direction: _Direction, length_mm: float, lobe: int = 0) -> Bronchus:
-    return Bronchus(name=name, parent=parent, direction=direction, length_mm=length_mm, lobe=lobe)
-
-
-def _segment(name: str, parent: str, direction: _Direction, length_mm: float, lobe: int) -> Bronchus:
-    return replace(_stem(name, parent, direction, length_mm, lobe), segment=True)
+    @property
+    def segment(self) -> bool:
+        """Whether it leads to one segment, by its name; the left segments 1 and 2 are one."""
+        return re.fullmatch(r"RB\d+|LB\d+|LB1\+2", self.name) is not None
 
 
 TEMPLATE = (
-    _stem("right main bronchus", "trachea", (-0.60, 0.15, -0.79), 24),
-    _stem("left main bronchus", "trachea", (0.76, 0.25, -0.60), 46),
-    _stem("right upper lobe bronchus", "right main bronchus", (-0.93, -0.05, 0.10), 15, RIGHT_UPPER),
-    _stem("bronchus intermedius", "right main bronchus", (-0.35, 0.25, -0.90), 24),
-    _segment("RB1", "right upper lobe bronchus", (-0.45, 0.05, 0.90), 13, RIGHT_UPPER),
-    _stem("RB2+3", "right upper lobe bronchus", (-0.95, 0.00, 0.00), 6, RIGHT_UPPER),
-    _segment("RB2", "RB2+3", (-0.65, 0.65, 0.30), 12, RIGHT_UPPER),
-    _segment("RB3", "RB2+3", (-0.60, -0.78, 0.00), 13, RIGHT_UPPER),
-    _stem("right middle lobe bronchus", "bronchus intermedius", (-0.50, -0.68, -0.50), 18, RIGHT_MIDDLE),
-    _stem("right lower lobe bronchus", "bronchus intermedius", (-0.25, 0.30, -0.90), 9, RIGHT_LOWER),
-    _segment("RB4", "right middle lobe bronchus", (-0.85, -0.25, -0.40), 13, RIGHT_MIDDLE),
-    _segment("RB5", "right middle lobe bronchus", (-0.25, -0.80, -0.50), 13, RIGHT_MIDDLE),
-    _segment("RB6", "right lower lobe bronchus", (-0.40, 0.92, 0.05), 11, RIGHT_LOWER),
-    _stem("right basal trunk", "right lower lobe bronchus", (-0.40, 0.15, -0.90), 13, RIGHT_LOWER),
-    _segment("RB7", "right basal trunk", (0.05, -0.25, -0.97), 12, RIGHT_LOWER),
-    _stem("RB8+9+10", "right basal trunk", (-0.55, 0.20, -0.80), 8, RIGHT_LOWER),
-    _segment("RB8", "RB8+9+10", (-0.65, -0.40, -0.65), 13, RIGHT_LOWER),
-    _stem("RB9+10", "RB8+9+10", (-0.35, 0.50, -0.80), 9, RIGHT_LOWER),
-    _segment("RB9", "RB9+10", (-0.75, 0.25, -0.65), 13, RIGHT_LOWER),
-    _segment("RB10", "RB9+10", (-0.10, 0.65, -0.78), 14, RIGHT_LOWER),
-    _stem("left upper lobe bronchus", "left main bronchus", (0.85, -0.45, 0.10), 13, LEFT_UPPER),
-    _stem("left lower lobe bronchus", "left main bronchus", (0.40, 0.40, -0.83), 11, LEFT_LOWER),
-    _stem("left upper division", "left upper lobe bronchus", (0.50, -0.20, 0.85), 10, LEFT_UPPER),
-    _stem("lingular bronchus", "left upper lobe bronchus", (0.60, -0.60, -0.55), 15, LEFT_UPPER),
-    _segment("LB1+2", "left upper division", (0.30, 0.40, 0.88), 14, LEFT_UPPER),
-    _segment("LB3", "left upper division", (0.45, -0.85, 0.30), 13, LEFT_UPPER),
-    _segment("LB4", "lingular bronchus", (0.85, -0.40, -0.25), 12, LEFT_UPPER),
-    _segment("LB5", "lingular bronchus", (0.25, -0.72, -0.65), 13, LEFT_UPPER),
-    _segment("LB6", "left lower lobe bronchus", (0.40, 0.92, 0.05), 11, LEFT_LOWER),
-    _stem("left basal trunk", "left lower lobe bronchus", (0.45, 0.10, -0.88), 14, LEFT_LOWER),
-    _segment("LB8", "left basal trunk", (0.45, -0.55, -0.72), 13, LEFT_LOWER),
-    _stem("LB9+10", "left basal trunk", (0.40, 0.45, -0.80), 9, LEFT_LOWER),
-    _segment("LB9", "LB9+10", (0.82, 0.15, -0.58), 13, LEFT_LOWER),
-    _segment("LB10", "LB9+10", (0.10, 0.65, -0.78), 14, LEFT_LOWER),
+    Bronchus("right main bronchus", "trachea", (-0.60, 0.15, -0.79), 24),
+    Bronchus("left main bronchus", "trachea", (0.76, 0.25, -0.60), 46),
+    Bronchus("right upper lobe bronchus", "right main bronchus", (-0.93, -0.05, 0.10), 15, RIGHT_UPPER),
+    Bronchus("bronchus intermedius", "right main bronchus", (-0.35, 0.25, -0.90), 24),
+    Bronchus("RB1", "right upper lobe bronchus", (-0.45, 0.05, 0.90), 13, RIGHT_UPPER),
+    Bronchus("RB2+3", "right upper lobe bronchus", (-0.95, 0.00, 0.00), 6, RIGHT_UPPER),
+    Bronchus("RB2", "RB2+3", (-0.65, 0.65, 0.30), 12, RIGHT_UPPER),
+    Bronchus("RB3", "RB2+3", (-0.60, -0.78, 0.00), 13, RIGHT_UPPER),
+    Bronchus("right middle lobe bronchus", "bronchus intermedius", (-0.50, -0.68, -0.50), 18, RIGHT_MIDDLE),
+    Bronchus("right lower lobe bronchus", "bronchus intermedius", (-0.25, 0.30, -0.90), 9, RIGHT_LOWER),
+    Bronchus("RB4", "right middle lobe bronchus", (-0.85, -0.25, -0.40), 13, RIGHT_MIDDLE),
+    Bronchus("RB5", "right middle lobe bronchus", (-0.25, -0.80, -0.50), 13, RIGHT_MIDDLE),
+    Bronchus("RB6", "right lower lobe bronchus", (-0.40, 0.92, 0.05), 11, RIGHT_LOWER),
+    Bronchus("right basal trunk", "right lower lobe bronchus", (-0.40, 0.15, -0.90), 13, RIGHT_LOWER),
+    Bronchus("RB7", "right basal trunk", (0.05, -0.25, -0.97), 12, RIGHT_LOWER),
+    Bronchus("RB8+9+10", "right basal trunk", (-0.55, 0.20, -0.80), 8, RIGHT_LOWER),
+    Bronchus("RB8", "RB8+9+10", (-0.65, -0.40, -0.65), 13, RIGHT_LOWER),
+    Bronchus("RB9+10", "RB8+9+10", (-0.35, 0.50, -0.80), 9, RIGHT_LOWER),
+    Bronchus("RB9", "RB9+10", (-0.75, 0.25, -0.65), 13, RIGHT_LOWER),
+    Bronchus("RB10", "RB9+10", (-0.10, 0.65, -0.78), 14, RIGHT_LOWER),
+    Bronchus("left upper lobe bronchus", "left main bronchus", (0.85, -0.45, 0.10), 13, LEFT_UPPER),
+    Bronchus("left lower lobe bronchus", "left main bronchus", (0.40, 0.40, -0.83), 11, LEFT_LOWER),
+    Bronchus("left upper division", "left upper lobe bronchus", (0.50, -0.20, 0.85), 10, LEFT_UPPER),
+    Bronchus("lingular bronchus", "left upper lobe bronchus", (0.60, -0.60, -0.55), 15, LEFT_UPPER),
+    Bronchus("LB1+2", "left upper division", (0.30, 0.40, 0.88), 14, LEFT_UPPER),
+    Bronchus("LB3", "left upper division", (0.45, -0.85, 0.30), 13, LEFT_UPPER),
+    Bronchus("LB4", "lingular bronchus", (0.85, -0.40, -0.25), 12, LEFT_UPPER),
+    Bronchus("LB5", "lingular bronchus", (0.25, -0.72, -0.65), 13, LEFT_UPPER),
+    Bronchus("LB6", "left lower lobe bronchus", (0.40, 0.92, 0.05), 11, LEFT_LOWER),
+    Bronchus("left basal trunk", "left lower lobe bronchus", (0.45, 0.10, -0.88), 14, LEFT_LOWER),
+    Bronchus("LB8", "left basal trunk", (0.45, -0.55, -0.72), 13, LEFT_LOWER),
+    Bronchus("LB9+10", "left basal trunk", (0.40, 0.45, -0.80), 9, LEFT_LOWER),
+    Bronchus("LB9", "LB9+10", (0.82, 0.15, -0.58), 13, LEFT_LOWER),
+    Bronchus("LB10", "LB9+10", (0.10, 0.65, -0.78), 14, LEFT_LOWER),
 )
 CENTRAL = (
     "right main bronchus", "left main bronchus", "right upper lobe bronchus", "left upper lobe bronchus",

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,7 @@ from anatomy.patient import PatientImages
 AS_MADE, TISSUE, AIRWAY, VESSEL, FISSURE, NODULE = range(6)
 """A voxel of corrections says nothing, that it is none of the others, or that it is lumen of an airway,
 vessel, fissure or nodule: one number a voxel, so that two corrections of it cannot contradict each other."""
-PAINTED: Mapping[str, int] = MappingProxyType(
-    {"airway": AIRWAY, "vessel": VESSEL, "fissure": FISSURE, "nodule": NODULE}
-)
+PAINTED: Mapping[str, int] = {"airway": AIRWAY, "vessel": VESSEL, "fissure": FISSURE, "nodule": NODULE}
 """The structures that a person may correct, and what a voxel of the corrections then says."""
 ROLES = {"airway": "lumen", "vessel": "vessels", "fissure": "fissures", "nodule": "nodules"}
 WALL_MM = 3.0

@@ -2,20 +2,17 @@
 
 import re
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 
 from anatomy.base.typed import Mask, UInt8
-from anatomy.morphology import at_label_borders, bounds, window
+from anatomy.morphology import at_label_borders, bounds, pieces_of, window
 
 RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER = 1, 2, 3, 4, 5
-LOBES: Mapping[int, str] = MappingProxyType(
-    {
-        RIGHT_UPPER: "right upper lobe", RIGHT_MIDDLE: "right middle lobe", RIGHT_LOWER: "right lower lobe",
-        LEFT_UPPER: "left upper lobe", LEFT_LOWER: "left lower lobe",
-    }
-)  # fmt: skip
+LOBES: Mapping[int, str] = {
+    RIGHT_UPPER: "right upper lobe", RIGHT_MIDDLE: "right middle lobe", RIGHT_LOWER: "right lower lobe",
+    LEFT_UPPER: "left upper lobe", LEFT_LOWER: "left lower lobe",
+}  # fmt: skip
 """Number of a lobe in a volume of lobes, and its name; 0 is no lobe."""
 
 FISSURES_UNKNOWN = "no fissure mask, so that nobody knows whether a fissure is crossed"
@@ -55,14 +52,10 @@ def lobe_named(name: str) -> int:
 
 def main_pieces(mask: Mask) -> Mask:
     """Return a lobe without the small pieces that lie apart from it."""
-    from scipy import ndimage
-
     box = window(*bounds(mask))
-    pieces, count = ndimage.label(mask[box], np.ones((3, 3, 3)))
+    pieces, sizes = pieces_of(mask[box], corners=True)
     kept = np.zeros(mask.shape, dtype=np.bool_, order="F")
-    if count:
-        sizes = np.bincount(pieces.ravel())
-        sizes[0] = 0
+    if len(sizes) > 1:
         # A piece of a lobe's mask with less than this share of it is a slip of the pen, not a part of the
         # lobe.
         kept[box] = (sizes >= 0.1 * sizes.sum())[pieces]

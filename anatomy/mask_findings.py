@@ -11,7 +11,16 @@ from anatomy.display import point
 from anatomy.grid import Grid
 from anatomy.landmarks import SAMPLE_MM, directions
 from anatomy.lobes import LOBES, RIGHT_LOWER
-from anatomy.morphology import bounds, components, distance_mm, grown_by_one, lattice_of, sampled, window
+from anatomy.morphology import (
+    bounds,
+    components,
+    distance_mm,
+    grown_by_one,
+    lattice_of,
+    pieces_of,
+    sampled,
+    window,
+)
 from anatomy.patient import PatientImages
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
 
@@ -124,8 +133,7 @@ def _of_lungs(
 
     lattice = lattice_of(grid, SAMPLE_MM)
     coarse = np.pad(lung[lattice], 1)
-    pieces, count = ndimage.label(coarse, np.ones((3, 3, 3)))
-    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
+    sizes = pieces_of(coarse, corners=True)[1][1:]
     total = float(max(sizes.sum(), 1))
     # A piece with less than this share of the lungs is no lung.
     yield "lung_pieces", float(sizes[sizes < 0.05 * total].sum()) / total

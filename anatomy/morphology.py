@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from anatomy.base.typed import Array, Float, Float32, Int, Mask
+from anatomy.base.typed import Array, Float, Float32, Int, Int32, Mask
 from anatomy.grid import Grid
 
 Window = tuple[slice, slice, slice]
@@ -142,6 +142,21 @@ def without_holes(mask: Mask) -> Mask:
     open_to_edge[0] = False
     filled: Mask = ~open_to_edge[pieces].T
     return filled
+
+
+def pieces_of(mask: Mask, *, corners: bool = False) -> tuple[Int32, Int]:
+    """Return the number of the piece of each voxel, 0 outside, and the size of each piece by its number.
+
+    Pieces are joined by faces, or by corners as well; the size of 0 is 0.
+    """
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(
+        mask, ndimage.generate_binary_structure(mask.ndim, mask.ndim if corners else 1)
+    )
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return pieces, sizes
 
 
 def largest_piece(mask: Mask) -> Mask:

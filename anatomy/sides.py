@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.base.typed import Array, Float, Int32, Mask
 from anatomy.grid import Grid
-from anatomy.morphology import at_label_borders
+from anatomy.morphology import at_label_borders, pieces_of
 
 
 def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | None:
@@ -67,11 +67,9 @@ def _two_largest(mask: Mask, axes: Float, least: float) -> Int32 | None:
     """
     from scipy import ndimage
 
-    parts, count = ndimage.label(mask)
-    if count < 2:
+    parts, sizes = pieces_of(mask)
+    if len(sizes) < 3:
         return None
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
     order = np.argsort(sizes)[::-1]
     # The smaller of two lungs holds at least this share of the larger one.
     if sizes[order[1]] < max(0.1 * sizes[order[0]], least):

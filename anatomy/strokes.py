@@ -9,7 +9,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Float32, Mask
 from anatomy.grid import Grid
-from anatomy.morphology import Window, bounds, window
+from anatomy.morphology import Window, bounds, pieces_of, window
 
 TOOLS = ("paint", "erase", "fill", "cut", "join")
 """A stroke does one of these; `Stroke` says how."""
@@ -126,9 +126,7 @@ def _cut(box: Window, brush: Mask, structure: Mask) -> tuple[Window, Mask]:
     cut, left = cut[whole], structure[whole]
     before = label(left)[0]
     left = left & ~cut
-    parts, _count = label(left)
-    sizes = np.bincount(parts.ravel())
-    sizes[0] = 0
+    parts, sizes = pieces_of(left)
     # What hung on nothing before is left alone: the cut has not freed it.
     freed = np.isin(before, np.unique(before[cut])) & left & (parts != np.argmax(sizes)) & (before > 0)
     return whole, cut | freed

@@ -98,7 +98,13 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
         FrameError: If a file states no frame, or one in which vectors are not LPS.
         AnatomyError: If a file holds numbers that are not finite.
     """
-    phase = _require_phase(keys)
+    if keys.masks_phase is None:
+        raise SettingsError(
+            "[motion] of patient.toml does not say in which phase of the breath the masks were taken",
+            expected="masks_phase from 0 (end-exhale) to 1 (end-inhale)",
+            remedy="Write masks_phase = 0.0 where the CT was taken at end-exhale, 1.0 at end-inhale of quiet "
+            "breathing, 0.5 halfway; a CT of deep inspiration lies beyond all of them and cannot be used",
+        )
     kinds = [bool(keys.file), bool(keys.end_exhale or keys.end_inhale), keys.population]
     if sum(kinds) != 1 or bool(keys.end_exhale) != bool(keys.end_inhale):
         raise SettingsError(
@@ -106,8 +112,7 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
             expected="one of: file; end_exhale and end_inhale; population = true",
             remedy='Write for instance file = "field.nrrd", maps_from = "end-exhale"',
         )
-    common: dict[str, Any] = {"masks_phase": phase, "amplitude": keys.amplitude}
-    common["hysteresis"] = keys.hysteresis
+    common: dict[str, Any] = {key: getattr(keys, key) for key in ("masks_phase", "amplitude", "hysteresis")}
     if keys.other_lungs:
         common["other_lungs"] = read_mask(folder / keys.other_lungs, role="lung")
     if keys.population:
@@ -138,17 +143,6 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
         vectors=vectors,
         **common,
     )
-
-
-def _require_phase(keys: MotionFile) -> float:
-    if keys.masks_phase is None:
-        raise SettingsError(
-            "[motion] of patient.toml does not say in which phase of the breath the masks were taken",
-            expected="masks_phase from 0 (end-exhale) to 1 (end-inhale)",
-            remedy="Write masks_phase = 0.0 where the CT was taken at end-exhale, 1.0 at end-inhale of quiet "
-            "breathing, 0.5 halfway; a CT of deep inspiration lies beyond all of them and cannot be used",
-        )
-    return keys.masks_phase
 
 
 def _require_frame(keys: MotionFile, path: Path) -> str:

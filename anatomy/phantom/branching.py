@@ -64,14 +64,6 @@ class Sprouts:
         self.name.append(name)
         return len(self.parent) - 1
 
-    def children(self) -> list[list[int]]:
-        """Return the children of every branch."""
-        lists: list[list[int]] = [[] for _ in self.parent]
-        for branch, parent in enumerate(self.parent):
-            if parent >= 0:
-                lists[parent].append(branch)
-        return lists
-
     @property
     def counts(self) -> Int:
         """Number of points of each branch, `(B,)`."""

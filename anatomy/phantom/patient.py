@@ -30,9 +30,9 @@ from anatomy.phantom.territory import Bulla, Nodule, make_territory
 from anatomy.phantom.traits import PLAIN, RESECTED_INTO, Traits
 
 Size = Literal["adult", "small"]
-SCALES: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 0.7})
+SCALES: Mapping[str, float] = {"adult": 1.0, "small": 0.7}
 """A small patient is a child of about ten years."""
-DEFAULT_SPACING_MM: Mapping[str, float] = MappingProxyType({"adult": 1.0, "small": 1.25})
+DEFAULT_SPACING_MM: Mapping[str, float] = {"adult": 1.0, "small": 1.25}
 """As a usual reconstruction; coarser for the small patient, which tests are run on."""
 FINEST_MM, COARSEST_MM = 0.3, 2.5
 """Each image of finer voxels would take gigabytes; coarser ones cannot hold the bronchi."""

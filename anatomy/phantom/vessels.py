@@ -11,6 +11,7 @@ from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIG
 from anatomy.phantom.branching import STEP_MM, Clearance, GrowthRule, Sprouts, grow, overlap_mm, smooth_line
 from anatomy.phantom.territory import Territory
 from anatomy.poses import unit
+from anatomy.tree.branches import children_of
 
 LEFT_MAIN = 2
 CENTRAL_KNOTS = {
@@ -96,7 +97,7 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
     ).clearance()
     # Arteries and airways share a sheath: about this much tissue lies between them.
     distance = outer_radius_mm + radius_mm + 0.5
-    children = airways.children()
+    children = children_of(airways.parent)
     side = np.tile(np.array((0.0, -1.0, 0.0)), (len(children), 1))
     # The left artery runs above and behind its bronchus, the right one in front.
     side[LEFT_MAIN] = (0.3, 0.7, 0.65)

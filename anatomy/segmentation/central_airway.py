@@ -9,7 +9,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int, Mask
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import bounds, distance_mm, window
+from anatomy.morphology import bounds, distance_mm, pieces_of, window
 from anatomy.segmentation.coarse import CoarseCt
 
 COLUMN_HU = -850.0
@@ -125,10 +125,8 @@ def _trachea_seeds(ct: CoarseCt, outside: Mask) -> list[Float]:
     """Return the middles `(3,)` LPS mm of columns of air that may be a trachea, the largest first."""
     from scipy import ndimage
 
-    columns = _column_cross_sections(ct, outside)
-    pieces, count = ndimage.label(columns)
-    boxes = ndimage.find_objects(pieces)
-    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
+    pieces, counts = pieces_of(_column_cross_sections(ct, outside))
+    boxes, sizes = ndimage.find_objects(pieces), counts[1:]
     tall = np.array([(box[2].stop - box[2].start) * ct.spacing_mm[2] for box in boxes]) >= SHORTEST_COLUMN_MM
     if not tall.any():
         raise AnatomyError(
@@ -172,8 +170,7 @@ def _column_cross_sections(ct: CoarseCt, outside: Mask) -> Mask:
     middle = float((body * np.arange(len(body))).sum() / body.sum())
     for k in range(ct.hu.shape[2]):
         plane = ct.hu[:, :, k]
-        pieces, count = ndimage.label((plane < COLUMN_HU) & ~outside[:, :, k])
-        sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+        pieces, sizes = pieces_of((plane < COLUMN_HU) & ~outside[:, :, k])
         for piece, box in enumerate(ndimage.find_objects(pieces), start=1):
             width, depth = (s.stop - s.start for s in box)
             centre = 0.5 * (box[0].start + box[0].stop - 1)

@@ -10,7 +10,7 @@ from anatomy.base.typed import Float, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
 from anatomy.landmarks import SAMPLE_MM, directions
-from anatomy.morphology import bounds, distance_mm, sampled, window
+from anatomy.morphology import bounds, distance_mm, pieces_of, sampled, window
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
 from anatomy.segmentation.input import FINE_SLICE_MM
 from anatomy.segmentation.lungs import Lungs
@@ -159,8 +159,6 @@ def _on_cubes(points: Float) -> tuple[Mask, Float]:
 
 def solid_tissue(ct: Volume, lung: Mask) -> tuple[str, ...]:
     """Warn of solid tissue in the lungs that is thicker than vessels: masses and consolidations."""
-    from scipy import ndimage
-
     step = np.maximum(1, np.floor(2.0 / ct.grid.spacing_mm)).astype(np.int64)
     sparse = tuple(slice(None, None, int(s)) for s in step)
     inside = lung[sparse]
@@ -171,8 +169,8 @@ def solid_tissue(ct: Volume, lung: Mask) -> tuple[str, ...]:
     if not core.any():
         return ()
     mass = solid & (distance_mm(np.asfortranarray(~core), spacing) <= SOLID_RADIUS_MM)
-    pieces, count = ndimage.label(mass)
-    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:] * float(np.prod(spacing)) / 1000.0
+    pieces, counts = pieces_of(mass)
+    sizes = counts[1:] * float(np.prod(spacing)) / 1000.0
     found = []
     for piece in np.flatnonzero(sizes >= LEAST_SOLID_ML):
         middle = np.argwhere(pieces == piece + 1).mean(axis=0) + [s.start for s in box]

@@ -1,7 +1,6 @@
 """Lungs and other masks made by other programs or by hand, in place of a step of the segmentation."""
 
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 
 import numpy as np
 
@@ -14,12 +13,10 @@ from anatomy.segmentation.coarse import CoarseCt
 from anatomy.sides import grow_sides
 
 RIGHT, LEFT = 1, 2
-NUMBERINGS: Mapping[str, tuple[int, ...]] = MappingProxyType(
-    {
-        "our own": (RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER),
-        "lungmask": (LEFT_UPPER, LEFT_LOWER, RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER),
-    }
-)
+NUMBERINGS: Mapping[str, tuple[int, ...]] = {
+    "our own": (RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER, LEFT_UPPER, LEFT_LOWER),
+    "lungmask": (LEFT_UPPER, LEFT_LOWER, RIGHT_UPPER, RIGHT_MIDDLE, RIGHT_LOWER),
+}
 """The lobes that the labels 1 to 5 mean: of this program, and of lungmask's model LTRCLobes (0.2)."""
 FIRST_OF_TOTAL = 10
 """TotalSegmentator's task total (2.x) has the lobes in the order of lungmask, from this label on."""

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 
@@ -10,15 +9,13 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 
-USUAL_SHARES: Mapping[int, tuple[float, float]] = MappingProxyType(
-    {
-        RIGHT_UPPER: (0.37, 0.15),
-        RIGHT_MIDDLE: (0.17, 0.08),
-        RIGHT_LOWER: (0.46, 0.15),
-        LEFT_UPPER: (0.52, 0.15),
-        LEFT_LOWER: (0.48, 0.15),
-    }
-)
+USUAL_SHARES: Mapping[int, tuple[float, float]] = {
+    RIGHT_UPPER: (0.37, 0.15),
+    RIGHT_MIDDLE: (0.17, 0.08),
+    RIGHT_LOWER: (0.46, 0.15),
+    LEFT_UPPER: (0.52, 0.15),
+    LEFT_LOWER: (0.48, 0.15),
+}
 """Mean share of each lobe in its lung, and twice the spread of the healthy, as lobes shrink and swell."""
 WEIGHT_OF_SHARES = 0.05
 """One spread off the usual share weighs as much as a fissure over a twentieth of the lung's cross-section."""

@@ -26,7 +26,7 @@ from anatomy.lobes import (
     UNKNOWN,
     fissures_between,
 )
-from anatomy.morphology import bounds, closed, largest_piece, window
+from anatomy.morphology import at_label_borders, bounds, closed, largest_piece, window
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.fissures import BLOCK, EDGE_MM, Cubic, Fissureness, blocks_of, fissureness
 from anatomy.segmentation.lobar_bronchi import LEAST_SHARE, TRUNK_SHARE, Regions, lobes_of_branches
@@ -308,7 +308,7 @@ class _LungParts:
         nearest = ndimage.distance_transform_edt(coarse == 0, return_distances=False, return_indices=True)
         whole = coarse[tuple(nearest)]
         # In blocks, 10 mm: so far from the border of the diffusion the fissure itself is looked for.
-        band = _grown(_borders(whole), 5)
+        band = _grown(at_label_borders(whole), 5)
         labels = self._on_cubic(np.where(band, 0, whole))
         labels[~_grown(self._fine, OUTER_VOXELS)] = -1
         cost = 1.0 + np.float32(FISSURE_COST) * self._likelihood
@@ -362,17 +362,6 @@ def _conductance(resistance: Float32, mask: Mask) -> list[Float32]:
         first, inside, of = (np.moveaxis(each, axis, 0) for each in (made, mask, resistance))
         first[:-1] = np.where(inside[:-1], inside[1:], False) / (of[:-1] + of[1:])
         found.append(made)
-    return found
-
-
-def _borders(labels: Int32) -> Mask:
-    """Return the voxels on both sides of every face between two labels."""
-    found = np.zeros(labels.shape, dtype=np.bool_)
-    for axis in range(3):
-        at, mark = np.moveaxis(labels, axis, 0), np.moveaxis(found, axis, 0)
-        meet = at[:-1] != at[1:]
-        mark[:-1] |= meet
-        mark[1:] |= meet
     return found
 
 

@@ -8,7 +8,16 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Float32, Int32, Mask
-from anatomy.morphology import bounds, closed, distance_mm, largest_piece, near, window, without_holes
+from anatomy.morphology import (
+    bounds,
+    closed,
+    distance_mm,
+    largest_piece,
+    near,
+    pieces_of,
+    window,
+    without_holes,
+)
 from anatomy.segmentation.central_airway import CentralAirway, grow_from
 from anatomy.segmentation.coarse import CoarseCt
 from anatomy.segmentation.input import AIR_HU
@@ -64,13 +73,10 @@ def lung_pieces(coarse: CoarseCt, air: Mask, airway: Mask) -> Mask:
     `air` `(Ni, Nj, Nk)` is what is as thin as lung, without the airway and the outside; `airway` are trachea
     and bronchi as far as they could be followed.
     """
-    from scipy import ndimage
-
-    pieces, count = ndimage.label(air)
-    volumes_ml = np.bincount(pieces.ravel(), minlength=count + 1) * coarse.voxel_ml
-    volumes_ml[0] = 0.0
+    pieces, sizes = pieces_of(air)
+    volumes_ml = sizes * coarse.voxel_ml
     large = volumes_ml >= SMALLEST_LUNG_ML
-    at_bronchi = np.zeros(count + 1, dtype=np.bool_)
+    at_bronchi = np.zeros(len(sizes), dtype=np.bool_)
     # Wall of a main bronchus and the tissue around it: lung begins within this distance of the bronchi.
     at_bronchi[np.unique(pieces[near(airway, 10.0, coarse.spacing_mm)])] = True
     lung = large & at_bronchi
@@ -108,16 +114,11 @@ def gas_pockets(coarse: CoarseCt, lung: Mask, air_hu: float) -> tuple[Mask, Mask
     if not core.any():
         return found, lung
     pocket = (distance_mm(np.asfortranarray(~core), coarse.spacing_mm) <= GAS_RADIUS_MM + 1.5) & lung[box]
-    pieces, count = ndimage.label(pocket)
-    volumes_ml = np.bincount(pieces.ravel(), minlength=count + 1) * coarse.voxel_ml
-    volumes_ml[0] = 0.0
+    pieces, sizes = pieces_of(pocket)
     # Holes of emphysema are smaller; a layer of gas over half a lung, 4 mm thick, is larger.
-    found[box] = (volumes_ml >= 20.0)[pieces]
-    pieces, count = ndimage.label(lung)
-    kept = np.bincount(pieces[found], minlength=count + 1) < 0.5 * np.bincount(
-        pieces.ravel(), minlength=count + 1
-    )
-    kept[0] = False
+    found[box] = (sizes * coarse.voxel_ml >= 20.0)[pieces]
+    pieces, sizes = pieces_of(lung)
+    kept = np.bincount(pieces[found], minlength=len(sizes)) < 0.5 * sizes
     return found, np.asfortranarray(kept[pieces] & ~found)
 
 
@@ -198,8 +199,6 @@ def coarse_lung_ex_vivo(
 
 def _background(ct: CoarseCt) -> Mask:
     """Grow the air around the lung from the edge of the image."""
-    from scipy import ndimage
-
     faces = [ct.hu[0], ct.hu[-1], ct.hu[:, 0], ct.hu[:, -1], ct.hu[:, :, 0], ct.hu[:, :, -1]]
     air = float(np.median(np.concatenate([face.ravel() for face in faces])))
     # Lung is at least this much above the air around it: several times the noise.
@@ -210,15 +209,7 @@ def _background(ct: CoarseCt) -> Mask:
             expected="an inflated lung surrounded by air (about -1000 HU)",
             remedy="For a CT of a patient leave out --ex-vivo",
         )
-    thin = ct.hu < 0.5 * (air + float(np.median(body)))
-    pieces, count = ndimage.label(thin)
-    at_edge = np.zeros(count + 1, dtype=np.bool_)
-    for axis in range(3):
-        for end in (0, -1):
-            at_edge[np.unique(pieces[tuple(end if a == axis else slice(None) for a in range(3))])] = True
-    at_edge[0] = False
-    background: Mask = at_edge[pieces]
-    return background
+    return ~without_holes(ct.hu >= 0.5 * (air + float(np.median(body))))
 
 
 def _airway(ct: CoarseCt, hull: Mask, seed_lps: Float | None) -> CentralAirway:

@@ -4,7 +4,6 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
 from anatomy.io.own_masks import DESCRIPTION, description_text
 from anatomy.lobes import BORDER, LOBES, SEEN
+from anatomy.machine_code.sources import version_of
 from anatomy.plausibility import require_known_checks
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
@@ -170,12 +170,8 @@ def _ct_source(request: SegmentationRequest) -> Mapping[str, Any] | None:
 
 
 def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str]) -> Mapping[str, Any]:
-    try:
-        program = version("lungaccess")
-    except PackageNotFoundError:
-        program = "unknown (not installed)"
     return {
-        "lungaccess": program,
+        "lungaccess": version_of("lungaccess") or "unknown (not installed)",
         "steps_version": VERSION,
         "numpy": np.__version__,
         "ct_grid": request.ct.grid.describe(),

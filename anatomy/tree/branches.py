@@ -35,16 +35,30 @@ class Strand:
     attach: int
 
 
+def children_of(parents: list[int]) -> list[list[int]]:
+    """Return the children of every node of a tree by the parent of each, -1 at the root."""
+    children: list[list[int]] = [[] for _ in parents]
+    for node, above in enumerate(parents):
+        if above >= 0:
+            children[above].append(node)
+    return children
+
+
+def line_from(start: int, children: list[list[int]]) -> list[int]:
+    """Follow a line to the next node that is an end or divides, included."""
+    nodes = [start]
+    while len(children[nodes[-1]]) == 1:
+        nodes.append(children[nodes[-1]][0])
+    return nodes
+
+
 def divide(mm: Float, parent: Int, depth_mm: Float, trunk_end: int) -> list[NodeBranch]:
     """Divide a tree of nodes (parents first) into branches, parents first.
 
     Branching points closer together than the radius at the first are one branching: the branch
     between them becomes the end of its parent.
     """
-    children: list[list[int]] = [[] for _ in range(len(parent))]
-    for node, above in enumerate(parent.tolist()):
-        if above >= 0:
-            children[above].append(node)
+    children = children_of(parent.tolist())
     trunk = [trunk_end]
     while parent[trunk[-1]] >= 0:
         trunk.append(int(parent[trunk[-1]]))
@@ -57,10 +71,7 @@ def divide(mm: Float, parent: Int, depth_mm: Float, trunk_end: int) -> list[Node
         for node in branch.nodes if branch is first else branch.nodes[-1:]:
             for child in children[node]:
                 if child not in on_trunk:
-                    nodes = [child]
-                    while len(children[nodes[-1]]) == 1:
-                        nodes.append(children[nodes[-1]][0])
-                    branches.append(NodeBranch(nodes=nodes, parent=branch, attach=node))
+                    branches.append(NodeBranch(nodes=line_from(child, children), parent=branch, attach=node))
         at += 1
     return _merge_close(branches, mm, depth_mm)
 

@@ -9,6 +9,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Float32, Int, Int32
 from anatomy.grid import Grid, Volume
+from anatomy.morphology import bounds, window
 from anatomy.tree.bridge import Piece, join_pieces
 
 CONNECT_26 = np.ones((3, 3, 3), dtype=bool)
@@ -127,18 +128,15 @@ def _left_out(lumen: Bool, pieces: list[Piece], grid: Grid) -> tuple[PieceLeftOu
 def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
     """Return grid and array of the bounding box of a mask, with one empty layer all around."""
     array = np.asarray(mask.array != 0) if mask.array.dtype != bool else mask.array
-    hits = [np.flatnonzero(array.any(axis=other)) for other in ((1, 2), (0, 2), (0, 1))]
-    if len(hits[0]) == 0:
+    start, stop = bounds(array)
+    if not stop.any():
         raise AnatomyError(
             "The airway mask is empty",
             expected="a mask of the airway lumen from the trachea to the bronchi",
             remedy="Check that the file and the label are those of the airway",
         )
-    start = np.array([h[0] for h in hits])
-    stop = np.array([h[-1] + 1 for h in hits])
-    inner = array[tuple(slice(a, b) for a, b in zip(start, stop, strict=True))]
     box = np.zeros(tuple(stop - start + 2), dtype=bool, order="F")
-    box[1:-1, 1:-1, 1:-1] = inner
+    box[1:-1, 1:-1, 1:-1] = array[window(start, stop)]
     return mask.grid.crop(start - 1, stop + 1), box
 
 
@@ -264,10 +262,10 @@ def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -
     while True:
         low = np.maximum(open_voxels.min(axis=0) - margin, 0)
         high = np.minimum(open_voxels.max(axis=0) + margin + 1, prepared.solid.shape)
-        window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        box = window(low, high)
         starts = skeleton[((skeleton >= low) & (skeleton < high)).all(axis=1)] - low
-        depth_mm = prepared.solid_depth_mm[window]
-        solid = prepared.solid[window]
+        depth_mm = prepared.solid_depth_mm[box]
+        solid = prepared.solid[box]
         floor = float(spacing.min()) / 4
         cost = np.asarray(np.where(solid, 1.0 / np.maximum(depth_mm.astype(np.float64), floor) ** 2, -1.0))
         search = MCP_Geometric(cost, fully_connected=True, sampling=tuple(spacing))

@@ -13,7 +13,6 @@ References:
 import itertools
 from collections.abc import Mapping
 from functools import cache, cached_property
-from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -27,67 +26,59 @@ _Segments = tuple[int, ...]
 
 RIGHT, LEFT = "R", "L"
 LB12 = "LB1+2"
-DIRECTIONS: Mapping[str, Mapping[int, tuple[float, float, float]]] = MappingProxyType(
-    {
-        RIGHT: {
-            1: (0.5, 0.0, 1.0), 2: (0.5, 1.0, 0.5), 3: (0.5, -1.0, 0.0), 4: (1.0, -0.5, -0.5),
-            5: (0.0, -1.0, -0.5), 6: (0.5, 1.0, 0.0), 7: (0.0, -0.5, -1.0), 8: (0.5, -0.5, -1.0),
-            9: (1.0, 0.0, -1.0), 10: (0.0, 0.5, -1.0),
-        },
-        LEFT: {
-            1: (0.5, 0.5, 1.0), 3: (0.5, -1.0, 0.5), 4: (1.0, -1.0, 0.0), 5: (0.5, -1.0, -1.0),
-            6: (0.5, 1.0, 0.0), 8: (0.5, -0.5, -1.0), 9: (1.0, 0.0, -1.0), 10: (0.0, 0.5, -1.0),
-        },
-    }
-)  # fmt: skip
+DIRECTIONS: Mapping[str, Mapping[int, tuple[float, float, float]]] = {
+    RIGHT: {
+        1: (0.5, 0.0, 1.0), 2: (0.5, 1.0, 0.5), 3: (0.5, -1.0, 0.0), 4: (1.0, -0.5, -0.5),
+        5: (0.0, -1.0, -0.5), 6: (0.5, 1.0, 0.0), 7: (0.0, -0.5, -1.0), 8: (0.5, -0.5, -1.0),
+        9: (1.0, 0.0, -1.0), 10: (0.0, 0.5, -1.0),
+    },
+    LEFT: {
+        1: (0.5, 0.5, 1.0), 3: (0.5, -1.0, 0.5), 4: (1.0, -1.0, 0.0), 5: (0.5, -1.0, -1.0),
+        6: (0.5, 1.0, 0.0), 8: (0.5, -0.5, -1.0), 9: (1.0, 0.0, -1.0), 10: (0.0, 0.5, -1.0),
+    },
+}  # fmt: skip
 """Where each segment lies from its bronchus: outwards, backwards and upwards, as anatomy puts it in words.
 
 A word counts 1, "slightly" counts a half [Boyden1955].  Left 1 stands for 1+2, and left 8 for 7+8, because B7
 leaves B8 in most left lungs.
 """
-STEMS: Mapping[str, Mapping[_Segments, float]] = MappingProxyType(
-    {
-        RIGHT: {
-            (1, 2, 3, 4, 5, 6, 7, 8, 9, 10): 1.0, (2, 3, 4, 5, 6, 7, 8, 9, 10): 0.009,
-            (4, 5, 6, 7, 8, 9, 10): 1.0, (1, 2, 3): 1.0, (1, 2): 0.39, (2, 3): 0.27, (1, 3): 0.28,
-            (4, 5): 1.0, (6, 7, 8, 9, 10): 1.0, (4, 5, 7, 8, 9, 10): 0.05, (4, 5, 6): 0.01,
-            (7, 8, 9, 10): 1.0, (8, 9, 10): 0.6, (9, 10): 0.5, (8, 9): 0.25, (7, 8): 0.1, (7, 9, 10): 0.05,
-            (7, 10): 0.05, (7, 8, 9): 0.05, (8, 10): 0.02,
-        },
-        LEFT: {
-            (1, 3, 4, 5, 6, 8, 9, 10): 1.0, (1, 3, 4, 5): 1.0, (1, 3): 0.9, (4, 5): 1.0, (3, 4, 5): 0.1,
-            (6, 8, 9, 10): 1.0, (8, 9, 10): 1.0, (9, 10): 0.8, (8, 9): 0.2, (8, 10): 0.02,
-        },
-    }
-)  # fmt: skip
+STEMS: Mapping[str, Mapping[_Segments, float]] = {
+    RIGHT: {
+        (1, 2, 3, 4, 5, 6, 7, 8, 9, 10): 1.0, (2, 3, 4, 5, 6, 7, 8, 9, 10): 0.009,
+        (4, 5, 6, 7, 8, 9, 10): 1.0, (1, 2, 3): 1.0, (1, 2): 0.39, (2, 3): 0.27, (1, 3): 0.28,
+        (4, 5): 1.0, (6, 7, 8, 9, 10): 1.0, (4, 5, 7, 8, 9, 10): 0.05, (4, 5, 6): 0.01,
+        (7, 8, 9, 10): 1.0, (8, 9, 10): 0.6, (9, 10): 0.5, (8, 9): 0.25, (7, 8): 0.1, (7, 9, 10): 0.05,
+        (7, 10): 0.05, (7, 8, 9): 0.05, (8, 10): 0.02,
+    },
+    LEFT: {
+        (1, 3, 4, 5, 6, 8, 9, 10): 1.0, (1, 3, 4, 5): 1.0, (1, 3): 0.9, (4, 5): 1.0, (3, 4, 5): 0.1,
+        (6, 8, 9, 10): 1.0, (8, 9, 10): 1.0, (9, 10): 0.8, (8, 9): 0.2, (8, 10): 0.02,
+    },
+}  # fmt: skip
 """How many patients have each stem, by the segments it supplies; no other set of segments has one.
 
 The upper lobes are those of 10,000 patients [Javed2024] [Javed2024a], with a third of the trifurcations
 added, because a tree of forks shows two of three as a short stem; the lower lobes follow [Huang2019].
 """
-STEM_NAMES: Mapping[str, Mapping[_Segments, str]] = MappingProxyType(
-    {
-        RIGHT: {
-            (1, 2, 3, 4, 5, 6, 7, 8, 9, 10): "right main bronchus",
-            (2, 3, 4, 5, 6, 7, 8, 9, 10): "right main bronchus",
-            (4, 5, 6, 7, 8, 9, 10): "bronchus intermedius", (1, 2, 3): "right upper lobe bronchus",
-            (4, 5): "right middle lobe bronchus", (6, 7, 8, 9, 10): "right lower lobe bronchus",
-            (7, 8, 9, 10): "right basal trunk",
-        },
-        LEFT: {
-            (1, 3, 4, 5, 6, 8, 9, 10): "left main bronchus", (1, 3, 4, 5): "left upper lobe bronchus",
-            (1, 3): "left upper division", (4, 5): "lingular bronchus",
-            (6, 8, 9, 10): "left lower lobe bronchus", (8, 9, 10): "left basal trunk",
-        },
-    }
-)  # fmt: skip
+STEM_NAMES: Mapping[str, Mapping[_Segments, str]] = {
+    RIGHT: {
+        (1, 2, 3, 4, 5, 6, 7, 8, 9, 10): "right main bronchus",
+        (2, 3, 4, 5, 6, 7, 8, 9, 10): "right main bronchus",
+        (4, 5, 6, 7, 8, 9, 10): "bronchus intermedius", (1, 2, 3): "right upper lobe bronchus",
+        (4, 5): "right middle lobe bronchus", (6, 7, 8, 9, 10): "right lower lobe bronchus",
+        (7, 8, 9, 10): "right basal trunk",
+    },
+    LEFT: {
+        (1, 3, 4, 5, 6, 8, 9, 10): "left main bronchus", (1, 3, 4, 5): "left upper lobe bronchus",
+        (1, 3): "left upper division", (4, 5): "lingular bronchus",
+        (6, 8, 9, 10): "left lower lobe bronchus", (8, 9, 10): "left basal trunk",
+    },
+}  # fmt: skip
 """Stems with a name of their own; any other one is called after its segments, such as RB9+10."""
-SEGMENT_LOBES: Mapping[str, Mapping[int, int]] = MappingProxyType(
-    {
-        RIGHT: {n: RIGHT_UPPER if n < 4 else RIGHT_MIDDLE if n < 6 else RIGHT_LOWER for n in range(1, 11)},
-        LEFT: {n: LEFT_UPPER if n < 6 else LEFT_LOWER for n in DIRECTIONS[LEFT]},
-    }
-)
+SEGMENT_LOBES: Mapping[str, Mapping[int, int]] = {
+    RIGHT: {n: RIGHT_UPPER if n < 4 else RIGHT_MIDDLE if n < 6 else RIGHT_LOWER for n in range(1, 11)},
+    LEFT: {n: LEFT_UPPER if n < 6 else LEFT_LOWER for n in DIRECTIONS[LEFT]},
+}
 """The lobe of each segment, a number of `anatomy.lobes.LOBES`."""
 CONCENTRATION, STEM_CONCENTRATION, PAIR_CONCENTRATION = 6.0, 3.0, 4.0
 """How closely directions of segments, of stems and between siblings keep to the atlas (von Mises-Fisher).

@@ -7,6 +7,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Float32, Int
+from anatomy.tree.branches import children_of, line_from
 from anatomy.tree.bridge import face_paths
 from anatomy.tree.depth import segments_inside
 from anatomy.tree.lumen import PreparedLumen
@@ -143,10 +144,7 @@ def _kept_inside(voxel_tree: VoxelTree, base: Float, wanted: Float, lumen: Bool)
 def unite_parallel(voxel_tree: VoxelTree, lumen: Bool) -> VoxelTree:
     """Let the children of a node share their path as long as they run through neighbouring voxels."""
     parent = voxel_tree.parent.tolist()
-    children: list[list[int]] = [[] for _ in parent]
-    for node, above in enumerate(parent):
-        if above >= 0:
-            children[above].append(node)
+    children = children_of(parent)
     on_trunk = set()
     at = voxel_tree.trunk_end
     while at >= 0:
@@ -158,10 +156,10 @@ def unite_parallel(voxel_tree: VoxelTree, lumen: Bool) -> VoxelTree:
         if node in gone or len(children[node]) < 2:
             continue
         first, *others = sorted(children[node], key=lambda child: child not in on_trunk)
-        kept = _line(first, children)
+        kept = line_from(first, children)
         at_division = node == voxel_tree.trunk_end
         for other in others:
-            line = _line(other, children)
+            line = line_from(other, children)
             hook, shared = _shared(voxel_tree, kept, line, lumen)
             if shared == 0:
                 continue
@@ -173,14 +171,6 @@ def unite_parallel(voxel_tree: VoxelTree, lumen: Bool) -> VoxelTree:
         if at_division and farthest >= 0:
             trunk_end = kept[farthest]
     return _without(voxel_tree, parent, gone, trunk_end, lumen)
-
-
-def _line(start: int, children: list[list[int]]) -> list[int]:
-    """Follow a line to the next node that is an end or divides, included."""
-    nodes = [start]
-    while len(children[nodes[-1]]) == 1:
-        nodes.append(children[nodes[-1]][0])
-    return nodes
 
 
 def _shared(voxel_tree: VoxelTree, kept: list[int], line: list[int], lumen: Bool) -> tuple[int, int]:
@@ -203,15 +193,12 @@ def _without(
     voxel_tree: VoxelTree, parent: list[int], gone: set[int], trunk_end: int, lumen: Bool
 ) -> VoxelTree:
     """Leave nodes out and sort the others so that parents come first."""
-    children: list[list[int]] = [[] for _ in parent]
-    for node, above in enumerate(parent):
-        if above >= 0 and node not in gone:
-            children[above].append(node)
+    children = children_of(parent)
     order, stack = [], [0]
     while stack:
         node = stack.pop()
         order.append(node)
-        stack += children[node][::-1]
+        stack += [child for child in children[node][::-1] if child not in gone]
     index = {node: at for at, node in enumerate(order)}
     new_parent = np.array([-1] + [index[parent[node]] for node in order[1:]])
     return voxel_tree_of(voxel_tree.ijk[order], new_parent, index[trunk_end], lumen)

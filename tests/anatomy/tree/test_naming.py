@@ -42,8 +42,7 @@ def varied(seed: int, monkeypatch: pytest.MonkeyPatch) -> tuple[AirwayTree, Cent
     kept = (each for each in planned.TEMPLATE if each.name not in moved[1])
     spread = FURTHER_JITTER[seed % len(FURTHER_JITTER)]
     template = tuple(
-        replace(
-            each,
+        each._replace(
             parent=moved[0].get(each.name, each.parent),
             direction=tuple(each.direction + spread * rng.normal(size=3)),
         )

@@ -8,6 +8,7 @@ from anatomy.base.settings import quantity, settings
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 from anatomy.phantom.chest import LOBES
 
+Lobe = Literal["", "right upper", "right middle", "right lower", "left upper", "left lower"]
 RESECTED_INTO = {
     RIGHT_UPPER: RIGHT_MIDDLE, RIGHT_MIDDLE: RIGHT_UPPER, RIGHT_LOWER: RIGHT_MIDDLE, LEFT_UPPER: LEFT_LOWER,
     LEFT_LOWER: LEFT_UPPER,
@@ -55,10 +56,7 @@ class Traits:
     open_fissures: Annotated[
         float, quantity("Share of fissures that is missing, from the hilum on", at_least=0.0, at_most=1.0)
     ] = 0.0
-    resected: Annotated[
-        Literal["", "right upper", "right middle", "right lower", "left upper", "left lower"],
-        Field(description="Lobe that was taken out"),
-    ] = ""
+    resected: Annotated[Lobe, Field(description="Lobe that was taken out")] = ""
     emphysema: Annotated[float, quantity("From none to severe", at_least=0.0, at_most=1.0)] = 0.0
 
     @property

@@ -34,7 +34,7 @@ from anatomy.lung import Lung
 from anatomy.patient import PatientImages
 from anatomy.phantom import Phantom, make_phantom, write_phantom
 from anatomy.phantom.patient import Size
-from anatomy.phantom.traits import Traits
+from anatomy.phantom.traits import Lobe, Traits
 from lungaccess.planning.coupled.atlas import motions_of
 from lungaccess.problem.system import load_system, preset_text
 
@@ -50,7 +50,7 @@ ADULT_MM, CHILD_MM = 1.0, 0.8
 """Edges of the voxels: those of a usual reconstruction, finer for the narrower airways of a child."""
 BRONCHUS_LENGTH, VESSEL_LIMIT_MM, VESSEL_RIM_MM, HILAR_VESSEL_MM = 1.35, 0.9, 5.0, 9.0
 """Set so that the medians of a phantom come near those of two patients' masks, see the measurements."""
-LOBES = ("right upper", "left upper", "right lower", "left lower", "right middle")
+LOBES: tuple[Lobe, ...] = ("right upper", "left upper", "right lower", "left lower", "right middle")
 
 
 @frozen_value

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -207,11 +207,17 @@ def page(outcomes: dict[Cell, str]) -> str:
         "|---|---|---|---|",
     ]
     for reason, refused in reasons.items():
-        goals = "; ".join(dict.fromkeys(each.goal for each in refused))
-        constraints = "; ".join(dict.fromkeys(each.constraint for each in refused))
-        systems = "; ".join(dict.fromkeys(each.system for each in refused))
+        goals = _named([each.goal for each in refused], GOALS)
+        constraints = _named([each.constraint for each in refused], CONSTRAINTS)
+        systems = _named([each.system for each in refused], SYSTEMS)
         lines.append(f"| {goals} | {constraints} | {systems} | {reason} |")
     return "\n".join(lines) + "\n"
+
+
+def _named(found: Iterable[str], of: Collection[str]) -> str:
+    """Return the names in their order, each once, or that these are all."""
+    names = dict.fromkeys(found)
+    return "all" if names.keys() == set(of) else "; ".join(names)
 
 
 def main() -> None:

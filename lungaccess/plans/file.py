@@ -1,19 +1,17 @@
 """Plans as JSON: nothing lost, nothing unknown accepted, protected by a digest."""
 
+import functools
 import json
 import math
 import os
 import re
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from anatomy.base.checksums import canonical_sha256
 from anatomy.base.errors import PlanFileError, SettingsError
@@ -32,8 +30,6 @@ LINES = "lungaccess-plan-1"
 """The format whose plans state a line for the scope."""
 
 WRITTEN = "a plan.json as `lungaccess plan` writes it"
-ARRAY_TYPES = (np.ndarray, NDArray)
-"""What `anatomy.base.typed` is made of: numpy resolves its name of arrays before 2.5, and keeps it since."""
 
 P = TypeVar("P", bound=Record)
 
@@ -71,8 +67,14 @@ def from_json(cls: type[P], text: str) -> P:
         )
     stated = content.pop("digest", None)
     try:
-        plan = _decode(cls, _in_schema(content), "plan")
+        reader: TypeAdapter[P] = _reader(cls)  # type: ignore[arg-type]
+        plan = reader.validate_json(json.dumps(_in_schema(content)), strict=True)
         found = digest(plan) if content["schema"] == SCHEMA else _digest(content)
+    except ValidationError as error:
+        raise _as_plan_error(error) from None
+    except SettingsError as error:
+        found = f"The plan's system is not valid: {error}"
+        raise PlanFileError(found, expected="a system that can be built") from error
     except DAMAGE as error:
         found = f"The plan holds values that no plan has ({reason(error)})"
         raise PlanFileError(found, expected=WRITTEN) from error
@@ -80,7 +82,20 @@ def from_json(cls: type[P], text: str) -> P:
         raise PlanFileError(
             "The plan does not match its own digest: it was edited or damaged", expected=str(stated)
         )
-    return typing.cast(P, plan)
+    return plan
+
+
+@functools.cache
+def _reader(cls: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(cls)
+
+
+def _as_plan_error(error: ValidationError) -> PlanFileError:
+    """Return the first of the faults of a plan."""
+    fault, *_others = error.errors(include_url=False)
+    where = ".".join(map(str, ("plan", *fault["loc"])))
+    found = "missing" if fault["type"] == "missing" else f"{fault['input']!r:.60}"
+    return PlanFileError(f"{where} is {found}", expected=f"{fault['msg']}; {WRITTEN}")
 
 
 def _in_schema(content: dict[str, Any]) -> dict[str, Any]:
@@ -97,7 +112,7 @@ def _in_schema(content: dict[str, Any]) -> dict[str, Any]:
         content = {**content, "system": {**content["system"], "needle": needle}}
     if "shape" in tube:
         return {**content, "schema": SCHEMA}
-    tubes = _system(content["system"], "plan.system").tubes
+    tubes = parse(System, content["system"], "plan.system").tubes
     outer, inner = float(tube["outer_insertion_mm"]), float(tube["inner_insertion_mm"])
     straight = max(inner - tubes.inner.curved_length_mm, 0.0)
     ends = [min(straight, outer), outer, max(straight, outer), inner]
@@ -183,65 +198,7 @@ def _as_declared(annotation: object, value: Any) -> Any:
     return value
 
 
-def _decode(wanted: Any, value: Any, where: str) -> Any:
-    """Build `wanted` (a type annotation) from plain JSON types, or raise."""
-    if wanted is System:
-        return _system(value, where)
-    if is_dataclass(wanted):
-        return _record(typing.cast(type, wanted), value, where)
-    origin, arguments = typing.get_origin(wanted), typing.get_args(wanted)
-    if origin in ARRAY_TYPES:
-        return _numbers(value, where)
-    if origin is tuple:
-        return tuple(_decode(arguments[0], v, f"{where}[{n}]") for n, v in enumerate(_is(list, value, where)))
-    if origin is Mapping or isinstance(origin, type) and issubclass(origin, Mapping):
-        return {k: _decode(arguments[1], v, f"{where}.{k}") for k, v in _is(dict, value, where).items()}
-    if origin in (typing.Union, types.UnionType):
-        return None if value is None else _decode(arguments[0], value, where)
-    return _is(wanted, value, where)
-
-
-def _record(cls: type, value: Any, where: str) -> Any:
-    content = _is(dict, value, where)
-    hints = typing.get_type_hints(cls)
-    names = {item.name for item in fields(cls)}
-    optional = {item.name for item in fields(cls) if item.metadata.get(LEFT_OUT_IF_EMPTY)}
-    lacks, unknown = names - optional - content.keys(), content.keys() - names
-    for problem, keys in (("lacks", lacks), ("has the unknown key", unknown)):
-        if keys:
-            raise PlanFileError(
-                f"{where} {problem} {', '.join(sorted(keys))}",
-                expected="the keys that `lungaccess plan` writes",
-            )
-    present = names & content.keys()
-    return cls(**{name: _decode(hints[name], content[name], f"{where}.{name}") for name in present})
-
-
-def _system(value: Any, where: str) -> System:
-    try:
-        return parse(System, _is(dict, value, where), where)
-    except SettingsError as error:
-        raise PlanFileError(
-            f"The plan's system is not valid: {error}", expected="a system that can be built"
-        ) from error
-
-
-def _numbers(value: Any, where: str) -> Any:
-    """Return nested lists of finite numbers unchanged."""
-    if isinstance(value, list):
-        return [_numbers(inner, f"{where}[{n}]") for n, inner in enumerate(value)]
-    return _is(int, value, where) if isinstance(value, int) else _is(float, value, where)
-
-
-def _is(wanted: type, value: Any, where: str) -> Any:
-    fits = isinstance(value, wanted) and (wanted is bool or not isinstance(value, bool))
-    if not fits or isinstance(value, float) and not math.isfinite(value):
-        raise PlanFileError(f"{where} is {value!r:.60}", expected=f"a value of type {wanted.__name__}")
-    return value
-
-
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-_PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean"}
 
 
 def schema_of(kind: type) -> dict[str, Any]:
@@ -250,49 +207,4 @@ def schema_of(kind: type) -> dict[str, Any]:
     It says which keys there are, their types and ranges; what several keys say together is judged when the
     file is read.
     """
-    parts: dict[str, Any] = {}
-    made = _schema(kind, parts)
-    return {"$schema": DIALECT, "title": kind.__name__, **made, **({"$defs": parts} if parts else {})}
-
-
-def _schema(kind: Any, parts: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of a type; schemas that others point at are added to `parts`."""
-    if is_dataclass(kind):
-        return _of_class(typing.cast(type, kind), parts)
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in ARRAY_TYPES:
-        return {"type": "array"}
-    if origin is tuple:
-        return {"type": "array", "items": _schema(arguments[0], parts)}
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        return {"type": "object", "additionalProperties": _schema(arguments[1], parts)}
-    if origin in (typing.Union, types.UnionType):
-        return {"anyOf": [_schema(arguments[0], parts), {"type": "null"}]}
-    return {"type": _PLAIN[kind]}
-
-
-def _of_class(kind: type, parts: dict[str, Any]) -> dict[str, Any]:
-    if not issubclass(kind, Record):
-        found = TypeAdapter(kind).json_schema()
-        parts |= found.pop("$defs", {})
-        return found
-    hints, keys = typing.get_type_hints(kind), fields(typing.cast(Any, kind))
-    return {
-        "type": "object",
-        "properties": {
-            each.name: _array(each.metadata["shape"])
-            if "shape" in each.metadata
-            else _schema(hints[each.name], parts)
-            for each in keys
-        },
-        "required": [each.name for each in keys if not each.metadata.get(LEFT_OUT_IF_EMPTY)],
-        "additionalProperties": False,
-    }
-
-
-def _array(shape: tuple[int | None, ...]) -> dict[str, Any]:
-    """Return the schema of an array of numbers, row in row; None stands for any length."""
-    if not shape:
-        return {"type": "number"}
-    length = {} if shape[0] is None else {"minItems": shape[0], "maxItems": shape[0]}
-    return {"type": "array", "items": _array(shape[1:]), **length}
+    return {"$schema": DIALECT, "title": kind.__name__, **TypeAdapter(kind).json_schema()}

@@ -3,11 +3,21 @@
 from collections.abc import Mapping
 from dataclasses import fields
 from types import MappingProxyType
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import (
+    float_schema,
+    list_schema,
+    no_info_after_validator_function,
+    typed_dict_field,
+    typed_dict_schema,
+)
 
 from anatomy.base.errors import PlanFileError
+from anatomy.base.records import LEFT_OUT_IF_EMPTY
 from anatomy.base.typed import Array
 from anatomy.grid import read_only
 
@@ -23,7 +33,26 @@ def shaped(*shape: int | None, dtype: type = np.float64) -> dict[str, Any]:
 
 
 class Record:
-    """Makes arrays read-only float64 (or int64) of the declared shape, and mappings read-only and sorted."""
+    """Makes arrays read-only float64 (or int64) of the declared shape, and mappings read-only and sorted.
+
+    Pydantic reads one from JSON: all its keys but those left out if empty, no others, and finite numbers.
+    """
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        hints = get_type_hints(cls)
+        keys = {
+            each.name: typed_dict_field(
+                _numbers(*each.metadata["shape"])
+                if "shape" in each.metadata
+                else handler.generate_schema(hints[each.name]),
+                required=not each.metadata.get(LEFT_OUT_IF_EMPTY),
+            )
+            for each in fields(cls)  # type: ignore[arg-type]
+        }
+        return no_info_after_validator_function(
+            lambda stated: cls(**stated), typed_dict_schema(keys, strict=True, extra_behavior="forbid")
+        )
 
     def __post_init__(self) -> None:
         for item in fields(self):  # type: ignore[arg-type]
@@ -35,6 +64,13 @@ class Record:
             else:
                 continue
             object.__setattr__(self, item.name, value)
+
+
+def _numbers(*shape: int | None) -> CoreSchema:
+    """Return the schema of an array of numbers, row in row; its records judge whether they are whole."""
+    if not shape:
+        return float_schema(strict=True, allow_inf_nan=False)
+    return list_schema(_numbers(*shape[1:]), strict=True, min_length=shape[0], max_length=shape[0])
 
 
 def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: str) -> Array:

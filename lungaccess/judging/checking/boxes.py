@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 class Select:
     """Tells from labels which voxels belong to a structure: those that have any of some bits.
 
-    Airway voxels of `but_branch` are left out; with `complement` all other voxels are taken instead.
+    Airway voxels of the branches `but` are left out; with `complement` all other voxels are taken instead.
     """
 
     bits: int
-    but_branch: int | None = None
+    but: tuple[int, ...] = ()
     complement: bool = False
 
     def __call__(self, labels: Labels) -> Bool:
         """Return which voxels are selected."""
         found = (labels & self.bits) != 0
-        if self.but_branch is not None:
-            found &= ((labels & structures.AIRWAY) == 0) | (branch_of(labels) != self.but_branch)
+        if self.but:
+            found &= ((labels & structures.AIRWAY) == 0) | ~np.isin(branch_of(labels), self.but)
         return np.asarray(found != self.complement)
 
 
@@ -45,9 +45,9 @@ def has(bits: int) -> Select:
     return Select(bits=bits)
 
 
-def airway_except(branch: int) -> Select:
-    """Select the airway voxels that do not belong to `branch`."""
-    return Select(bits=structures.AIRWAY, but_branch=branch)
+def airway_except(*branches: int) -> Select:
+    """Select the airway voxels that belong to none of some branches."""
+    return Select(bits=structures.AIRWAY, but=branches)
 
 
 not_lumen = Select(bits=structures.LUMEN, complement=True)
@@ -169,7 +169,7 @@ class Tiles:
             for tile in self._tiles_between(low, high)
             for key in _keys(select)
             for cluster in self._clusters(key, tile)
-            if (select.but_branch is None or cluster.branch != select.but_branch)
+            if cluster.branch not in select.but
             and ((cluster.low_mm <= high) & (cluster.high_mm >= low)).all(axis=1).any()
         ]
 

@@ -38,6 +38,7 @@ from lungaccess.judging.checking.shapes import Curve, distance_to_polyline, radi
 from lungaccess.judging.checking.wall_exit import Exit, check_exit, check_wall_run
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
+from stages.needle.device import Needle
 from stages.tube.device import AIRWAY_MM, Tube
 
 if TYPE_CHECKING:
@@ -88,14 +89,8 @@ def _strains(tube: Tube, behind_mm: Float, bent: Float, inserted_mm: float) -> I
 
 def bent_at_rest(tube: Tube) -> list[tuple[float, float, float]]:
     """Return the parts of a tube: begin and end in mm from its tip, and precurvature in 1/mm."""
-    parts, begin = [], 0.0
-    for piece in reversed(tube.bent_pieces):
-        parts.append((begin, begin + piece.length_mm, piece.precurvature_per_mm))
-        begin += piece.length_mm
-    if tube.curved_length_mm > 0.0:
-        parts.append((0.0, tube.curved_length_mm, tube.precurvature_per_mm))
-        begin = tube.curved_length_mm
-    return [*parts, (begin, np.inf, 0.0)]
+    parts = [(begin, end, curvature) for begin, end, curvature, _direction in _pieces(tube)]
+    return [*parts, (parts[-1][1], np.inf, 0.0)]
 
 
 def slots_at(segments: Sequence[SlottedSegment], from_tip_mm: float) -> tuple[float, float]:
@@ -121,22 +116,24 @@ def _check_handle(plan: Plan, inserted_mm: tuple[float, ...], found: Findings) -
     device, tubes = plan.system.scope, plan.system.tubes
     stiffness = device.bending_stiffness_n_mm2
     for tube, inserted in zip(reversed(tubes.nested), inserted_mm, strict=True):
-        plain = 1e3 * tube.youngs_modulus_gpa * np.pi / 64.0
-        plain *= tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4
         inside = np.append(np.arange(inserted, inserted + device.bending_length_mm, STEP_MM), inserted)
-        stiffness += plain * max(slots_at(tube.slotted_segments, float(at))[0] for at in inside)
+        stiffness += _stiffest_n_mm2(tube, tube.outer_diameter_mm, inside)
     shaft = plan.system.needle
     if shaft is not None and plan.system.needle_preloaded:
         passes = inserted_mm[-1] + shaft.max_length_mm + device.bending_length_mm
-        plain = 1e3 * shaft.youngs_modulus_gpa * np.pi / 64.0
-        plain *= shaft.diameter_mm**4 - shaft.inner_diameter_mm**4
-        places = np.arange(0.0, passes, STEP_MM)
-        stiffness += plain * max(slots_at(shaft.slotted_segments, float(at))[0] for at in places)
+        stiffness += _stiffest_n_mm2(shaft, shaft.diameter_mm, np.arange(0.0, passes, STEP_MM))
     bend = float(plan.scope.states[-1, 2])
     limit = np.deg2rad(device.bend_up_deg if bend >= 0.0 else device.bend_down_deg)
     detail = "bend that the handle sets so that section, tubes and needle bend as planned"
     wanted = abs(bend) * stiffness / device.bending_stiffness_n_mm2
     found.at_most("scope.handle", wanted, float(limit), "rad", detail, 1e-6)
+
+
+def _stiffest_n_mm2(shaft: Tube | Needle, diameter_mm: float, from_tip_mm: Float) -> float:
+    """Return the greatest bending stiffness of a shaft at places of it."""
+    plain = 1e3 * shaft.youngs_modulus_gpa * np.pi / 64.0
+    plain *= diameter_mm**4 - shaft.inner_diameter_mm**4
+    return plain * max(slots_at(shaft.slotted_segments, float(at))[0] for at in from_tip_mm)
 
 
 WALL_ZONE_MM = 1.0
@@ -230,12 +227,21 @@ def _check_out_of_lumen(environment: Environment, curve: Curve, way_out: Exit, f
 
 def _first_contact(lung: "Lung", curve: Curve, way_out: Exit, plan: Plan) -> int:
     """Return the frame from which on, up to the exit, the tube's rim is never wholly in the lumen."""
-    phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
-    frames = curve.frames[: way_out.frame + 1, None, :3]
     radius = shapes.radius_at(plan, curve.arc_mm[: way_out.frame + 1])
+    return last_wet(labels_at(lung, rim(curve.frames[: way_out.frame + 1], radius)))
+
+
+def rim(frames: Float, radius_mm: Float) -> Float:
+    """Return `RIM_POINTS` points around the axis at each of S frames, `(S RIM_POINTS, 3)`."""
+    phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
+    frames = frames[:, None, :3]
     across = np.cos(phi)[:, None] * frames[..., 0] + np.sin(phi)[:, None] * frames[..., 1]
-    rim = frames[..., 3] + radius[:, None, None] * across
-    wet = ((labels_at(lung, rim) & structures.LUMEN) != 0).reshape(len(radius), RIM_POINTS).all(axis=1)
+    return np.asarray(frames[..., 3] + radius_mm[:, None, None] * across).reshape(-1, 3)
+
+
+def last_wet(labels: Labels) -> int:
+    """Return the last frame of which the rim is wholly in the lumen, 0 without one."""
+    wet = ((labels & structures.LUMEN) != 0).reshape(-1, RIM_POINTS).all(axis=1)
     return int(np.flatnonzero(wet)[-1]) if wet.any() else 0
 
 

@@ -11,15 +11,7 @@ from numpy.typing import ArrayLike
 
 from anatomy import structures
 from anatomy.base.typed import Bool, Float
-from lungaccess.judging.checking.boxes import (
-    Environment,
-    Select,
-    airway_except,
-    branch_of,
-    has,
-    labels_at,
-    region_around,
-)
+from lungaccess.judging.checking.boxes import Environment, Select, airway_except, branch_of, has, labels_at
 from lungaccess.judging.checking.clearances import (
     CLEARANCE_TOLERANCE_MM,
     REACH_MM,
@@ -129,22 +121,38 @@ def _check_containment(plan: Plan, lung: "Lung", curve: Curve, found: Findings) 
     found.true("needle.containment", not hit.any(), f"{int(hit.sum())} samples in an obstacle")
 
 
+Case = tuple[str, Select, Bool, float]
+"""The name of a structure, which voxels it has, frames of the needle, and the distance that they keep."""
+
+
 def _check_clearance(
     plan: Plan, device: Needle, environment: Environment, curve: Curve, found: Findings
 ) -> None:
-    """The needle, as capsules padded by the sagitta, keeps radius and margins from every structure."""
-    radius = 0.5 * device.diameter_mm
-    required = radius + plan.system.margins.total_mm
+    """The needle keeps radius and margins from every structure, and what is stated of that is true."""
+    required = device.radius_mm + plan.system.margins.total_mm
     everywhere = np.ones(len(curve.points), dtype=bool)
     exempt = curve.arc_mm < plan.exemption.needle_length_mm - TINY_MM
-    cases: list[tuple[str, Select, np.ndarray, float]] = [
+    cases: list[Case] = [
         ("vessel", has(structures.VESSEL), everywhere, required),
         ("outside", has(structures.OUTSIDE), everywhere, required),
         ("airway", has(structures.AIRWAY), ~exempt, required),
         ("other_airway", airway_except(plan.exemption.branch), exempt, required),
-        ("lumen", has(structures.LUMEN), exempt, radius),
+        ("lumen", has(structures.LUMEN), exempt, device.radius_mm),
         ("fissure", has(structures.FISSURE), everywhere, required),
     ]
+    nearest = _check_clear(cases, environment, curve, found, fissures=plan.fissures_are_obstacles)
+    # Towards the airway counts all of it behind the exempt length, and other branches before.
+    airway = min(nearest.pop("airway", REACH_MM), nearest.pop("other_airway", REACH_MM))
+    nearest.pop("lumen", None)
+    diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
+    for name, exact in {**nearest, "airway": airway}.items():
+        check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
+
+
+def _check_clear(
+    cases: Sequence[Case], environment: Environment, curve: Curve, found: Findings, *, fissures: bool
+) -> dict[str, float]:
+    """Record whether a needle, as capsules padded by the sagitta, keeps its distances; return the least."""
     nearest: dict[str, float] = {}
     for name, select, where, needed in structures_known(cases, "needle", environment.lung, found):
         first, last = run_of_frames(where)
@@ -156,14 +164,9 @@ def _check_clearance(
             curve.points[first : last + 1],
             needed + curve.sagitta_mm[first:last],
             found,
-            limited=name != "fissure" or plan.fissures_are_obstacles,
+            limited=name != "fissure" or fissures,
         )
-    # Towards the airway counts all of it behind the exempt length, and other branches before.
-    airway = min(nearest.pop("airway", REACH_MM), nearest.pop("other_airway", REACH_MM))
-    nearest.pop("lumen", None)
-    diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
-    for name, exact in {**nearest, "airway": airway}.items():
-        check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
+    return nearest
 
 
 def run_of_frames(where: np.ndarray) -> tuple[int, int]:
@@ -211,35 +214,25 @@ def check_needle_alone(
                 "target.reached", miss, POSITION_TOLERANCE_MM, "mm", "end of the needle to the target"
             )
             exempt = curve.arc_mm < exempt_mm - TINY_MM
-            _check_clear(Environment(lung), system, curve, exempt, found)
-            _check_exit(lung, system, curve, exempt, branches, at_wall, found)
+            environment = Environment(lung)
+            _check_alone(environment, system, curve, exempt, found)
+            _check_exit(environment, system, curve, exempt, branches, at_wall, found)
     return found.report()
 
 
-def _check_clear(
+def _check_alone(
     environment: Environment, system: System, curve: Curve, exempt: Bool, found: Findings
 ) -> None:
     """Everything but the airway along all of the needle, and the airway beyond the exempt length."""
     everywhere = np.ones(len(curve.points), dtype=bool)
     required = system.track_radius_mm + system.margins.total_mm
-    cases = [
-        ("vessel", structures.VESSEL, everywhere),
-        ("outside", structures.OUTSIDE, everywhere),
-        ("fissure", structures.FISSURE, everywhere),
-        ("airway", structures.AIRWAY, ~exempt),
+    cases: list[Case] = [
+        ("vessel", has(structures.VESSEL), everywhere, required),
+        ("outside", has(structures.OUTSIDE), everywhere, required),
+        ("fissure", has(structures.FISSURE), everywhere, required),
+        ("airway", has(structures.AIRWAY), ~exempt, required),
     ]
-    for name, bits, where in structures_known(cases, "needle", environment.lung, found):
-        first, last = run_of_frames(where)
-        if last - first < 1:
-            continue
-        check_clear(
-            f"needle.clearance.{name}",
-            environment.boxes(has(bits), REACH_MM),
-            curve.points[first : last + 1],
-            required + curve.sagitta_mm[first:last],
-            found,
-            limited=name != "fissure" or not system.fissures_allowed,
-        )
+    _check_clear(cases, environment, curve, found, fissures=not system.fissures_allowed)
     labels = labels_at(environment.lung, curve.points)
     forbidden = structures.obstacle_bits(not system.fissures_allowed)
     hit = (labels & np.where(exempt, forbidden & ~structures.AIRWAY, forbidden)) != 0
@@ -247,7 +240,7 @@ def _check_clear(
 
 
 def _check_exit(
-    lung: "Lung",
+    environment: Environment,
     system: System,
     curve: Curve,
     exempt: Bool,
@@ -259,12 +252,8 @@ def _check_exit(
     if not exempt.any():
         return
     points, arc = curve.points[exempt], curve.arc_mm[exempt]
-    region = region_around(lung, points, REACH_MM)
-    airway = (region.labels & structures.AIRWAY) != 0
-    others = airway & ~np.isin(branch_of(region.labels), list(branches))
-    required = system.track_radius_mm + system.margins.total_mm
-    gap = float(_box_distance(points, region.grid.lps(np.argwhere(others)), lung).min())
-    tolerance = CLEARANCE_TOLERANCE_MM
+    required, tolerance = system.track_radius_mm + system.margins.total_mm, CLEARANCE_TOLERANCE_MM
+    gap = float(environment.boxes(airway_except(*branches), REACH_MM).distance_mm(points).min())
     found.at_least("needle.clearance.other_airway", gap, required, "mm", "to branches not pierced", tolerance)
     kept = np.full(len(points), system.track_radius_mm)
     if at_wall:
@@ -273,23 +262,10 @@ def _check_exit(
         points, kept = points[arc >= WALL_ZONE_MM - TINY_MM], kept[arc >= WALL_ZONE_MM - TINY_MM]
     if not len(points):
         return
-    lumen = region.grid.lps(np.argwhere((region.labels & structures.LUMEN) != 0))
-    distance = _box_distance(points, lumen, lung)
+    distance = environment.boxes(has(structures.LUMEN), REACH_MM).distance_mm(points)
     worst = int((distance - kept).argmin())
     found.at_least(
         "needle.clearance.lumen", float(distance[worst]), float(kept[worst]), "mm", "near the exit", tolerance
     )
-    outside = (labels_at(lung, points) & structures.LUMEN) == 0
+    outside = (labels_at(environment.lung, points) & structures.LUMEN) == 0
     found.true("needle.not_in_lumen", outside.all(), f"{int((~outside).sum())} samples in an airway")
-
-
-def _box_distance(points: Float, centres: Float, lung: "Lung") -> Float:
-    """Return the distance `(N,)` of points from voxels as solid boxes, at most `REACH_MM`."""
-    axes = lung.grid.lps_from_ijk[:3, :3] / lung.grid.spacing_mm
-    half = 0.5 * lung.grid.spacing_mm
-    least = np.full(len(points), REACH_MM)
-    for number, point in enumerate(points):
-        aside = np.abs((centres - point) @ axes) - half
-        gaps = np.linalg.norm(np.maximum(aside, 0.0), axis=1)
-        least[number] = min(least[number], gaps.min(initial=REACH_MM))
-    return least

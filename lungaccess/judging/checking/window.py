@@ -17,7 +17,7 @@ from anatomy.base.typed import Float
 from anatomy.meshes import MeshDistance, SurfaceMesh
 from lungaccess.judging.checking import shapes
 from lungaccess.judging.checking.boxes import Environment, Select, airway_except, has, labels_at, not_lumen
-from lungaccess.judging.checking.deployment import OUT_OF_LUMEN_MM, RIM_POINTS, WALL_ZONE_MM
+from lungaccess.judging.checking.deployment import OUT_OF_LUMEN_MM, WALL_ZONE_MM, last_wet, rim
 from lungaccess.judging.checking.findings import Findings
 from lungaccess.judging.checking.outcome import forbidden_bits
 from lungaccess.judging.checking.shapes import Curve, cut_at, integrate
@@ -354,14 +354,9 @@ def _touching(
     plan: Plan, environment: Environment, breath: Breath, curve: Curve, phase: float, strays: Float
 ) -> int:
     """Return how many samples from the last contact with the wall on have an obstacle behind it too near."""
-    phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
     radius = shapes.radius_at(plan, curve.arc_mm)
-    frames = curve.frames[:, None, :3]
-    across = np.cos(phi)[:, None] * frames[..., 0] + np.sin(phi)[:, None] * frames[..., 1]
-    rim = (frames[..., 3] + (radius + strays)[:, None, None] * across).reshape(-1, 3)
-    labels = labels_at(environment.lung, breath.pulled_back(breath.carried(rim, phase), phase))
-    wet = ((labels & structures.LUMEN) != 0).reshape(len(radius), RIM_POINTS).all(axis=1)
-    first = int(np.flatnonzero(wet)[-1]) if wet.any() else 0
+    around = breath.carried(rim(curve.frames, radius + strays), phase)
+    first = last_wet(labels_at(environment.lung, breath.pulled_back(around, phase)))
     points = breath.carried(curve.points[first:], phase)
     needed = radius[first:] + plan.system.margins.total_mm + plan.tube.clearance_loss_mm + strays[first:]
     boxes = environment.boxes(has(forbidden_bits(plan) & ~structures.AIRWAY), float(needed.max()))

@@ -250,10 +250,8 @@ def steps_table(plan: lazy.Plan, lung: lazy.Lung) -> Table:
         (f"pass {number}", f"{said[:1].upper()}{said[1:]}.")
         for number, said in enumerate(plan.redirections, 2)
     ]
-    made = terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows)
-    made.caption = f"{lazy.handle_words(plan)} {lazy.steps_note(plan, lung)}"
-    made.caption_justify = "left"
-    return made
+    note = f"{lazy.handle_words(plan)} {lazy.steps_note(plan, lung)}"
+    return terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows, note)
 
 
 def _stage_rows(plan: lazy.Plan, lung: lazy.Lung) -> list[terminal.Row]:
@@ -334,10 +332,8 @@ def limits_table(appraisal: lazy.Appraisal) -> Table:
         (each.what, each.found_words, each.bound_words, each.used_words if each.ok else "BROKEN")
         for each in appraisal.limits[: lazy.SHOWN_LIMITS]
     ]
-    made = terminal.table(lazy.LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows)
-    made.caption = "`lungaccess check PLAN PATIENT --all` lists every finding."
-    made.caption_justify = "left"
-    return made
+    more = "`lungaccess check PLAN PATIENT --all` lists every finding."
+    return terminal.table(lazy.LIMITS_TITLE, ("limit", "measured", "needs", "used"), rows, more)
 
 
 def check_tables(report: lazy.CheckReport) -> list[Table]:

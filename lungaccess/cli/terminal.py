@@ -130,10 +130,11 @@ def show_warnings(warnings: Iterable[str]) -> None:
         console.print(Panel(text, title="warnings", title_align="left", border_style="yellow"))
 
 
-def table(title: str, headings: Iterable[str], rows: Iterable[Row]) -> Table:
+def table(title: str, headings: Iterable[str], rows: Iterable[Row], caption: str | None = None) -> Table:
     """Return a plain table; its columns after the first are right-aligned where they hold numbers."""
     listed = list(rows)
     made = bare_table(title)
+    made.caption, made.caption_justify = caption, "left"
     for number, heading in enumerate(headings):
         cells = [row[number] for row in listed]
         numeric = number > 0 and all(_is_number(cell) for cell in cells if cell)

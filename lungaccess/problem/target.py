@@ -122,15 +122,20 @@ def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = No
 
 def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target:
     """Return a target at a point `(3,)` LPS mm; TargetError unless it is finite and in free lung."""
+    point = _point(lps_mm, "target")
+    require_free(lung, point, origin)
+    return Target(lps_mm=read_only(point), origin=origin)
+
+
+def _point(lps_mm: ArrayLike, what: str) -> Float:
     point = np.array(lps_mm, dtype=np.float64)
     if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():
         raise TargetError(
-            f"The target {point.tolist()} is not a point",
-            expected="three finite mm",
+            f"The {what} {point.tolist()} is not a point",
+            expected="three finite numbers, LPS mm",
             remedy="State a point such as lps:-57,131,-520",
         )
-    require_free(lung, point, origin)
-    return Target(lps_mm=read_only(point), origin=origin)
+    return point
 
 
 def nodule_target(lung: Organ, number: int) -> Target:
@@ -228,11 +233,7 @@ class Place:
 
 def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
     """Return what is at a point `(3,)` LPS mm; TargetError if it is not three finite numbers."""
-    point = np.array(lps_mm, dtype=np.float64)
-    if point.shape != (3,) or not (np.abs(point) <= MOST_COORDINATE_MM).all():
-        raise TargetError(
-            f"The place {point.tolist()} is not a point", expected="three finite numbers, LPS mm"
-        )
+    point = _point(lps_mm, "place")
     label = lung.label_at(point)
     structures = {"airway": AIRWAY | LUMEN, "vessel": VESSEL, "pleura": OUTSIDE}
     if lung.has_fissures:

@@ -113,8 +113,9 @@ def _main_bronchi(tree: AirwayTree, lungs: list[Float]) -> tuple[float, float] |
 def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
     """Return how far left of the carina the middle between the lungs lies in front of it and below, mm."""
     low = max(float(carina[2]) - HEART_MM[1], *(float(np.quantile(p[:, 2], 0.03)) for p in lungs))
-    bins = []
-    for points in lungs:
+    left_is_right = lungs[0][:, 0].mean() < lungs[1][:, 0].mean()
+    inner = []
+    for n, points in enumerate(lungs):
         at = points[
             (points[:, 1] <= carina[1])
             & (points[:, 1] >= carina[1] - HEART_MM[0])
@@ -123,16 +124,9 @@ def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
             & (points[:, 2] >= low)
         ]
         lines = np.floor((at[:, 1:] - carina[1:]) / (2.0 * SAMPLE_MM)).astype(np.int64)
-        bins.append((at[:, 0], lines))
-    left_is_right = lungs[0][:, 0].mean() < lungs[1][:, 0].mean()
-    inner = []
-    for n, (x, lines) in enumerate(bins):
-        towards_plus = (n == 0) == left_is_right
-        nearest: dict[tuple[int, int], float] = {}
-        for value, line in zip(x.tolist(), map(tuple, lines.tolist()), strict=True):
-            known = nearest.get(line, value)
-            nearest[line] = max(known, value) if towards_plus else min(known, value)
-        inner.append(nearest)
+        # Of the places on a line the last one counts, which is the nearest to the other lung.
+        order = np.argsort(at[:, 0] if (n == 0) == left_is_right else -at[:, 0])
+        inner.append(dict(zip(map(tuple, lines[order].tolist()), at[order, 0].tolist(), strict=True)))
     shared = inner[0].keys() & inner[1].keys()
     # From fewer lines across the chest no place of the heart is told.
     if len(shared) < 20:

@@ -4,6 +4,7 @@ import os.path
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -272,16 +273,7 @@ class _Gathered:
             # How much of a file lies in the lungs by its header is said once these are known.
             by_index = place(mask, self._basis_grid, self._grid).array
             offset_mm = grid.lps(np.zeros(3)) - self._basis_grid.lps(np.zeros(3))
-            self._later.append(
-                lambda lung: moved(
-                    name,
-                    self._basis,
-                    offset_mm,
-                    found,
-                    share_by_header=_share(found.array, lung),
-                    share_by_index=_share(by_index, lung),
-                )
-            )
+            self._later.append(partial(moved, name, self._basis, offset_mm, found, by_index))
         else:
             self._statements.append(placement(name, role, mask, grid, self._grid, found))
         return np.asarray(found.array)
@@ -293,11 +285,6 @@ class _Gathered:
             lung = self.lobes > 0
         yield from self._statements
         yield from (later(lung) for later in self._later)
-
-
-def _share(mask: Array, lung: Mask | None) -> float | None:
-    count = np.count_nonzero(mask)
-    return None if lung is None or not count else float(np.count_nonzero(mask & lung)) / count
 
 
 def _read_file(
@@ -367,15 +354,7 @@ def placement(name: str, role: str, mask: Mask, grid: Grid, target: Grid, found:
     return " ".join(sentences)
 
 
-def moved(
-    name: str,
-    basis: str,
-    offset_mm: Float,
-    found: Placed,
-    *,
-    share_by_header: float | None,
-    share_by_index: float | None,
-) -> str:
+def moved(name: str, basis: str, offset_mm: Float, found: Placed, by_index: Array, lung: Mask | None) -> str:
     """Say that a mask of as many voxels as another one lies `offset_mm` (3,) away by its header.
 
     The shares tell how much of it is in the lungs by its header, and if it lay where the other one lies.
@@ -385,11 +364,11 @@ def moved(
         f"({', '.join(f'{x:.1f}' for x in offset_mm)}) mm away in LPS: it was placed by its header, "
         "which may be wrong."
     ]
-    if share_by_header is not None or share_by_index is not None:
-        sentences.append(
-            f"By its header {percent(share_by_header or 0.0)} of it lie in the lungs, voxel by voxel "
-            f"{percent(share_by_index or 0.0)}."
-        )
+    counts = [np.count_nonzero(each) for each in (found.array, by_index)]
+    if lung is not None and any(counts):
+        inside = [np.count_nonzero(each & lung) for each in (found.array, by_index)]
+        by_header, by_voxel = (percent(n / max(count, 1)) for n, count in zip(inside, counts, strict=True))
+        sentences.append(f"By its header {by_header} of it lie in the lungs, voxel by voxel {by_voxel}.")
     if found.n_lost:
         sentences.append(f"{found.n_lost} of its {found.n_voxels} voxels lie outside the images.")
     return " ".join(sentences)

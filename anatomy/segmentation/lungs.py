@@ -100,18 +100,7 @@ def segment_lungs(
         _fine_lung(ct, coarse, sides == side, notch, airway, threshold, gas)
         for side, notch in zip((RIGHT, LEFT), added, strict=True)
     )
-    _part(right, left)
-    central = _on_ct(coarse, airway.main)
-    central &= ct.array < threshold
-    return Lungs(
-        left=left,
-        right=right,
-        trachea_seed_ijk=coarse.ct_voxel(airway.seed),
-        central_airway=central,
-        threshold_hu=threshold,
-        scale=scale,
-        warnings=(*airway.warnings, *warnings, *truncation(left | right, ct.grid)),
-    )
+    return _parted(ct, coarse, airway, right, left, threshold, scale, (*airway.warnings, *warnings))
 
 
 def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | None = None) -> Lungs:
@@ -124,17 +113,9 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
     coarse, _, scale, airways = in_hounsfield(CoarseCt.of(ct), seed)
     ct, airway = scale.image(ct), next(airways)
     main = _on_ct(coarse, near(airway.main, WALL_MM, coarse.spacing_mm))
-    sides = [_filled(side, ct.grid) & ~main for side in (left, right)]
-    _part(sides[1], sides[0])
-    return Lungs(
-        left=sides[0],
-        right=sides[1],
-        trachea_seed_ijk=coarse.ct_voxel(airway.seed),
-        central_airway=_on_ct(coarse, airway.main) & (ct.array < FIRST_THRESHOLD_HU),
-        threshold_hu=FIRST_THRESHOLD_HU,
-        scale=scale,
-        warnings=(*scale.warnings(), *airway.warnings, *truncation(sides[0] | sides[1], ct.grid)),
-    )
+    left, right = (_filled(side, ct.grid) & ~main for side in (left, right))
+    said = (*scale.warnings(), *airway.warnings)
+    return _parted(ct, coarse, airway, right, left, FIRST_THRESHOLD_HU, scale, said)
 
 
 def _filled(mask: Mask, grid: Grid) -> Mask:
@@ -273,11 +254,22 @@ def _fine_lung(
     return lung
 
 
-def _part(right: Mask, left: Mask) -> None:
-    """Leave what both closings filled to neither lung: it is the pleura between them."""
+def _parted(
+    ct: Volume, coarse: CoarseCt, airway: CentralAirway, right: Mask, left: Mask, threshold: float,
+    scale: Scale, said: tuple[str, ...],
+) -> Lungs:  # fmt: skip
+    """Return the lungs; what both closings filled is of neither: it is the pleura between them."""
     both = right & left
-    right &= ~both
-    left &= ~both
+    left, right = left & ~both, right & ~both
+    return Lungs(
+        left=left,
+        right=right,
+        trachea_seed_ijk=coarse.ct_voxel(airway.seed),
+        central_airway=_on_ct(coarse, airway.main) & (ct.array < threshold),
+        threshold_hu=threshold,
+        scale=scale,
+        warnings=(*said, *truncation(left | right, ct.grid)),
+    )
 
 
 def truncation(lung: Mask, grid: Grid) -> tuple[str, ...]:

@@ -7,7 +7,6 @@ the diaphragm, which bulges into the lung.
 """
 
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -87,7 +86,7 @@ class _Cube:
 
     def on(self, grid: Grid, inside: Mask) -> Mask:
         """Return voxels of the cube on another grid."""
-        box = grid.window(_corners(self.grid), 0.0)
+        box = grid.window(self.grid.corners_lps, 0.0)
         part = grid.crop([each.start for each in box], [each.stop for each in box])
         whole = np.zeros(grid.shape, dtype=np.bool_, order="F")
         whole[box] = _interpolated(inside, self.grid, part) > 0.5
@@ -210,14 +209,9 @@ def _interpolated(array: Mask | Float32, grid: Grid, at: Grid) -> Float32:
     """Return an image at the voxels of another grid, linear between its own; it goes on as it ends."""
     from scipy.ndimage import affine_transform
 
-    box = grid.window(_corners(at), float(grid.spacing_mm.max()))
+    box = grid.window(at.corners_lps, float(grid.spacing_mm.max()))
     part = grid.crop([each.start for each in box], [each.stop for each in box])
     matrix = part.ijk_from_lps @ at.lps_from_ijk
     values = array[box].astype(np.float32)
     found = affine_transform(values, matrix[:3, :3], matrix[:3, 3], at.shape, order=1, mode="nearest")
     return np.asfortranarray(found)
-
-
-def _corners(grid: Grid) -> Float:
-    """Return the middles of the voxels in the corners of a grid, LPS mm `(8, 3)`."""
-    return np.asarray(grid.lps(list(product(*((0, n - 1) for n in grid.shape)))))

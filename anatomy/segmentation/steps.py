@@ -15,6 +15,7 @@ from anatomy.io.frames import parse_point
 from anatomy.io.images import read_mask, read_volume
 from anatomy.io.mask_values import require_label_values
 from anatomy.io.voxels import OBSTACLE_COST, as_stored, from_stored
+from anatomy.lobes import BORDER, SEEN
 from anatomy.morphology import near
 from anatomy.plausibility import DOUBTFUL, findings_of, require_plausible, warnings_of_findings
 from anatomy.segmentation import folder as folders
@@ -30,7 +31,13 @@ from anatomy.segmentation.nodules import nodule_from_contours, stout_warnings, w
 from anatomy.segmentation.outlining import outline_nodule
 from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import SegmentationRequest
-from anatomy.segmentation.scan_warnings import misplaced, scan_warnings
+from anatomy.segmentation.scan_warnings import (
+    airway_warnings,
+    cut_off,
+    misplaced,
+    scan_warnings,
+    tree_or_error,
+)
 
 Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
@@ -178,7 +185,6 @@ class Steps:
 
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.airway import segment_airway
-            from anatomy.segmentation.scan_warnings import airway_warnings, cut_off
 
             grid = self._folder.grid
             lumen, wall = self._source_mask("airway"), self._source_mask("airway_wall")
@@ -206,8 +212,6 @@ class Steps:
 
     def _tree_of(self, lumen: Mask) -> AirwayTree | AnatomyError:
         """Return the tree of the lumen, which is made once, or why there is none."""
-        from anatomy.segmentation.scan_warnings import tree_or_error
-
         if self._tree is None or self._tree[0] is not lumen:
             self._tell("airway tree")
             self._tree = (lumen, tree_or_error(Volume(grid=self._folder.grid, array=lumen)))
@@ -301,7 +305,6 @@ class Steps:
         key = self._key("lobes", sources=names, of=made_of, ct=self._ct_digest, by_hand=by_hand)
 
         def compute() -> tuple[Images, dict[str, Any]]:
-            from anatomy.lobes import BORDER, SEEN
             from anatomy.segmentation.lobes import confirmed_lobes, lobes_given, segment_lobes
 
             given = {name: self._source(name).astype(np.uint8) for name in names if name in self._sources}
@@ -392,6 +395,4 @@ class Steps:
 
 
 def _airways(airway: Images) -> Airways:
-    from anatomy.segmentation.airway import Airways
-
     return Airways(lumen=airway["airway"], wall=airway["airway_wall"])

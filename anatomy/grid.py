@@ -103,6 +103,16 @@ class Grid:
         ni, nj, nk = (int(n) for n in np.asarray(shape))
         return cls(shape=(ni, nj, nk), lps_from_ijk=matrix)
 
+    @classmethod
+    def over(cls, low_lps: Float, high_lps: Float, spacing_mm: float) -> Self:
+        """Make a grid of cubic voxels along LPS, whose centres reach from one corner `(3,)` to another."""
+        return cls.from_spacing(np.ceil((high_lps - low_lps) / spacing_mm) + 1, (spacing_mm,) * 3, low_lps)
+
+    @property
+    def centres_lps(self) -> Float:
+        """The middles of all voxels, `(ni, nj, nk, 3)`."""
+        return self.lps(np.moveaxis(np.indices(self.shape), 0, -1))
+
     @property
     def spacing_mm(self) -> Float:
         """Voxel size along i, j, k, `(3,)` mm."""

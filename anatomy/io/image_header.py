@@ -95,10 +95,10 @@ def not_of_components(path: Path, found: int | str, components: int) -> FileErro
     return FileError(f"{path} has {found} numbers a voxel", expected=expected, remedy=remedy)
 
 
-def truncated(path: Path, why: str) -> FileError:
-    """Make the error for a file that ends too early."""
+def truncated(path: Path, why: str, what: str = "truncated") -> FileError:
+    """Make the error for a file that ends too early, or is damaged."""
     return FileError(
-        f"{path} is truncated: {why}", expected="a complete file", remedy="Copy or download the file again"
+        f"{path} is {what}: {why}", expected="a complete file", remedy="Copy or download the file again"
     )
 
 

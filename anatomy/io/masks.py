@@ -364,9 +364,9 @@ def moved(name: str, basis: str, offset_mm: Float, found: Placed, by_index: Arra
         f"({', '.join(f'{x:.1f}' for x in offset_mm)}) mm away in LPS: it was placed by its header, "
         "which may be wrong."
     ]
-    counts = [np.count_nonzero(each) for each in (found.array, by_index)]
+    counts = [int(np.count_nonzero(each)) for each in (found.array, by_index)]
     if lung is not None and any(counts):
-        inside = [np.count_nonzero(each & lung) for each in (found.array, by_index)]
+        inside = [int(np.count_nonzero(each & lung)) for each in (found.array, by_index)]
         by_header, by_voxel = (percent(n / max(count, 1)) for n, count in zip(inside, counts, strict=True))
         sentences.append(f"By its header {by_header} of it lie in the lungs, voxel by voxel {by_voxel}.")
     if found.n_lost:

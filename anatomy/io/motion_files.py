@@ -212,9 +212,8 @@ def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
             remedy="Export the registration in one of them",
         )
     low, high = masks.corners_lps.min(axis=0), masks.corners_lps.max(axis=0)
-    size = [int(n) for n in np.ceil((high - low) / SAMPLE_MM) + 1]
-    grid = Grid.from_spacing(size, (SAMPLE_MM,) * 3, low)
-    numbers = ",".join(repr(float(n)) for n in (*low, *size, *grid.spacing_mm))
+    grid = Grid.over(low, high, SAMPLE_MM)
+    numbers = ",".join(repr(float(n)) for n in (*low, *grid.shape, *grid.spacing_mm))
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "values.npy")
         command = [sys.executable, "-P", transform_values.__file__, str(path.resolve()), numbers, str(out)]
@@ -311,9 +310,9 @@ def _image(path: Path) -> tuple[Any, bool]:
     is_mask = bool(np.isin(values, (0, values.max())).all())
     grid = volume.grid
     low, high = grid.corners_lps.min(axis=0), grid.corners_lps.max(axis=0)
-    coarse = Grid.from_spacing(np.ceil((high - low) / WORKING_MM).astype(int) + 1, (WORKING_MM,) * 3, low)
+    coarse = Grid.over(low, high, WORKING_MM)
     smooth = ndimage.gaussian_filter(values.astype(np.float32), 0.4 * WORKING_MM / grid.spacing_mm)
-    index = grid.ijk(coarse.lps(np.moveaxis(np.indices(coarse.shape), 0, -1)))
+    index = grid.ijk(coarse.centres_lps)
     out = ndimage.map_coordinates(smooth, np.moveaxis(index, -1, 0), order=1, mode="nearest")
     if is_mask:
         inside = out > 0.5 * float(values.max())

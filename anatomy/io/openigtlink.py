@@ -58,34 +58,30 @@ def require_pyigtl() -> Any:
 
 def pose_message(name: str, lps_from_device: Float, time_s: float) -> bytes:
     """Return a TRANSFORM: a pose `(4, 4)` LPS mm of a device of a name of at most 20 letters."""
-    matrix = LPS_FROM_RAS @ lps_from_device
-    made = require_pyigtl().TransformMessage(matrix, timestamp=time_s, device_name=_name(name))
-    return bytes(made.pack())
+    return _packed("TransformMessage", name, time_s, LPS_FROM_RAS @ lps_from_device)
 
 
 def points_message(name: str, points_lps: Float, labels: Sequence[str], time_s: float) -> bytes:
     """Return a POINT: points `(N, 3)` LPS mm, N at least 1, with a label each."""
     points = points_lps @ LPS_FROM_RAS[:3, :3].T
-    made = require_pyigtl().PointMessage(
-        points, names=[_ascii(label) for label in labels], timestamp=time_s, device_name=_name(name)
-    )
-    return bytes(made.pack())
+    return _packed("PointMessage", name, time_s, points, names=[_ascii(label) for label in labels])
 
 
 def text_message(name: str, text: str, time_s: float) -> bytes:
     """Return a STRING; letters beyond ASCII become question marks."""
-    made = require_pyigtl().StringMessage(_ascii(text), timestamp=time_s, device_name=_name(name))
-    return bytes(made.pack())
+    return _packed("StringMessage", name, time_s, _ascii(text))
 
 
 def _ascii(text: str) -> str:
     return text.encode("ascii", "replace").decode("ascii")
 
 
-def _name(name: str) -> str:
-    if not 0 < len(_ascii(name)) <= NAME_BYTES:
+def _packed(kind: str, name: str, time_s: float, content: Any, **others: Any) -> bytes:
+    device = _ascii(name)
+    if not 0 < len(device) <= NAME_BYTES:
         raise SettingsError(f"The device name {name!r} is too long or empty", expected="1 to 20 letters")
-    return _ascii(name)
+    made = getattr(require_pyigtl(), kind)(content, **others, timestamp=time_s, device_name=device)
+    return bytes(made.pack())
 
 
 class Decoder:

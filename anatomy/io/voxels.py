@@ -49,15 +49,9 @@ def inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
                     return
                 decoder = zlib.decompressobj(_ANY_HEADER)
     except zlib.error as error:
-        raise _damaged(path, f"its compressed data are corrupt ({error})") from error
+        raise truncated(path, f"its compressed data are corrupt ({error})", "damaged") from error
     if not decoder.eof:
-        raise _damaged(path, "it ends before its compressed data do")
-
-
-def _damaged(path: Path, why: str) -> FileError:
-    return FileError(
-        f"{path} is damaged: {why}", expected="a complete file", remedy="Copy or download the file again"
-    )
+        raise truncated(path, "it ends before its compressed data do", "damaged")
 
 
 def require_whole(header: ImageHeader, stream: Iterator[bytes], path: Path) -> None:

@@ -135,9 +135,8 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
     with the others, and the mean distance of the borders, mm.
     """
     low, high = motion.grid.corners_lps.min(axis=0), motion.grid.corners_lps.max(axis=0)
-    shape = np.ceil((high - low) / SAMPLE_MM).astype(int) + 1
-    lattice = Grid.from_spacing(shape, (SAMPLE_MM,) * 3, low)
-    points = lattice.lps(np.moveaxis(np.indices(lattice.shape), 0, -1)).reshape(-1, 3)
+    lattice = Grid.over(low, high, SAMPLE_MM)
+    points = lattice.centres_lps.reshape(-1, 3)
     there = other.at(points, False)
     lungs = (labels & OUTSIDE) == 0
     still, is_left = grid.values_at(lungs, points, False), points[:, 0] > motion.middle_x_mm

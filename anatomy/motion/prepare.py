@@ -39,9 +39,8 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
     inside = np.argwhere((labels[tuple(slice(None, None, n) for n in steps)] & OUTSIDE) == 0)
     places = grid.lps(inside * steps)
     low, high = places.min(axis=0) - BORDER_MM, places.max(axis=0) + BORDER_MM
-    shape = np.ceil((high - low) / NODE_MM).astype(int) + 1
-    nodes_grid = Grid.from_spacing(shape, (NODE_MM,) * 3, low)
-    at = nodes_grid.lps(np.moveaxis(np.indices(nodes_grid.shape), 0, -1)).reshape(-1, 3)
+    nodes_grid = Grid.over(low, high, NODE_MM)
+    at = nodes_grid.centres_lps.reshape(-1, 3)
     is_left = places[:, 0] > middle_x_mm
     if not is_left.any() or is_left.all():
         raise AnatomyError(
@@ -216,7 +215,7 @@ def _at_masks(source: MotionSource, field: At, places: Float) -> tuple[Float, fl
 
 def _near_lung(labels: Labels, grid: Grid, nodes_grid: Grid, side: int, middle_x_mm: float) -> Mask:
     """Return the nodes that lie in a lung."""
-    points = nodes_grid.lps(np.moveaxis(np.indices(nodes_grid.shape), 0, -1))
+    points = nodes_grid.centres_lps
     index = np.rint(grid.ijk(points)).astype(int)
     within = ((index >= 0) & (index < np.asarray(grid.shape))).all(axis=-1)
     held = labels[tuple(np.clip(index, 0, np.asarray(grid.shape) - 1).reshape(-1, 3).T)]

@@ -147,10 +147,8 @@ class PhantomBreathing:
         """Return grid and vectors `(ni, nj, nk, 3)` of the displacement field from end-exhale."""
         lungs = phantom.grid.lps(np.argwhere(phantom.images.lung.array))
         low, high = lungs.min(axis=0) - BORDER_MM, lungs.max(axis=0) + BORDER_MM
-        shape = np.ceil((high - low) / FIELD_MM).astype(int) + 1
-        grid = Grid.from_spacing(shape, (FIELD_MM,) * 3, low)
-        places = grid.lps(np.moveaxis(np.indices(grid.shape), 0, -1)).reshape(-1, 3)
-        return grid, self.from_exhale(places).reshape(*grid.shape, 3)
+        grid = Grid.over(low, high, FIELD_MM)
+        return grid, self.from_exhale(grid.centres_lps.reshape(-1, 3)).reshape(*grid.shape, 3)
 
     def source(self, phantom: Phantom) -> MotionSource:
         """Return the motion as it would be read from the field."""

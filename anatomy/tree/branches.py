@@ -110,6 +110,22 @@ def _short_child(
     return max(found, key=lambda child: float(depth_mm[child.nodes[-1]]), default=None)
 
 
+def strands_of(
+    branches: list[NodeBranch], lines: list[tuple[Float, dict[int, int]]], radii_mm: list[Float]
+) -> list[Strand]:
+    """Return branches as points; `lines` are the points `(n, 3)` of each, and where its nodes are in them."""
+    index = {id(branch): b for b, branch in enumerate(branches)}
+    return [
+        Strand(
+            points_lps=points,
+            radius_mm=radius_mm,
+            parent=-1 if branch.parent is None else index[id(branch.parent)],
+            attach=-1 if branch.parent is None else lines[index[id(branch.parent)]][1][branch.attach],
+        )
+        for branch, (points, _), radius_mm in zip(branches, lines, radii_mm, strict=True)
+    ]
+
+
 def assemble(strands: list[Strand], report: TreeReport) -> AirwayTree:
     """Put branches together; generations, lengths along the tree and tangents follow from them."""
     start = np.concatenate(([0], np.cumsum([len(s.radius_mm) for s in strands])))

@@ -9,7 +9,7 @@ from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume
-from anatomy.tree.branches import NodeBranch, Strand, assemble, divide
+from anatomy.tree.branches import NodeBranch, Strand, assemble, divide, strands_of
 from anatomy.tree.depth import exact_depth_mm, inside, segments_inside
 from anatomy.tree.lumen import PreparedLumen, complete, prepare_lumen, require_at_most, tunnels
 from anatomy.tree.skeleton import SkeletonTree, find_trachea, prune, span, spanning_tree, thin
@@ -63,8 +63,7 @@ def tree_from_mask(lumen: Volume) -> AirwayTree:
         voxels_dropped=prepared.voxels_dropped,
         cavity_voxels=prepared.cavity_voxels,
     )
-    tree = assemble(strands_along(voxel_tree, prepared, spacing_mm=0.75), report)
-    return replace(tree, report=replace(report, warnings=warnings_of(tree)))
+    return _tree_of(strands_along(voxel_tree, prepared, spacing_mm=0.75), report)
 
 
 def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> AirwayTree:
@@ -95,16 +94,11 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
     parent = np.array(above)
     mm, radius = skeleton.mm[order], skeleton.depth_mm[order]
     branches = divide(mm, parent, radius, order.index(trunk.nodes[-1]))
-    index = {id(branch): b for b, branch in enumerate(branches)}
-    strands = [
-        Strand(
-            points_lps=mm[branch.nodes],
-            radius_mm=radius[branch.nodes],
-            parent=-1 if branch.parent is None else index[id(branch.parent)],
-            attach=-1 if branch.parent is None else branch.parent.nodes.index(branch.attach),
-        )
-        for branch in branches
-    ]
+    lines = [(mm[each.nodes], {node: at for at, node in enumerate(each.nodes)}) for each in branches]
+    return _tree_of(strands_of(branches, lines, [radius[each.nodes] for each in branches]), report)
+
+
+def _tree_of(strands: list[Strand], report: TreeReport) -> AirwayTree:
     tree = assemble(strands, report)
     return replace(tree, report=replace(report, warnings=warnings_of(tree)))
 
@@ -273,15 +267,11 @@ def _checked(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> t
 
 def _united(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int]:
     """Unite points that coincide and drop edges that then lead nowhere or twice to the same point."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
     # Files store points in single precision; true neighbours are a hundred times farther apart.
     same = KDTree(points).query_pairs(1e-3, output_type="ndarray")
-    n = len(points)
-    links = coo_array((np.ones(len(same)), (same[:, 0], same[:, 1])), shape=(n, n))
-    _, label = connected_components(links, directed=False)
+    label = _piece_of_points(len(points), same)
     _, first, index = np.unique(label, return_index=True, return_inverse=True)
     # Numbered by first occurrence, so that the order of the file is kept.
     order = np.argsort(first)
@@ -291,18 +281,21 @@ def _united(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int
     return points[first[order]], radius[first[order]], mapped
 
 
-def _largest_piece(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int, int, int]:
-    """Keep the connected piece with most points; also count the pieces and points left out."""
+def _piece_of_points(count: int, pairs: Int) -> Int:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    n = len(points)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, label = connected_components(graph, directed=False)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def _largest_piece(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int, int, int]:
+    """Keep the connected piece with most points; also count the pieces and points left out."""
+    label = _piece_of_points(len(points), pairs)
     keep = label == np.argmax(np.bincount(label))
     new = np.cumsum(keep) - 1
     inner = pairs[keep[pairs[:, 0]]] if len(pairs) else pairs
-    return points[keep], radius[keep], new[inner], count - 1, int(n - keep.sum())
+    return points[keep], radius[keep], new[inner], int(label.max()), int(len(points) - keep.sum())
 
 
 def strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: float) -> list[Strand]:
@@ -314,21 +307,12 @@ def strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: fl
     _drop_cap(branches, mm, depth)
     marks = {b.attach for b in branches} | set(np.flatnonzero(voxel_tree.across_gap).tolist())
     marks |= set(voxel_tree.parent[voxel_tree.across_gap].tolist())
-    index = {id(branch): b for b, branch in enumerate(branches)}
     lines = [_resample(branch, voxel_tree, prepared, marks, spacing_mm) for branch in branches]
     ends = np.cumsum([len(points) for points, _ in lines])
     radius = np.split(
         exact_depth_mm(prepared.lumen, voxel_mm, np.concatenate([points for points, _ in lines])), ends[:-1]
     )
-    return [
-        Strand(
-            points_lps=prepared.grid.lps(lines[b][0]),
-            radius_mm=radius[b],
-            parent=-1 if branch.parent is None else index[id(branch.parent)],
-            attach=-1 if branch.parent is None else lines[index[id(branch.parent)]][1][branch.attach],
-        )
-        for b, branch in enumerate(branches)
-    ]
+    return strands_of(branches, [(prepared.grid.lps(points), index) for points, index in lines], radius)
 
 
 def _drop_cap(branches: list[NodeBranch], mm: Float, depth_mm: Float) -> None:

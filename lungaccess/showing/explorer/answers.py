@@ -298,7 +298,7 @@ class Answers:
             ),
         }  # fmt: skip
         if not known:
-            message["packed"] = packed_plan(found, self.lung, "", charts=False)
+            message["packed"] = packed_plan(found, self.lung, "", sections=False)
         kept = KeptPlan(digest=found.digest, text=found.to_json(), curve=tuple(curve))
         return Part(message, plan=kept)
 

@@ -1,6 +1,6 @@
 """A plan in the breath, for its page: the displacement of the lung, and clearances at phases."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,8 +30,6 @@ FIELD_STEP_MM = 0.02
 """Displacements are stored in such steps: finer than anything that is seen or measured."""
 SAMPLES = 21
 """Phases at which clearances are computed: every 5 % of the breath, as often as the check looks."""
-VALUE_STEP_MM = 0.01
-"""Distances at phases are stored in such steps."""
 REACH_MM = 1.4 * CAP_MM
 """Tissue of the masks is looked at this near to the devices: enough for `CAP_MM` where it shrinks by 0.7."""
 
@@ -59,8 +57,8 @@ def field_data(plan: Plan, lung: Lung) -> Packed:
     }
 
 
-def breath_data(plan: Plan, lung: Lung) -> Packed:
-    """Return what carries tubes and needle of a plan, its window, and its clearances at phases."""
+def breath_data(plan: Plan, lung: Lung, found: Mapping[str, Any]) -> Packed:
+    """Return what carries tubes and needle of a plan, its window, and what of `samples` is in no chart."""
     moving, window = Moving.of(plan, lung), plan.window
     return {
         "centre_lps": moving.rigid.centre.tolist(),
@@ -68,18 +66,22 @@ def breath_data(plan: Plan, lung: Lung) -> Packed:
         "gradient": moving.rigid.gradient.tolist(),
         "window": None if window is None else window.phases.tolist(),
         "warning_only": window is not None and window.warning_only,
-        "samples": _samples(plan, lung, moving),
+        "samples": {
+            "phases": found["phases"],
+            "target_mm": found["target_mm"],
+            "margins_mm": [pack(each, "f4") for each in found["margin_mm"]],
+        },
     }
 
 
-def _samples(plan: Plan, lung: Lung, moving: Moving) -> Packed:
+def samples(plan: Plan, lung: Lung) -> dict[str, Any]:
     """Return distances at `SAMPLES` phases: of the axes to each structure, and of their end to the target.
 
-    The exact surfaces of the voxels are deformed, and distances measured to them.  "margin_mm" is as in
-    `deployment.profile`; "spare_mm" the least beyond what is required, on tubes beyond their exit and needle,
+    The exact surfaces of the voxels are deformed, and distances measured to them.  "margin_mm" is what the
+    needle has to spare; "spare_mm" the least beyond what is required, on tubes beyond their exit and needle,
     wherever tissue strays by the window's hysteresis; "allowed_mm" is how far from the target they may end.
     """
-    phases = np.linspace(0.0, 1.0, SAMPLES)
+    moving, phases = Moving.of(plan, lung), np.linspace(0.0, 1.0, SAMPLES)
     points, along, start = profile_points(plan)
     share = 0.0 if plan.window is None else plan.window.hysteresis
     lever = np.linalg.norm(points - plan.scope.lps_from_scope_tip[:3, 3], axis=1)
@@ -95,8 +97,8 @@ def _samples(plan: Plan, lung: Lung, moving: Moving) -> Packed:
     ends = [moving.carried(points[-1:], phase) - moving.moved(target, phase) for phase in phases]
     return {
         "phases": phases.tolist(),
-        "clearance_mm": {name: _whole(values) for name, values in clearance.items()},
-        "margin_mm": _whole(margin[:, -of_needle:]),
+        "clearance_mm": clearance,
+        "margin_mm": margin[:, -of_needle:],
         "spare_mm": {
             name: np.round((v - kept)[:, free].min(axis=1), 3).tolist() for name, v in limited.items()
         },
@@ -105,11 +107,6 @@ def _samples(plan: Plan, lung: Lung, moving: Moving) -> Packed:
             moving.tissue, TOLERANCE_MM if plan.window is None else plan.window.tolerance_mm, float(lever[-1])
         ),
     }
-
-
-def _whole(values: Float) -> Packed:
-    """Return distances `(K, N)` as whole numbers of `VALUE_STEP_MM`, rounded down."""
-    return {"step_mm": VALUE_STEP_MM, "values": pack(np.floor(values / VALUE_STEP_MM).astype(np.int32), "i4")}
 
 
 def clearances_at(plan: Plan, lung: Lung, moving: Moving, phases: Float) -> dict[str, Float]:
@@ -162,11 +159,12 @@ def _least_stretch(moving: Moving, places: Float) -> float:
     return float(np.clip(bounds[near].min(), 0.0, 1.0))
 
 
-def packed_breath(plans: Sequence[Plan], lung: Lung) -> dict[str, Any]:
-    """Return the data of the page for all plans; empty where the first has no window to show."""
-    if shown_window(plans[0], lung) is None:
+def packed_breath(plans: Sequence[Plan], lung: Lung, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the data of the page for all plans with their `samples`; empty where the first has none."""
+    if not found[0]:
         return {}
-    return {"breath": {**field_data(plans[0], lung), "plans": [breath_data(each, lung) for each in plans]}}
+    data = [breath_data(each, lung, sampled) for each, sampled in zip(plans, found, strict=True)]
+    return {"breath": {**field_data(plans[0], lung), "plans": data}}
 
 
 def window_headline(plan: Plan, lung: Lung, accepted: bool) -> str:
@@ -248,17 +246,6 @@ def player(window: BreathingWindow | None, accepted: bool) -> str:
         '<input type="range" id="phase" min="0" max="1000" step="1" '
         f'value="{round(1000 * window.masks_phase)}" aria-label="Phase of the breath"></span>'
         '<output id="phase-words" for="phase"></output></div>'
-    )
-
-
-def chart(window: BreathingWindow | None) -> str:
-    """Return the figure of what is to spare over the breath; "" without a window."""
-    if window is None:
-        return ""
-    return (
-        '\n      <figure id="chart-breath"><figcaption>To spare over the breath: clearance of tubes and '
-        "needle beyond what is required, and tolerance of the end "
-        f"(0: none left; at {SAMPLES} phases; shaded: the window)</figcaption></figure>"
     )
 
 

@@ -13,12 +13,11 @@ from anatomy.lung import Lung
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
 from lungaccess.plans.bifurcations import HALF_ANGLE_RAD, camera_aside_mm, route_bifurcations
-from lungaccess.plans.costs import known_costs, obstacle_clearance_mm
+from lungaccess.plans.costs import obstacle_clearance_mm
 from lungaccess.plans.curves import SHORTEST_MM, needle_pieces, tube_pieces, tube_radii
 from lungaccess.plans.insertion import SHOWN_STEP_MM, shown_motion
 from lungaccess.plans.plan import Plan
 from lungaccess.showing.report.pack import Packed, pack
-from stages.needle import Objective
 from stages.scope import ScopeMotion
 from stages.tube import Neighbourhood, points_on_arcs
 
@@ -40,11 +39,10 @@ FARTHEST_MM = 20.0
 """The border of the lumen is looked for along each ray as far as the radius of a wide trachea."""
 
 
-def packed_plan(plan: Plan, lung: Lung, name: str, *, charts: bool = True) -> Packed:
-    """Return everything by which a page shows one plan in motion and along its path.
+def packed_plan(plan: Plan, lung: Lung, name: str, *, sections: bool = True) -> Packed:
+    """Return everything by which a page shows one plan in motion.
 
-    Charts along the path, and cross-sections of the airway around the tip of the scope, take longer than all
-    others.
+    Cross-sections of the airway around the tip of the scope take longer than all others.
     """
     return {
         "name": name,
@@ -58,16 +56,13 @@ def packed_plan(plan: Plan, lung: Lung, name: str, *, charts: bool = True) -> Pa
             "inner": plan.system.tubes.inner.radius_mm,
             "needle": plan.system.track_radius_mm,
         },
-        "scope": {**_scope(plan, lung), **(_around_tip(plan, lung) if charts else {})},
+        "scope": {**_scope(plan, lung), **(_around_tip(plan, lung) if sections else {})},
         "tubes": _tubes(plan),
         "needle": {
             "points": pack(plan.curves().needle.points_lps, "f4"),
             "arc_length_mm": pack(plan.curves().needle.arc_length_mm, "f4"),
+            "margin_mm": pack(_margin_mm(plan, lung), "f4"),
         },
-        "profile": profile(plan, lung) if charts else _margin(plan, lung),
-        "costs": known_costs(plan.costs, has_map=lung.cost is not None),
-        "objective": plan.objective,
-        "objective_words": Objective.of(plan.objective).words,
     }
 
 
@@ -188,44 +183,42 @@ def _insertions(inserted_mm: Sequence[float]) -> Float:
     return np.unique(np.concatenate(parts))
 
 
-def profile(plan: Plan, lung: Lung) -> Packed:
+def profile(plan: Plan, lung: Lung) -> dict[str, Any]:
     """Return clearances, curvature and cost along tubes and needle, by distance from the scope's tip.
 
     "clearance_mm" holds the exact distance of the axis to each structure, voxels as solid boxes, up to
     `CAP_MM`; for "airway" the pierced branch is passed over as long as it is exempt, and up to the exit
-    there is only `NOT_MEASURED`.  "margin_mm" is the least of them against "required_mm" on the needle.
+    there is only `NOT_MEASURED`.  "marks" are the places of the exit and of the needle's start.
     """
     device, (points, along, start) = plan.system.needle, profile_points(plan)
     clearances = _clearances(plan, lung, points, along <= start + plan.exemption.needle_length_mm)
     clearances["airway"][along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
-    required = required_mm(plan, along, start)
-    limited = [v for k, v in clearances.items() if k != "fissure" or plan.fissures_are_obstacles]
-    margin = np.min(limited, axis=0) - required
+    exit_mm = float(plan.tube.exit.arc_length_mm)
     return {
-        "arc_length_mm": pack(along, "f4"),
+        "arc_length_mm": along,
         "tube_mm": start,
-        "exit_mm": float(plan.tube.exit.arc_length_mm),
+        "exit_mm": exit_mm,
+        "marks": {"exit": exit_mm, **({} if plan.needle is None else {"needle": start})},
         "exempt_to_mm": start + float(plan.exemption.needle_length_mm),
         "fissures_are_obstacles": plan.fissures_are_obstacles,
         "cap_mm": CAP_MM,
-        "clearance_mm": {name: pack(values, "f4") for name, values in clearances.items()},
-        "required_mm": pack(required, "f4"),
-        "margin_mm": pack(margin[-len(plan.curves().needle.arc_length_mm) :], "f4"),
-        "curvature_per_mm": pack(_curvature(plan, along), "f4"),
+        "clearance_mm": clearances,
+        "required_mm": required_mm(plan, along, start),
+        "curvature_per_mm": _curvature(plan, along),
         "most_curvature_per_mm": 0.0 if device is None else device.max_curvature_per_mm,
         **_cost_so_far(plan, lung),
     }
 
 
-def _margin(plan: Plan, lung: Lung) -> Packed:
-    """Return what `profile` has of the needle alone, exact up to where its colour on the page ends."""
+def _margin_mm(plan: Plan, lung: Lung) -> Float:
+    """Return what the needle has to spare, mm, exact up to where its colour on the page ends."""
     points, along, start = profile_points(plan)
     needle = slice(len(along) - len(plan.curves().needle.arc_length_mm), None)
     required = required_mm(plan, along, start)[needle]
     exempt = along[needle] <= start + plan.exemption.needle_length_mm
     found = _clearances(plan, lung, points[needle], exempt, float(required.max(initial=0.0)) + COLOURED_MM)
     limited = [v for k, v in found.items() if k != "fissure" or plan.fissures_are_obstacles]
-    return {"margin_mm": pack(np.min(limited, axis=0) - required, "f4")}
+    return np.asarray(np.min(limited, axis=0) - required)
 
 
 def profile_points(plan: Plan) -> tuple[Float, Float, float]:
@@ -287,7 +280,7 @@ def _cost_so_far(plan: Plan, lung: Lung) -> dict[str, Any]:
     if plan.needle is None:
         begin_mm = plan.tube.exit.arc_length_mm
     so_far = {
-        key: pack(np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * steps)]), "f4")
+        key: np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * steps)])
         for key, rate in rates.items()
     }
-    return {"cost_mm": pack(begin_mm + lengths_mm, "f4"), "cost": so_far}
+    return {"cost_mm": begin_mm + lengths_mm, "cost": so_far}

@@ -2,7 +2,7 @@
 
 import csv
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.goals import SUCCESS
 from lungaccess.problem.nodules import target_words
 from lungaccess.problem.procedures import Procedure, load_procedure, procedure_names
-from lungaccess.showing.report.html import breathing, tables, words
-from lungaccess.showing.report.html.deployment import device_points, packed_plan
+from lungaccess.showing.report.html import breathing, charts, tables, words
+from lungaccess.showing.report.html.deployment import device_points, packed_plan, profile
 from lungaccess.showing.report.html.document import scene_figure, slice_controls, write_page
 from lungaccess.showing.report.html.meshes import start_meshes, structure_meshes
 from lungaccess.showing.report.html.tables import resting_section, risk_section
@@ -34,7 +34,7 @@ from lungaccess.showing.report.html.volumes import image_words, page_image
 from stages.needle import StartRegion
 
 MODULES = (
-    "motion.js", "charts.js", "bronchoscopy.js", "tip_section.js", "breath.js", "player.js", "devices.js",
+    "motion.js", "bronchoscopy.js", "tip_section.js", "breath.js", "player.js", "devices.js",
     "device_page.js", "plan.js",
 )  # fmt: skip
 FOLLOW = '<label><input type="checkbox" id="follow" checked> follow the foremost tip</label>'
@@ -91,7 +91,8 @@ def plan_page(
     region = start_region_of(plan, lung) if first.accepted else "Not computed for a refused plan"
     drawn, told = (None, region) if isinstance(region, str) else (region, region.words)
     window = breathing.shown_window(plan, lung)
-    data = page_data(plans, appraisals, lung, chosen, drawn)
+    moved: list[dict[str, Any]] = [{} if window is None else breathing.samples(each, lung) for each in plans]
+    data = page_data(plans, appraisals, lung, chosen, drawn, moved)
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
         "glance": glance_section(plan, first),
@@ -100,7 +101,8 @@ def plan_page(
         "details": words.estimate_details(first.headline),
         "breathing": breathing.window_headline(plan, lung, first.accepted),
         "phase_player": breathing.player(window, first.accepted),
-        "phase_chart": breathing.chart(window),
+        "charts": _charts(plans, lung, moved)
+        + charts.history_figure(cost_history(chosen.cost_over_time), made_small(plan)),
         "phase_slices": breathing.slices_note(window),
         "limits": tables.limits_section(first),
         "summary": summary(plan, lung),
@@ -110,7 +112,6 @@ def plan_page(
             f"The page holds {image_words(data)}"
         ),
         "slice_controls": slice_controls(more=FOLLOW),
-        "made_small": words.text(made_small(plan).capitalize()),
         "plans": _plans_section(plans, appraisals),
         "key_numbers": tables.key_section(plan, lung),
         "findings": tables.check_section(first.check),
@@ -121,6 +122,15 @@ def plan_page(
         "provenance": tables.provenance_section(plan, lung),
     }
     return write_page(path, "plan.html", MODULES, data, parts)
+
+
+def _charts(plans: Sequence[Plan], lung: Lung, moved: Sequence[Mapping[str, Any]]) -> str:
+    """Return the charts of all plans, hidden but for those of the first."""
+    return "".join(
+        f'<div data-of-plan="{n}"{" hidden" if n else ""}>'
+        f"{charts.plan_figures(each, profile(each, lung), found, lung.cost is not None)}</div>"
+        for n, (each, found) in enumerate(zip(plans, moved, strict=True))
+    )
 
 
 def _resting(plan: Plan, lung: Lung, options: PageOptions) -> str:
@@ -178,7 +188,8 @@ def page_data(
     appraisals: Sequence[Appraisal],
     lung: Lung,
     options: PageOptions,
-    region: StartRegion | None = None,
+    region: StartRegion | None,
+    moved: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Return what the scripts of the page draw, as plain JSON values."""
     near = np.concatenate([device_points(each) for each in plans])
@@ -194,9 +205,7 @@ def page_data(
         ],
         "passes": passes,
         **page_image(lung, near, options.ct),
-        "cost_over_time": cost_history(options.cost_over_time),
-        "made_small": made_small(plans[0]),
-        **breathing.packed_breath(plans, lung),
+        **breathing.packed_breath(plans, lung, moved),
     }
 
 

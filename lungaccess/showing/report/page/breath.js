@@ -21,7 +21,8 @@ export class Breath {
     for (let row = 0; row < steps.length; row += nk) {
       for (let k = 0, sum = 0; k < nk; k++) breath.nodes[row + k] = packed.step_mm * (sum += steps[row + k]);
     }
-    breath.plans = await Promise.all(packed.plans.map(unpackedPlan));
+    breath.plans = packed.plans;
+    for (const plan of breath.plans) plan.margins = await Promise.all(plan.samples.margins_mm.map(unpack));
     return breath;
   }
 
@@ -126,17 +127,6 @@ export class Breath {
     const verdict = inside === null ? "not computed" : inside ? good : "✗ not proved";
     return `${(100 * phase).toFixed(0)} % of the breath: ${verdict}; at ${(100 * known).toFixed(0)} % ends ${samples.target_mm[n].toFixed(1)} mm from the target`;
   }
-}
-
-async function unpackedPlan(plan) {
-  const { clearance_mm: clearance, margin_mm: margin } = plan.samples;
-  const rows = async ({ step_mm: step, values }) => {
-    const [count, width] = values.shape, all = Float32Array.from(await unpack(values), (value) => step * value);
-    return Array.from({ length: count }, (_, n) => all.subarray(n * width, (n + 1) * width));
-  };
-  const names = Object.keys(clearance), found = await Promise.all(names.map((name) => rows(clearance[name])));
-  const byName = Object.fromEntries(names.map((name, n) => [name, found[n]]));
-  return { ...plan, samples: { ...plan.samples, clearance: byName, margin: await rows(margin) } };
 }
 
 // Return the rows of the rotation nearest to a matrix of three rows (Newton's iteration for its polar factor).

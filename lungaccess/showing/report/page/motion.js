@@ -18,11 +18,11 @@ export class Motion {
   static async of(packed) {
     const motion = new Motion();
     motion.plan = packed;
-    const { scope, tubes, needle, profile } = packed;
+    const { scope, tubes, needle } = packed;
     Object.assign(motion, await unpackAll({
       route: scope.points, routeMm: scope.arc_length_mm, forward: scope.forward, up: scope.up, insertedMm: scope.inserted_mm,
       sections: scope.sections, shaft: scope.shaft, shaftMm: scope.shaft_mm, tubes: tubes.points, innerMm: tubes.inner_mm,
-      outerMm: tubes.outer_mm, middleMm: tubes.middle_mm, needle: needle.points, needleMm: needle.arc_length_mm, margin: profile.margin_mm,
+      outerMm: tubes.outer_mm, middleMm: tubes.middle_mm, needle: needle.points, needleMm: needle.arc_length_mm, margin: needle.margin_mm,
     }));
     motion.tubePoints = tubes.points.shape[1];
     motion.sectionPoints = scope.sections.shape[1];

@@ -2,9 +2,8 @@
 import { byId, openPage } from "./anatomy_page.js";
 import { Breath } from "./breath.js";
 import { bifurcationsAhead, Bronchoscopy, pausesOf } from "./bronchoscopy.js";
-import { lineChart } from "./charts.js";
 import { DEVICE_COLOURS, planStyle } from "./colours.js";
-import { reportData, unpack } from "./decode.js";
+import { reportData } from "./decode.js";
 import { DevicePage } from "./device_page.js";
 import { deviceLines, showBall, showDevices, showOther } from "./devices.js";
 import { Motion, STAGES } from "./motion.js";
@@ -24,23 +23,15 @@ const DEVICES = [
   { key: "target", name: "Target", colour: TARGET, shown: true },
   { key: "aim", name: "Aim of the devices, beside the moving target", colour: AIM, shown: true },
 ];
-const CHART = {
-  airway: ["airway wall", "#3A9BD5", ""], vessel: ["vessel", "#D81B60", "9 4"],
-  pleura: ["pleura", "#B8860B", "3 4"], fissure: ["fissure", "#785EF0", "12 4 3 4"],
-};
-const COSTS = [["#0072B2", ""], ["#D55E00", "8 4"]];
 const BREATH_S = 5;
 const MOST_ACROSS_MM = 60;
 const AIM_MM = 1.1, ABOVE_CARINA_MM = 30;
-// The chart of distances reaches to so many times what is required, or what is nearest.
-const CHART_ROOM = 3;
 
 class PlanPage extends DevicePage {
   constructor(data) {
     super(data);
     this.player = new Player(this, () => (byId("pause").checked ? pausesOf(this.motion) : []));
     this.shown = Object.fromEntries(DEVICES.map(({ key, shown }) => [key, shown]));
-    this.cursors = [];
     this.phase = 0;
     this.exhaling = false;
   }
@@ -66,7 +57,6 @@ class PlanPage extends DevicePage {
     this.openSlices([...Object.keys(STANDARD), "across", "along"]);
     this.linkSlices({ placed: () => this.follow(false) });
     byId("along").value = this.motion.hasNeedle ? "needle" : "scope";
-    await this.drawCharts();
     this.draw();
   }
 
@@ -124,9 +114,8 @@ class PlanPage extends DevicePage {
       byId("followed").append(new Option(name, n));
     });
     byId("followed-row").hidden = this.data.plans.length < 2;
-    byId("followed").addEventListener("change", async (event) => {
+    byId("followed").addEventListener("change", (event) => {
       this.followed = Number(event.target.value);
-      await this.drawCharts();
       this.redraw();
     });
   }
@@ -151,7 +140,7 @@ class PlanPage extends DevicePage {
   // Let the slices go with the foremost tip, or with their cross.
   follow(on) {
     byId("follow").checked = on;
-    for (const move of this.cursors) move(this.motion.alongMm(this.state));
+    this.moveCursors(this.motion.alongMm(this.state));
   }
 
   // Go to where the scope stands before the next bifurcation, or the one before.
@@ -207,7 +196,8 @@ class PlanPage extends DevicePage {
       if (!this.leavesOut(byId("inside"))) this.bronchoscopy.draw(state, this.motion);
       this.drawScene();
     }
-    for (const move of this.cursors) move(this.motion.alongMm(state));
+    this.showCharts();
+    this.moveCursors(this.motion.alongMm(state));
     if (this.views && !this.leavesOut(this.slices.axial.canvas)) this.drawSlices();
   }
 
@@ -222,7 +212,7 @@ class PlanPage extends DevicePage {
     const motion = this.motions[number];
     if (this.share === 0) return motion.at(position);
     const { n } = this.breath.sample(number, this.phase);
-    return this.breath.carried(motion.at(position, this.breath.plans[number].samples.margin[n]), number, this.phase);
+    return this.breath.carried(motion.at(position, this.breath.plans[number].margins[n]), number, this.phase);
   }
 
   get share() {
@@ -243,16 +233,14 @@ class PlanPage extends DevicePage {
   // Bring words, clock, charts, surfaces and slices to the phase.
   drawBreath() {
     const { breath, followed, phase, share } = this;
-    const words = breath.words(followed, phase, this.data.plans[followed].accepted), { n } = breath.sample(followed, phase);
+    const words = breath.words(followed, phase, this.data.plans[followed].accepted);
     byId("phase-words").textContent = words;
     byId("phase").setAttribute("aria-valuetext", words);
     const half = this.exhaling ? -phase : phase;
     byId("clock-hand").setAttribute("transform", `rotate(${180 * (half - breath.masksPhase)} 100 92)`);
     if (this.scene) this.scene.share = share;
     if (this.image) this.image.share = share;
-    if (this.moveOverBreath) this.moveOverBreath(100 * phase);
-    const shown = share === 0 ? null : n;
-    if (this.drawClearance && shown !== this.clearanceAt) this.drawClearance(shown);
+    document.body.style.setProperty("--phase", 100 * phase);
   }
 
   drawView() {
@@ -282,7 +270,7 @@ class PlanPage extends DevicePage {
     this.panel.show();
     this.drawTipSection(state);
     byId("slice-place").textContent = `Through ${following ? "the foremost tip, at" : "the cross, at"} LPS ${views.place.map((v) => v.toFixed(1)).join(", ")} mm.`;
-    if (!following) for (const move of this.cursors) move(alongLine(this.devices, views.place).alongMm);
+    if (!following) this.moveCursors(alongLine(this.devices, views.place).alongMm);
   }
 
   // The plane across the foremost tip, or across the devices where they are nearest to the cross.
@@ -315,70 +303,15 @@ class PlanPage extends DevicePage {
     else caption.textContent = "The cross-section at the scope's tip is known in the phase of the masks alone.";
   }
 
-  // Draw what is to spare over the breath, from 0 on: what is nearer than required, or too far, is on the floor.
-  drawOverBreath() {
-    if (!this.breath) return;
-    const { samples, window } = this.breath.plans[this.followed];
-    const xs = samples.phases.map((phase) => 100 * phase), kept = (values) => values.map((mm) => Math.max(mm, 0));
-    const series = Object.entries(samples.spare_mm).map(([key, values]) =>
-      ({ name: CHART[key][0], colour: CHART[key][1], dash: CHART[key][2], xs, ys: kept(values) }));
-    const target = samples.target_mm.map((mm) => samples.allowed_mm - mm);
-    series.push({ name: "target", colour: "#009E73", dash: "1 3", width: 3, xs, ys: kept(target) });
-    this.moveOverBreath = lineChart(byId("chart-breath"), {
-      x: { name: "% of the breath (0: end-exhale, 100: end-inhale)" }, y: { name: "mm to spare" }, series, top: 5,
-      spans: (window || []).map(([from, to]) => ({ from: 100 * from, to: 100 * to })),
-    });
+  // Show the charts of the plan that is followed, of the distances those at the computed phase that is nearest.
+  showCharts() {
+    const sample = this.share === 0 ? "masks" : String(this.breath.sample(this.followed, this.phase).n);
+    for (const each of document.querySelectorAll("[data-of-plan]")) each.hidden = Number(each.dataset.ofPlan) !== this.followed;
+    for (const each of document.querySelectorAll("[data-sample]")) each.hidden = each.dataset.sample !== sample;
   }
 
-  async drawCharts() {
-    const { profile, costs, objective } = this.motion.plan;
-    const along = await unpack(profile.arc_length_mm);
-    const x = { name: "mm beyond the tip of the scope" };
-    const hasNeedle = this.motion.hasNeedle;
-    const marks = [{ at: profile.exit_mm, name: "exit" }, ...(hasNeedle ? [{ at: profile.tube_mm, name: "needle" }] : [])];
-    const clearances = await Promise.all(Object.entries(profile.clearance_mm).map(async ([key, packed]) => {
-      const allowed = key === "fissure" && !profile.fissures_are_obstacles ? " (may be crossed)" : "";
-      return { key, name: CHART[key][0] + allowed, colour: CHART[key][1], dash: CHART[key][2], xs: along, ys: await unpack(packed) };
-    }));
-    const required = { name: "required", colour: "currentColor", xs: along, ys: await unpack(profile.required_mm), stairs: true, width: 1.8 };
-    const cost = await Promise.all(Object.entries(profile.cost).map(async ([key, packed], n) => ({
-      name: key === "cost_map" ? "cost map" : "1/clearance", colour: COSTS[n][0], dash: COSTS[n][1],
-      xs: await unpack(profile.cost_mm), ys: await unpack(packed),
-    })));
-    const bend = { name: "curvature", colour: "#0072B2", xs: along, ys: await unpack(profile.curvature_per_mm), stairs: true };
-    const limit = { name: "limit of the needle", colour: "currentColor", dash: "6 4", width: 1.6,
-      xs: [profile.tube_mm, along[along.length - 1]], ys: [profile.most_curvature_per_mm, profile.most_curvature_per_mm] };
-    // At a computed phase of the breath, or of the masks.
-    this.drawClearance = (sample) => {
-      this.clearanceAt = sample;
-      const known = sample === null ? null : this.breath.plans[this.followed].samples;
-      const series = clearances.map((each) => {
-        const ys = known ? known.clearance[each.key][sample] : each.ys, least = leastOf(ys);
-        return { ...each, ys, least, name: `${each.name}: ${least < profile.cap_mm ? "" : "over "}${least.toFixed(1)} mm at least` };
-      });
-      const nearest = Math.min(...series.map(({ least }) => least)), top = CHART_ROOM * Math.max(nearest, ...required.ys);
-      this.cursors[0] = lineChart(byId("chart-clearance"), {
-        x: known ? { name: `${x.name}, at ${(100 * known.phases[sample]).toFixed(0)} % of the breath` } : x,
-        y: { name: "mm" }, series: [...series, required], top: Math.min(top, profile.cap_mm), marks,
-        spans: [{ from: 0, to: Math.max(profile.exempt_to_mm, 0) }],
-      });
-    };
-    this.cursors = [];
-    this.drawClearance(this.share === 0 ? null : this.breath.sample(this.followed, this.phase).n);
-    this.drawOverBreath();
-    this.cursors.push(
-      lineChart(byId("chart-curvature"), { x, y: { name: "1/mm" }, series: hasNeedle ? [bend, limit] : [bend], marks }),
-      lineChart(byId("chart-cost"), { x, y: { name: "cost so far" }, series: cost }),
-    );
-    byId("cost-total").textContent = `In all ${costs[objective].toPrecision(4)} (${this.motion.plan.objective_words}, as the plan states).`;
-    const history = this.data.cost_over_time;
-    byId("chart-history").hidden = history.length < 2;
-    if (history.length < 2) return;
-    const ys = history.map(([, value]) => value);
-    lineChart(byId("chart-history"), {
-      x: { name: "planning time, s" }, y: { name: this.data.made_small, from: Math.min(...ys) * 0.98 }, top: Math.max(...ys) * 1.02,
-      series: [{ name: "best plan so far", colour: "#0072B2", xs: history.map(([s]) => s), ys, stairs: true }],
-    });
+  moveCursors(mm) {
+    document.body.style.setProperty("--along-mm", mm);
   }
 
   // What a test may read; docs/how_to/report.md names the fields.
@@ -404,9 +337,6 @@ function swatchOf({ colour, bands }) {
   const px = (mm) => `${1.5 * mm}px`, [on, off] = bands;
   return `repeating-linear-gradient(90deg, ${colour} 0 ${px(on)}, #ffffff ${px(on)} ${px(on + off)})`;
 }
-
-// Return the least of distances; below 0 there is none.
-const leastOf = (values) => values.reduce((least, value) => (value >= 0 ? Math.min(least, value) : least), Infinity);
 
 // Return the line of everything that is out, from the scope on.
 function wholeLine({ scope, outer, middle, inner, needle }) {

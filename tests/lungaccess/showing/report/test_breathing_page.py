@@ -21,7 +21,13 @@ from lungaccess.plans.window import BreathingAim, BreathingWindow
 from lungaccess.showing.report.clock import PROVED, sectors, window_png
 from lungaccess.showing.report.html import breathing
 from lungaccess.showing.report.html import breathing as controls
-from lungaccess.showing.report.html.deployment import CAP_MM, packed_plan, profile, profile_points
+from lungaccess.showing.report.html.deployment import (
+    CAP_MM,
+    COLOURED_MM,
+    packed_plan,
+    profile,
+    profile_points,
+)
 from lungaccess.showing.report.html.page_of_plan import summary
 from lungaccess.showing.report.pack import unpack
 from lungaccess.uncertainty.breathing.moving import Moving
@@ -38,8 +44,13 @@ def moving(plan: Plan, breathing_lung: Lung) -> Moving:
 
 
 @pytest.fixture(scope="module")
-def packed(plan: Plan, breathing_lung: Lung) -> dict[str, Any]:
-    return dict(breathing.packed_breath((plan,), breathing_lung)["breath"])
+def samples(plan: Plan, breathing_lung: Lung) -> dict[str, Any]:
+    return breathing.samples(plan, breathing_lung)
+
+
+@pytest.fixture(scope="module")
+def packed(plan: Plan, breathing_lung: Lung, samples: dict[str, Any]) -> dict[str, Any]:
+    return dict(breathing.packed_breath((plan,), breathing_lung, [samples])["breath"])
 
 
 @pytest.fixture(scope="module")
@@ -71,15 +82,15 @@ def test_the_page_stores_the_displacement_finely(packed: dict[str, Any], moving:
 
 
 def test_clearances_in_the_phase_of_the_masks_are_those_of_the_plan(
-    packed: dict[str, Any], plan: Plan, breathing_lung: Lung
+    packed: dict[str, Any], samples: dict[str, Any], plan: Plan, breathing_lung: Lung
 ) -> None:
-    known, samples = profile(plan, breathing_lung), packed["plans"][0]["samples"]
+    known = profile(plan, breathing_lung)
     assert samples["phases"][-1] == packed["masks_phase"] == 1.0
     for name, values in known["clearance_mm"].items():
-        stored = samples["clearance_mm"][name]
-        assert np.abs(stored["step_mm"] * unpack(stored["values"])[-1] - unpack(values)).max() < 0.02
-    margin = samples["margin_mm"]["step_mm"] * unpack(samples["margin_mm"]["values"])
-    assert np.abs(margin[-1] - unpack(known["margin_mm"])).max() < 0.02
+        assert np.abs(samples["clearance_mm"][name][-1] - values).max() < 0.01
+    margin = unpack(packed["plans"][0]["samples"]["margins_mm"][-1])
+    stated = unpack(packed_plan(plan, breathing_lung, "", sections=False)["needle"]["margin_mm"])
+    assert np.abs(np.minimum(margin, COLOURED_MM) - np.minimum(stated, COLOURED_MM)).max() < 0.01
     assert samples["target_mm"][-1] < 0.01
     assert samples["target_mm"][0] > 0.1
 
@@ -120,8 +131,8 @@ def test_the_headline_says_good_and_bad_news(
 def test_a_plan_without_a_window_says_so_and_does_not_move(plan: Plan, breathing_lung: Lung) -> None:
     still = replace(plan, window=None)
     assert "was not computed" in controls.window_headline(still, breathing_lung, True)
-    assert breathing.packed_breath((still,), breathing_lung) == {}
-    assert controls.player(None, True) == controls.chart(None) == controls.slices_note(None) == ""
+    assert breathing.packed_breath((still,), breathing_lung, [{}]) == {}
+    assert controls.player(None, True) == controls.slices_note(None) == ""
 
 
 def test_an_aim_is_drawn_and_told(plan: Plan, breathing_lung: Lung) -> None:
@@ -133,14 +144,14 @@ def test_an_aim_is_drawn_and_told(plan: Plan, breathing_lung: Lung) -> None:
 
 
 def test_what_strays_takes_from_what_is_to_spare(
-    packed: dict[str, Any], plan: Plan, breathing_lung: Lung
+    samples: dict[str, Any], plan: Plan, breathing_lung: Lung
 ) -> None:
     """A share of the distance from the tip of the scope, at which the end of the needle is the farthest."""
     assert plan.window is not None
     share = 0.02
     straying = replace(plan, window=replace(plan.window, hysteresis=share))
     lung = replace(breathing_lung, motion=replace(breathing_lung.motion, hysteresis=share))
-    one, other = packed["plans"][0]["samples"], breathing.breath_data(straying, lung)["samples"]
+    one, other = samples, breathing.samples(straying, lung)
     tip = plan.scope.lps_from_scope_tip[:3, 3]
     farthest_mm = float(np.linalg.norm(profile_points(plan)[0] - tip, axis=1).max())
     for name, values in one["spare_mm"].items():

@@ -127,12 +127,12 @@ def test_text_stands_out_from_its_ground(window: browser.Browser, scheme: str) -
 
 def test_charts_show_what_matters_and_keep_their_height(window: browser.Browser) -> None:
     """The nearest curve takes a good part of the height; text below a chart makes no chart taller."""
-    heights = "return [...document.querySelectorAll('.charts figure > svg')].map((e) => e.clientHeight)"
+    heights = "return [...document.querySelectorAll('.charts svg:has(> svg)')].map((e) => e.clientHeight)"
     before = window.run(heights)
-    window.run("document.getElementById('cost-total').append(' word'.repeat(300))")
+    window.run("document.querySelector('.cost-total').append(' word'.repeat(300))")
     assert window.run(heights) == before
     lowest = window.run(
-        """const curves = [...document.querySelectorAll('#chart-clearance > svg > svg > path')].slice(0, -1);
+        """const curves = [...document.querySelectorAll('.chart-clearance svg > svg > path')].slice(0, -1);
         return Math.max(...curves.map((e) => e.getBBox()).map((b) => b.y + b.height))"""
     )
     # In the lower half of the frame, which goes from 12 down to 226.

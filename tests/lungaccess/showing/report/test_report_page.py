@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.showing.report import pack
 from lungaccess.showing.report.html import (
     breathing,
+    charts,
     deployment,
     document,
     page_of_no_plan,
@@ -101,12 +103,7 @@ def test_scripts_find_only_elements_that_the_page_has() -> None:
         script = document.bundle([*document.SHARED_MODULES, *page.MODULES])
         html = document.asset(template) + document.scene_figure() + document.slice_controls()
         if page is page_of_plan:
-            html += (
-                page_of_plan.FOLLOW
-                + breathing.player(WINDOW, True)
-                + breathing.chart(WINDOW)
-                + breathing.clock_svg(WINDOW, True)
-            )
+            html += page_of_plan.FOLLOW + breathing.player(WINDOW, True) + breathing.clock_svg(WINDOW, True)
         html += page_of_no_plan.PLACES if page is page_of_no_plan else ""
         present = set(re.findall(r'id="([\w-]+)"', html + document.asset("frame.html")))
         wanted = set(re.findall(r'(?:byId|getElementById)\("([\w-]+)"\)', script))
@@ -198,8 +195,7 @@ def test_the_profile_agrees_with_the_plan_and_with_exact_distances(
 ) -> None:
     for plan in plans:
         profile = deployment.profile(plan, small_lung)
-        along = pack.unpack(profile["arc_length_mm"])
-        found = {name: pack.unpack(each) for name, each in profile["clearance_mm"].items()}
+        along, found = profile["arc_length_mm"], profile["clearance_mm"]
         assert set(found) == STRUCTURES
         needle = along > profile["tube_mm"] + 1e-6
         vessel = found["vessel"][needle]
@@ -208,12 +204,10 @@ def test_the_profile_agrees_with_the_plan_and_with_exact_distances(
         )
         end = small_lung.exact_clearance_mm(plan.needle.end_lps[None], VESSEL, cap_mm=deployment.CAP_MM)
         assert vessel[-1] == pytest.approx(end[0], abs=1e-3)
-        margin = pack.unpack(profile["margin_mm"])
-        assert margin.min() >= -1e-3
         assert (found["airway"][along < profile["exit_mm"] - 0.3] == deployment.NOT_MEASURED).all()
-        total = pack.unpack(profile["cost"]["inverse_clearance"])[-1]
+        total = profile["cost"]["inverse_clearance"][-1]
         assert total == pytest.approx(plan.costs["inverse_clearance"], rel=0.02)
-        bend = pack.unpack(profile["curvature_per_mm"])
+        bend = profile["curvature_per_mm"]
         assert bend[-1] == pytest.approx(abs(plan.needle.arcs[-1].curvature_per_mm), rel=1e-5)
         assert bend[needle].max() <= profile["most_curvature_per_mm"] * (1 + 1e-6)
 
@@ -346,14 +340,37 @@ def test_a_notebook_shows_the_page_in_a_frame(
     assert 'sandbox="allow-scripts"' in shown and 'height="500"' in shown
 
 
-def test_a_plan_without_charts_has_the_colours_of_the_needle(
+def test_the_colours_of_the_needle_are_those_of_what_the_charts_have_to_spare(
     plans: tuple[Plan, ...], small_lung: Lung
 ) -> None:
     whole, short = (
-        deployment.packed_plan(plans[0], small_lung, "", charts=charts) for charts in (True, False)
+        deployment.packed_plan(plans[0], small_lung, "", sections=sections) for sections in (True, False)
     )
-    margins = [pack.unpack(each["profile"].pop("margin_mm")) for each in (whole, short)]
+    margin, profile = pack.unpack(short["needle"]["margin_mm"]), deployment.profile(plans[0], small_lung)
+    limited = [
+        v for k, v in profile["clearance_mm"].items() if k != "fissure" or plans[0].fissures_are_obstacles
+    ]
+    known = (np.min(limited, axis=0) - profile["required_mm"])[-len(margin) :]
     most = deployment.COLOURED_MM
-    np.testing.assert_array_equal(*(np.minimum(each, most) for each in margins))
-    assert margins[0].min() < most and f"WIDE_MM = {most:g};" in document.asset("motion.js")
-    assert not short["profile"] and short["scope"].items() <= whole["scope"].items()
+    np.testing.assert_allclose(np.minimum(margin, most), np.minimum(known, most), atol=1e-6)
+    assert -1e-3 <= margin.min() < most and f"WIDE_MM = {most:g};" in document.asset("motion.js")
+    assert short["needle"] == whole["needle"] and short["scope"].items() <= whole["scope"].items()
+
+
+def test_charts_show_each_value_in_its_place() -> None:
+    line = charts.Line("a & b", "#123456", "", [0.0, 10.0, 20.0, 30.0], [1.0, -1.0, 4.0, 2.0], stairs=True)
+    html = charts.line_chart(
+        "Title", ("mm", "1/mm"), [line], most=4.0, marks={"exit": 15.0}, cursor="--along-mm"
+    )
+    svg = ElementTree.fromstring(f"<div>{html}</div>")
+    drawn = svg.find("svg/svg/path")
+    assert drawn is not None
+    # The frame goes from 50 to 506 and from 226 up to 12; below 0 there is a gap, and the last step is down.
+    assert drawn.get("d") == "M50.0 172.5M354.0 12.0L506.0 12.0L506.0 119.0"
+    assert ["".join(each.itertext()) for each in svg.iterfind("ul/li")] == ["a & b"]
+    label = svg.find("svg")
+    assert label is not None and label.get("aria-label") == "Title: a & b 1 to 4"
+    said = [each.text for each in svg.iter("text")]
+    assert said == ["0", "1", "2", "3", "4", "0", "10", "20", "30", "mm", "1/mm", "exit"]
+    assert charts.ticks(0.0, 0.026) == pytest.approx([0.0, 0.01, 0.02])
+    assert "translateX(calc((var(--along-mm, -1.0) - 0.0) * 15.2px))" in html

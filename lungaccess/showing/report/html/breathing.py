@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.base.typed import Bool, Float
+from anatomy.grid import Grid
 from anatomy.lung import Lung
 from anatomy.meshes import point_distances_mm
 from anatomy.structures import AIRWAY, FISSURE, OUTSIDE, VESSEL
@@ -17,6 +18,7 @@ from lungaccess.plans.window import BreathingWindow
 from lungaccess.showing.report.clock import PROVED, limit_names, on_rim, sectors
 from lungaccess.showing.report.html import words
 from lungaccess.showing.report.html.deployment import CAP_MM, NOT_MEASURED, profile_points, required_mm
+from lungaccess.showing.report.html.volumes import packed_volume
 from lungaccess.showing.report.pack import Packed, pack
 from lungaccess.uncertainty.breathing.moving import Moving
 from lungaccess.uncertainty.breathing.window import TOLERANCE_MM, miss_allowed
@@ -40,18 +42,14 @@ def shown_window(plan: Plan, lung: Lung) -> BreathingWindow | None:
 
 
 def field_data(plan: Plan, lung: Lung) -> Packed:
-    """Return the displacement that moves the anatomy of the page, as differences along its last axis.
-
-    Each component `[i, j, k]` counts `FIELD_STEP_MM`.
-    """
+    """Return the displacement that moves the anatomy of a page: a volume in `FIELD_STEP_MM` for each axis."""
     moving = Moving.of(plan, lung)
     motion = moving.tissue
     counts = np.rint(np.moveaxis(moving.field, -1, 0) / FIELD_STEP_MM).astype(np.int32)
+    grid = Grid.from_spacing(counts.shape[1:], 3 * [float(motion.frame[3])], motion.frame[:3])
     return {
-        "first_lps": motion.frame[:3].tolist(),
-        "spacing_mm": float(motion.frame[3]),
         "step_mm": FIELD_STEP_MM,
-        "differences": pack(np.diff(counts, axis=-1, prepend=0), "i4"),
+        "fields": [packed_volume(grid, each, "i4", differences=True) for each in counts],
         "amplitude": motion.amplitude,
         "masks_phase": motion.masks_phase,
     }

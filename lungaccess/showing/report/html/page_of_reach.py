@@ -46,6 +46,11 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
             "not counted: outside the lung, in an obstacle"
         ),
         "slice_controls": slice_controls(),
+        "key": "".join(
+            f'<li><span class="swatch" style="background: {colour}"></span>{words.text(name)}</li>'
+            for name, colour in COLOURS.items()
+        ),
+        "most_clearance": f"{CLEARANCE_MM[1]:g}",
         "scene": scene_figure(),
         "volumes": volumes_section(maps),
         "systems": systems_section(maps),
@@ -71,7 +76,7 @@ def packed_map(reach: ReachMap) -> Packed:
     return {
         "name": reach.system.name,
         "kinds": {name: int(code) for name, code in KINDS.items()},
-        "ijk_from_lps": reach.kinds.grid.ijk_from_lps.tolist(),
+        "lps_from_ijk": reach.kinds.grid.lps_from_ijk.tolist(),
         "shape": list(reach.kinds.grid.shape),
         "kind": pack(reach.kinds.array.transpose(2, 1, 0), "u1"),
         "clearance": pack(clearance.transpose(2, 1, 0), "u1"),

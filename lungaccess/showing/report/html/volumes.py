@@ -13,7 +13,7 @@ from anatomy.kept_records import kept
 from anatomy.lung import Lung
 from anatomy.morphology import window
 from anatomy.structures import AIRWAY, FISSURE, LUMEN, OUTSIDE, VESSEL
-from lungaccess.showing.report.pack import Packed, pack
+from lungaccess.showing.report.pack import TYPES, Packed, pack
 
 CODES = {"outside": 0, "lung": 1, "airway wall": 2, "lumen": 3, "vessel": 4, "fissure": 5, "nodule": 6}
 LABELS_VERSION = 2
@@ -94,7 +94,7 @@ def fine_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packe
     fine = page_grids(lung.grid, device_lps)[1]
     if ct is not None:
         _require_holds(ct, device_lps)
-    found = None if ct is None else [_packed(fine, _ct_bytes(ct, fine), differences=True)]
+    found = None if ct is None else [packed_volume(fine, _ct_bytes(ct, fine), differences=True)]
     return _image(lung, [_fine_labels(lung, fine)], ct, found)
 
 
@@ -166,7 +166,7 @@ def _fine_labels(lung: Lung, fine: Grid) -> Packed:
 
 def _labels_on(lung: Lung, grid: Grid, low: Int, high: Int) -> Packed:
     """Return the structures on another grid, from the voxels from `low` to before `high`."""
-    return _packed(grid, resampled(label_codes(lung, low, high), grid, 0, 0))
+    return packed_volume(grid, resampled(label_codes(lung, low, high), grid, 0, 0))
 
 
 def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
@@ -179,7 +179,7 @@ def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
     factor = 1.0
     while True:
         found = [
-            _packed(grid, _ct_bytes(ct, grid), differences=True)
+            packed_volume(grid, _ct_bytes(ct, grid), differences=True)
             for grid in page_grids(lung.grid, device_lps, factor)
         ]
         # Text of a stored CT at most: a page of 10 MB still opens at once and can be sent.
@@ -250,13 +250,13 @@ def _ct_bytes(ct: Volume, grid: Grid) -> UInt8:
     return np.searchsorted(0.5 * (HU_OF_BYTE[1:] + HU_OF_BYTE[:-1]), values).astype(np.uint8)
 
 
-def _packed(grid: Grid, values: ArrayLike, *, differences: bool = False) -> Packed:
+def packed_volume(grid: Grid, values: ArrayLike, kind: str = "u1", *, differences: bool = False) -> Packed:
     """Return a volume; with `differences` each voxel is stored as its difference from the one before in i."""
-    array = np.asarray(values, dtype=np.uint8).transpose(2, 1, 0)
-    stored = np.diff(array, axis=2, prepend=np.uint8(0)) if differences else array
+    array = np.asarray(values, dtype=TYPES[kind]).transpose(2, 1, 0)
+    stored = np.diff(array, axis=2, prepend=array.dtype.type(0)) if differences else array
     return {
         "first_lps": grid.lps_from_ijk[:3, 3].tolist(),
         "spacing_mm": float(grid.spacing_mm[0]),
         "differences": differences,
-        "voxels": pack(stored, "u1"),
+        "voxels": pack(stored, kind),
     }

@@ -5,7 +5,7 @@ import { Scene, VIEW_HALF_ANGLE } from "./scene.js";
 import { SlicePanel } from "./slice_panel.js";
 import { SliceViews } from "./slice_views.js";
 import { Slice, STANDARD } from "./slices.js";
-import { addSwitch, made, oncePerFrame } from "./structures.js";
+import { addSwitch, oncePerFrame } from "./structures.js";
 import { rgb } from "./vectors.js";
 import { ViewTools } from "./view_tools.js";
 
@@ -163,11 +163,9 @@ export class AnatomyPage {
       changed: this.redrawSlices, moved, picked,
       pointed: (place, name) => this.panel.describe(place, name), windowed: () => this.panel.showWindow(),
     });
-    this.panel = new SlicePanel(document, this.views, (place) => this.distancesOf(place));
+    this.panel = new SlicePanel(this.views, (place) => this.distancesOf(place));
     if (!this.scene) return;
     const { canvas } = this.scene;
-    this.crossMark = made("span", { className: "scene-cross", ariaHidden: "true" });
-    canvas.parentNode.append(this.crossMark);
     const take = (x, y) => {
       const hit = this.scene.pick(x, y);
       if (!hit) return;
@@ -182,10 +180,10 @@ export class AnatomyPage {
 
   // Show where the cross of the slices is in the 3-D view.
   showCross() {
-    if (!this.crossMark) return;
-    const at = this.scene.project(this.views.place);
-    this.crossMark.hidden = !at;
-    if (at) this.crossMark.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px)`;
+    if (!this.scene || !this.views) return;
+    const at = this.scene.project(this.views.place), cross = document.querySelector(".scene-cross");
+    cross.hidden = !at;
+    if (at) cross.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px)`;
   }
 
   moveTo(place) {

@@ -1,27 +1,20 @@
 // Breathing: where tissue and devices are in a phase, from 0 (end-exhale) to 1 (end-inhale).
 import { unpack } from "./decode.js";
 import { add, cross, dot, minus, times, unit } from "./vectors.js";
+import { linear, placedVolume } from "./voxels.js";
 
 const MOST_STEPS = 40;
 const CONVERGED_MM = 1e-3;
 const POLAR_STEPS = 12;
 const AHEAD_MM = 1;
 const PLACES = 65535;
+// A place is moved so far into the field, so that rounding does not put it beyond.
+const INSIDE_MM = 1e-6;
 
 export class Breath {
   static async of(packed) {
-    const breath = new Breath();
-    Object.assign(breath, { first: packed.first_lps, spacing: packed.spacing_mm });
-    breath.amplitude = packed.amplitude;
-    breath.masksPhase = packed.masks_phase;
-    const [, ni, nj, nk] = packed.differences.shape;
-    breath.counts = [ni, nj, nk];
-    const steps = await unpack(packed.differences);
-    breath.nodes = new Float32Array(steps.length);
-    for (let row = 0; row < steps.length; row += nk) {
-      for (let k = 0, sum = 0; k < nk; k++) breath.nodes[row + k] = packed.step_mm * (sum += steps[row + k]);
-    }
-    breath.plans = packed.plans;
+    const breath = Object.assign(new Breath(), packed, { masksPhase: packed.masks_phase });
+    breath.fields = await Promise.all(packed.fields.map(async (field) => [await placedVolume(field)]));
     for (const plan of breath.plans) plan.margins = await Promise.all(plan.samples.margins_mm.map(unpack));
     return breath;
   }
@@ -32,23 +25,12 @@ export class Breath {
   }
 
   // Return the displacement between end-exhale and end-inhale of a place of the masks, mm.
-  displacement([x, y, z]) {
-    const [ni, nj, nk] = this.counts, [i, u] = this.cell(x, 0), [j, v] = this.cell(y, 1), [k, w] = this.cell(z, 2);
-    const nodes = this.nodes, plane = ni * nj * nk, found = [0, 0, 0];
-    for (let axis = 0; axis < 3; axis++) {
-      const a = axis * plane + (i * nj + j) * nk + k, b = a + nk, c = a + nj * nk, d = c + nk;
-      const along = (n) => nodes[n] + w * (nodes[n + 1] - nodes[n]);
-      const low = along(a) + v * (along(b) - along(a));
-      found[axis] = low + u * (along(c) + v * (along(d) - along(c)) - low);
-    }
-    return found;
-  }
-
-  cell(value, axis) {
-    const most = this.counts[axis] - 1;
-    const at = Math.min(Math.max((value - this.first[axis]) / this.spacing, 0), most);
-    const whole = Math.min(Math.floor(at), most - 1);
-    return [whole, at - whole];
+  displacement(place) {
+    const [{ grid: { first, shape }, spacing }] = this.fields[0];
+    // Beyond the field it is that at its border.
+    const [x, y, z] = place.map((value, axis) =>
+      Math.min(Math.max(value, first[axis] + INSIDE_MM), first[axis] + (shape[axis] - 1) * spacing - INSIDE_MM));
+    return this.fields.map((field) => this.step_mm * linear(field, x, y, z));
   }
 
   moved(place, share) {

@@ -9,10 +9,7 @@ export function reportData() {
 
 function bytesOf(base64) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(base64);
-  const text = atob(base64);
-  const bytes = new Uint8Array(text.length);
-  for (let n = 0; n < text.length; n++) bytes[n] = text.charCodeAt(n);
-  return bytes;
+  return Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 }
 
 async function inflated(bytes) {
@@ -22,12 +19,9 @@ async function inflated(bytes) {
 
 // Return the flat typed array of a packed one.
 export async function unpack(packed) {
-  const planes = await inflated(bytesOf(packed.data));
-  const Kind = TYPES[packed.kind];
-  const width = Kind.BYTES_PER_ELEMENT;
+  const planes = await inflated(bytesOf(packed.data)), Kind = TYPES[packed.kind], width = Kind.BYTES_PER_ELEMENT;
   if (width === 1) return planes;
-  const count = planes.length / width;
-  const joined = new Uint8Array(planes.length);
+  const count = planes.length / width, joined = new Uint8Array(planes.length);
   for (let b = 0; b < width; b++) {
     for (let n = 0, from = b * count, to = b; n < count; n++, from++, to += width) joined[to] = planes[from];
   }

@@ -22,19 +22,11 @@ export class Layers {
     gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
     this.colour = this.texture(gl.TEXTURE_2D);
     this.known = this.texture(gl.TEXTURE_2D);
-    this.solids = this.framebuffer(() => {
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.colour, 0);
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT1, gl.TEXTURE_2D, this.known, 0);
-      gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
-    });
+    this.solids = this.framebuffer([this.colour, this.known]);
     // A framebuffer for the second picture of the solid bodies alone, to read from.
-    this.reading = this.framebuffer(() => {
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.known, 0);
-    });
+    this.reading = this.framebuffer([this.known]);
     this.arrays = Array.from({ length: LAYERS }, () => this.texture(gl.TEXTURE_2D_ARRAY));
-    this.peeled = this.arrays.map((array) => Array.from({ length: this.slices }, (_, n) => this.framebuffer(() => {
-      gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, array, 0, n);
-    })));
+    this.peeled = this.arrays.map((array) => Array.from({ length: this.slices }, (_, n) => this.framebuffer([array], n)));
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     return true;
   }
@@ -50,11 +42,16 @@ export class Layers {
     return texture;
   }
 
-  framebuffer(attach) {
-    const gl = this.gl;
-    const framebuffer = gl.createFramebuffer();
+  // Return a framebuffer of pictures, or of a slice of an array of them.
+  framebuffer(textures, slice = null) {
+    const { gl } = this, framebuffer = gl.createFramebuffer();
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    attach();
+    const places = textures.map((_, n) => gl.COLOR_ATTACHMENT0 + n);
+    textures.forEach((texture, n) => {
+      if (slice === null) gl.framebufferTexture2D(gl.FRAMEBUFFER, places[n], gl.TEXTURE_2D, texture, 0);
+      else gl.framebufferTextureLayer(gl.FRAMEBUFFER, places[n], texture, 0, slice);
+    });
+    gl.drawBuffers(places);
     gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
     return framebuffer;
   }

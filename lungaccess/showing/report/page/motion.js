@@ -16,19 +16,16 @@ export function marginColour(margin) {
 
 export class Motion {
   static async of(packed) {
-    const motion = new Motion();
-    motion.plan = packed;
-    const { scope, tubes, needle } = packed;
-    Object.assign(motion, await unpackAll({
+    const motion = new Motion(), { scope, tubes, needle } = packed;
+    Object.assign(motion, { plan: packed }, await unpackAll({
       route: scope.points, routeMm: scope.arc_length_mm, forward: scope.forward, up: scope.up, insertedMm: scope.inserted_mm,
       sections: scope.sections, shaft: scope.shaft, shaftMm: scope.shaft_mm, tubes: tubes.points, innerMm: tubes.inner_mm,
       outerMm: tubes.outer_mm, middleMm: tubes.middle_mm, needle: needle.points, needleMm: needle.arc_length_mm, margin: needle.margin_mm,
     }));
     motion.tubePoints = tubes.points.shape[1];
     motion.sectionPoints = scope.sections.shape[1];
-    const last = (array) => array[array.length - 1];
-    motion.ends = { scope: last(motion.insertedMm), outer: last(motion.outerMm), inner: last(motion.innerMm),
-      needle: last(motion.needleMm) };
+    const [scopeMm, outer, inner, needleMm] = ["insertedMm", "outerMm", "innerMm", "needleMm"].map((name) => motion[name].at(-1));
+    motion.ends = { scope: scopeMm, outer, inner, needle: needleMm };
     motion.starts = stageStarts(motion.ends);
     return motion;
   }
@@ -60,45 +57,31 @@ export class Motion {
     state.needle = needleMm > 0 ? cut(this.needle, this.needleMm, needleMm) : [];
     state.needleColours = state.needle.map((_, n) => marginColour(margin[Math.min(n, margin.length - 1)]));
     const line = [state.needle, state.inner, state.middle, state.outer].find((points) => points.length > 1);
-    state.tip = line ? line[line.length - 1] : state.scope[state.scope.length - 1];
-    state.direction = line ? unit(minus(line[line.length - 1], line[line.length - 2])) : state.camera.forward;
+    state.tip = (line || state.scope).at(-1);
+    state.direction = line ? unit(minus(line.at(-1), line.at(-2))) : state.camera.forward;
     return state;
   }
 
   // Return how much of the scope is in, with its bending section, after so much motion.
   inserted(moved) {
-    const [n, share] = place(this.routeMm, moved);
-    const next = Math.min(n + 1, this.insertedMm.length - 1);
-    return this.insertedMm[n] + share * (this.insertedMm[next] - this.insertedMm[n]);
+    return between(this.insertedMm, this.routeMm, moved);
   }
 
   // Return the points of the shaft and of the bending section before it.
   body(moved, scopeMm) {
-    const [n, share] = place(this.routeMm, moved);
-    const count = this.sectionPoints, next = Math.min(n + 1, this.routeMm.length - 1);
-    const points = cut(this.shaft, this.shaftMm, scopeMm - this.insertedMm[0]);
-    for (let k = 0; k < count; k++) {
-      points.push(mix(point(this.sections, n * count + k), point(this.sections, next * count + k), share));
-    }
-    return points;
+    const shaft = cut(this.shaft, this.shaftMm, scopeMm - this.insertedMm[0]);
+    return [...shaft, ...row(this.sections, this.routeMm, moved, this.sectionPoints)];
   }
 
   camera(moved) {
-    const [n, share] = place(this.routeMm, moved);
-    const between = (array) => mix(point(array, n), point(array, Math.min(n + 1, this.routeMm.length - 1)), share);
-    return { eye: between(this.route), forward: unit(between(this.forward)), up: unit(between(this.up)) };
+    const [eye, forward, up] = [this.route, this.forward, this.up].map((array) => row(array, this.routeMm, moved)[0]);
+    return { eye, forward: unit(forward), up: unit(up) };
   }
 
   // Return the points of the outer tube, and of what the middle and the inner one reach beyond it.
   tube(innerMm) {
-    const [n, share] = place(this.innerMm, innerMm);
-    const next = Math.min(n + 1, this.innerMm.length - 1);
-    const count = this.tubePoints;
-    const ends = [this.outerMm, this.middleMm].map((mm) => mm[n] + share * (mm[next] - mm[n]));
-    const points = [];
-    for (let k = 0; k < count; k++) {
-      points.push(mix(point(this.tubes, n * count + k), point(this.tubes, next * count + k), share));
-    }
+    const count = this.tubePoints, points = row(this.tubes, this.innerMm, innerMm, count);
+    const ends = [this.outerMm, this.middleMm].map((mm) => between(mm, this.innerMm, innerMm));
     const [outer, middle] = ends.map((mm) => {
       const at = innerMm > 0 ? (mm / innerMm) * (count - 1) : 0;
       const whole = Math.min(Math.floor(at), count - 1);
@@ -130,12 +113,8 @@ export class Motion {
 // Return where each stage begins on the slider, and 1; a stage without length has no part of it.
 function stageStarts(ends) {
   const lengths = [ends.scope, ends.outer, ends.inner - ends.outer, ends.needle];
-  const weights = WEIGHTS.map((weight, n) => (lengths[n] > 1e-6 ? weight : 0));
-  const total = weights.reduce((sum, weight) => sum + weight, 0);
-  const starts = [0];
-  for (const weight of weights) starts.push(starts[starts.length - 1] + weight / total);
-  starts[STAGES.length] = 1;
-  return starts;
+  const weights = WEIGHTS.map((weight, n) => (lengths[n] > 1e-6 ? weight : 0)), sum = (few) => few.reduce((a, b) => a + b, 0);
+  return [...STAGES.map((_, n) => sum(weights.slice(0, n)) / sum(weights)), 1];
 }
 
 const clamp = (value) => Math.min(Math.max(value, 0), 1);
@@ -147,10 +126,19 @@ function place(along, mm) {
   return [n, clamp((mm - along[n]) / Math.max(along[n + 1] - along[n], 1e-9))];
 }
 
-function cut(points, along, mm) {
+// Return the value at a length, between those that are stored.
+function between(values, along, mm) {
   const [n, share] = place(along, mm);
-  const kept = [];
-  for (let k = 0; k <= n; k++) kept.push(point(points, k));
-  kept.push(mix(point(points, n), point(points, n + 1), share));
-  return kept;
+  return values[n] + share * (values[Math.min(n + 1, along.length - 1)] - values[n]);
+}
+
+// Return the points at a length, between rows of so many that are stored.
+function row(points, along, mm, count = 1) {
+  const [n, share] = place(along, mm), next = Math.min(n + 1, along.length - 1);
+  return Array.from({ length: count }, (_, k) => mix(point(points, n * count + k), point(points, next * count + k), share));
+}
+
+function cut(points, along, mm) {
+  const kept = Array.from({ length: place(along, mm)[0] + 1 }, (_, k) => point(points, k));
+  return [...kept, ...row(points, along, mm)];
 }

@@ -1,6 +1,6 @@
 // The camera that goes round the patient: by mouse, by fingers and by keys.
 import { distanceToSee } from "./scene.js";
-import { add, cross, dot, letters, minus, norm, times, unit } from "./vectors.js";
+import { add, cross, letters, minus, norm, times, unit } from "./vectors.js";
 
 const TURN_KEYS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 const VIEWS = { front: [0, 0], left: [Math.PI / 2, 0], right: [-Math.PI / 2, 0], back: [Math.PI, 0], feet: [0, -1.45] };
@@ -117,15 +117,9 @@ export class Orbit {
 
   // Yaw 0 is seen from the front, so that the patient's left is on the right.
   camera() {
-    const cosine = Math.cos(this.pitch);
-    const back = [Math.sin(this.yaw) * cosine, -Math.cos(this.yaw) * cosine, Math.sin(this.pitch)];
-    const forward = times(back, -1);
-    const right = unit(cross(forward, [0, 0, 1]));
-    const above = cross(right, forward);
-    return {
-      eye: add(this.centre, times(back, this.distance)), forward, up: [0, 0, 1], right, above,
-      distance: this.distance,
-    };
+    const { centre, distance } = this, back = backOf(this.yaw, this.pitch), forward = times(back, -1);
+    const right = unit(cross(forward, [0, 0, 1])), above = cross(right, forward);
+    return { eye: add(centre, times(back, distance)), forward, up: [0, 0, 1], right, above, distance };
   }
 
   // The patient's sides at the edges of the picture: left, right, bottom, top.
@@ -135,13 +129,13 @@ export class Orbit {
   }
 }
 
+// Return the direction in which one goes back from what is seen from a side.
+const backOf = (yaw, pitch) => [Math.sin(yaw) * Math.cos(pitch), -Math.cos(yaw) * Math.cos(pitch), Math.sin(pitch)];
+
 // Return the name of the side from which a line of points is seen long: the front, unless another side is much better.
 export function sideOf(points) {
   const line = minus(points[points.length - 1], points[0]);
-  const seen = Object.entries(VIEWS).map(([name, [yaw, pitch]]) => {
-    const back = [Math.sin(yaw) * Math.cos(pitch), -Math.cos(yaw) * Math.cos(pitch), Math.sin(pitch)];
-    return [name, norm(minus(line, times(back, dot(line, back))))];
-  });
+  const seen = Object.entries(VIEWS).map(([name, angles]) => [name, norm(cross(line, backOf(...angles)))]);
   const best = seen.reduce((a, b) => (b[1] > a[1] + 1e-9 ? b : a));
   return best[1] > BETTER * seen[0][1] ? best[0] : "front";
 }

@@ -27,7 +27,7 @@ function hitsAt(scene, across, up, ray) {
   const { view, layers } = scene;
   const hits = [], step = (view.span[1] - view.span[0]) / 65534;
   // Four pixels are of one surface if it is not steeper than so.
-  const most = (STEEPEST * 2 * view.camera.distance) / (view.clip[5] * layers.height * step);
+  const most = (STEEPEST * 2 * view.camera.distance) / (view.clipFromEye[5] * layers.height * step);
   const put = (kind, key, depth, more) => {
     const mm = view.span[0] + depth * step;
     hits.push({ kind, key, depth_mm: mm, point: add(view.camera.eye, times(ray, mm)), ...more });
@@ -50,7 +50,7 @@ function hitsAt(scene, across, up, ray) {
 }
 
 // Return the direction through a place of the picture, -1 to 1, so long that it advances 1 mm along the view.
-export function rayThrough({ view: { camera, clip, eye } }, across, up) {
+export function rayThrough({ view: { camera, clipFromEye: clip, eyeFromLps: eye } }, across, up) {
   const right = [eye[0], eye[4], eye[8]], above = [eye[1], eye[5], eye[9]];
   return add(camera.forward, add(times(right, across / clip[0]), times(above, up / clip[5])));
 }
@@ -69,7 +69,7 @@ function nearestPoint({ places }, point) {
 // the first picture.
 export function project({ canvas, view }, point) {
   if (!view) return null;
-  const { eye, clip } = view;
+  const { eyeFromLps: eye, clipFromEye: clip } = view;
   const at = (row) => eye[row] * point[0] + eye[4 + row] * point[1] + eye[8 + row] * point[2] + eye[12 + row];
   const z = -at(2);
   if (z <= 0) return null;

@@ -2,7 +2,7 @@
 import { byId, openPage } from "./anatomy_page.js";
 import { Breath } from "./breath.js";
 import { bifurcationsAhead, Bronchoscopy, pausesOf } from "./bronchoscopy.js";
-import { DEVICE_COLOURS, planStyle } from "./colours.js";
+import { planStyle } from "./colours.js";
 import { reportData } from "./decode.js";
 import { DevicePage } from "./device_page.js";
 import { deviceLines, showBall, showDevices, showOther } from "./devices.js";
@@ -15,14 +15,6 @@ import { TipSection } from "./tip_section.js";
 import { cross, dot, minus, mix, norm } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
 
-const { scope: SCOPE, outer: OUTER, middle: MIDDLE, inner: INNER, needle: NEEDLE, target: TARGET, aim: AIM } = DEVICE_COLOURS;
-const DEVICES = [
-  { key: "scope", name: "Bronchoscope", colour: SCOPE, shown: true },
-  { key: "tubes", name: "Tubes: outer, inner", colour: `linear-gradient(90deg, ${OUTER} 50%, ${INNER} 50%)`, shown: true },
-  { key: "needle", name: "Needle, darker where tight", colour: `linear-gradient(90deg, ${NEEDLE}, ${DEVICE_COLOURS.needle_with_room})`, shown: true },
-  { key: "target", name: "Target", colour: TARGET, shown: true },
-  { key: "aim", name: "Aim of the devices, beside the moving target", colour: AIM, shown: true },
-];
 const BREATH_S = 5;
 const MOST_ACROSS_MM = 60;
 const AIM_MM = 1.1, ABOVE_CARINA_MM = 30;
@@ -31,7 +23,7 @@ class PlanPage extends DevicePage {
   constructor(data) {
     super(data);
     this.player = new Player(this, () => (byId("pause").checked ? pausesOf(this.motion) : []));
-    this.shown = Object.fromEntries(DEVICES.map(({ key, shown }) => [key, shown]));
+    this.shown = Object.fromEntries([...byId("devices").querySelectorAll("input")].map((box) => [box.dataset.key, box.checked]));
     this.phase = 0;
     this.exhaling = false;
   }
@@ -94,16 +86,12 @@ class PlanPage extends DevicePage {
   }
 
   listSwitches() {
-    const hasNeedle = this.motions.some((motion) => motion.hasNeedle);
-    for (const element of document.querySelectorAll("[data-needle]")) element.hidden = !hasNeedle;
-    const hasAim = this.data.plans.some((plan) => plan.aim_lps);
-    const present = { needle: hasNeedle, aim: hasAim };
-    for (const device of DEVICES.filter(({ key }) => present[key] !== false)) {
-      addSwitch(byId("devices"), device, (on) => {
-        this.shown[device.key] = on;
-        this.redraw();
-      });
-    }
+    const without = [["needle", this.motions.every((motion) => !motion.hasNeedle)], ["aim", this.data.plans.every((plan) => !plan.aim_lps)]];
+    for (const [name, hidden] of without) for (const each of document.querySelectorAll(`[data-${name}]`)) each.hidden = hidden;
+    byId("devices").addEventListener("change", ({ target }) => {
+      this.shown[target.dataset.key] = target.checked;
+      this.redraw();
+    });
     this.listStructures();
     this.data.plans.forEach((plan, n) => {
       const name = `${plan.name}${plan.accepted ? "" : " (refused)"}`;
@@ -121,12 +109,11 @@ class PlanPage extends DevicePage {
   }
 
   connectControls() {
-    for (const button of document.querySelectorAll("button[data-stage]")) {
-      button.addEventListener("click", () => {
-        this.player.stop();
-        this.moveTo(this.motion.starts[Number(button.dataset.stage)]);
-      });
-    }
+    document.querySelector(".player").addEventListener("click", ({ target: { dataset: { stage } } }) => {
+      if (stage === undefined) return;
+      this.player.stop();
+      this.moveTo(this.motion.starts[stage]);
+    });
     if (this.breath) this.connectBreath();
     byId("follow").addEventListener("change", () => {
       this.follow(byId("follow").checked);

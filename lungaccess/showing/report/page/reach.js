@@ -3,16 +3,15 @@ import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
 import { VIRIDIS } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { STANDARD } from "./slices.js";
-import { addSwitch, made, swatch } from "./structures.js";
+import { addSwitch } from "./structures.js";
 import { minus, norm, ramp, rgb } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
+import { nearest, VoxelGrid, volumeOf } from "./voxels.js";
 
-const NO_PATH = [150, 150, 150];
 const OVER_SHARE = 0.85;
 
-const bytes = (colour) => colour.map((value) => Math.round(255 * value));
-
-const shade = (share) => bytes(ramp(VIRIDIS, share));
+const painted = (colour) => colour.map((value) => 255 * OVER_SHARE * value);
+const NO_PATH = painted([0.588, 0.588, 0.588]);
 
 class ReachPage extends AnatomyPage {
   constructor(data) {
@@ -22,9 +21,10 @@ class ReachPage extends AnatomyPage {
   }
 
   async open() {
-    this.maps = await Promise.all(this.data.maps.map(async (map) => ({
-      ...map, kindOf: await unpack(map.kind), clearanceOf: await unpack(map.clearance),
-    })));
+    this.maps = await Promise.all(this.data.maps.map(async (map) => {
+      const grid = new VoxelGrid(map.shape, map.lps_from_ijk), volume = async (packed) => [volumeOf(grid, await unpack(packed))];
+      return { ...map, kindOf: await volume(map.kind), clearanceOf: await volume(map.clearance) };
+    }));
     if (await this.openScene()) await this.addMaps();
     this.image = await VoxelImage.of(this.data);
     this.listControls();
@@ -70,11 +70,9 @@ class ReachPage extends AnatomyPage {
   }
 
   showSurfaces() {
-    if (this.scene) {
-      for (const [key, surface] of this.scene.surfaces) {
-        const [n, name] = key.split(": ");
-        if (name) surface.shown = Number(n) === this.number && this.boxes.has(name) && this.boxes.get(name).checked;
-      }
+    for (const [key, surface] of this.scene ? this.scene.surfaces : []) {
+      const [n, name] = key.split(": ");
+      if (name) surface.shown = Number(n) === this.number && this.boxes.has(name) && this.boxes.get(name).checked;
     }
     this.redraw();
   }
@@ -84,48 +82,29 @@ class ReachPage extends AnatomyPage {
     const sizes = [volume.width, volume.height, volume.depth];
     this.views.setWidth(Math.max(...sizes) * volume.spacing);
     this.views.centre = volume.first.map((first, axis) => first + ((sizes[axis] - 1) * volume.spacing) / 2);
-    for (let axis = 0; axis < 3; axis++) {
-      const slider = byId(`place-${axis}`);
-      slider.min = Math.ceil(volume.first[axis]);
-      slider.max = Math.floor(volume.first[axis] + (sizes[axis] - 1) * volume.spacing);
-      slider.value = this.place[axis];
-      slider.addEventListener("input", () => {
-        this.moveTo(this.place.map((value, n) => (n === axis ? Number(slider.value) : value)));
-      });
-    }
+    sizes.forEach((size, axis) => {
+      const slider = byId(`place-${axis}`), first = volume.first[axis];
+      Object.assign(slider, { min: Math.ceil(first), max: Math.floor(first + (size - 1) * volume.spacing), value: this.place[axis] });
+      slider.addEventListener("input", () => this.moveTo(this.place.with(axis, Number(slider.value))));
+    });
   }
 
   moveTo(place) {
     super.moveTo(place);
     this.views.moveTo(place);
-    place.forEach((value, axis) => {
-      byId(`place-${axis}`).value = value;
-    });
-  }
-
-  // Return the index of the map's voxel that holds a point, -1 beyond the map.
-  voxel(x, y, z) {
-    const [ni, nj, nk] = this.map.shape;
-    const m = this.map.ijk_from_lps;
-    const [i, j, k] = [0, 1, 2].map((r) => Math.round(m[r][0] * x + m[r][1] * y + m[r][2] * z + m[r][3]));
-    return i >= 0 && j >= 0 && k >= 0 && i < ni && j < nj && k < nk ? (k * nj + j) * ni + i : -1;
+    place.forEach((value, axis) => (byId(`place-${axis}`).value = value));
   }
 
   // Return what paints the map over the structures.
   painter() {
-    const { map } = this;
-    const colours = [];
-    for (const [name, code] of Object.entries(map.kinds)) colours[code] = bytes(rgb(this.data.colours[name]));
-    const reached = [map.kinds["direct arc"], map.kinds.search];
-    const byClearance = byId("quantity").value === "clearance";
-    const [low, high] = this.data.clearance_range_mm;
-    const shades = Array.from({ length: 256 }, (_, n) => shade((n / map.steps_per_mm - low) / (high - low)));
+    const { kinds, kindOf, clearanceOf, steps_per_mm: stepsPerMm } = this.map, [low, high] = this.data.clearance_range_mm;
+    const colours = [], shades = Array.from({ length: 256 }, (_, n) => painted(ramp(VIRIDIS, (n / stepsPerMm - low) / (high - low))));
+    for (const [name, code] of Object.entries(kinds)) colours[code] = painted(rgb(this.data.colours[name]));
+    if (byId("quantity").value === "kind") return (x, y, z) => colours[nearest(kindOf, x, y, z)];
+    const reached = [kinds["direct arc"], kinds.search];
     return (x, y, z) => {
-      const at = this.voxel(x, y, z);
-      const kind = at < 0 ? 0 : map.kindOf[at];
-      if (!kind) return null;
-      const colour = byClearance ? (reached.includes(kind) ? shades[map.clearanceOf[at]] : NO_PATH) : colours[kind];
-      return colour.map((value) => OVER_SHARE * value);
+      const kind = nearest(kindOf, x, y, z);
+      return reached.includes(kind) ? shades[nearest(clearanceOf, x, y, z)] : kind && NO_PATH;
     };
   }
 
@@ -134,28 +113,14 @@ class ReachPage extends AnatomyPage {
     this.views.draw(STANDARD, {}, isCoarse);
     this.panel.show();
     byId("slice-place").textContent = `Through LPS ${this.place.map((v) => v.toFixed(0)).join(", ")} mm: ${this.words()}.`;
-    this.showKey();
   }
 
   // Say what the map says at the place.
   words() {
-    const at = this.voxel(...this.place);
-    const kind = at < 0 ? 0 : this.map.kindOf[at];
-    const named = Object.entries(this.map.kinds).find(([, code]) => code === kind);
-    if (!named) return "not counted";
-    const clearance = this.map.clearanceOf[at] / this.map.steps_per_mm;
-    return clearance > 0 ? `${named[0]}, clearance ${clearance.toFixed(1)} mm` : named[0];
-  }
-
-  showKey() {
-    const clearance = byId("quantity").value === "clearance";
-    const entries = clearance
-      ? [0, 0.25, 0.5, 0.75, 1].map((share) => {
-        const mm = this.data.clearance_range_mm[1] * share;
-        return [`${mm} mm${share === 1 ? " and more" : ""}`, `rgb(${shade(share).join(",")})`];
-      }).concat([["no path", `rgb(${NO_PATH.join(",")})`]])
-      : Object.entries(this.data.colours);
-    byId("key").replaceChildren(...entries.map(([name, colour]) => made("li", {}, swatch(colour), ` ${name}`)));
+    const { kinds, kindOf, clearanceOf, steps_per_mm: stepsPerMm } = this.map, kind = nearest(kindOf, ...this.place);
+    if (!kind) return "not counted";
+    const name = Object.keys(kinds).find((each) => kinds[each] === kind), mm = nearest(clearanceOf, ...this.place) / stepsPerMm;
+    return mm > 0 ? `${name}, clearance ${mm.toFixed(1)} mm` : name;
   }
 
   // What a test may read; docs/how_to/report.md names the fields.

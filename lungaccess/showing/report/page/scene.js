@@ -124,7 +124,7 @@ export class Scene {
   }
 
   focusOn(surface) {
-    const gl = this.gl;
+    const { gl } = this;
     gl.bindVertexArray(surface.array);
     if (surface.nearness) gl.deleteBuffer(surface.nearness);
     surface.nearness = null;
@@ -153,12 +153,8 @@ export class Scene {
     this.fitted = [clientWidth, clientHeight];
     const wished = this.isHurried ? COARSE : this.slow && this.quality === "rest" ? RESTING : FINE;
     const scale = Math.min(wished, Math.sqrt(MOST_PIXELS / Math.max(clientWidth * clientHeight, 1)));
-    const width = Math.max(Math.round(clientWidth * scale), 1);
-    const height = Math.max(Math.round(clientHeight * scale), 1);
-    if (this.canvas.width !== width || this.canvas.height !== height) {
-      this.canvas.width = width;
-      this.canvas.height = height;
-    }
+    const [width, height] = this.fitted.map((px) => Math.max(Math.round(px * scale), 1));
+    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
   }
 
   // Draw everything that is shown, as the camera sees it.
@@ -214,27 +210,24 @@ export class Scene {
     const deep = box.map((corner) => dot(minus(corner, camera.eye), camera.forward));
     const far = Math.max(...deep, 10), near = Math.max(Math.min(...deep), far / 1000, 0.5);
     return {
-      camera, far, near, span: [near, far], aspect, eye: eyeFromLps(camera.eye, camera.forward, camera.up),
-      clip: perspective(VIEW_HALF_ANGLE, aspect, near, far),
+      camera, span: [near, far], eyeFromLps: eyeFromLps(camera.eye, camera.forward, camera.up),
+      clipFromEye: perspective(VIEW_HALF_ANGLE, aspect, near, far),
     };
   }
 
   // Draw the layers of each structure by itself, so that nothing depends on the order of triangles or structures.
   peel(view) {
-    const gl = this.gl, program = this.programs.layer, { places } = program;
-    this.use(program, view);
-    gl.uniform4fv(places.cut, this.cut || NO_CUT);
-    gl.uniform1i(places.before, 0);
+    const gl = this.gl, program = this.programs.layer;
+    program({ ...view, cut: this.cut || NO_CUT, before: 0 });
     gl.activeTexture(gl.TEXTURE0);
     view.counts.forEach((count, k) => {
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, this.layers.arrays[k === 0 ? 1 : k - 1]);
-      gl.uniform1i(places.peeled, k);
       view.shown.slice(0, count).forEach(([, surface], n) => {
         this.layers.into(this.layers.peeled[k][n]);
         // Of a closed surface only the outside, unless a cut lets one see into it.
         if (this.cut) gl.disable(gl.CULL_FACE);
         else gl.enable(gl.CULL_FACE);
-        gl.uniform1i(places.slice, n);
+        program({ peeled: k, slice: n });
         this.drawSurface(surface, program, this.isHurried);
       });
     });
@@ -242,7 +235,7 @@ export class Scene {
   }
 
   putTogether(view, background, scale) {
-    const gl = this.gl, { program, places } = this.programs.together(...view.counts);
+    const gl = this.gl;
     const dark = Math.max(...background) < 0.3;
     // On a dark ground a surface has to be denser to be seen as well, and what is faint most of all;
     // that does not step back before what is near the focus.
@@ -252,34 +245,30 @@ export class Scene {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, this.canvas.width, this.canvas.height);
     gl.disable(gl.DEPTH_TEST);
-    gl.useProgram(program);
     const pictures = [
-      [gl.TEXTURE_2D_ARRAY, this.layers.arrays[0], places.first], [gl.TEXTURE_2D_ARRAY, this.layers.arrays[1], places.second],
-      [gl.TEXTURE_2D, this.layers.colour, places.solids], [gl.TEXTURE_2D, this.layers.known, places.known],
+      [gl.TEXTURE_2D_ARRAY, this.layers.arrays[0]], [gl.TEXTURE_2D_ARRAY, this.layers.arrays[1]],
+      [gl.TEXTURE_2D, this.layers.colour], [gl.TEXTURE_2D, this.layers.known],
     ];
-    pictures.forEach(([kind, texture, place], n) => {
+    const bind = () => pictures.forEach(([kind, texture], n) => {
       gl.activeTexture(gl.TEXTURE0 + n);
       gl.bindTexture(kind, texture);
-      gl.uniform1i(place, n);
     });
+    bind();
     const looks = new Float32Array(4 * MOST_SLICES);
     view.shown.forEach(([, { colour, opacity }], n) => looks.set([...colour, gain(opacity) * opacity], 4 * n));
-    gl.uniform4fv(places.looks, looks);
-    gl.uniform3fv(places.dense, isFocused ? [FAR_DENSE, NEAR_DENSE - FAR_DENSE, RIM] : [1, 0, RIM]);
-    gl.uniform3fv(places.background, background);
-    gl.uniform3fv(places.ink, dark ? [0, 0, 0] : [0.1, 0.12, 0.14]);
-    gl.uniform1f(places.outline, Math.max(Math.round(OUTLINE_PX * scale), 1));
-    const step = (view.span[1] - view.span[0]) / 65534;
-    gl.uniform1f(places.step_mm, step);
     // Haze begins a little before what is looked at, and grows evenly.
-    const { distance } = view.camera, deep = 0.36 * distance + 48;
-    gl.uniform3f(places.haze, (HAZE * step) / deep, (HAZE * (view.span[0] - distance + deep / 6)) / deep, HAZE);
+    const { distance } = view.camera, deep = 0.36 * distance + 48, step = (view.span[1] - view.span[0]) / 65534;
+    this.programs.together(...view.counts)({
+      first: 0, second: 1, solids: 2, known: 3, looks, background, step_mm: step,
+      dense: isFocused ? [FAR_DENSE, NEAR_DENSE - FAR_DENSE, RIM] : [1, 0, RIM],
+      ink: dark ? [0, 0, 0] : [0.1, 0.12, 0.14],
+      outline: Math.max(Math.round(OUTLINE_PX * scale), 1),
+      haze: [(HAZE * step) / deep, (HAZE * (view.span[0] - distance + deep / 6)) / deep, HAZE],
+    });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     // A texture that is drawn into must not be bound to be read.
-    pictures.forEach(([kind], n) => {
-      gl.activeTexture(gl.TEXTURE0 + n);
-      gl.bindTexture(kind, null);
-    });
+    for (const picture of pictures) picture[1] = null;
+    bind();
   }
 
   // Return what is under a place of the canvas, in pixels of the page from its upper left; picking.js says what.
@@ -306,10 +295,10 @@ export class Scene {
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
     const view = {
-      eye: eyeFromLps(pose.eye, pose.forward, pose.up), clip: perspective(pose.halfAngle, 1, 0.2, 400), span: [0.2, 400],
+      eyeFromLps: eyeFromLps(pose.eye, pose.forward, pose.up), clipFromEye: perspective(pose.halfAngle, 1, 0.2, 400), span: [0.2, 400],
     };
     if (surface) {
-      this.use(this.programs.inside, view);
+      this.programs.inside(view);
       this.drawSurface(surface, this.programs.inside);
     }
     this.setSolids(INSIDE, devices);
@@ -322,12 +311,11 @@ export class Scene {
 
   // Draw all solid bodies, or only those of one name; each has its number among them, from 0.
   drawSolids(view, only) {
-    const gl = this.gl;
-    this.use(this.programs.solid, view);
-    this.gl.uniform1f(this.programs.solid.places.lamp, only ? LAMP_PER_MM2 : 0);
+    const gl = this.gl, program = this.programs.solid;
+    program({ ...view, lamp: only ? LAMP_PER_MM2 : 0 });
     [...this.solids].forEach(([name, solid], n) => {
       if (only && name !== only) return;
-      gl.uniform1f(this.programs.solid.places.number, n / 255);
+      program({ number: n / 255 });
       gl.bindVertexArray(solid.array);
       gl.drawElements(gl.TRIANGLES, solid.count, gl.UNSIGNED_INT, 0);
     });
@@ -335,30 +323,18 @@ export class Scene {
 
   // Draw the points, which are numbered after the solid bodies.
   drawPoints(view) {
-    const gl = this.gl, { places } = this.programs.points;
-    if (!this.points.size) return;
-    this.use(this.programs.points, view);
-    const scale = this.canvas.width / Math.max(this.canvas.clientWidth, 1);
-    gl.uniform2f(places.pixels, (view.clip[0] * this.canvas.width) / 2, LEAST_POINT_PX * scale);
+    const gl = this.gl, program = this.programs.points, { width, clientWidth } = this.canvas;
+    program({ ...view, pixels: [(view.clipFromEye[0] * width) / 2, (LEAST_POINT_PX * width) / Math.max(clientWidth, 1)] });
     [...this.points.values()].forEach((points, n) => {
-      gl.uniform1f(places.number, (this.solids.size + n) / 255);
+      program({ number: (this.solids.size + n) / 255 });
       gl.bindVertexArray(points.array);
       gl.drawArrays(gl.POINTS, 0, points.count);
     });
   }
 
-  use({ program, places }, view) {
-    this.gl.useProgram(program);
-    this.gl.uniformMatrix4fv(places.clipFromEye, false, view.clip);
-    this.gl.uniformMatrix4fv(places.eyeFromLps, false, view.eye);
-    if (places.span) this.gl.uniform2fv(places.span, view.span);
-  }
-
-  drawSurface(surface, { places }, isCoarse = false) {
+  drawSurface(surface, program, isCoarse = false) {
     const gl = this.gl;
-    gl.uniform3fv(places.low, surface.low);
-    gl.uniform3fv(places.size, surface.size);
-    gl.uniform1f(places.share, this.share);
+    program({ low: surface.low, size: surface.size, share: this.share });
     gl.bindVertexArray(surface.array);
     if (isCoarse) this.useCoarse(surface);
     gl.drawElements(gl.TRIANGLES, isCoarse ? surface.coarse.count : surface.count, gl.UNSIGNED_INT, 0);
@@ -370,7 +346,7 @@ export class Scene {
     const gl = this.gl;
     if (surface.coarse) return gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
     const faces = coarser(surface.places, surface.faces, surface.size);
-    surface.coarse = { buffer: elements(gl, faces), count: faces.length };
+    surface.coarse = { buffer: buffered(gl, gl.ELEMENT_ARRAY_BUFFER, faces), count: faces.length };
     return surface.buffers.push(surface.coarse.buffer);
   }
 }
@@ -379,25 +355,23 @@ export class Scene {
 function uploaded(gl, attributes, faces = []) {
   const array = gl.createVertexArray();
   gl.bindVertexArray(array);
-  const buffers = attributes.map((each, n) => attribute(gl, n, ...each)), fine = faces.length ? elements(gl, faces) : null;
+  const buffers = attributes.map((each, n) => attribute(gl, n, ...each)), fine = faces.length ? buffered(gl, gl.ELEMENT_ARRAY_BUFFER, faces) : null;
   gl.bindVertexArray(null);
   return { array, buffers: [...buffers, fine], fine, count: faces.length };
 }
 
-// Return the buffer of faces, which belongs to the vertex array that is bound.
-function elements(gl, faces) {
-  const buffer = gl.createBuffer();
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+function attribute(gl, place, values, type, normalised, size, stride) {
+  const buffer = buffered(gl, gl.ARRAY_BUFFER, values);
+  gl.enableVertexAttribArray(place);
+  gl.vertexAttribPointer(place, size, type, normalised, stride, 0);
   return buffer;
 }
 
-function attribute(gl, place, values, type, normalised, size, stride) {
+// Return a buffer of values, which is bound; one of faces then belongs to the vertex array that is bound.
+function buffered(gl, kind, values) {
   const buffer = gl.createBuffer();
-  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-  gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-  gl.enableVertexAttribArray(place);
-  gl.vertexAttribPointer(place, size, type, normalised, stride, 0);
+  gl.bindBuffer(kind, buffer);
+  gl.bufferData(kind, values, gl.STATIC_DRAW);
   return buffer;
 }
 

@@ -184,26 +184,29 @@ void main() {
 }`;
 }
 
-function compiled(gl, kind, text) {
-  const shader = gl.createShader(kind);
-  gl.shaderSource(shader, text);
-  gl.compileShader(shader);
-  if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-  return shader;
-}
-
+// Return a program: a function that takes it into use and sets its uniforms; it has no use for others.
 function linked(gl, vertex, fragment) {
   const program = gl.createProgram();
-  gl.attachShader(program, compiled(gl, gl.VERTEX_SHADER, vertex));
-  gl.attachShader(program, compiled(gl, gl.FRAGMENT_SHADER, fragment));
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(program, shader);
+  }
   gl.linkProgram(program);
   if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-  const places = {};
+  const setters = {};
   for (let n = 0; n < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); n++) {
-    const name = gl.getActiveUniform(program, n).name.replace("[0]", "");
-    places[name] = gl.getUniformLocation(program, name);
+    const { name, type } = gl.getActiveUniform(program, n), place = gl.getUniformLocation(program, name);
+    const setter = { [gl.FLOAT]: "uniform1f", [gl.FLOAT_VEC2]: "uniform2fv", [gl.FLOAT_VEC3]: "uniform3fv", [gl.FLOAT_VEC4]: "uniform4fv" }[type];
+    setters[name.replace("[0]", "")] = (value) =>
+      (type === gl.FLOAT_MAT4 ? gl.uniformMatrix4fv(place, false, value) : gl[setter || "uniform1i"](place, value));
   }
-  return { program, places };
+  return (uniforms) => {
+    gl.useProgram(program);
+    for (const [name, value] of Object.entries(uniforms)) if (setters[name]) setters[name](value);
+  };
 }
 
 // Return the five programs: a layer of a surface, the airway from inside, solid bodies, points, and what puts layers

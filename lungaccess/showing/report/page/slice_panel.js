@@ -2,37 +2,31 @@
 import { made, swatch } from "./structures.js";
 import { minus, norm } from "./vectors.js";
 
+const panelField = (id) => document.getElementById(id);
+
 // Connects the controls with slices.
 export class SlicePanel {
   // said(place): further words about a place, such as its distance from the target.
-  constructor(root, views, said = () => []) {
+  constructor(views, said = () => []) {
     Object.assign(this, { views, said });
-    this.find = (id) => root.querySelector(`#${id}`);
-    const { image } = views;
-    this.find("ct-controls").hidden = !image.hasCt;
-    for (const name of ["cross", "window", "pan"]) if (name !== "window" || image.hasCt) this.addDrag(name);
-    this.find("drag").addEventListener("change", () => this.chooseDrag(this.find("drag").value));
-    this.find("field").addEventListener("change", () => {
-      const mm = Number(this.find("field").value);
-      if (mm) views.setWidth(mm);
-    });
-    this.find("window").addEventListener("change", () => this.changeWindow(() => image.setWindow(this.find("window").value)));
+    const { image } = views, on = (id, act) => panelField(id).addEventListener("change", ({ target }) => act(target));
+    panelField("ct-controls").hidden = !image.hasCt;
+    if (!image.hasCt) panelField("drag").querySelector("[value=window]").remove();
+    on("drag", ({ value }) => this.chooseDrag(value));
+    on("field", ({ value }) => value && views.setWidth(Number(value)));
+    on("window", ({ value }) => this.changeWindow(() => image.setWindow(value)));
     for (const id of ["window-level", "window-width"]) {
-      this.find(id).addEventListener("change", () => this.changeWindow(() => {
-        const [level, width] = [this.find("window-level"), this.find("window-width")].map((field) => Number(field.value));
+      on(id, () => this.changeWindow(() => {
+        const [level, width] = [panelField("window-level"), panelField("window-width")].map((field) => Number(field.value));
         if (Number.isFinite(level) && width > 0) image.setLevels(level, width);
       }));
     }
-    this.find("tint").addEventListener("change", () => {
-      image.tint = this.find("tint").checked;
+    on("tint", ({ checked }) => {
+      image.tint = checked;
       views.changed();
     });
     for (const structure of image.structures()) this.addOpacity(structure);
     this.showWindow();
-  }
-
-  addDrag(name) {
-    this.find("drag").append(new Option({ cross: "the cross", window: "the window", pan: "the pictures" }[name], name));
   }
 
   chooseDrag(kind) {
@@ -49,14 +43,14 @@ export class SlicePanel {
   // Write the window into its fields.
   showWindow() {
     const { image } = this.views, { level, width } = image.levels;
-    this.find("window").value = image.windowName || "free";
-    this.find("window-level").value = Math.round(level);
-    this.find("window-width").value = Math.round(width);
+    panelField("window").value = image.windowName || "free";
+    panelField("window-level").value = Math.round(level);
+    panelField("window-width").value = Math.round(width);
   }
 
   // Write the width of the pictures into its field, and say what is at the pointer or the cross.
   show() {
-    const field = this.find("field"), { widthMm } = this.views, known = [...field.options].find((option) => Number(option.value) === widthMm);
+    const field = panelField("field"), { widthMm } = this.views, known = [...field.options].find((option) => Number(option.value) === widthMm);
     const free = field.querySelector("option[value='']");
     free.textContent = known ? "other" : `${widthMm.toFixed(0)} mm`;
     field.value = known ? known.value : "";
@@ -72,7 +66,7 @@ export class SlicePanel {
       this.views.image.setOpacity(name, Number(slider.value) / 100);
       this.views.changed();
     });
-    this.find("opacities").append(made("li", {}, made("label", {}, swatch(colour), name, slider)));
+    panelField("opacities").append(made("li", {}, made("label", {}, swatch(colour), name, slider)));
   }
 
   // Say what is at a place: of the pointer, or of the cross when there is none.
@@ -80,7 +74,7 @@ export class SlicePanel {
     this.pointer = place ? { place, name } : null;
     const { views } = this, { image } = views, at = place || views.place;
     const hu = name && place ? views.slices[name].huAt(at) : image.huAt(at), voxel = image.grid.voxel(image.inMasks(at));
-    this.find("under-pointer").textContent = [
+    panelField("under-pointer").textContent = [
       `${place ? "Pointer" : "Cross"}: LPS ${at.map((value) => value.toFixed(1)).join(", ")} mm`,
       voxel ? `voxel ${voxel.join(", ")}` : "beyond the image",
       image.structureAt(at),

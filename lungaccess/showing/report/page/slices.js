@@ -240,13 +240,11 @@ export class Slice {
     pen.globalAlpha = away <= NEAR_MM ? 0.6 : 0.3;
     pen.lineWidth = 1;
     pen.beginPath();
-    for (const [from, to] of [[0, x - CROSS_GAP], [x + CROSS_GAP, width]]) {
-      pen.moveTo(from, y);
-      pen.lineTo(Math.max(from, to), y);
-    }
-    for (const [from, to] of [[0, y - CROSS_GAP], [y + CROSS_GAP, height]]) {
-      pen.moveTo(x, from);
-      pen.lineTo(x, Math.max(from, to));
+    const across = [[0, y, x - CROSS_GAP, y], [x + CROSS_GAP, y, Math.max(width, x + CROSS_GAP), y]];
+    const down = [[x, 0, x, y - CROSS_GAP], [x, y + CROSS_GAP, x, Math.max(height, y + CROSS_GAP)]];
+    for (const [x0, y0, x1, y1] of [...across, ...down]) {
+      pen.moveTo(x0, y0);
+      pen.lineTo(x1, y1);
     }
     pen.stroke();
     pen.globalAlpha = 1;

@@ -74,17 +74,13 @@ export function coarser(places, faces, size) {
 
 // Return for each vertex how near it is to a line of points, 0 to 255.
 export function nearnessOf({ places, low, size }, line) {
-  const found = new Uint8Array(places.length / 3);
-  const least = [0, 1, 2].map((axis) => Math.min(...line.map((point) => point[axis])) - NOT_MM);
-  const most = [0, 1, 2].map((axis) => Math.max(...line.map((point) => point[axis])) + NOT_MM);
+  const found = new Uint8Array(places.length / 3), axes = [0, 1, 2];
+  const ends = axes.map((axis) => line.map((point) => point[axis]));
+  const bounds = ends.map((values) => [Math.min(...values) - NOT_MM, Math.max(...values) + NOT_MM]);
   for (let n = 0; n < found.length; n++) {
-    const x = low[0] + (places[3 * n] / 65535) * size[0];
-    if (x < least[0] || x > most[0]) continue;
-    const y = low[1] + (places[3 * n + 1] / 65535) * size[1];
-    if (y < least[1] || y > most[1]) continue;
-    const z = low[2] + (places[3 * n + 2] / 65535) * size[2];
-    if (z < least[2] || z > most[2]) continue;
-    const share = (NOT_MM - alongLine(line, [x, y, z]).awayMm) / (NOT_MM - WHOLLY_MM);
+    const at = (axis) => low[axis] + (places[3 * n + axis] / 65535) * size[axis];
+    if (axes.some((axis) => at(axis) < bounds[axis][0] || at(axis) > bounds[axis][1])) continue;
+    const share = (NOT_MM - alongLine(line, axes.map(at)).awayMm) / (NOT_MM - WHOLLY_MM);
     found[n] = Math.round(255 * Math.min(Math.max(share, 0), 1));
   }
   return found;

@@ -1,7 +1,7 @@
 // What one does in the 3-D view besides turning it: point, measure, cut, and save a picture or a film.
 import { inscribe } from "./slices.js";
 import { Solids } from "./solids.js";
-import { made } from "./structures.js";
+import { made, oncePerFrame } from "./structures.js";
 import { add, dot, minus, norm, rgb, times, unit } from "./vectors.js";
 
 const MEASURE_INK = "#FFD23F";
@@ -61,15 +61,11 @@ export class ViewTools {
   // Pointing ----------------------------------------------------------------------------------------------------------
 
   connectPointing() {
-    let waiting = null;
+    const pointSoon = oncePerFrame(() => this.pointer && this.pointAt(...this.pointer));
     this.canvas.addEventListener("pointermove", (event) => {
       if (event.buttons || event.pointerType === "touch") return this.leave();
       this.pointer = [event.offsetX, event.offsetY];
-      waiting ??= requestAnimationFrame(() => {
-        waiting = null;
-        if (this.pointer) this.pointAt(...this.pointer);
-      });
-      return undefined;
+      return pointSoon();
     });
     this.canvas.addEventListener("pointerleave", () => this.leave());
     this.canvas.addEventListener("keydown", (event) => {
@@ -165,9 +161,8 @@ export class ViewTools {
   connectSaving() {
     for (const { key, name } of this.page.films()) this.find("film-kind").append(new Option(name, key));
     this.find("save-picture").addEventListener("click", async () => save(await this.picture(), `${this.fileName()}.png`));
-    const type = this.filmType();
-    this.find("save-film").disabled = !type;
-    if (!type) this.find("save-film").title = "This browser records no film";
+    this.filmType = this.canvas.captureStream && window.MediaRecorder && FILM_TYPES.find((type) => MediaRecorder.isTypeSupported(type));
+    if (!this.filmType) Object.assign(this.find("save-film"), { disabled: true, title: "This browser records no film" });
     this.find("save-film").addEventListener("click", async () => {
       if (this.recording) return this.recording.stop();
       const film = await this.film(this.find("film-kind").value);
@@ -182,8 +177,7 @@ export class ViewTools {
   // Return a PNG of the view as it is, with the letters of the sides and the labels.
   picture() {
     this.page.show("fine", false);
-    const sheet = document.createElement("canvas");
-    [sheet.width, sheet.height] = [this.canvas.width, this.canvas.height];
+    const { width, height } = this.canvas, sheet = made("canvas", { width, height });
     this.copyTo(sheet);
     return new Promise((resolve) => sheet.toBlob(resolve, "image/png"));
   }
@@ -201,18 +195,13 @@ export class ViewTools {
     }
   }
 
-  filmType() {
-    if (!this.canvas.captureStream || !window.MediaRecorder) return null;
-    return FILM_TYPES.find((type) => MediaRecorder.isTypeSupported(type)) || null;
-  }
-
   // Return a film of one turn, or of what the page moves: in the time it takes, with as many pictures as can be drawn.
   async film(kind, seconds = FILM_S) {
-    const sheet = document.createElement("canvas");
     // Even numbers, as encoders want them; the view itself may change its size.
-    [sheet.width, sheet.height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((px) => 2 * Math.ceil(px / 2));
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight].map((px) => 2 * Math.ceil(px / 2));
+    const sheet = made("canvas", { width, height });
     this.copyTo(sheet);
-    const recorder = new MediaRecorder(sheet.captureStream(FILM_FPS), { mimeType: this.filmType(), videoBitsPerSecond: 8e6 });
+    const recorder = new MediaRecorder(sheet.captureStream(FILM_FPS), { mimeType: this.filmType, videoBitsPerSecond: 8e6 });
     const parts = [], ended = new Promise((resolve) => recorder.addEventListener("stop", resolve));
     recorder.addEventListener("dataavailable", (event) => parts.push(event.data));
     this.recording = recorder;
@@ -242,9 +231,7 @@ export class ViewTools {
 
 // Let the browser store a file.
 function save(blob, name) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
+  const link = made("a", { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
 }

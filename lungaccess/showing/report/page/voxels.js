@@ -44,7 +44,8 @@ export async function placedVolume(packed, table = null) {
   const volume = await unpackVolume(packed);
   const { width, height, depth, first, spacing } = volume;
   const rows = [0, 1, 2].map((row) => [0, 1, 2].map((column) => (row === column ? spacing : 0)).concat(first[row]));
-  return volumeOf(new VoxelGrid([width, height, depth], rows), table ? decoded(volume.voxels, table) : volume.voxels);
+  const voxels = table ? Int16Array.from(volume.voxels, (byte) => table[byte]) : volume.voxels;
+  return volumeOf(new VoxelGrid([width, height, depth], rows), voxels);
 }
 
 // Return a volume of voxels, i fastest, on a grid.
@@ -52,12 +53,6 @@ export function volumeOf(grid, voxels) {
   const [width, height, depth] = grid.shape;
   const m = Float64Array.from(grid.inverse.flatMap((row, n) => [...row, grid.shift[n]]));
   return { grid, voxels, width, height, depth, m, first: grid.first, spacing: grid.spacing[0] };
-}
-
-function decoded(bytes, table) {
-  const values = new Int16Array(bytes.length);
-  for (let n = 0; n < bytes.length; n++) values[n] = table[bytes[n]];
-  return values;
 }
 
 // Return the value of the voxel that holds a point, of the last volume that does; 0 beyond all.

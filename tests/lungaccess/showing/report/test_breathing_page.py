@@ -75,8 +75,8 @@ def test_tissue_and_devices_are_where_the_check_has_them(
 
 
 def test_the_page_stores_the_displacement_finely(packed: dict[str, Any], moving: Moving) -> None:
-    counts = np.cumsum(unpack(packed["differences"]), axis=-1)
-    error = np.abs(packed["step_mm"] * np.moveaxis(counts, 0, -1) - moving.field).max()
+    counts = [np.cumsum(unpack(each["voxels"]), axis=-1).transpose(2, 1, 0) for each in packed["fields"]]
+    error = np.abs(packed["step_mm"] * np.stack(counts, axis=-1) - moving.field).max()
     assert error <= 0.5 * breathing.FIELD_STEP_MM + 1e-9
     assert np.ptp(moving.field) > 3.0
 

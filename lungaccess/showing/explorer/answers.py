@@ -16,7 +16,7 @@ from anatomy.base.words import plural
 from anatomy.grid import Volume
 from anatomy.lung import Lung
 from lungaccess.planning import ProgressEvent, run, tips_near
-from lungaccess.planning.coupled import Atlas, atlas_is_kept, feasible_exits, open_atlas
+from lungaccess.planning.coupled import Atlas, FeasibleExits, atlas_is_kept, feasible_exits, open_atlas
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
@@ -205,10 +205,10 @@ class Answers:
         system.require_needle("The list of feasible exits")
         atlas = self._atlas(system, turn)
         tips = None if question.scope_tip is None else tips_near(atlas, _tip(atlas, question.scope_tip))
-        began = told = time.monotonic()
+        told = -np.inf
         for found in feasible_exits(self.lung, system, target, atlas=atlas, scope_tips=tips):
             now = time.monotonic()
-            if not (found.is_complete or now - told >= TELL_EVERY_S or told == began):
+            if not (found.is_complete or now - told >= TELL_EVERY_S):
                 yield None
                 continue
             told = now
@@ -216,9 +216,8 @@ class Answers:
             entries = found.entries[best]
             yield Part(
                 {
-                    "answer": "exits", "complete": found.is_complete, "deployments": len(found.entries),
-                    "in_workspace": found.in_workspace, "tried": found.tried, "blocked": dict(found.blocked),
-                    "target_lps": target.lps_mm.tolist(), "elapsed_s": now - began,
+                    "answer": "exits", "complete": found.is_complete, "words": _exits_words(found),
+                    "deployments": len(found.entries), "target_lps": target.lps_mm.tolist(),
                 },
                 {
                     "points": found.exit_lps.astype(np.float32),
@@ -387,6 +386,19 @@ def _tip(atlas: Atlas, tip: int) -> Float:
 def _require_below(number: int, count: int, what: str) -> None:
     if number >= count:
         raise SettingsError(f"There is no {what} {number}", expected=f"a number below {count}")
+
+
+def _exits_words(found: FeasibleExits) -> str:
+    """Return how many exits there are, or what stopped all arcs."""
+    tried = f" ({found.tried} of {found.in_workspace} positions of the tubes tried so far)"
+    more = "" if found.is_complete else tried
+    if found.count:
+        return f"{plural(found.count, 'place')} to leave the airway with one clear arc{more}"
+    if not found.in_workspace:
+        return "From no position of the tubes does the needle get as far as the target in one arc"
+    most_first = sorted(found.blocked.items(), key=lambda each: -each[1])
+    stopped = ", ".join(f"{name} stops {count}" for name, count in most_first)
+    return f"No single arc is clear from {found.in_workspace} positions of the tubes{more}: {stopped}"
 
 
 def _goal_words(goal: Goal, found: Plan) -> dict[str, str]:

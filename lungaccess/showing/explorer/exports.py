@@ -35,6 +35,7 @@ from lungaccess.showing.explorer.questions import ExplainQuestion
 from lungaccess.showing.explorer.worker import Part, Turn
 from lungaccess.showing.report.html import PageOptions, plan_page
 from lungaccess.showing.report.html.volumes import CtFile
+from lungaccess.showing.report.reach import COLOURS
 from lungaccess.showing.slicer import export_slicer
 
 Reached = MutableMapping[tuple[Any, ...], Int]
@@ -175,7 +176,8 @@ def reach_parts(
         {
             "answer": "reach grid", "shape": list(grid.shape), "spacing_mm": float(grid.spacing_mm[0]),
             "ijk_from_lps": grid.ijk_from_lps.tolist(), "lps_from_ijk": grid.lps_from_ijk.tolist(),
-            "kinds": dict(KINDS), "counted": len(stream.counted), "system": system.name,
+            "colours": {code: COLOURS[name] for name, code in KINDS.items() if name != "undecided"},
+            "counted": len(stream.counted), "system": system.name,
         }
     )  # fmt: skip
     key = (system.scope, system.tubes, system.margins, atlas.with_fissures)

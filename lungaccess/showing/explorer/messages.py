@@ -58,7 +58,7 @@ def read_frame(sent: Frame) -> tuple[dict[str, Any], dict[str, Array]]:
 
 def error_message(number: int | None, error: LungaccessError) -> Message:
     """Return the answer to a question that cannot be answered; None where its number is not known."""
-    return {"id": number, "answer": "error", "error": error.to_mapping()}
+    return {"id": number, "answer": "error", "error": {**error.to_mapping(), "words": str(error)}}
 
 
 def _json(message: Message) -> str:

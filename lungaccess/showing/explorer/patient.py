@@ -17,7 +17,6 @@ from lungaccess.problem.nodules import nodules_of
 from lungaccess.showing.explorer.worker import PatientSource
 from lungaccess.showing.report.html.meshes import structure_meshes
 from lungaccess.showing.report.html.volumes import CtFile, fine_image, page_image
-from lungaccess.showing.report.reach import COLOURS
 
 MOST_NODULES = 50
 NODULE = "nodule"
@@ -48,7 +47,6 @@ def patient_facts(lung: Lung, source: PatientSource) -> dict[str, Any]:
         "may_outline": source.ct is not None and (source.patient / STATE).is_file(),
         "carina_lps": np.asarray(lung.tree.carina_lps).tolist(),
         "targets": _targets(lung),
-        "reach_colours": COLOURS,
         "first_system": source.system,
         "systems": [_system(system) for system in systems.values()],
     }
@@ -65,9 +63,8 @@ def _targets(lung: Lung) -> list[dict[str, Any]]:
             continue
         place = lung.region_at(point)
         words = [f"{sizes[text]:.0f} mm"] if text in sizes else []
-        found.append(
-            {"text": text, "lps_mm": point.tolist(), "lobe": ", ".join([*([place] if place else []), *words])}
-        )
+        label = ", ".join([text, *([place] if place else []), *words])
+        found.append({"text": text, "lps_mm": point.tolist(), "label": label})
     return found
 
 

@@ -1,54 +1,91 @@
-// What the page asks: of each kind the latest question alone counts, and its progress is shown.
+// What the page asks over the socket to the server, and the answers, part by part; lungaccess.showing.explorer.messages says how.
 import { byId } from "../report/anatomy_page.js";
-import { errorWords } from "./widgets.js";
+import { TYPES } from "../report/decode.js";
+import { say } from "./widgets.js";
 
+const LAST = ["end", "error", "superseded"];
+const LOST = { kind: "Connection", words: "The explorer has ended. Start `lungaccess view` again." };
 // Answers that come soon, and are shown before a better picture is drawn.
 const SOON = ["exits", "plan", "place", "appraise"];
 
 export class Asker {
-  // say shows words about what is going on.
-  constructor(connection, say) {
-    Object.assign(this, { connection, say, numbers: {}, awaited: 0 });
+  constructor() {
+    Object.assign(this, { number: 0, latest: {}, open: new Map(), shown: null });
   }
 
-  // Ask, and say an error where that is the answer; resolves with the last message.
-  async asked(ask, values, part) {
-    const last = await this.connection.ask(ask, values, part).done;
-    if (last.answer === "error") this.say(errorWords(last.error));
-    return last;
+  async connect() {
+    this.socket = new WebSocket(`ws://${location.host}/socket`);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.addEventListener("message", ({ data }) => this.received(typeof data === "string" ? JSON.parse(data) : unpacked(data)));
+    await new Promise((resolve, reject) => {
+      this.socket.addEventListener("open", resolve);
+      this.socket.addEventListener("error", () => reject(new Error("the explorer does not answer")));
+    });
+    this.socket.addEventListener("close", () => {
+      for (const id of this.open.keys()) this.received({ id, answer: "error", error: LOST });
+      say(LOST.words);
+    });
   }
 
-  // Ask so that a later question with the same name takes the place of this one.
-  async latest(name, values, part) {
-    this.forget(name);
-    const number = this.numbers[name], isLatest = () => this.numbers[name] === number;
-    const counts = SOON.includes(name) ? 1 : 0;
-    this.awaited += counts;
-    try {
-      const last = await this.connection.ask(name, values, (message) => {
-        if (!isLatest()) return null;
-        return message.answer === "progress" ? this.showProgress(message) : part(message);
-      }).done;
-      if (!isLatest()) return { answer: "superseded" };
-      this.showProgress(null);
-      return last;
-    } finally {
-      this.awaited -= counts;
-    }
+  // Whether an answer is awaited that comes soon.
+  get awaited() {
+    return [...this.open.values()].some(({ key }) => SOON.includes(key));
+  }
+
+  // Ask; of questions with the same name and slot the latest alone counts.  part receives each part of the answer with its
+  // arrays, one after the other: it may be asynchronous.  failed receives an error in words, and the error.  The promise
+  // resolves after them with the last message, whose "answer" is "end", "error" or "superseded".
+  ask(name, values, part = () => {}, failed = say) {
+    const id = ++this.number, key = values.slot ? `${name} ${values.slot}` : name;
+    this.latest[key] = id;
+    return new Promise((resolve, reject) => {
+      this.open.set(id, { key, part, failed, resolve, reject, parts: Promise.resolve() });
+      if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ ask: name, id, ...values }));
+      else this.received({ id, answer: "error", error: LOST });
+    });
   }
 
   // Take no more of what is answered to the latest question of a name.
   forget(name) {
-    this.numbers[name] = (this.numbers[name] || 0) + 1;
+    delete this.latest[name];
   }
 
-  showProgress(message) {
-    const bar = byId("progress");
-    bar.hidden = message === null;
-    if (!message) return;
-    if (message.share === null) bar.removeAttribute("value");
-    else bar.value = message.share;
-    const share = message.share === null ? "" : `: ${Math.round(100 * message.share)} %`;
-    this.say(`${message.what[0].toUpperCase()}${message.what.slice(1)}${share}`);
+  received(message) {
+    const { id, answer } = message, question = this.open.get(id);
+    if (!question) return;
+    question.parts = question.parts.then(() => this.take(question, message));
+    if (LAST.includes(answer)) question.parts.finally(() => this.open.delete(id)).then(question.resolve, question.reject);
   }
+
+  // Take a part of an answer; the last one is what became of the question.
+  async take({ key, part, failed }, message) {
+    const { id, answer, error } = message, isLast = LAST.includes(answer);
+    if (isLast && this.shown === id) byId("progress").hidden = true;
+    if (this.latest[key] !== id) return { answer: "superseded" };
+    if (answer === "progress") this.showProgress(message);
+    else if (!isLast) await part(message);
+    if (isLast) delete this.latest[key];
+    if (error) failed(error.words, error);
+    return message;
+  }
+
+  showProgress({ id, what, share }) {
+    const bar = byId("progress");
+    this.shown = id;
+    bar.hidden = false;
+    if (share === null) bar.removeAttribute("value");
+    else bar.value = share;
+    say(`${what[0].toUpperCase()}${what.slice(1)}${share === null ? "" : `: ${Math.round(100 * share)} %`}`);
+  }
+}
+
+// Return the message of a binary frame; its arrays take the place of their descriptions.
+function unpacked(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const message = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  const arrays = {};
+  for (const { name, kind, shape, offset } of message.arrays) {
+    arrays[name] = new TYPES[kind](buffer, 4 + length + offset, shape.reduce((product, n) => product * n, 1));
+  }
+  return { ...message, arrays };
 }

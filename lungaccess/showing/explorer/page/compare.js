@@ -1,22 +1,19 @@
 // Up to five plans beside each other: a table, and all of them in 3-D and in the slices.
 import { byId } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
-import { Motion } from "../report/motion.js";
-import { made } from "../report/structures.js";
+import { made, swatch } from "../report/structures.js";
 import { MOST_COMPARED, planKey, planQuestion } from "./state.js";
-import { button, errorWords, fillRows, mm } from "./widgets.js";
+import { button, fillRows, mm, say } from "./widgets.js";
 
 export class Compared {
   constructor(page) {
-    this.page = page;
-    this.rows = [];
-    this.hidden = new Set();
+    Object.assign(this, { page, rows: [], hidden: new Set() });
+    byId("keep").addEventListener("click", () => this.keep());
   }
 
   // The plans that are drawn: all but those that are hidden, and the one that is shown anyway.
   get shown() {
-    const { plan } = this.page;
-    return this.rows.filter((row) => row.plan && row.plan.motion && !this.hidden.has(row.key) && row.plan !== plan)
+    return this.rows.filter(({ plan, key }) => plan?.motion && plan !== this.page.plan && !this.hidden.has(key))
       .map(({ plan: { motion }, number }) => ({ motion, number }));
   }
 
@@ -27,8 +24,8 @@ export class Compared {
   keep() {
     const { state, plan } = this.page;
     if (!plan) return;
-    if (state.compared.some((asked) => planKey(asked) === planKey(state.asked))) this.page.say("This plan is kept already.");
-    else if (state.compared.length >= MOST_COMPARED) this.page.say(`${MOST_COMPARED} plans are kept: remove one first.`);
+    if (state.compared.some((asked) => planKey(asked) === planKey(state.asked))) say("This plan is kept already.");
+    else if (state.compared.length >= MOST_COMPARED) say(`${MOST_COMPARED} plans are kept: remove one first.`);
     else state.compare([...state.compared, { ...state.asked }]);
   }
 
@@ -37,7 +34,7 @@ export class Compared {
     const before = new Map(this.rows.map((row) => [row.key, row]));
     this.rows = this.page.state.compared.map((asked, n) => {
       const key = planKey(asked);
-      return { plan: this.page.plans.get(key), ...before.get(key), asked, key, number: n + 1 };
+      return Object.assign(before.get(key) ?? { plan: this.page.plans.get(key) }, { asked, key, number: n + 1 });
     });
     this.list();
     this.fill();
@@ -46,59 +43,40 @@ export class Compared {
   async fill() {
     if (this.filling) return;
     this.filling = true;
-    for (let row = this.missing(); row; row = this.missing()) {
+    const { page } = this, isMissing = ({ tried, plan }) => !tried && !(plan && plan.final && plan.appraisal);
+    for (let row = this.rows.find(isMissing); row; row = this.rows.find(isMissing)) {
+      const { key, asked } = row;
       row.tried = true;
-      const known = this.page.plans.get(row.key);
-      if (known && known.final) row.plan = known;
-      else {
-        const last = await this.page.connection.ask("plan", { ...planQuestion(row.asked), slot: "compare" }, async (found) => {
+      row.plan = page.plans.get(key);
+      if (!row.plan || !row.plan.final) {
+        const { answer } = await page.asker.ask("plan", { ...planQuestion(asked), slot: "compare" }, async (found) => {
           if (found.answer === "no_plan") row.error = found.found;
-          if (found.answer !== "plan") return;
-          row.plan = { ...(row.plan || {}), ...found };
-          if (found.packed) row.plan.motion = await Motion.of({ ...found.packed, scope_tip_lps: found.scope_tip_lps });
-        }).done;
-        if (last.answer === "superseded") row.tried = false;
-        if (last.answer === "error") row.error = errorWords(last.error);
-        if (row.plan && row.plan.final) this.page.plans.set(row.key, row.plan);
+          else row.plan = await page.keepPlan(found, key);
+        }, (words) => (row.error = words));
+        row.tried = answer !== "superseded";
       }
-      if (row.plan && !row.plan.appraisal) {
-        await this.page.connection.ask("appraise", { plan: row.plan.digest, slot: "compare" }, (found) => {
-          row.plan.appraisal = found;
-        }).done;
-      }
+      if (row.plan) await page.appraise(row.plan, "compare");
       this.list();
     }
     this.filling = false;
   }
 
-  missing() {
-    return this.rows.find((row) => !row.tried && !(row.plan && row.plan.final && row.plan.appraisal));
-  }
-
   list() {
-    byId("compare-table").hidden = !this.rows.length;
-    byId("compare-none").hidden = this.rows.length > 0;
-    fillRows(byId("compare"), this.rows.map((row, n) => this.row(row, n)));
+    fillRows(byId("compare"), this.rows.map((row) => this.cells(row)));
     this.page.redraw();
   }
 
-  row({ key, asked, plan, number, error }, n) {
-    const swatch = made("span", { className: "swatch", style: `background: ${planStyle(number).colour}` });
-    const box = made("input", { type: "checkbox", checked: !this.hidden.has(key), ariaLabel: `Show plan ${n + 1}`, onchange: ({ target }) => {
-      this.hidden[target.checked ? "delete" : "add"](key);
+  cells({ key, asked, plan, number, error }) {
+    const { state } = this.page;
+    const box = made("input", { type: "checkbox", checked: !this.hidden.has(key), ariaLabel: `Show plan ${number}`, onchange: () => {
+      this.hidden[box.checked ? "delete" : "add"](key);
       this.page.redraw();
     } });
     const system = plan ? plan.system : asked.system, from = asked.exit !== null ? ", from an exit" : asked.tip !== null ? ", from a tip" : "";
-    const open = button(`${number}: ${asked.target.replaceAll(",", ", ")}; ${system}${from}`, `Show plan ${n + 1} again`, () => this.page.state.set({ ...asked }));
-    const remove = button("✕", `Remove plan ${n + 1}`, () => this.page.state.compare(this.page.state.compared.filter((_, k) => k !== n)));
+    const open = button(`${number}: ${asked.target.replaceAll(",", ", ")}; ${system}${from}`, `Show plan ${number} again`, () => state.set({ ...asked }));
+    const remove = button("✕", `Remove plan ${number}`, () => state.compare(state.compared.toSpliced(number - 1, 1)));
     const chance = plan && (plan.appraisal ? (plan.appraisal.accepted ? plan.appraisal.chance : "refused") : "not checked");
     const cells = plan ? [chance, mm(plan.needle_mm, 0), mm(plan.least_mm)] : [error || "…", "", ""];
-    return [made("span", {}, box, swatch, open), ...cells, remove];
-  }
-
-  report() {
-    return this.rows.map(({ key, plan, error }) => ({
-      key, digest: plan ? plan.digest : null, appraised: Boolean(plan && plan.appraisal), hidden: this.hidden.has(key), error: error || null,
-    }));
+    return [made("span", {}, box, swatch(planStyle(number).colour), open), ...cells, remove];
   }
 }

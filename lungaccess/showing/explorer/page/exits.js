@@ -1,63 +1,72 @@
-// The feasible exits of the target: painted in 3-D and in the slices, listed, chosen.
+// The feasible exits of the target and the places of the scope, as the atlas has them: painted, listed, chosen.
 import { VIRIDIS } from "../report/colours.js";
-import { made } from "../report/structures.js";
-import { point, ramp, rgb } from "../report/vectors.js";
-import { button, mm } from "./widgets.js";
+import { minus, norm, point, ramp, rgb } from "../report/vectors.js";
+import { button, leastOf, mm } from "./widgets.js";
 
 // Without its darkest end.
 const RAMP = VIRIDIS.slice(1);
 const RADIUS_MM = 1.1, CHOSEN_MM = 1.8, MOST_LISTED = 12;
 const CHOSEN = rgb("#FFFFFF");
+const NEXT_MM = 6, STEP_MM = 2;
 
 export class Exits {
   constructor(answer) {
     const { arrays } = answer;
-    this.answer = answer;
-    this.entries = arrays.entry;
-    this.tips = arrays.tip;
-    this.places = Array.from({ length: arrays.entry.length }, (_, n) => point(arrays.points, n));
-    this.count = this.places.length;
+    Object.assign(this, { answer, entries: arrays.entry, tips: arrays.tip, count: arrays.entry.length });
+    this.places = Array.from(arrays.entry, (_, n) => point(arrays.points, n));
   }
 
-  // Return a share from 0, worst, to 1, best, for each exit, by "cost" or "clearance".
-  shares(by) {
-    const values = Array.from(by === "cost" ? this.answer.arrays.cost : this.answer.arrays.clearance_mm);
-    const low = Math.min(...values), high = Math.max(...values);
-    const share = (value) => (high > low ? (value - low) / (high - low) : 1);
-    return values.map((value) => (by === "cost" ? 1 - share(value) : share(value)));
-  }
-
-  // Return the points of the 3-D view; the chosen one is white and larger.
+  // Return the points of the 3-D view, coloured from worst to best by "cost" or "clearance"; the chosen one is white and larger.
   points(by, chosen) {
-    const shares = this.shares(by);
-    const colours = shares.map((share, n) => (n === chosen ? CHOSEN : ramp(RAMP, share)));
-    const radii = shares.map((_, n) => (n === chosen ? CHOSEN_MM : RADIUS_MM));
-    return { places: this.places.flat(), colours: colours.flat(), radii };
+    const { cost, clearance_mm: clearance } = this.answer.arrays;
+    const values = Array.from(by === "cost" ? cost.map((value) => -value) : clearance);
+    const low = Math.min(...values), high = Math.max(...values), share = (value) => (high > low ? (value - low) / (high - low) : 1);
+    const colours = values.map((value, n) => (n === chosen ? CHOSEN : ramp(RAMP, share(value))));
+    return { places: this.places.flat(), colours: colours.flat(), radii: values.map((_, n) => (n === chosen ? CHOSEN_MM : RADIUS_MM)) };
   }
 
   // Return the number of the exit with an entry of the atlas, -1 for none.
   numberOf(entry) {
-    return entry === null ? -1 : this.entries.indexOf(entry);
+    return this.entries.indexOf(entry);
   }
 
-  // Say in words how many there are.
-  words() {
-    const { in_workspace: held, tried, complete, blocked } = this.answer;
-    const more = complete ? "" : ` (${tried} of ${held} positions of the tubes tried so far)`;
-    if (this.count) return `${this.count} ${this.count === 1 ? "place" : "places"} to leave the airway with one clear arc${more}`;
-    if (!held) return "From no position of the tubes does the needle get as far as the target in one arc";
-    const stopped = Object.entries(blocked).sort((a, b) => b[1] - a[1]).map(([name, count]) => `${name} stops ${count}`);
-    return `No single arc is clear from ${held} positions of the tubes${more}: ${stopped.join(", ")}`;
-  }
-
-  // List them in a table body, the least costly first; choose receives an entry.
-  list(body, chosen, choose) {
+  // Return the rows of a table, the least costly first; choose receives an entry.
+  rows(chosen, choose) {
     const { clearance_mm: clearance, length_mm: length, count } = this.answer.arrays;
-    const rows = this.places.slice(0, MOST_LISTED).map((_, n) => made("tr", {},
-      made("th", { scope: "row" }, button(`${n + 1}`, `Plan from exit ${n + 1}`, () => choose(this.entries[n]),
-        { ariaPressed: String(n === chosen) })),
-      ...[mm(clearance[n]), mm(length[n], 0), String(count[n])].map((text) => made("td", {}, text))));
-    body.replaceChildren(...rows);
-    return this.places.length - rows.length;
+    return this.places.slice(0, MOST_LISTED).map((_, n) => [
+      button(`${n + 1}`, `Plan from exit ${n + 1}`, () => choose(this.entries[n]), { ariaPressed: String(n === chosen) }),
+      mm(clearance[n]), mm(length[n], 0), String(count[n]),
+    ]);
+  }
+
+  get unlisted() {
+    return this.count > MOST_LISTED ? `${this.count - MOST_LISTED} more are painted` : "";
+  }
+}
+
+export class Tips {
+  constructor({ arrays: { tips, turned, depth_mm: depth, deployments } }) {
+    Object.assign(this, { tips, depth });
+    // Those along the axis of the airway from which something can be deployed.
+    this.usable = [...turned.keys()].filter((n) => !turned[n] && deployments[n]);
+  }
+
+  // Return the place of a tip, null where the atlas has none of that number.
+  place(number) {
+    return number in this.depth ? point(this.tips, 2 * number) : null;
+  }
+
+  nearest(place) {
+    return leastOf(this.usable, (n) => norm(minus(this.place(n), place)));
+  }
+
+  // Return the next tip towards the trachea (-1) or away from it (1), where the airway forks the one nearer to a point.
+  next(from, way, towards) {
+    const start = this.place(from);
+    return start && leastOf(this.usable, (n) => {
+      const deeper = way * (this.depth[n] - this.depth[from]), place = this.place(n), away = norm(minus(place, start));
+      if (deeper <= 0 || away > NEXT_MM || Math.abs(away - deeper) > STEP_MM) return Infinity;
+      return Math.abs(deeper - STEP_MM) + (towards ? 0.2 * norm(minus(place, towards)) : 0);
+    });
   }
 }

@@ -7,22 +7,21 @@ import { deviceLines, otherLines, showBall, showDevices, showOther } from "../re
 import { Motion } from "../report/motion.js";
 import { STANDARD } from "../report/slices.js";
 import { Player } from "../report/player.js";
-import { made, oncePerFrame } from "../report/structures.js";
+import { oncePerFrame } from "../report/structures.js";
 import { minus, norm, rgb } from "../report/vectors.js";
 import { VoxelImage } from "../report/voxel_image.js";
 import { placedVolume } from "../report/voxels.js";
 import { Asker } from "./asker.js";
 import { Compared } from "./compare.js";
-import { Connection } from "./connection.js";
-import { connectHelp, connectKeys } from "./keys.js";
+import { connectKeys } from "./keys.js";
 import { connectPainting } from "./paint.js";
 import { Panes } from "./panes.js";
 import { PlanPanel } from "./plan_panel.js";
 import { connectPointer } from "./pointer.js";
 import { Search } from "./search.js";
-import { MOST_COMPARED, planKey, State } from "./state.js";
+import { FREE, MOST_COMPARED, planKey, State } from "./state.js";
 import { WhatIfPanel } from "./what_if.js";
-import { errorWords, lpsText, mm } from "./widgets.js";
+import { fillList, fillRows, lpsText, mm, say } from "./widgets.js";
 
 const KEPT_PLANS = 30, REST_MS = 250, DARK_AIRWAY = "#A6D8F8", COMPARED = "compared ";
 
@@ -56,16 +55,15 @@ class ExplorerPage extends DevicePage {
   }
 
   async open() {
-    this.connection = await Connection.open(() => this.say("The explorer has ended: start `lungaccess view` again."));
-    this.asker = new Asker(this.connection, (words) => this.say(words));
-    this.say("Reading the patient…");
-    await this.asker.asked("patient", {}, (facts) => this.takePatient(facts));
-    this.say("Loading the anatomy…");
-    await this.asker.asked("scene", {}, (part) => this.takeScene(part));
-    await this.scenePart;
+    this.asker = new Asker();
+    await this.asker.connect();
+    say("Reading the patient…");
+    await this.asker.ask("patient", {}, (facts) => this.takePatient(facts));
+    say("Loading the anatomy…");
+    await this.asker.ask("scene", {}, (part) => this.takeScene(part));
     this.listStructures();
     this.connectControls();
-    this.say("Ready. Click into a slice, or pick a nodule.");
+    say("Ready. Click into a slice, or pick a nodule.");
     this.ready = true;
     this.follow();
   }
@@ -81,15 +79,11 @@ class ExplorerPage extends DevicePage {
     if (quality === "moving") this.better = setTimeout(later, REST_MS);
   }
 
-  say(words) {
-    byId("status").textContent = words;
-  }
-
   takeFacts(facts) {
     this.facts = facts;
-    byId("warnings").replaceChildren(...facts.warnings.map((words) => made("li", {}, words)));
-    byId("nodule").replaceChildren(new Option(facts.targets.length ? "choose" : "none", ""), ...facts.targets.map(({ text, lobe }) =>
-      new Option(lobe ? `${text}, ${lobe}` : text, text)));
+    fillList(byId("warnings"), facts.warnings);
+    const options = facts.targets.map(({ text, label }) => new Option(label, text));
+    byId("nodule").replaceChildren(new Option(options.length ? "choose" : "none", ""), ...options);
   }
 
   takePatient(facts) {
@@ -97,9 +91,6 @@ class ExplorerPage extends DevicePage {
     byId("patient").textContent = facts.patient;
     document.title = `${facts.patient} - lungaccess`;
     this.data = { ...this.data, patient: facts.patient, page: "explorer" };
-    for (const kind of ["direct arc", "unreachable"]) {
-      document.documentElement.style.setProperty(`--${kind.replace(" ", "-")}`, facts.reach_colours[kind]);
-    }
     this.start = [...(facts.targets[0] ? facts.targets[0].lps_mm : facts.carina_lps)];
     this.state = new State(facts.first_system, () => this.follow());
     this.whatIfPanel = new WhatIfPanel(facts, this.state);
@@ -107,24 +98,20 @@ class ExplorerPage extends DevicePage {
     this.compared = new Compared(this);
   }
 
-  takeScene({ image, structures }) {
-    if (image) this.imagePart = VoxelImage.of(image).then((made) => this.takeImage(made));
-    if (structures) this.scenePart = this.imagePart.then(() => this.takeStructures(structures));
-  }
-
-  takeImage(image) {
-    this.image = image;
-    if (this.facts.has_ct) image.finer = { slice: (raster) => this.sharpSlice(raster) };
-    byId("ct-controls").hidden = !image.hasCt;
-    this.openSlices();
-    byId("reach-slices").checked = !image.hasCt;
+  async takeScene({ image, structures }) {
+    if (structures) return this.takeStructures(structures);
+    this.image = await VoxelImage.of(image);
+    if (this.facts.has_ct) this.image.finer = { slice: (raster) => this.sharpSlice(raster) };
+    byId("ct-controls").hidden = !this.image.hasCt;
+    byId("reach-slices").checked = !this.image.hasCt;
+    return this.openSlices();
   }
 
   // Return the values of the CT, as the server has it, at the pixels of a plane; voxels.js says what a source is.
   async sharpSlice(raster) {
     let values = null;
     // A slot of its own: each slice asks one at a time, and none takes the place of another.
-    await this.connection.ask("slice", { ...raster, slot: `${++this.sharp}` }, ({ arrays: { hu } }) => (values = hu)).done;
+    await this.asker.ask("slice", { ...raster, slot: `${++this.sharp}` }, ({ arrays: { hu } }) => (values = hu));
     return values;
   }
 
@@ -144,24 +131,21 @@ class ExplorerPage extends DevicePage {
   }
 
   connectControls() {
-    byId("undo").addEventListener("click", () => history.back());
-    byId("redo").addEventListener("click", () => history.forward());
+    const clicks = {
+      undo: () => history.back(), redo: () => history.forward(), outline: () => this.outline(),
+      "cross-target": () => this.chooseTarget(lpsText(this.place)), free: () => this.state.set(FREE),
+      "tip-back": () => this.moveTip(-1), "tip-forward": () => this.moveTip(1), "help-open": () => byId("help").showModal(),
+    };
+    for (const [id, act] of Object.entries(clicks)) byId(id).addEventListener("click", act);
     byId("target-form").addEventListener("submit", (event) => {
       event.preventDefault();
       this.chooseTarget(byId("target-text").value.trim());
     });
     byId("nodule").addEventListener("change", (event) => event.target.value && this.chooseTarget(event.target.value));
-    byId("cross-target").addEventListener("click", () => this.chooseTarget(lpsText(this.place)));
-    byId("outline").addEventListener("click", () => this.outline());
     byId("reach-slices").addEventListener("change", () => this.redrawSlices());
     byId("reach-scene").addEventListener("change", () => this.showReach());
     byId("exits-by").addEventListener("change", () => this.showExits());
-    byId("tip-back").addEventListener("click", () => this.moveTip(-1));
-    byId("tip-forward").addEventListener("click", () => this.moveTip(1));
-    byId("free").addEventListener("click", () => this.state.set({ exit: null, tip: null }));
-    connectHelp();
     connectKeys(this);
-    this.planPanel.connect();
     this.whatIfPanel.connect();
   }
 
@@ -186,12 +170,12 @@ class ExplorerPage extends DevicePage {
   }
 
   describe() {
-    this.asker.latest("place", { point: this.place }, (found) => {
+    this.asker.ask("place", { point: this.place }, (found) => {
       const isTarget = this.targetLps && norm(minus(this.place, this.targetLps)) < 0.1;
       const known = isTarget && this.facts.targets.find(({ text }) => text === this.state.asked.target);
       const near = Object.entries(found.distance_mm).filter(([, value]) => value < 30).map(([name, value]) => `${mm(value)} to ${name}`);
       byId("place-words").textContent = [
-        (known ? [known.text, known.lobe] : [found.tissue, found.lobe]).filter(Boolean).join(", "), ...near, lpsText(found.lps_mm),
+        known ? known.label : [found.tissue, found.lobe].filter(Boolean).join(", "), ...near, lpsText(found.lps_mm),
       ].join("; ");
       byId("cross-target").hidden = !found.may_be_target || Boolean(isTarget);
       byId("outline").hidden = !this.facts.may_outline || found.tissue === "nodule";
@@ -205,8 +189,8 @@ class ExplorerPage extends DevicePage {
   // Outline the nodule at the cross at once; a second press makes it part of the patient, which is opened anew.
   async outline() {
     const point = this.outlined || [...this.place], take = Boolean(this.outlined);
-    byId("target-error").hidden = true;
-    const last = await this.asker.latest("outline", { point, take }, async (found) => {
+    byId("target-error").textContent = "";
+    await this.asker.ask("outline", { point, take }, async (found) => {
       if (take) {
         history.replaceState(null, "", `/#${new URLSearchParams({ target: found.target })}`);
         location.reload();
@@ -215,27 +199,27 @@ class ExplorerPage extends DevicePage {
       await this.takeFine(found.image);
       this.outlined = point;
       byId("outline").textContent = `Add this nodule of ${mm(found.diameter_mm)}, ${found.volume_ml.toFixed(2)} ml, and plan to it`;
-    });
-    if (last.answer !== "error") return;
-    byId("target-error").hidden = false;
-    byId("target-error").textContent = errorWords(last.error);
+    }, (words) => (byId("target-error").textContent = words));
   }
 
   chooseTarget(text) {
-    this.search.click();
-    this.state.set({ target: text, exit: null, tip: null });
+    this.state.set({ ...FREE, target: text });
   }
 
   chooseExit(entry) {
-    this.state.set({ exit: entry, tip: null });
+    this.state.set({ ...FREE, exit: entry });
+  }
+
+  chooseTip(tip) {
+    this.state.set({ ...FREE, tip });
   }
 
   // Choose the next place of the scope along the airway.
   moveTip(way) {
     const { tips, motion, state: { asked } } = this;
-    const from = tips && (tips.place(asked.tip) ? asked.tip : tips.nearest(motion ? motion.plan.scope_tip_lps : this.place));
-    const next = tips && tips.next(from, way, this.targetLps);
-    if (next !== null && next !== undefined) this.state.set({ tip: next, exit: null });
+    const from = tips?.place(asked.tip) ? asked.tip : tips?.nearest(motion?.plan.scope_tip_lps ?? this.place);
+    const next = tips?.next(from, way, this.targetLps) ?? null;
+    if (next !== null) this.chooseTip(next);
   }
 
   // Show what the address says: everything begins here.
@@ -245,7 +229,7 @@ class ExplorerPage extends DevicePage {
     this.whatIfPanel.show();
     byId("nodule").value = this.facts.targets.some(({ text }) => text === asked.target) ? asked.target : "";
     byId("target-text").value = asked.target;
-    byId("target-error").hidden = true;
+    byId("target-error").textContent = "";
     this.search.follow();
     if (!asked.target) this.clear();
     this.compared.follow();
@@ -257,12 +241,6 @@ class ExplorerPage extends DevicePage {
     this.showExits();
     this.showPlan();
     this.fitImage(this.place);
-  }
-
-  // Whether the system has a needle: without one the tubes themselves reach the target.
-  get hasNeedle() {
-    const { system } = this.whatIfPanel;
-    return !system || system.needle_length_mm !== null;
   }
 
   // Show a layer of the reach, or words in its place.
@@ -285,10 +263,9 @@ class ExplorerPage extends DevicePage {
   planFailed(error) {
     this.failure = error.kind;
     this.motion = this.plan = null;
-    byId("target-error").hidden = error.kind !== "TargetError" && error.kind !== "FrameError";
-    byId("target-error").textContent = errorWords(error);
-    this.planPanel.clear(errorWords(error));
-    this.say("No plan.");
+    byId("target-error").textContent = ["TargetError", "FrameError"].includes(error.kind) ? error.words : "";
+    this.planPanel.clear(error.words);
+    say("No plan.");
     this.showPlan();
   }
 
@@ -302,40 +279,42 @@ class ExplorerPage extends DevicePage {
 
   // Fetch fine voxels around a point.
   fitImage(around) {
-    this.asker.latest("image", { around }, ({ image }) => this.takeFine(image));
+    this.asker.ask("image", { around }, ({ image }) => this.takeFine(image));
   }
 
   async takeFine(image) {
-    const [labels, ct] = await Promise.all([
-      placedVolume(image.labels[0]), image.ct ? placedVolume(image.ct[0], image.hounsfield) : null,
-    ]);
-    this.image.labels[1] = labels;
-    if (ct) this.image.ct[1] = ct;
+    this.image.labels[1] = await placedVolume(image.labels[0]);
+    if (image.ct) this.image.ct[1] = await placedVolume(image.ct[0], image.hounsfield);
     this.redrawSlices();
   }
 
-  async takePlan(found, key) {
-    const known = this.plans.get(key);
-    const plan = { ...(known || {}), ...found, key };
-    if (found.packed) plan.motion = await Motion.of({ ...found.packed, scope_tip_lps: found.scope_tip_lps });
+  // Keep what is found of a plan with what is known of it, and return it: a final one stays, and a check holds for one digest.
+  async keepPlan(found, key) {
+    const known = this.plans.get(key), { packed, ...rest } = found;
+    const plan = known?.final ? known : { ...known, ...rest, key };
+    if (packed && plan !== known) plan.motion = await Motion.of({ ...packed, scope_tip_lps: found.scope_tip_lps });
     this.plans.delete(key);
     this.plans.set(key, plan);
     if (this.plans.size > KEPT_PLANS) this.plans.delete(this.plans.keys().next().value);
+    return plan;
+  }
+
+  // Have a plan checked and appraised, if it was not yet.
+  async appraise(plan, slot = "") {
+    if (plan.final && !plan.appraisal) await this.asker.ask("appraise", { plan: plan.digest, slot }, (found) => (plan.appraisal = found));
+  }
+
+  async takePlan(found, key) {
+    const plan = await this.keepPlan(found, key), isFirst = this.motion === null;
     if (key !== planKey(this.state.asked)) return;
-    const first = this.motion === null;
     this.takeTarget(plan.motion.plan.target_lps);
-    this.plan = plan;
-    this.motion = plan.motion;
+    Object.assign(this, { plan, motion: plan.motion });
     this.planPanel.show(plan);
     this.showPlan();
-    if (first && this.orbit) this.lookAtPlan();
+    if (isFirst && this.orbit) this.lookAtPlan();
     if (!plan.final) return;
-    this.say("The plan is final.");
-    if (!plan.appraisal) {
-      await this.asker.latest("appraise", { plan: plan.digest }, (answer) => {
-        plan.appraisal = answer;
-      });
-    }
+    say("The plan is final.");
+    await this.appraise(plan);
     if (this.plan === plan && plan.appraisal) this.planPanel.appraised(plan);
     this.compared.list();
   }
@@ -344,7 +323,7 @@ class ExplorerPage extends DevicePage {
     this.motion = this.plan = null;
     this.takeTarget(found.target_lps);
     this.planPanel.noPlan(found);
-    this.say("No plan was found.");
+    say("No plan was found.");
     this.showPlan();
   }
 
@@ -357,19 +336,13 @@ class ExplorerPage extends DevicePage {
   }
 
   showExits(words = null) {
-    const { exits } = this, { asked } = this.state;
-    const chosen = exits ? exits.numberOf(asked.exit) : -1;
-    byId("exits-words").textContent = words ?? (exits ? exits.words() : "");
-    byId("exits-box").hidden = !exits || !exits.count;
-    if (exits && exits.count) {
-      const more = exits.list(byId("exits"), chosen, (entry) => this.chooseExit(entry));
-      byId("exits-more").textContent = more > 0 ? `${more} more are painted` : "";
-    }
-    if (this.scene) {
-      this.scene.setPoints("exits", exits && exits.count ? exits.points(byId("exits-by").value, chosen) : null);
-      const tip = this.tips && this.tips.place(asked.tip);
-      this.scene.setPoints("tip", tip ? { places: tip, colours: rgb("#56B4E9"), radii: 2.2 } : null);
-    }
+    const { exits, state: { asked } } = this, chosen = exits?.numberOf(asked.exit);
+    byId("exits-words").textContent = words ?? exits?.answer.words ?? "";
+    fillRows(byId("exits"), exits?.rows(chosen, (entry) => this.chooseExit(entry)) ?? []);
+    byId("exits-more").textContent = exits?.unlisted ?? "";
+    this.scene?.setPoints("exits", exits?.count ? exits.points(byId("exits-by").value, chosen) : null);
+    const tip = this.tips?.place(asked.tip);
+    this.scene?.setPoints("tip", tip ? { places: tip, colours: rgb("#56B4E9"), radii: 2.2 } : null);
     byId("chosen-words").textContent = asked.exit !== null ? "The plan starts from the chosen exit." : asked.tip !== null ? "The plan starts from the chosen place of the scope tip." : "Exit and scope tip are chosen by the planner.";
     byId("free").disabled = asked.exit === null && asked.tip === null;
     this.redraw();
@@ -402,7 +375,6 @@ class ExplorerPage extends DevicePage {
       if (this.panes.isShown("scene")) this.drawScene();
     }
     if (slices && this.views) this.drawSlices();
-    byId("reach-key").hidden = !byId("reach-slices").checked && !byId("reach-scene").checked;
   }
 
   // Keep the tip of what plays in the middle; at the end all of the plan is.
@@ -434,27 +406,26 @@ class ExplorerPage extends DevicePage {
 
   // Take the patient again, of which the masks were corrected: what was known of it holds no longer.
   async renew() {
-    await this.asker.asked("patient", {}, (facts) => this.takeFacts(facts));
+    await this.asker.ask("patient", {}, (facts) => this.takeFacts(facts));
     this.plans.clear();
     this.plan = this.motion = this.search.systemKey = null;
     this.compared.rows = [];
     this.follow();
   }
 
-  // What a test may read.
+  // What a test may read; while another plan is searched, the one before is still shown.
   report() {
-    const state = this.motion ? this.motion.at(this.player.position) : null;
-    // While another plan is searched, the one before is still shown.
-    const plan = this.plan && this.plan.key === planKey(this.state.asked) ? this.plan : null;
+    const { plan, exits, reach, scene } = this, isPlan = plan?.key === planKey(this.state.asked);
     return {
       ...super.report(), asked: { ...this.state.asked }, place_lps: this.place, target_lps: this.targetLps, failure: this.failure,
-      exits: this.exits ? { count: this.exits.count, complete: this.exits.answer.complete, entries: [...this.exits.entries], tips: [...this.exits.tips] } : null,
-      plan: plan ? { digest: plan.digest, final: plan.final, cost: plan.cost, command: plan.command, curve: plan.curve,
-        appraised: Boolean(plan.appraisal), scope_tip_lps: plan.scope_tip_lps, exit_lps: plan.exit_lps, system: plan.system } : null,
-      tip_lps: state ? state.tip : null, compared: this.compared.report(), times_ms: { ...this.search.times },
-      reach: this.reach ? { share: this.reach.share, system: this.reach.grid.system } : null,
-      finer: this.slices ? Object.fromEntries(Object.entries(this.slices).map(([name, slice]) => [name, slice.isFine])) : {},
-      place: this.placeFound || null, points: this.scene ? Object.fromEntries([...this.scene.points].map(([key, p]) => [key, p.count])) : {},
+      exits: exits && { count: exits.count, complete: exits.answer.complete, entries: [...exits.entries] },
+      plan: isPlan ? { ...plan, motion: null, appraised: Boolean(plan.appraisal) } : null,
+      tip_lps: this.motion ? this.motion.at(this.player.position).tip : null,
+      compared: this.compared.rows.map(({ key, plan: of }) =>
+        ({ digest: of?.digest, appraised: Boolean(of?.appraisal), hidden: this.compared.hidden.has(key) })),
+      reach: reach && { share: reach.share, system: reach.grid.system },
+      finer: Object.fromEntries(Object.entries(this.slices ?? {}).map(([name, slice]) => [name, slice.isFine])),
+      place: this.placeFound ?? null, points: Object.fromEntries([...scene?.points ?? []].map(([key, { count }]) => [key, count])),
     };
   }
 }

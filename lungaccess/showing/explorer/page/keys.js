@@ -1,45 +1,33 @@
-// Keys, and the help, which lists them.
+// Keys, which the help lists.
 import { byId } from "../report/anatomy_page.js";
 
-export function connectHelp() {
-  byId("help-open").addEventListener("click", () => byId("help").showModal());
-  byId("help-close").addEventListener("click", () => byId("help").close());
+// Return what follows an item in a list, or comes before it, round the ends.
+function beside(items, now, step) {
+  const from = step < 0 ? Math.max(now, 0) : now;
+  return items.at((from + step) % items.length);
 }
 
 export function connectKeys(page) {
+  const press = (id) => () => byId(id).click();
+  const target = () => {
+    const { facts: { targets }, state: { asked } } = page;
+    if (targets.length) page.chooseTarget(beside(targets, targets.findIndex(({ text }) => text === asked.target), 1).text);
+  };
+  const exit = (step) => () => {
+    const { exits, state: { asked } } = page;
+    if (exits?.count) page.chooseExit(beside(exits.entries, exits.numberOf(asked.exit), step));
+  };
   const actions = {
-    n: () => nextTarget(page), e: () => nextExit(page, 1), E: () => nextExit(page, -1), "[": () => page.moveTip(-1), "]": () => page.moveTip(1),
-    x: () => byId("free").click(), k: () => byId("keep").click(), v: () => page.lookAtPlan(), p: () => byId("play").click(),
-    "?": () => byId("help-open").click(),
+    n: target, e: exit(1), E: exit(-1), "[": press("tip-back"), "]": press("tip-forward"), x: press("free"), k: press("keep"),
+    v: () => page.lookAtPlan(), p: press("play"), "?": press("help-open"),
+    "Ctrl z": (event) => byId(event.shiftKey ? "redo" : "undo").click(),
   };
   document.addEventListener("keydown", (event) => {
-    if (event.key.toLowerCase() === "z" && (event.ctrlKey || event.metaKey)) {
-      if (isText(event.target)) return;
-      if (event.shiftKey) history.forward();
-      else history.back();
-      event.preventDefault();
-      return;
-    }
-    if (event.defaultPrevented || event.ctrlKey || event.metaKey || event.altKey || isText(event.target) || byId("help").open) return;
-    const action = actions[event.key];
-    if (!action) return;
-    action();
+    const action = actions[event.ctrlKey || event.metaKey ? `Ctrl ${event.key.toLowerCase()}` : event.key];
+    if (!action || event.defaultPrevented || event.altKey || isText(event.target) || byId("help").open) return;
+    action(event);
     event.preventDefault();
   });
 }
 
 const isText = (element) => element.matches("input:not([type=checkbox]):not([type=range]), select, textarea");
-
-function nextTarget(page) {
-  const { targets } = page.facts;
-  if (!targets.length) return;
-  const now = targets.findIndex(({ text }) => text === page.state.asked.target);
-  page.chooseTarget(targets[(now + 1) % targets.length].text);
-}
-
-function nextExit(page, step) {
-  const { exits, state: { asked } } = page;
-  if (!exits || !exits.count) return;
-  const now = exits.numberOf(asked.exit);
-  page.chooseExit(exits.entries[(now < 0 ? (step > 0 ? 0 : exits.count - 1) : now + step + exits.count) % exits.count]);
-}

@@ -2,64 +2,63 @@
 import { byId } from "../report/anatomy_page.js";
 import { made } from "../report/structures.js";
 import { Asker } from "./asker.js";
-import { Connection } from "./connection.js";
-import { button, errorWords } from "./widgets.js";
+import { button, fillList, say } from "./widgets.js";
 
-let asker = null, busy = true;
-const say = (words) => (byId("status").textContent = words);
-const shown = (name) => (byId(name).hidden ? "" : byId(name).textContent);
+const GO_ON = "Go on all the same";
+const asker = new Asker();
+let busy = true;
 
 // Ask, and show an error beside the folder, in which another one can be chosen.
 async function ask(name, values, part) {
   busy = true;
-  byId("problem").hidden = true;
-  const last = await asker.latest(name, values, part);
+  byId("question").hidden = true;
+  byId("problem").textContent = "";
+  await asker.ask(name, values, part, (words) => {
+    say("Choose another folder or file.");
+    byId("problem").textContent = words;
+  });
   busy = false;
-  if (last.answer !== "error") return;
-  say("Choose another folder or file.");
-  byId("problem").textContent = errorWords(last.error);
-  byId("problem").hidden = false;
 }
 
 const look = (path) => ask("look", { path }, ({ path: shown, parent, folders, files, left_out: isCut }) => {
   const separator = shown.includes("\\") ? "\\" : "/", inside = (name) => `${shown.replace(/[\\/]$/, "")}${separator}${name}`;
   byId("path").value = shown;
-  byId("question").hidden = true;
-  byId("entries").replaceChildren(...[
+  fillList(byId("entries"), [
     button("..", "The folder above", () => look(parent)),
     ...folders.map((name) => button(`${name}${separator}`, `Folder ${name}`, () => look(inside(name)))),
     ...files.map((name) => button(name, `Open ${name}`, () => open(inside(name)))),
     ...(isCut ? ["There are more: type the name."] : []),
-  ].map((each) => made("li", {}, each)));
+  ]);
   say("Choose a folder or a file.");
 });
 
 // Show what is to be decided: sentences, and what can be done.
 function decide(words, choices) {
-  byId("words").replaceChildren(...words.filter(Boolean).map((each) => made("li", {}, each)));
+  fillList(byId("words"), words.filter(Boolean));
   byId("choices").replaceChildren(...choices);
   byId("question").hidden = false;
   if (choices.length) say("Your decision is needed.");
 }
 
 function open(path, values = {}) {
-  byId("question").hidden = byId("picture").hidden = true;
+  const again = (more) => () => open(path, { ...values, ...more });
+  byId("picture").hidden = true;
   byId("choices").replaceChildren();
   ask("open", { path, ...values }, (part) => {
-    const { answer, accept, thick_slices: thick } = part;
+    const { answer, accept, thick_slices } = part;
     if (answer === "link") Object.assign(byId("picture"), { src: part.address, hidden: false });
     if (answer === "begun") decide([part.words], []);
     if (answer === "opened") location.assign("/");
     if (answer === "segmented") decide([`The masks are in ${part.folder}: look at them.`, ...part.warnings], [
       button("The masks are right: explore", "Explore", () => open(part.folder, { thick_slices: Boolean(values.thick_slices) }))]);
     if (answer === "refused") decide([part.found, `Expected: ${part.expected}`, "Whoever goes on all the same plans on masks that may be wrong; it is noted in the patient."], [
-      button("Go on all the same", "Go on all the same", () => open(path, { ...values, accept, thick_slices: thick }))]);
+      button(GO_ON, GO_ON, again({ accept, thick_slices }))]);
     if (answer !== "series") return;
     const { uid, words, proposed, arrays: { picture } } = part, [height, width] = part.shape;
     const canvas = made("canvas", { width, height, role: "img", ariaLabel: `Middle slice of ${words}` });
     canvas.getContext("2d").putImageData(new ImageData(new Uint8ClampedArray(picture), width, height), 0, 0);
     decide(["The folder holds several series: which one is it?"], [...byId("choices").children,
-      made("button", { type: "button", className: proposed ? "proposed" : "", onclick: () => open(path, { ...values, series: uid }) }, canvas, proposed ? `Proposed: ${words}` : words)]);
+      made("button", { type: "button", className: proposed ? "proposed" : "", onclick: again({ series: uid }) }, canvas, proposed ? `Proposed: ${words}` : words)]);
   });
 }
 
@@ -101,9 +100,8 @@ byId("place").addEventListener("submit", (event) => {
   look(byId("path").value);
 });
 byId("take").addEventListener("click", () => open(byId("path").value));
-async function start() {
-  asker = new Asker(await Connection.open(() => say("The explorer has ended: start `lungaccess view` again.")), say);
-  await look("");
-}
 
-window.lungaccessReport = { ready: start(), state: () => ({ busy, question: shown("question"), problem: shown("problem") }) };
+window.lungaccessReport = {
+  ready: asker.connect().then(() => look("")),
+  state: () => ({ busy, question: byId("question").hidden ? "" : byId("question").textContent, problem: byId("problem").textContent }),
+};

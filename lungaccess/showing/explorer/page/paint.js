@@ -1,8 +1,7 @@
 // Masks mended by hand: strokes drawn in the slices, of which the server makes voxels, a new lung and a new plan.
 import { byId } from "../report/anatomy_page.js";
-import { cross } from "../report/vectors.js";
+import { add, cross } from "../report/vectors.js";
 import { whatIf } from "./state.js";
-import { errorWords } from "./widgets.js";
 
 const MOST_POINTS = 300, INKS = { paint: "#FFD54A99", erase: "#FF6E6E99" };
 const round = (point) => point.map((value) => Number(value.toFixed(2)));
@@ -16,8 +15,9 @@ export function connectPainting(page) {
 
   // Draw the stroke until the voxels that come of it are there.
   function show(points) {
-    const [first] = points || [], nearby = first && [[first[0] + 0.01, first[1] + 0.01, first[2] + 0.01]];
-    page.stroke = points && { points: [...points, ...nearby.filter(() => points.length < 2)], radius: radius(), colour: INKS[value("tool")] || INKS.paint };
+    // A line needs two points.
+    const line = points?.length === 1 ? [points[0], add(points[0], [0.01, 0.01, 0.01])] : points;
+    page.stroke = line && { points: line, radius: radius(), colour: INKS[value("tool")] || INKS.paint };
     page.redrawSlices();
   }
 
@@ -27,37 +27,35 @@ export function connectPainting(page) {
       ...(normal && byId("mend-flat").checked ? { normal } : {}), what_if: whatIf(state.asked),
     };
     say("The masks are being changed…");
-    const last = await page.asker.latest("paint", asked, async ({ image, size_ml: size }) => {
+    const { answer } = await page.asker.ask("paint", asked, async ({ image, size_ml: size }) => {
       changed = true;
       say(`${size.toFixed(2)} ml changed. The 3-D view shows them when this is closed.`);
       await page.takeFine(image);
-    });
-    if (last.answer === "superseded") return;
-    show(null);
-    if (last.answer === "error") say(errorWords(last.error));
-    if (last.answer === "end") await page.renew();
+    }, say);
+    if (answer !== "superseded") show(null);
+    if (answer === "end") await page.renew();
   }
 
   for (const [name, slice] of Object.entries(page.slices)) {
     const { canvas } = slice;
     const isMine = (event) => event.target === canvas && box.open && event.button === 0 && !event.shiftKey;
-    const listen = (kind, act) => canvas.parentElement.addEventListener(kind, act, { capture: true });
-    listen("pointerdown", (event) => {
-      if (!isMine(event)) return;
+    // Before the slices hear of it: a stroke is drawn instead of what a drag does else.
+    const listen = (kind, isWanted, act) => canvas.parentElement.addEventListener(kind, (event) => {
+      if (!isWanted(event)) return;
       event.stopPropagation();
+      act(event);
+    }, { capture: true });
+    const isDrawn = () => stroke?.name === name;
+    listen("pointerdown", isMine, (event) => {
       canvas.setPointerCapture(event.pointerId);
       stroke = { name, points: [page.views.placeAt(event, slice)] };
       show(stroke.points);
     });
-    listen("pointermove", (event) => {
-      if (!stroke || stroke.name !== name) return;
-      event.stopPropagation();
+    listen("pointermove", isDrawn, (event) => {
       if (stroke.points.length < MOST_POINTS) stroke.points.push(page.views.placeAt(event, slice));
       show(stroke.points);
     });
-    listen("pointerup", (event) => {
-      if (!stroke || stroke.name !== name) return;
-      event.stopPropagation();
+    listen("pointerup", isDrawn, () => {
       const { points } = stroke, { right, up } = slice.plane;
       stroke = null;
       if (value("tool") !== "join") send(points, cross(right, up));

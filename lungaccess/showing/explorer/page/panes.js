@@ -2,7 +2,8 @@
 import { made } from "../report/structures.js";
 
 const AREAS = ["a", "b", "c", "d"], NAMES = { scene: "3-D", axial: "Axial", coronal: "Coronal", sagittal: "Sagittal", bronchoscopy: "Bronchoscopy" };
-const MOST_PIXELS = 320_000, LEAST = 12, MOST = 88, STEP = 2;
+const MOST_PIXELS = 320_000, LEAST = 12, MOST = 88;
+const STEPS = { ArrowLeft: -2, ArrowUp: -2, ArrowRight: 2, ArrowDown: 2 };
 
 export class Panes {
   // changed is called when a view is in another place or of another size.
@@ -14,7 +15,7 @@ export class Panes {
       pane.append(made("select", { ariaLabel: `View in the place of ${NAMES[name]}`, onchange: ({ target }) => this.swap(name, target.value) },
         ...this.order.map((key) => new Option(NAMES[key], key))));
     }
-    this.place();
+    this.swap();
     document.querySelectorAll(".split").forEach(connectSplit);
     const sizes = new ResizeObserver((entries) => {
       for (const { target } of entries) fit(target);
@@ -23,19 +24,16 @@ export class Panes {
     document.querySelectorAll("canvas[id^=slice]").forEach((canvas) => sizes.observe(canvas));
   }
 
-  swap(a, b) {
+  // Let two views change their places, if any, and put all where they belong.
+  swap(a = "", b = "") {
     this.order = this.order.map((name) => ({ [a]: b, [b]: a })[name] ?? name);
-    this.place();
-    this.changed();
-  }
-
-  place() {
     this.order.forEach((name, n) => {
       const pane = this.panes[name];
       pane.hidden = n >= AREAS.length;
       Object.assign(pane.style, { gridArea: AREAS[n] ?? "", order: n });
       pane.querySelector(":scope > select").value = name;
     });
+    this.changed();
   }
 
   isShown(name) {
@@ -62,9 +60,8 @@ function connectSplit(bar) {
     if (bar.hasPointerCapture(pointerId)) set(100 * (isUpright ? (clientX - left) / width : (clientY - top) / height));
   });
   bar.addEventListener("keydown", (event) => {
-    const step = { ArrowLeft: -STEP, ArrowUp: -STEP, ArrowRight: STEP, ArrowDown: STEP }[event.key];
-    if (!step) return;
-    set(Number(bar.ariaValueNow) + step);
+    if (!(event.key in STEPS)) return;
+    set(Number(bar.ariaValueNow) + STEPS[event.key]);
     event.preventDefault();
   });
 }

@@ -2,25 +2,20 @@
 import { byId } from "../report/anatomy_page.js";
 import { made } from "../report/structures.js";
 import { planKey, whatIf } from "./state.js";
-import { errorWords, fillRows } from "./widgets.js";
+import { fillList, fillRows, say } from "./widgets.js";
 
 const MOST_LIMITS = 6;
+const TO_COPY = "This browser does not let the page copy the command. Select it, and copy it by the browser's own menu.";
 
 export class PlanPanel {
   constructor(page) {
     this.page = page;
-  }
-
-  connect() {
     byId("export").addEventListener("change", ({ target }) => {
-      const what = target.value;
+      this.export(target.value);
       target.value = "";
-      if (what) this.export(what);
     });
-    byId("keep").addEventListener("click", () => this.page.compared.keep());
-    byId("copy").addEventListener("click", () => navigator.clipboard.writeText(byId("command").textContent).then(
-      () => this.page.say("The command is copied."),
-      () => this.page.say("This browser does not let the page copy the command. Select it, and copy it by the browser's own menu.")));
+    byId("copy").addEventListener("click", () => navigator.clipboard.writeText(byId("command").textContent)
+      .then(() => say("The command is copied."), () => say(TO_COPY)));
     byId("explain").addEventListener("click", () => this.explain());
   }
 
@@ -31,33 +26,30 @@ export class PlanPanel {
 
   clear(words, grade) {
     this.say(words, grade);
-    for (const id of ["plan-table", "details-table", "no-plan", "plan-actions", "command-box"]) byId(id).hidden = true;
-    for (const id of ["advice", "limits"]) byId(id).replaceChildren();
-    byId("estimate").textContent = "";
+    for (const id of ["plan-rows", "details-rows", "advice", "limits", "estimate"]) byId(id).replaceChildren();
+    for (const id of ["no-plan", "plan-actions", "command-box"]) byId(id).hidden = true;
   }
 
-  show(plan) {
-    const { final, system, goal, iterations, appraisal } = plan;
+  show({ final, system, goal, iterations, appraisal, way, cpu_s: cpu, risk, command }) {
     byId("no-plan").hidden = true;
-    for (const id of ["plan-table", "details-table"]) byId(id).hidden = false;
     if (!appraisal) this.say(final ? "Proved by the planner; the check is running…" : "Proved by the planner, not checked yet; better plans follow…");
     fillRows(byId("plan-rows"), [
-      ["Chance", appraisal ? appraisal.chance : "not estimated yet"], ["Way", plan.way],
-      ["Time", `planned in ${plan.cpu_s < 0.1 ? "less than 0.1" : plan.cpu_s.toFixed(1)} s of processor time. ${appraisal ? `${appraisal.window}.` : ""}`],
-      ["Risk", appraisal ? appraisal.risk : plan.risk],
+      ["Chance", appraisal ? appraisal.chance : "not estimated yet"], ["Way", way],
+      ["Time", `planned in ${cpu < 0.1 ? "less than 0.1" : cpu.toFixed(1)} s of processor time. ${appraisal ? `${appraisal.window}.` : ""}`],
+      ["Risk", appraisal ? appraisal.risk : risk],
     ]);
     fillRows(byId("details-rows"), [["system", system], [goal.words, goal.value], ["found at", `iteration ${iterations}`]]);
     for (const id of ["plan-actions", "command-box"]) byId(id).hidden = !final;
-    byId("command").textContent = plan.command;
+    byId("command").textContent = command;
     byId("command-note").textContent =
-      `The plan is the same, byte for byte but for its times.${plan.command.includes("system.toml") ? " Export system.toml first." : ""}`;
+      `The plan is the same, byte for byte but for its times.${command.includes("system.toml") ? " Export system.toml first." : ""}`;
   }
 
   appraised(plan) {
     const { headline, limits, said, advice } = plan.appraisal;
     this.show(plan);
     this.say(said, headline.grade);
-    byId("advice").replaceChildren(...advice.map((words) => made("li", {}, words)));
+    fillList(byId("advice"), advice);
     byId("estimate").textContent = headline.text;
     fillRows(byId("limits"), limits.slice(0, MOST_LIMITS).map(({ what, value, bound, side, unit, ok }) => [
       what, `${Number(value).toPrecision(3)} ${unit}`, `${side} ${Number(bound).toPrecision(3)}`,
@@ -67,43 +59,32 @@ export class PlanPanel {
 
   noPlan({ found, remedy, reasons }) {
     this.clear("No plan was found.", "poor");
-    byId("no-plan").hidden = false;
+    for (const id of ["no-plan", "explain"]) byId(id).hidden = false;
     byId("no-plan-why").textContent = [found, remedy].filter(Boolean).join(" ");
     fillRows(byId("no-plan-reasons"), Object.entries(reasons).map(([name, count]) => [name, String(count)]));
-    byId("explain").hidden = false;
     byId("explanation").replaceChildren();
   }
 
-  async explain() {
-    const { page } = this, { asked } = page.state, key = planKey(asked);
+  explain() {
+    const { asker, state } = this.page, { asked } = state, key = planKey(asked);
     byId("explain").hidden = true;
-    const last = await page.asker.latest("explain", { target: asked.target, what_if: whatIf(asked), seed: asked.seed }, ({ headline, sections }) => {
-      if (key !== planKey(page.state.asked)) return;
+    return asker.ask("explain", { target: asked.target, what_if: whatIf(asked), seed: asked.seed }, ({ headline, sections }) => {
+      if (key !== planKey(state.asked)) return;
       byId("explanation").replaceChildren(made("p", {}, headline), ...sections.map(({ title, headings, rows }) => {
-        const head = made("thead", {}, made("tr", {}, ...headings.map((text) => made("th", { scope: "col" }, text))));
-        const body = made("tbody");
+        const head = made("tr", {}, ...headings.map((text) => made("th", { scope: "col" }, text))), body = made("tbody");
         fillRows(body, rows);
-        return made("div", { className: "wide" }, made("table", {}, made("caption", {}, title), head, body));
+        return made("div", { className: "wide" }, made("table", {}, made("caption", {}, title), made("thead", {}, head), body));
       }));
-      page.say("Explained.");
-    });
-    if (last.answer === "error") byId("explanation").textContent = errorWords(last.error);
+      say("Explained.");
+    }, (words) => (byId("explanation").textContent = words));
   }
 
-  async export(what) {
-    const { plan } = this.page;
-    let address = null;
-    const last = await this.page.connection.ask("export", { plan: plan.digest, what, slot: what }, (message) => {
-      if (message.answer === "link") address = message.address;
-      else this.page.asker.showProgress(message.answer === "progress" ? message : null);
-    }).done;
-    this.page.asker.showProgress(null);
-    if (last.answer !== "end" || !address) {
-      this.page.say(last.error ? errorWords(last.error) : `${what} was not made.`);
-      return;
-    }
-    made("a", { href: address, download: what }).click();
-    this.page.say(`${what} is made.`);
-    this.exported = { what, address };
+  // Make a file about the plan, and let the browser keep it.
+  export(what) {
+    return this.page.asker.ask("export", { plan: this.page.plan.digest, what, slot: what }, ({ address }) => {
+      if (!address) return;
+      made("a", { href: address, download: what }).click();
+      say(`${what} is made.`);
+    });
   }
 }

@@ -9,10 +9,7 @@ export function connectPointer(page) {
   const { scene, orbit } = page, canvas = scene.canvas;
   let dragged = null;
 
-  const place = (event) => {
-    const box = canvas.getBoundingClientRect();
-    return [event.clientX - box.left, event.clientY - box.top];
-  };
+  const place = ({ offsetX, offsetY }) => [offsetX, offsetY];
   const near = (point, at) => {
     const seen = scene.project(point);
     return seen ? Math.hypot(seen[0] - at[0], seen[1] - at[1]) : Infinity;
@@ -24,13 +21,12 @@ export function connectPointer(page) {
   const handleAt = (at) => {
     if (!scene.view || page.tools.measuring) return null;
     const { exits, tips, plan, state: { asked } } = page;
-    const chosen = exits ? exits.numberOf(asked.exit) : -1;
     const handles = {
-      exit: chosen >= 0 ? exits.places[chosen] : plan && exits && exits.count ? plan.exit_lps : null,
-      tip: tips && (tips.place(asked.tip) || (plan && plan.scope_tip_lps)),
+      exit: exits?.places[exits.numberOf(asked.exit)] ?? (exits?.count ? plan?.exit_lps : null),
+      tip: tips?.place(asked.tip) ?? (tips && plan?.scope_tip_lps),
     };
-    const away = ([, point]) => near(point, at), found = leastOf(Object.entries(handles).filter(([, point]) => point), away);
-    return found && away(found) <= HANDLE_PX ? found[0] : null;
+    const away = (kind) => (handles[kind] ? near(handles[kind], at) : Infinity), found = leastOf(Object.keys(handles), away);
+    return found && away(found) <= HANDLE_PX ? found : null;
   };
 
   const dragTo = (at) => {
@@ -44,7 +40,7 @@ export function connectPointer(page) {
   // Before the camera hears of it: a handle moves instead of the view.
   canvas.parentElement.addEventListener("pointerdown", (event) => {
     if (event.target !== canvas || event.button !== 0) return;
-    const at = place(event), kind = event.shiftKey ? null : handleAt(at);
+    const kind = event.shiftKey ? null : handleAt(place(event));
     if (!kind) return;
     dragged = { kind, value: null };
     canvas.setPointerCapture(event.pointerId);
@@ -65,7 +61,7 @@ export function connectPointer(page) {
     if (event.type === "pointercancel") return;
     if (value === null) page.pickAt(place(event));
     else if (kind === "exit") page.chooseExit(value);
-    else page.state.set({ tip: value, exit: null });
+    else page.chooseTip(value);
   };
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, letGo);
 
@@ -84,17 +80,12 @@ export function connectPointer(page) {
   // Choose what is at a place of the view: an exit, a nodule, or a place in the plane through the cross.
   page.pickAt = (at) => {
     if (!scene.view) return undefined;
-    const { exits } = page;
-    if (exits && exits.count) {
-      const found = nearestExit(at);
-      if (near(exits.places[found], at) <= HANDLE_PX / 2) return page.chooseExit(exits.entries[found]);
-    }
-    const hit = scene.pick(...at, { pickable: ["nodule"] }), found = hit && hit.hits.find(({ key }) => key === "nodule");
-    if (found) {
-      const nodules = page.facts.targets.filter(({ text }) => text.startsWith("nodule "));
-      const nodule = leastOf(nodules, ({ lps_mm: place }) => norm(minus(place, found.point)));
-      if (nodule) return page.chooseTarget(nodule.text);
-    }
+    const { exits } = page, exit = exits && nearestExit(at);
+    if (exit !== null && near(exits.places[exit], at) <= HANDLE_PX / 2) return page.chooseExit(exits.entries[exit]);
+    const found = scene.pick(...at, { pickable: ["nodule"] })?.hits.find(({ key }) => key === "nodule");
+    const nodules = page.facts.targets.filter(({ text }) => found && text.startsWith("nodule "));
+    const nodule = leastOf(nodules, ({ lps_mm: place }) => norm(minus(place, found.point)));
+    if (nodule) return page.chooseTarget(nodule.text);
     const { eye, forward } = orbit.camera();
     const [x, y] = [(2 * at[0]) / canvas.clientWidth - 1, 1 - (2 * at[1]) / canvas.clientHeight];
     const ray = rayThrough(scene, x, y);

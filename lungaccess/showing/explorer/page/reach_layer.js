@@ -1,4 +1,5 @@
 // What the system reaches of the lung: voxels that take their colour as they become known.
+import { rgb } from "../report/vectors.js";
 import { nearest, volumeOf, VoxelGrid } from "../report/voxels.js";
 
 // How densely a voxel is painted over the picture: known, and as it was before the system was changed, which has codes of its own.
@@ -6,18 +7,17 @@ const SHOWN = 0.25, PALE = 0.1, BEFORE = 128;
 
 export class ReachLayer {
   // before: the layer of the system before the change, whose voxels are pale until they are known anew.
-  constructor(grid, shades, before = null) {
-    const { shape: [ni, nj, nk], lps_from_ijk: rows, kinds } = grid;
-    Object.assign(this, { grid, shades, share: 0, said: "" });
+  constructor(grid, before = null) {
+    const { shape: [ni, nj, nk], lps_from_ijk: rows, colours } = grid;
+    Object.assign(this, { grid, share: 0, said: "", colours: [] });
     // The last index is the fastest, as in the arrays of the answers.
     this.volume = volumeOf(new VoxelGrid([nk, nj, ni], rows.map(([i, j, k, first]) => [k, j, i, first])), new Uint8Array(ni * nj * nk));
     if (before && before.kinds.length === this.kinds.length) this.kinds.set(before.kinds.map((kind) => kind && kind | BEFORE));
     // What is only not reached by a single arc keeps the colours of its tissue.
-    this.colours = [];
-    for (const [name, code] of Object.entries(kinds)) {
-      if (name === "undecided") continue;
-      this.colours[code] = [...shades[name].map((value) => 255 * value), SHOWN];
-      this.colours[code | BEFORE] = [...this.colours[code].slice(0, 3), PALE];
+    for (const [code, colour] of Object.entries(colours)) {
+      const bytes = rgb(colour).map((value) => 255 * value);
+      this.colours[code] = [...bytes, SHOWN];
+      this.colours[code | BEFORE] = [...bytes, PALE];
     }
   }
 
@@ -27,7 +27,7 @@ export class ReachLayer {
 
   // Return the layer after a change of the system: all of it pale, until what is changed is known.
   outdated() {
-    const layer = new ReachLayer(this.grid, this.shades, this);
+    const layer = new ReachLayer(this.grid, this);
     layer.isOutdated = true;
     return layer;
   }
@@ -37,6 +37,7 @@ export class ReachLayer {
     voxels.forEach((voxel, n) => {
       this.kinds[voxel] = kinds[n];
     });
+    return this;
   }
 
   // Return what paints the map over a slice: the same function as long as the map is the same.

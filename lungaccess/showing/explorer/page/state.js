@@ -1,11 +1,10 @@
 // What the page shows, as the part of its address behind #: it can be kept, sent and undone.
 
 // What a plan follows from; numbers are null where the system's own value holds.
-const NUMBERS = { scope: "scope_diameter_mm", radius: "needle_radius_mm", length: "needle_length_mm", margin: "margin_mm" };
-const START = {
-  target: "", system: "", scope: null, radius: null, length: null, margin: null, fissures: null, iterations: 20, seed: 0,
-  tip: null, exit: null,
-};
+export const NUMBERS = { scope: "scope_diameter_mm", radius: "needle_radius_mm", length: "needle_length_mm", margin: "margin_mm" };
+export const OWN = { scope: null, radius: null, length: null, margin: null, fissures: null };
+export const FREE = { exit: null, tip: null };
+const START = { target: "", system: "", ...OWN, iterations: 20, seed: 0, ...FREE };
 export const MOST_COMPARED = 5;
 
 export class State {
@@ -27,51 +26,37 @@ export class State {
   }
 
   // Change something, so that it can be undone, or as if it had been so with "replaceState".
-  set(changes, how) {
+  set(changes, how = "pushState") {
     Object.assign(this.asked, changes);
-    this.push(how);
-  }
-
-  // Keep a list of compared plans.
-  compare(list) {
-    this.compared = list.slice(0, MOST_COMPARED);
-    this.push();
-  }
-
-  push(how = "pushState") {
-    const address = `#${this.text}`;
+    const text = plainText(this.asked, this.first);
+    for (const each of this.compared) text.append("with", plainText(each, this.first).toString());
+    const address = `#${text}`;
     if (address !== location.hash) history[how](null, "", address);
     this.changed();
   }
 
-  get text() {
-    const text = plainText(this.asked, this.first);
-    for (const each of this.compared) text.append("with", plainText(each, this.first).toString());
-    return text.toString();
+  // Keep a list of compared plans.
+  compare(list) {
+    this.compared = list;
+    this.set({});
   }
 }
+
+// Return what a text states for a key, null for nothing and for what is wrong.
+export function valueFrom(key, text) {
+  if (key === "fissures") return text === "yes" ? true : text === "no" ? false : null;
+  if (key === "target" || key === "system") return text.slice(0, 200);
+  return text !== "" && Number.isFinite(Number(text)) ? Number(text) : null;
+}
+
+export const textOf = (value) => (typeof value === "boolean" ? (value ? "yes" : "no") : String(value ?? ""));
 
 // Return what is asked of a text; what it does not state, or states wrongly, is as at first.
-function plainFrom(text, first) {
-  const asked = { ...first };
-  for (const key of Object.keys(first)) {
-    if (!text.has(key)) continue;
-    const value = text.get(key);
-    if (key === "fissures") asked.fissures = { yes: true, no: false }[value] ?? null;
-    else if (key === "target" || key === "system") asked[key] = value.slice(0, 200);
-    else if (value !== "" && Number.isFinite(Number(value))) asked[key] = Number(value);
-  }
-  return asked;
-}
+const plainFrom = (text, first) => Object.fromEntries(Object.entries(first).map(([key, value]) =>
+  [key, text.has(key) ? valueFrom(key, text.get(key)) ?? value : value]));
 
-function plainText(asked, first) {
-  const text = new URLSearchParams();
-  for (const [key, value] of Object.entries(asked)) {
-    if (value === first[key] || value === null) continue;
-    text.set(key, key === "fissures" ? (value ? "yes" : "no") : String(value));
-  }
-  return text;
-}
+const plainText = (asked, first) => new URLSearchParams(Object.entries(asked)
+  .filter(([key, value]) => value !== first[key] && value !== null).map(([key, value]) => [key, textOf(value)]));
 
 // Return what of a state is changed of its system, as the server reads it.
 export function whatIf(asked) {

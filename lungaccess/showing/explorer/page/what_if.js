@@ -1,66 +1,61 @@
-// What is changed of the system: one control for each value; what is changed is marked, what cannot be is answered beside it.
+// What is changed of the system and the search: a field for each value of the address; what is changed is marked, what cannot
+// be is answered beside it.
 import { byId } from "../report/anatomy_page.js";
+import { FREE, NUMBERS, OWN, textOf, valueFrom } from "./state.js";
 
-const FIELDS = { scope_diameter_mm: "scope", needle_radius_mm: "radius", needle_length_mm: "length", margin_mm: "margin" };
-const OWN = { scope: null, radius: null, length: null, margin: null, fissures: null };
 const SLIDER_WAIT_MS = 60;
 
 export class WhatIfPanel {
   constructor(facts, state) {
-    Object.assign(this, { facts, state, field: byId("system") });
-    byId("system").replaceChildren(...facts.systems.map(({ name }) => new Option(name, name)));
+    Object.assign(this, { facts, state, field: byId("system"), fields: document.querySelectorAll(".fields [name]") });
+    byId("system").replaceChildren(...facts.systems.map(({ name }) => new Option(name)));
   }
 
   get system() {
     return this.facts.systems.find(({ name }) => name === this.state.asked.system);
   }
 
+  // Return the system's own value of a number, null if it has none; undefined for what is no number of a system.
+  ownOf(key) {
+    return key in NUMBERS ? this.system?.[NUMBERS[key]] ?? null : undefined;
+  }
+
   connect() {
-    byId("what-if").addEventListener("change", ({ target }) => {
-      const { id, value } = target, key = FIELDS[id];
-      this.field = target;
-      if (id === "system") this.set({ system: value });
-      else if (id === "fissures") this.set({ fissures: { yes: true, no: false }[value] ?? null });
-      else if (key && target.checkValidity()) this.setNumber(id, value);
-      else if (key) this.fail(`${value || "This"} is not possible: expected is a number from ${target.min} to ${target.max} mm.`);
-    });
     let waiting = null;
-    byId("needle_radius_slider").addEventListener("input", ({ target: { value } }) => {
-      byId("needle_radius_mm").value = value;
-      clearTimeout(waiting);
-      waiting = setTimeout(() => this.setNumber("needle_radius_mm", value), SLIDER_WAIT_MS);
-    });
-    byId("iterations").addEventListener("change", ({ target: { value } }) => this.state.set({ iterations: Number(value) }));
-    byId("seed").addEventListener("change", ({ target: { value } }) => this.state.set({ seed: Math.max(0, Math.round(Number(value) || 0)) }));
+    for (const field of this.fields) {
+      const isSlider = field.type === "range";
+      field.addEventListener(isSlider ? "input" : "change", () => {
+        clearTimeout(waiting);
+        if (isSlider) waiting = setTimeout(() => this.take(field), SLIDER_WAIT_MS);
+        else this.take(field);
+      });
+    }
     byId("reset").addEventListener("click", () => this.set(OWN));
   }
 
-  setNumber(id, text) {
-    const own = this.system ? this.system[id] : null, value = text === "" ? own : Number(text);
-    this.set({ [FIELDS[id]]: own !== null && Math.abs(value - own) < 1e-9 ? null : value });
+  // Take over what a field states; what is the system's own value is no change.
+  take(field) {
+    const { name, value, title } = field, stated = valueFrom(name, value), own = this.ownOf(name);
+    this.field = field;
+    if (!field.checkValidity()) this.fail(`${value || "This"} is not possible: expected is ${title}.`);
+    else this.set({ [name]: Math.abs(stated - own) < 1e-9 ? null : stated });
   }
 
   // Another system has other deployments: a chosen exit or tip is none of them.
   set(changes) {
-    this.state.set({ ...changes, exit: null, tip: null });
+    const isSystem = Object.keys(changes).some((key) => key === "system" || key in OWN);
+    this.state.set({ ...changes, ...(isSystem && FREE) });
   }
 
   show() {
-    const { asked } = this.state, { system } = this;
+    const { asked } = this.state;
     this.fail("");
-    byId("system").value = asked.system;
-    for (const [id, key] of Object.entries(FIELDS)) {
-      const field = byId(id), own = system ? system[id] : null;
-      field.value = asked[key] ?? (own === null ? "" : Number(own.toFixed(3)));
+    for (const field of this.fields) {
+      const value = asked[field.name], own = this.ownOf(field.name);
+      field.value = textOf(value ?? (own ? Number(own.toFixed(3)) : own));
       field.disabled = own === null;
-      field.classList.toggle("changed", asked[key] !== null);
+      field.classList.toggle("changed", field.name in OWN && value !== null);
     }
-    const { disabled, value } = byId("needle_radius_mm");
-    Object.assign(byId("needle_radius_slider"), { disabled, value });
-    byId("fissures").value = asked.fissures === null ? "" : asked.fissures ? "yes" : "no";
-    byId("fissures").classList.toggle("changed", asked.fissures !== null);
-    byId("iterations").value = String(asked.iterations);
-    byId("seed").value = String(asked.seed);
   }
 
   // The system is prepared: what is refused from now on gives way to it.
@@ -78,9 +73,7 @@ export class WhatIfPanel {
   }
 
   fail(words) {
-    const error = byId("what-if-error");
-    this.field.closest("label").after(error);
-    error.hidden = !words;
-    error.textContent = words;
+    this.field.closest("label").after(byId("what-if-error"));
+    byId("what-if-error").textContent = words;
   }
 }

@@ -1,5 +1,9 @@
 // Small parts of the page: buttons, tables, and words.
+import { byId } from "../report/anatomy_page.js";
 import { made } from "../report/structures.js";
+
+// Show words about what is going on.
+export const say = (words) => (byId("status").textContent = words);
 
 export const button = (text, name, press, attributes = {}) =>
   made("button", { type: "button", ariaLabel: name, onclick: press, ...attributes }, text);
@@ -10,6 +14,9 @@ export function fillRows(body, rows) {
     made("tr", {}, made("th", { scope: "row" }, first), ...cells.map((cell) => made("td", {}, cell ?? "")))));
 }
 
+// Fill a list with items, each text or elements.
+export const fillList = (list, items) => list.replaceChildren(...items.map((item) => made("li", {}, item)));
+
 // Return the item with the least cost, null if none has one.
 export function leastOf(items, costOf) {
   const costs = items.map(costOf), least = Math.min(...costs);
@@ -18,9 +25,3 @@ export function leastOf(items, costOf) {
 
 export const mm = (value, digits = 1) => (value === null || value === undefined ? "" : `${value.toFixed(digits)} mm`);
 export const lpsText = (point) => `lps:${point.map((value) => Number(value.toFixed(1))).join(",")}`;
-
-// Return the words of a typed error of the server.
-export function errorWords({ found, expected, remedy }) {
-  const stop = (text) => (text ? `${text.replace(/\.$/, "")}.` : "");
-  return [stop(found), expected && `Expected: ${stop(expected)}`, stop(remedy)].filter(Boolean).join(" ");
-}

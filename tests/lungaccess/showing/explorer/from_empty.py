@@ -110,12 +110,12 @@ def walk(ct: Path, nodule: list[float], out: Path, served: Served, page: Page, a
             settled(
                 page,
                 "document.getElementById('outline').textContent.startsWith('Add this nodule')"
-                " || !document.getElementById('target-error').hidden",
+                " || document.getElementById('target-error').textContent",
             )
 
         on.step("outlined", outlined)
         print("   page:", page.text("outline"), page.text("target-error"))
-        if not page.run("return document.getElementById('target-error').hidden"):
+        if page.text("target-error"):
             page.click("cross-target")
         else:
 

@@ -37,9 +37,9 @@ DECIDED = f"(s.failure || ({PLANNED}) || {NO_PLAN})"
 NO_TARGET = "TargetError"
 """What is said of a point that cannot be a target, such as one in a vessel."""
 EXPORTED = """const page = window.lungaccessExplorer; let address = null;
-page.connection.ask('export', { plan: '%s', what: 'plan.json', slot: 'session' }, (each) => {
+page.asker.ask('export', { plan: '%s', what: 'plan.json', slot: 'session' }, (each) => {
   if (each.answer === 'link') address = each.address;
-}).done.then(() => fetch(address)).then((file) => file.text()).then(done, (error) => done(String(error)))"""
+}).then(() => fetch(address)).then((file) => file.text()).then(done, (error) => done(String(error)))"""
 """The plan with a digest, as the page exports it."""
 RUN = "import sys; from lungaccess.cli.app import main; sys.exit(main())"
 GROWTH = 1.15

@@ -160,7 +160,7 @@ def test_a_wrong_target_is_explained_and_undone(page: Page) -> None:
     for text, words in (("lps:500,0,0", "outside"), ("1,2,3", "frame"), ("nodule 99", "nodule 99")):
         page.run("document.getElementById('target-text').value = arguments[0]", text)
         page.run("document.getElementById('target-form').requestSubmit()")
-        page.wait("!document.getElementById('target-error').hidden")
+        page.wait("document.getElementById('target-error').textContent")
         assert words in page.text("target-error")
         assert page.state()["plan"] is None
         page.click("undo")

@@ -197,7 +197,7 @@ def test_the_3d_view_follows_what_plays_and_comes_back(room: Page) -> None:
 def test_bad_input_is_answered_beside_its_field_and_forgotten(room: Page, field: str, value: str) -> None:
     plan = room.state()["plan"]["digest"]
     room.choose(field, value)
-    room.wait("!document.getElementById('what-if-error').hidden")
+    room.wait("document.getElementById('what-if-error').textContent")
     beside = (
         "return document.getElementById('what-if-error').previousElementSibling.querySelector('input').id"
     )
@@ -211,7 +211,7 @@ def test_bad_input_is_answered_beside_its_field_and_forgotten(room: Page, field:
         is False
     )
     room.target("nodule 1")
-    assert room.run("return document.getElementById('what-if-error').hidden")
+    assert room.text("what-if-error") == ""
     assert room.run("return document.getElementById(arguments[0]).value", field) != value
     room.target(TARGET)
 

@@ -18,6 +18,7 @@ from anatomy.base.errors import SettingsError
 from lungaccess.showing.explorer import Explorer, PatientSource
 from lungaccess.showing.explorer.server import FOLDERS, asset_names, page_text
 from lungaccess.showing.explorer.worker import Given
+from lungaccess.showing.report.reach import COLOURS
 from tests.lungaccess.showing.explorer.client import Client, opened, serving, source_of, with_client
 
 NOBODY = PatientSource(folder=Path("nowhere"), system="lung-default")
@@ -83,6 +84,12 @@ def test_with_the_token_the_page_and_its_modules_are_served_and_kept_nowhere() -
         assert "default-src 'none'" in policy and "unsafe" not in policy and "*" not in policy
         assert headers["X-Content-Type-Options"] == "nosniff"
     assert found["/explorer/explorer.js"][1]["Content-Type"].startswith("text/javascript")
+
+
+def test_the_legend_of_the_reach_has_the_colours_of_the_map() -> None:
+    sheet = page_text("explorer", "explorer.css")
+    for name, kind in (("direct", "direct arc"), ("unreachable", "unreachable")):
+        assert f".swatch.{name} {{ background: {COLOURS[kind]}; }}" in sheet
 
 
 @pytest.mark.parametrize(

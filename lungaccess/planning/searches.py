@@ -224,7 +224,6 @@ def with_aim(plan: Plan, request: Request) -> Plan:
 
 
 def _parallel(search: PlanSearch, method: str, processes: int) -> Iterator[Step]:
-    """Return the steps of a search in several processes."""
     if not isinstance(search, ParallelSearch):
         raise SettingsError(
             f"{processes} processes are asked for with {method}, each of whose samples depends on all before",

@@ -213,10 +213,7 @@ def with_choices(planned: Choices, system: System, made: list[Deployment], frame
         exits=np.append(planned.exits, [each.exit_mm for each in made]),
         lengths=np.append(planned.lengths, [each.inner_mm for each in made]), tubes=tubes, shapes=shapes,
         n_arcs=counts,
-        beside=np.append(
-            planned.beside,
-            [each.shape.required_beside_mm for each in made],
-        ),
+        beside=np.append(planned.beside, [each.shape.required_beside_mm for each in made]),
     )  # fmt: skip
 
 

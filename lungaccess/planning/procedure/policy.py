@@ -458,7 +458,6 @@ class Policy:
         return self._on_the_way(chosen, mean_pose(poses.needle), target[0])
 
     def _decision(self, chosen: Chosen, left: int, *, tubes_out: bool) -> Decision:
-        """Return what was chosen in one procedure as a decision."""
         chance, changed = float(chosen.chances[0]), bool(chosen.changed[0])
         action = (
             Action.DEPLOY if chosen.found[0, 0] or (changed and self.plan.needle is None) else Action.NEEDLE
@@ -515,7 +514,6 @@ class Policy:
 
     @cached_property
     def _offer(self) -> Offer:
-        """The deployments to choose from."""
         planned = np.asarray(self.plan.scope.lps_from_scope_tip)[None]
         # Deployments to choose from are looked for from the planned tip, and from five imagined ones.
         frames = np.concatenate([planned, self._imagined.frames[:5]])

@@ -172,7 +172,6 @@ class _Run:
             return _joined([received(end, "simulation") for end in ends])
 
     def _send_part(self, numbers: Int, end: Connection) -> None:
-        """Go through some procedures in a process of their own."""
         end_with_parent()
         end.send(self._part(numbers))
 

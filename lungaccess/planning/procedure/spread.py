@@ -263,7 +263,6 @@ def _turn(one: Float, other: Float) -> Float:
 
 
 def _turned(vector: Float, turn: Float) -> Float:
-    """Return vectors turned by rotation vectors."""
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     along = (turn * vector).sum(axis=-1, keepdims=True) * turn * 0.5 * np.sinc(0.5 * angle / np.pi) ** 2
     return np.asarray(np.cos(angle) * vector + np.cross(turn, vector) * np.sinc(angle / np.pi) + along)

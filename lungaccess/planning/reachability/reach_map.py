@@ -305,7 +305,6 @@ def compare_reach(
 def _key(
     lung: Lung, atlas: Atlas, spacing_mm: float, arcs: int, trees: int, phases: tuple[float, float] | None
 ) -> str:
-    """Return a hash of everything that a map depends on."""
     digest = hashlib.sha256(FORMAT + kernel_digest().encode())
     digest.update(f"{atlas.lung.key} {system_fingerprint(atlas.system)} {atlas.with_fissures}".encode())
     digest.update(f"{spacing_mm!r} {arcs} {trees}".encode())
@@ -384,13 +383,9 @@ class ReachStream:
 
     def _again(self, points: ArrayLike, entries: Int) -> Bool:
         """Tell which points `(N, 3)` the arc from a deployment reaches with the needle of the system."""
-        system, places = self._system, np.asarray(points)
-        environment = needle_environment(
-            self._lung,
-            system.require_needle("A direct arc"),
-            system.margins,
-            with_fissures=self._atlas.with_fissures,
-        )
+        system, places, fissures = self._system, np.asarray(points), self._atlas.with_fissures
+        needle = system.require_needle("A direct arc")
+        environment = needle_environment(self._lung, needle, system.margins, with_fissures=fissures)
         deployments, reached = self._atlas.deployments, np.zeros(len(entries), dtype=bool)
         for row in np.flatnonzero(entries >= 0).tolist():
             at = entries[row : row + 1]

@@ -106,7 +106,6 @@ class Geometry:
         return Frame(x=c * x + s * y, y=c * y - s * x, z=z, point=rows[0])
 
     def _features(self, x: Any) -> Any:
-        """Return the features of the tubes; see `shape_model`."""
         moved = x[self._layout.joints] - self._value("model_centre")
         pairs = [moved[a] * moved[b] for a in range(moved.shape[0]) for b in range(a, moved.shape[0])]
         matrix = casadi.reshape(self._value("model"), self._layout.model_terms, N_FEATURES).T

@@ -225,7 +225,6 @@ class Problem:
         return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
 
     def _model(self, shape: TubeShape, *, constant: bool = False) -> ShapeModel:
-        """Return the model of tubes around a shape."""
         return ShapeModel(self.design, shape, self.longest_mm, constant=constant)
 
     @property

@@ -157,7 +157,6 @@ def _prepare(client: "Client", runs: Sequence[Run], cache: Path | None, say: Pro
 
 
 def _failed(run: Run, error: BaseException) -> Answer:
-    """Return what is stored of a run that could not be made."""
     from distributed import KilledWorker
 
     return Answer(

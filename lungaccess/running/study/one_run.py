@@ -98,11 +98,10 @@ def prepare(problem: Problem, cache: Path | None = None) -> None:
 def _here(run: Run, cache: Path | None) -> Answer:
     with _one_at_a_time:
         numba.set_num_threads(1)
-        return _measured(run, cache)
+        return _answered(run, _opened(run.problem.patient, cache), cache)
 
 
-def _measured(run: Run, cache: Path | None) -> Answer:
-    opened = _opened(run.problem.patient, cache)
+def _answered(run: Run, opened: Opened, cache: Path | None) -> Answer:
     began, cpu_began = time.perf_counter(), time.process_time()
     try:
         atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None

@@ -100,7 +100,6 @@ class Obstacles:
 
     @cached_property
     def _boxes(self) -> list[tuple[slice, ...]]:
-        """The bounding box of every branch."""
         from scipy.ndimage import find_objects
 
         return list(find_objects(branch_of(self.lung.labels) + 1))

@@ -22,7 +22,6 @@ from lungaccess.problem.system import load_system
 from lungaccess.running.benchmark.runs import decimals, require_table_file
 from lungaccess.running.benchmark.synthetic.cases import (
     VERSION,
-    BenchmarkPhantom,
     BenchmarkQuery,
     PublishedTips,
     all_queries,
@@ -124,7 +123,7 @@ def score_submission(
             done += 1
             answer = answers.get(query.name)
             if answer is not None and (answer.planned or (answer.unreachable and certify_boxes)):
-                judge = judge or _Scorer(phantom_named(name), folder, cache, tips, samples, certify_boxes)
+                judge = judge or _Scorer(_own_masks(name, folder / name, cache), tips, samples, certify_boxes)
                 yield judge.score(query, answer, submission.planner)
             else:
                 status = MISSING if answer is None else CLAIMED if answer.unreachable else NONE
@@ -148,17 +147,8 @@ def _named(query: BenchmarkQuery, planner: str, status: str, **more: Any) -> Sco
 class _Scorer:
     """Scores the answers about one phantom."""
 
-    def __init__(
-        self,
-        case: BenchmarkPhantom,
-        folder: Path,
-        cache: Path | None,
-        tips: PublishedTips,
-        samples: int,
-        certify_boxes: int,
-    ) -> None:
-        self._lung = _own_masks(case, folder / case.name, cache)
-        self._checker = Checker(self._lung)
+    def __init__(self, lung: Lung, tips: PublishedTips, samples: int, certify_boxes: int) -> None:
+        self._lung, self._checker = lung, Checker(lung)
         self._tips, self._samples, self._certify_boxes = tips, samples, certify_boxes
         self._proofs: dict[str, UnreachableProof] = {}
 
@@ -215,8 +205,8 @@ class _Scorer:
         return self._proofs[query.system].prove(target, most_boxes=self._certify_boxes).proved
 
 
-def _own_masks(case: BenchmarkPhantom, folder: Path, cache: Path | None) -> Lung:
-    """Return the lung of a case, whose masks are those of the manifest.
+def _own_masks(name: str, folder: Path, cache: Path | None) -> Lung:
+    """Return the lung of a phantom, whose masks are those of the manifest.
 
     Raises:
         AnatomyError: If they are not: answers about other masks count for nothing.
@@ -224,7 +214,7 @@ def _own_masks(case: BenchmarkPhantom, folder: Path, cache: Path | None) -> Lung
     from anatomy.io.patients import load_patient as read_images
     from lungaccess.running.benchmark.synthetic.cases import masks_sha256
 
-    wanted, found = entries()[case.name].masks_sha256, masks_sha256(read_images(folder))
+    wanted, found = entries()[name].masks_sha256, masks_sha256(read_images(folder))
     if found != wanted:
         raise AnatomyError(
             f"The masks in {folder} have the hash {found[:16]}",

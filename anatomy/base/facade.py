@@ -45,9 +45,8 @@ def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callabl
             return sorted(names)
         if name not in names:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(names[name]), name)
-        setattr(sys.modules[package], name, value)
-        return value
+        # Not kept here: who replaces a name where it is defined replaces it for all.
+        return getattr(import_module(names[name]), name)
 
     def names_of() -> list[str]:
         return sorted({*vars(sys.modules[package]), *public_names(file)})

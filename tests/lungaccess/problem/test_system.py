@@ -194,9 +194,10 @@ def test_a_system_warns_of_a_needle_that_bends_its_tubes_away() -> None:
 
 def test_example_of_the_documentation_works(tmp_path: Path) -> None:
     page = (DOCS / "how_to" / "devices.md").read_text(encoding="utf-8")
-    example = page.split("```toml\n")[1].split("```")[0]
+    shown = page.split("```{literalinclude} ")[1].split("\n")[0]
+    example = (DOCS / "how_to" / shown).read_text(encoding="utf-8")
     system = load_system(write(tmp_path, example))
-    assert system.needle.min_radius_of_curvature_mm == pytest.approx(100.0)
+    assert system.needle.min_radius_of_curvature_mm == pytest.approx(50.0)
 
 
 def test_documentation_names_every_key() -> None:

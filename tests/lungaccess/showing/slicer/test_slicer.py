@@ -329,7 +329,7 @@ def test_the_command_says_what_it_wrote(
         lambda *_, **__: Exported(files=("scene.mrml",), report=report),
     )
     appraisal = Appraisal(check=report, risk=None, limits=())
-    monkeypatch.setattr("lungaccess.judging.appraisal.appraise", lambda *_, **__: appraisal)
+    monkeypatch.setattr("lungaccess.judging.appraisal.appraiser.appraise", lambda *_, **__: appraisal)
     plan.save(tmp_path / "plan.json")
     words = ["export", str(tmp_path / "plan.json"), "toy", "--slicer", str(tmp_path / "out")]
     assert cli.main(words) == code

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import (
+    CoreConfig,
     float_schema,
     list_schema,
     no_info_after_validator_function,
@@ -51,7 +52,10 @@ class Record:
             for each in fields(cls)  # type: ignore[arg-type]
         }
         return no_info_after_validator_function(
-            lambda stated: cls(**stated), typed_dict_schema(keys, strict=True, extra_behavior="forbid")
+            lambda stated: cls(**stated),
+            typed_dict_schema(
+                keys, strict=True, extra_behavior="forbid", config=CoreConfig(allow_inf_nan=False)
+            ),
         )
 
     def __post_init__(self) -> None:

@@ -247,6 +247,18 @@ def test_huge_number_is_not_finite() -> None:
         Plan.from_json(text)
 
 
+@pytest.mark.parametrize("number", ["1e999", "-1e999", "1" + 400 * "0", "NaN"])
+def test_no_measure_is_infinite(number: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is refused by itself, not because the digest is that of other numbers."""
+    monkeypatch.setattr("lungaccess.plans.file.digest", lambda _plan: "any")
+    content = json.loads(make_plan().to_json()) | {"digest": "any"}
+    assert Plan.from_json(json.dumps(content)).seed == 2**40
+    for part, key in (("tube", "lateral_sweep_mm"), ("needle", "length_mm"), ("costs", "length_mm")):
+        changed = content | {part: content[part] | {key: "here"}}
+        with pytest.raises(PlanFileError, match=None if number == "NaN" else f"{part}.{key}"):
+            Plan.from_json(json.dumps(changed).replace('"here"', number))
+
+
 @given(st.integers(0, 10**9))
 def test_truncated_file(cut: int) -> None:
     text = make_plan().to_json()

@@ -103,7 +103,6 @@ def _with_part(volume: Volume | None, box: Window, part: Array, grid: Grid) -> V
 
 
 def _wall(wall: Mask, before: Mask, after: Mask, changed: Mask, grid: Grid) -> Mask:
-    """Return the wall around the lumen as it is now."""
     erased, added = before & ~after, after & ~before
     if erased.any():
         from scipy.spatial import cKDTree
@@ -132,7 +131,6 @@ def _labelled(labels: Volume, box: Window, nodules: Mask, painted: Mask) -> Volu
 
 
 def _warnings(grid: Grid, before: Mapping[str, Mask], after: Mapping[str, Mask]) -> list[str]:
-    """Say how much was corrected of what."""
     words = []
     for name, role in ROLES.items():
         if role not in after:

@@ -214,5 +214,4 @@ def _load(folder: Path, *, warn: bool = False) -> Lung | None:
 
 
 def _mapped(folder: Path, name: str) -> Array:
-    """Open a stored array without reading it, as a plain read-only array."""
     return read_only(np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")))

@@ -11,8 +11,6 @@ from anatomy.base.typed import Float, Float32, Mask
 from anatomy.grid import Grid
 from anatomy.morphology import Window, bounds, pieces_of, window
 
-TOOLS = ("paint", "erase", "fill", "cut", "join")
-"""A stroke does one of these; `Stroke` says how."""
 LONGEST_GAP_MM = 40.0
 """A gap in an airway is shorter: what lies farther apart is joined by painting."""
 AROUND_GAP_MM = 12.0

@@ -186,7 +186,6 @@ def _explain(cls: type, detail: ErrorDetails) -> tuple[str, str]:
 
 
 def _shown(value: object) -> str:
-    """Return a value as a message shows it."""
     text = repr(value)
     return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 

@@ -232,7 +232,6 @@ def _require_still(
 
 
 def _of_file(text: str, path: Path) -> list[Markup]:
-    """Return the markups of the text of a `.mrk.json`."""
     with reading(path):
         content = json.loads(text)
         listed = content.get("markups") if isinstance(content, dict) else None

@@ -143,7 +143,6 @@ def _below(folder: Path) -> list[Path]:
 
 
 def _here(folder: Path) -> list[Path]:
-    """Return a folder if it is a patient."""
     known: tuple[Callable[[Path], bool], ...] = (is_med_rad, is_liver, is_totalsegmentator)
     return [folder] if (folder / DESCRIPTION).is_file() or any(kind(folder) for kind in known) else []
 

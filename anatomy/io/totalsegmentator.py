@@ -198,5 +198,4 @@ def _label_names(path: Path, *, must_have: bool) -> tuple[dict[int, str], list[s
 
 
 def _lobe(name: str) -> int:
-    """Return the number of the lobe of a structure, 0 for any other."""
     return lobe_named(name) if ROLES[name] == "lobes" else 0

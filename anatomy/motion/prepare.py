@@ -214,7 +214,6 @@ def _at_masks(source: MotionSource, field: At, places: Float) -> tuple[Float, fl
 
 
 def _near_lung(labels: Labels, grid: Grid, nodes_grid: Grid, side: int, middle_x_mm: float) -> Mask:
-    """Return the nodes that lie in a lung."""
     points = nodes_grid.centres_lps
     index = np.rint(grid.ijk(points)).astype(int)
     within = ((index >= 0) & (index < np.asarray(grid.shape))).all(axis=-1)

@@ -118,29 +118,6 @@ class Centerlines:
         return len(self.branch_parent)
 
     @property
-    def branch_diameter_mm(self) -> Float:
-        """Mean lumen diameter of every branch, `(B,)` mm."""
-        return np.asarray(
-            2 * np.add.reduceat(self.radius_mm, self.branch_start[:-1]) / np.diff(self.branch_start)
-        )
-
-    @property
-    def branch_length_mm(self) -> Float:
-        """Arc length of every branch, `(B,)` mm."""
-        a, b = self.edges.T
-        length = np.linalg.norm(self.points_lps[a] - self.points_lps[b], axis=1)
-        branch = np.repeat(np.arange(self.n_branches), np.diff(self.branch_start))
-        return np.bincount(branch[b], weights=length, minlength=self.n_branches).astype(np.float64)
-
-    @property
-    def edges(self) -> Int:
-        """Index pairs `(M, 2)` of joined points within branches."""
-        first = np.arange(len(self.points_lps) - 1)
-        inside = np.ones(len(first), dtype=bool)
-        inside[self.branch_start[1:-1] - 1] = False
-        return np.stack([first[inside], first[inside] + 1], axis=1)
-
-    @property
     def generation(self) -> Int:
         """Number of branchings from the root, `(B,)`; the root has 0."""
         generation = np.zeros(self.n_branches, dtype=np.int64)

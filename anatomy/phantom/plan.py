@@ -127,7 +127,6 @@ def _share_out(cloud: Float, starts: Float, directions: Float) -> Int:
 def _segment_clouds(
     ends: dict[str, tuple[Float, Float]], territory: Territory, resected: int
 ) -> dict[str, Float]:
-    """Return the points that every segment supplies."""
     clouds: dict[str, Float] = {}
     for lobe in sorted(set(LOBES.values()) - {resected}):
         segments = [b for b in TEMPLATE if b.segment and b.lobe == lobe]

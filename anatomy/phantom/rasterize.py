@@ -92,7 +92,6 @@ def draw_body(chest: Chest, grid: Grid, open_fissures: float = 0.0, *, precise: 
 
 
 def _around(chest: Chest, side: Side, x: Array, y: Array, z: Array) -> UInt8:
-    """Return the labels of what is not lung."""
     s = chest.scale
     heart = chest.heart(x, y, z) < 0
     x, y, z = x / s, y / s, z / s

@@ -217,7 +217,6 @@ def between(values: Array, places: Sequence[Float], *, cubic: bool = True) -> Ar
 
 
 def _along(values: Array, places: Float, cubic: bool) -> Array:
-    """Return an image at places along its first axis."""
     last = len(values) - 1
     first = np.clip(np.floor(places), 0, last).astype(np.int64)
     if (first == places).all():

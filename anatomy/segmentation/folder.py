@@ -60,6 +60,7 @@ class SegmentationFolder:
     ) -> None:
         self.path = require_writable_folder(folder)
         self.grid = grid
+        self._description, self._aside = self.path / DESCRIPTION, self.path / f".{DESCRIPTION}.aside"
         self._refuse_inputs(inputs)
         if not force and not (self.path / STATE).is_file():
             self._refuse_foreign()
@@ -169,9 +170,22 @@ class SegmentationFolder:
         sealed = self._record | {"checksum": values_checksum(self._record)}
         write_text(self.path / STATE, json.dumps(sealed, indent=1) + "\n")
 
-    def recorded(self, entry: str) -> Any:
-        """Return an entry of the record, or None."""
-        return self._record.get(entry)
+    def set_description_aside(self) -> None:
+        """Take `patient.toml` away until `describe`, so that no half-made patient is read; harmless again."""
+        if self._description.is_file():
+            os.replace(self._description, self._aside)
+
+    def describe(self, text: str) -> bool:
+        """Put `patient.toml` back: `text`, or what a person edited; return True if the latter."""
+        self.set_description_aside()
+        written = self._record.get("description") or []
+        if self._aside.is_file() and sha256(self._aside) not in written:
+            os.replace(self._aside, self._description)
+            return True
+        self.save(description=[*written[-1:], hashlib.sha256(text.encode("utf-8")).hexdigest()])
+        write_text(self._description, text)
+        self._aside.unlink(missing_ok=True)
+        return False
 
     def _entry(self, name: str) -> dict[str, Any]:
         return dict(self._record.get("images", {}).get(name, {}))
@@ -275,33 +289,3 @@ def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
         source = tuple(slice(int(a), int(b)) for a, b in zip(low - shift, high - shift, strict=True))
         placed[into] = volume.array[source]
     return Volume(grid=grid, array=placed)
-
-
-class Description:
-    """The `patient.toml` of a folder: set aside while images change, so that no half-made patient is read.
-
-    A person's own edits are kept.
-    """
-
-    def __init__(self, folder: SegmentationFolder, name: str) -> None:
-        self._folder = folder
-        self._path = folder.path / name
-        self._aside = folder.path / f".{name}.aside"
-
-    def set_aside(self) -> None:
-        """Take the description away until `finish`; harmless when it is away already."""
-        if self._path.is_file():
-            os.replace(self._path, self._aside)
-
-    def finish(self, text: str) -> bool:
-        """Put the description back: `text`, or what a person edited; return True if the latter."""
-        self.set_aside()
-        written = self._folder.recorded("description") or []
-        if self._aside.is_file() and sha256(self._aside) not in written:
-            os.replace(self._aside, self._path)
-            return True
-        digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
-        self._folder.save(description=[*written[-1:], digest])
-        write_text(self._path, text)
-        self._aside.unlink(missing_ok=True)
-        return False

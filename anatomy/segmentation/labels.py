@@ -113,7 +113,6 @@ def _fits(lobes: list[int], middles: Float) -> bool:
 
 
 def _middles(grid: Grid, masks: Iterable[Mask]) -> Float:
-    """Return the middle of each mask, LPS mm, `(N, 3)`."""
     found = []
     for mask in masks:
         lines = [mask.sum(axis=axes) for axes in ((1, 2), (0, 2), (0, 1))]

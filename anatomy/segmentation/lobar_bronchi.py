@@ -139,7 +139,6 @@ def _named(regions: Regions, part: Int, lobes: tuple[int, ...]) -> Int:
 
 
 def _value(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> float:
-    """Return how good it is to give the branches these lobes `(B,)`."""
     parts = [lobe == each for each in lobes]
     if not all(part.any() for part in parts):
         return -np.inf

@@ -198,7 +198,6 @@ def coarse_lung_ex_vivo(
 
 
 def _background(ct: CoarseCt) -> Mask:
-    """Grow the air around the lung from the edge of the image."""
     faces = [ct.hu[0], ct.hu[-1], ct.hu[:, 0], ct.hu[:, -1], ct.hu[:, :, 0], ct.hu[:, :, -1]]
     air = float(np.median(np.concatenate([face.ravel() for face in faces])))
     # Lung is at least this much above the air around it: several times the noise.
@@ -213,7 +212,6 @@ def _background(ct: CoarseCt) -> Mask:
 
 
 def _airway(ct: CoarseCt, hull: Mask, seed_lps: Float | None) -> CentralAirway:
-    """Grow the airway from the widest air inside the hull of the lung."""
     import edt
 
     if seed_lps is not None:

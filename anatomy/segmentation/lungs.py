@@ -119,7 +119,6 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
 
 
 def _filled(mask: Mask, grid: Grid) -> Mask:
-    """Close and fill a mask in the box around it."""
     box = window(*bounds(mask, np.ceil(2.0 * CLOSING_MM / grid.spacing_mm).astype(np.int64)))
     filled = np.array(mask, order="F")
     if mask.any():
@@ -128,7 +127,6 @@ def _filled(mask: Mask, grid: Grid) -> Mask:
 
 
 def _on_ct(coarse: CoarseCt, mask: Mask) -> Mask:
-    """Return a mask of coarse voxels on the grid of the CT."""
     whole = np.zeros(coarse.fine_shape, dtype=np.bool_, order="F")
     low, high = coarse.box_in_ct(mask, 0.0)
     whole[window(low, high)] = coarse.to_ct(mask, low, high)

@@ -13,13 +13,13 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import Grid, Volume
 from anatomy.io.frames import parse_point
-from anatomy.io.own_masks import DESCRIPTION, description_text
+from anatomy.io.own_masks import description_text
 from anatomy.lobes import BORDER, LOBES, SEEN
 from anatomy.machine_code.sources import version_of
 from anatomy.plausibility import require_known_checks
 from anatomy.segmentation.box import VOXEL_MM, Box
 from anatomy.segmentation.canonical import canonical
-from anatomy.segmentation.folder import Description, SegmentationFolder, digest_of_ct
+from anatomy.segmentation.folder import SegmentationFolder, digest_of_ct
 from anatomy.segmentation.input import has_thick_slices, require_chest_ct, slice_mm
 from anatomy.segmentation.nodules import centre_of
 from anatomy.segmentation.parts import Parts
@@ -103,8 +103,7 @@ def segment(
     inputs = [Path(name) for name in (*request.given.hashes(), *request.sources)]
     folder = SegmentationFolder(request.out, grid, digest, inputs=inputs, force=request.force)
     folder.remember(ct_source=_ct_source(request))  # Early: a run that is refused goes on in this folder.
-    description = Description(folder, DESCRIPTION)
-    steps = Steps(request, folder, description, digest, tell, begun)
+    steps = Steps(request, folder, digest, tell, begun)
     parts = steps.run()
     if parts.nodule.any() and target is None:
         target = centre_of(parts.nodule, parts.ct.grid)
@@ -136,7 +135,7 @@ def segment(
         recomputed=tuple(steps.recomputed),
         corrected=tuple(steps.corrected),
         from_elsewhere=steps.from_elsewhere,
-        kept_description=description.finish(description_text(keys)),
+        kept_description=folder.describe(description_text(keys)),
         warnings=tuple(warnings),
     )
 

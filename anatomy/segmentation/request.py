@@ -100,7 +100,6 @@ def read_given(files: Mapping[str, Path], folder: Path | None, grid: Grid) -> Gi
 
 
 def _read(image: str, path: Path) -> _Read:
-    """Read one image from whatever a path names."""
     if path.is_dir():
         return _one_of_folder(image, path)
     file, stated = file_and_label(path)

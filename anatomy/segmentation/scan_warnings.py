@@ -232,7 +232,6 @@ def quality_of(parts: Parts) -> Quality:
 
 
 def _leaks(tree: AirwayTree) -> list[str]:
-    """Warn of branches that are much wider than what they grow from."""
     radius = np.asarray(tree.branch_mean_radius_mm)
     parent = np.asarray(tree.branch_parent)
     # A bronchus is never so much wider than its parent; a leak is.

@@ -22,7 +22,7 @@ from anatomy.segmentation import folder as folders
 from anatomy.segmentation.airway import Airways
 from anatomy.segmentation.box import Box
 from anatomy.segmentation.central_airway import without_top
-from anatomy.segmentation.folder import IMAGES, Description, SegmentationFolder
+from anatomy.segmentation.folder import IMAGES, SegmentationFolder
 from anatomy.segmentation.gate import plausibility
 from anatomy.segmentation.input import Scale, slice_mm
 from anatomy.segmentation.labels import LEFT, RIGHT, lung_labels, sides_of
@@ -59,13 +59,11 @@ class Steps:
         self,
         request: SegmentationRequest,
         folder: SegmentationFolder,
-        description: Description,
         ct_digest: str,
         progress: Progress,
         begun: Callable[[Parts], None] | None = None,
     ) -> None:
-        self._begun = begun
-        self._request, self._folder, self._description = request, folder, description
+        self._request, self._folder, self._begun = request, folder, begun
         self._ct_digest, self._tell = ct_digest, progress
         self._work_in(Box.whole(request.ct.grid, request.voxel_mm))
         self._ct = request.ct
@@ -235,7 +233,7 @@ class Steps:
         try:
             self.accepted = require_plausible(failed, self._request.accept)
         except AnatomyError as error:
-            self._description.set_aside()
+            self._folder.set_description_aside()
             raise RefusedError(error, begun) from None
 
     def _nodule(self, lungs: Lungs) -> Mask:
@@ -360,11 +358,9 @@ class Steps:
         return folders.key_of(step, version=VERSION, replaced=replaced, before=before, place=place, **others)
 
     def _work_in(self, box: Box) -> None:
-        """Have all further images lie on the voxels of a box."""
         self._box, self._folder.grid = box, box.grid
 
     def _source(self, name: str) -> Array:
-        """Return what replaces an image, on the voxels of the box."""
         return self._box.placed(self._sources[name], name)
 
     def _source_mask(self, name: str) -> Mask | None:
@@ -378,7 +374,7 @@ class Steps:
         if all(digests.values()):
             images = {name: self._read(name) for name in names}
         else:
-            self._description.set_aside()
+            self._folder.set_description_aside()
             images, facts = compute()
             self._tell(f"writing {', '.join(names)}")
             self._folder.note(step, facts)

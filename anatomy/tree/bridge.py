@@ -126,7 +126,6 @@ def _in_direction(near: Int, far: Int, begin: Int, end: Int, spacing_mm: Float) 
 
 
 def _towards(voxels: Int, contact: Int, spacing_mm: Float) -> Float:
-    """Return the unit vector from the middle of the voxels around `contact` to it."""
     offset = (contact - voxels) * spacing_mm
     vector = offset[np.linalg.norm(offset, axis=1) <= NEAR_MM].mean(axis=0)
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))

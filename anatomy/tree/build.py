@@ -49,8 +49,9 @@ def tree_from_mask(lumen: Volume) -> AirwayTree:
     # Lines that centring has drawn together are one line too.
     voxel_tree = unite_parallel(centred(voxel_tree, prepared, ROUNDS), prepared.lumen)
     voxel_tree = centred(voxel_tree, prepared, ROUNDS // 3)
-    report = TreeReport(
-        gaps_bridged=prepared.gaps + _contacts(voxel_tree, prepared),
+    report = replace(
+        prepared.report,
+        gaps_bridged=prepared.report.gaps_bridged + _contacts(voxel_tree, prepared),
         spurs_pruned=tuple(
             SpurPruned(position_lps=grid.lps(ijk[end]), length_mm=length) for end, length in spurs
         ),
@@ -58,10 +59,6 @@ def tree_from_mask(lumen: Volume) -> AirwayTree:
             LoopOpened(position_lps=grid.lps((ijk[a] + ijk[b]) / 2), length_mm=length)
             for a, b, length in rings
         ),
-        pieces_left_out=prepared.left_out,
-        components_dropped=prepared.components_dropped,
-        voxels_dropped=prepared.voxels_dropped,
-        cavity_voxels=prepared.cavity_voxels,
     )
     return _tree_of(strands_along(voxel_tree, prepared, spacing_mm=0.75), report)
 
@@ -290,7 +287,6 @@ def _piece_of_points(count: int, pairs: Int) -> Int:
 
 
 def _largest_piece(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int, int, int]:
-    """Keep the connected piece with most points; also count the pieces and points left out."""
     label = _piece_of_points(len(points), pairs)
     keep = label == np.argmax(np.bincount(label))
     new = np.cumsum(keep) - 1

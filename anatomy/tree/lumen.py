@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from anatomy.airway_tree import GapBridged, PieceLeftOut
+from anatomy.airway_tree import GapBridged, PieceLeftOut, TreeReport
 from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Float32, Int, Int32
@@ -38,11 +38,7 @@ class PreparedLumen:
     bridges: Bool
     depth_mm: Float32
     solid_depth_mm: Float32
-    gaps: tuple[GapBridged, ...]
-    left_out: tuple[PieceLeftOut, ...]
-    components_dropped: int
-    voxels_dropped: int
-    cavity_voxels: int
+    report: TreeReport
 
 
 def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
@@ -91,16 +87,17 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
         bridges=bridges,
         depth_mm=depth,
         solid_depth_mm=depth_of_centres(solid, grid.spacing_mm) if cavity_voxels else depth,
-        gaps=tuple(gaps),
-        left_out=left_out,
-        components_dropped=count - 1 - len(gaps),
-        voxels_dropped=int(sizes[1:].sum() - lumen.sum()),
-        cavity_voxels=cavity_voxels,
+        report=TreeReport(
+            gaps_bridged=tuple(gaps),
+            pieces_left_out=left_out,
+            components_dropped=count - 1 - len(gaps),
+            voxels_dropped=int(sizes[1:].sum() - lumen.sum()),
+            cavity_voxels=cavity_voxels,
+        ),
     )
 
 
 def _left_out(lumen: Bool, pieces: list[Piece], grid: Grid) -> tuple[PieceLeftOut, ...]:
-    """Return what is known of pieces that were not joined to the lumen."""
     from scipy.spatial import KDTree
 
     if not pieces:

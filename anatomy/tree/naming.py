@@ -365,6 +365,5 @@ def _name_lung(
 
 
 def _text(side: str, segments: _Segments) -> str:
-    """Return the name of the bronchus of some segments."""
     numbers = ["1+2" if side == LEFT and n == 1 else f"{n}" for n in segments]
     return STEM_NAMES[side].get(segments, f"{side}B{'+'.join(numbers)}")

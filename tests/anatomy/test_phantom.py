@@ -17,6 +17,7 @@ from anatomy.base.typed import Float, Int16, UInt8
 from anatomy.io import load_patient, read_volume
 from anatomy.phantom import LABELS, LOBES, Centerlines, Phantom, make_phantom, write_phantom
 from anatomy.tree import tree_from_mask
+from tests.anatomy.phantom_lines import diameters_mm, lengths_mm
 
 FULL = np.ones((3, 3, 3))
 SIZES = pytest.mark.parametrize("size", ["small", pytest.param("adult", marks=pytest.mark.slow)])
@@ -134,8 +135,8 @@ def test_left_is_left_and_up_is_up(small: Phantom, airway: Centerlines) -> None:
     assert end[right, 0] < 0 < end[left_main, 0]
     down = -_directions(airway)[:, 2]
     assert down[right] > down[left_main]
-    assert airway.branch_length_mm[right] < airway.branch_length_mm[left_main]
-    assert airway.branch_diameter_mm[right] > airway.branch_diameter_mm[left_main]
+    assert lengths_mm(airway)[right] < lengths_mm(airway)[left_main]
+    assert diameters_mm(airway)[right] > diameters_mm(airway)[left_main]
 
 
 def test_two_lungs_that_do_not_touch(small: Phantom) -> None:
@@ -172,8 +173,8 @@ def test_every_tree_is_connected_point_by_point(small: Phantom) -> None:
 def test_the_small_airway_has_a_carina_and_five_generations_in_the_mask(airway: Centerlines) -> None:
     assert (np.bincount(airway.generation)[:3] == [1, 2, 4]).all()
     assert airway.generation.max() >= 5
-    assert (airway.branch_diameter_mm[airway.generation <= 3] > 3.9).all()
-    assert (airway.branch_diameter_mm[airway.generation <= 3] > 4.3).sum() >= 8
+    assert (diameters_mm(airway)[airway.generation <= 3] > 3.9).all()
+    assert (diameters_mm(airway)[airway.generation <= 3] > 4.3).sum() >= 8
 
 
 def test_a_bronchoscope_of_4_2_mm_can_stand_in_three_generations(small: Phantom, airway: Centerlines) -> None:
@@ -196,19 +197,19 @@ def test_the_tree_of_the_mask_is_the_tree_that_was_drawn(small: Phantom, airway:
 
 
 def test_diameters_fall_by_order_as_in_measured_lungs(airway: Centerlines) -> None:
-    fall = np.polyfit(airway.generation, np.log(airway.branch_diameter_mm), 1)[0]
+    fall = np.polyfit(airway.generation, np.log(diameters_mm(airway)), 1)[0]
     assert -0.30 < fall < -0.12
-    rise, at_zero = np.polyfit(airway.strahler_order, np.log(airway.branch_diameter_mm), 1)
+    rise, at_zero = np.polyfit(airway.strahler_order, np.log(diameters_mm(airway)), 1)
     assert 1.2 < np.exp(rise) < 1.8
     fit = rise * airway.strahler_order + at_zero
-    assert np.corrcoef(fit, np.log(airway.branch_diameter_mm))[0, 1] > 0.85
+    assert np.corrcoef(fit, np.log(diameters_mm(airway)))[0, 1] > 0.85
     child = np.arange(1, airway.n_branches)
-    assert (airway.branch_diameter_mm[child] < airway.branch_diameter_mm[airway.branch_parent[child]]).all()
+    assert (diameters_mm(airway)[child] < diameters_mm(airway)[airway.branch_parent[child]]).all()
 
 
 def test_lengths_and_angles_are_plausible(airway: Centerlines) -> None:
     grown = airway.generation > 4
-    ratio = (airway.branch_length_mm / airway.branch_diameter_mm)[grown]
+    ratio = (lengths_mm(airway) / diameters_mm(airway))[grown]
     assert 2.5 < np.median(ratio) < 4.0
     turns = _turns_deg(airway)[airway.generation[1:] > 4]
     assert 25 < turns.mean() < 45
@@ -346,8 +347,8 @@ def test_the_adult_has_eight_generations_of_adult_size(adult: Phantom) -> None:
     lines = adult.centerlines["airway"]
     assert (np.bincount(lines.generation)[:3] == [1, 2, 4]).all()
     assert lines.generation.max() >= 8
-    assert 16 < lines.branch_diameter_mm[0] < 20
-    assert 100 < lines.branch_length_mm[0] < 120
+    assert 16 < diameters_mm(lines)[0] < 20
+    assert 100 < lengths_mm(lines)[0] < 120
     litres = adult.images.lung.array.sum() * adult.grid.voxel_volume_mm3 / 1e6
     assert 4 < litres < 6.5
     assert ndimage.label(adult.images.lumen.array)[1] == 1

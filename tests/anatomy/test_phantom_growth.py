@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from anatomy.phantom.branching import Sprouts, centerlines, limit_turn, split_cloud
+from tests.anatomy.phantom_lines import lengths_mm
 
 
 def _tiny_tree() -> Sprouts:
@@ -25,14 +26,14 @@ def test_orders_of_a_tiny_tree() -> None:
     assert lines.generation.tolist() == [0, 1, 1, 2, 2]
     assert lines.horsfield_order.tolist() == [3, 2, 1, 1, 1]
     assert lines.strahler_order.tolist() == [2, 2, 1, 1, 1]
-    assert lines.branch_length_mm.tolist() == [2, 2, 2, 2, 2]
+    assert lengths_mm(lines).tolist() == [2, 2, 2, 2, 2]
 
 
 def test_a_single_remaining_child_continues_its_parent() -> None:
     keep = np.array([True, True, False, True, True])
     lines = centerlines(_tiny_tree(), np.arange(15.0), np.arange(15.0), keep)
     assert lines.generation.tolist() == [0, 1, 1]
-    assert lines.branch_length_mm.tolist() == [4, 2, 2]
+    assert lengths_mm(lines).tolist() == [4, 2, 2]
     assert lines.radius_mm[:5].tolist() == [0, 1, 2, 4, 5]
 
 

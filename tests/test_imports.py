@@ -13,7 +13,7 @@ from importlinter import cli
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 OURS = ("anatomy", "stages", "lungaccess")
-KERNELS_MAY_USE = {"__future__", "collections", "heapq", "math", "numba", "numpy", "platform", "typing"}
+KERNELS_MAY_USE = {"__future__", "collections", "math", "numba", "numpy", "platform", "typing"}
 COMPILED_WITH = ("anatomy.machine_code.cache",)
 CHECK_MAY_USE = (
     "anatomy.*",

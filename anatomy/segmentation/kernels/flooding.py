@@ -1,12 +1,40 @@
 """Shares a volume out among labelled seeds: by the cheapest way from a seed, and by diffusion."""
 
-import heapq
-
 import numpy as np
 
-from anatomy.kernels.compiling import kernel
+from anatomy.kernels.compiling import inner_kernel, kernel
 
 HALF, INFINITE = np.float32(0.5), np.float32(np.inf)
+
+
+@inner_kernel
+def _push(heap, item):
+    """Put an item on a heap whose least item comes first."""
+    heap.append(item)
+    at = len(heap) - 1
+    while at > 0 and item < heap[(at - 1) // 2]:
+        heap[at] = heap[(at - 1) // 2]
+        at = (at - 1) // 2
+    heap[at] = item
+
+
+@inner_kernel
+def _pop(heap):
+    """Take the least item from a heap."""
+    least, last = heap[0], heap.pop()
+    size, at = len(heap), 0
+    if size == 0:
+        return least
+    while 2 * at + 1 < size:
+        child = 2 * at + 1
+        if child + 1 < size and heap[child + 1] < heap[child]:
+            child += 1
+        if last <= heap[child]:
+            break
+        heap[at] = heap[child]
+        at = child
+    heap[at] = last
+    return least
 
 
 @kernel()
@@ -27,9 +55,9 @@ def flood(labels, cost):
     for seed in range(label.size):
         if label[seed] > 0:
             least[seed] = np.float32(0.0)
-            heapq.heappush(heap, (least[seed], np.int64(seed)))
+            _push(heap, (least[seed], np.int64(seed)))
     while len(heap) > 0:
-        so_far, at = heapq.heappop(heap)
+        so_far, at = _pop(heap)
         if so_far > least[at]:
             continue
         i, j, k = at % ni, at // ni % nj, at // (nj * ni)
@@ -45,7 +73,7 @@ def flood(labels, cost):
             total = so_far + HALF * (price[at] + price[near])
             if total < least[near]:
                 least[near], label[near] = total, label[at]
-                heapq.heappush(heap, (total, np.int64(near)))
+                _push(heap, (total, np.int64(near)))
 
 
 @kernel()

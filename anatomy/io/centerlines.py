@@ -133,10 +133,8 @@ class _Reader:
         """
         stream, coded = (element.text or "").strip().encode(), True
         if form == "appended":
-            stream, coded = (
-                self.appended[max(int(element.get("offset", "0")), 0) :],
-                self.encoding == "base64",
-            )
+            offset = max(int(element.get("offset", "0")), 0)
+            stream, coded = self.appended[offset:], self.encoding == "base64"
         if coded:
             coded_text = stream.partition(b"<")[0].translate(None, b" \t\r\n")
             parts = re.findall(rb"[^=]+=*", coded_text)

@@ -31,13 +31,7 @@ from anatomy.segmentation.nodules import nodule_from_contours, stout_warnings, w
 from anatomy.segmentation.outlining import outline_nodule
 from anatomy.segmentation.parts import Parts, RefusedError
 from anatomy.segmentation.request import SegmentationRequest
-from anatomy.segmentation.scan_warnings import (
-    airway_warnings,
-    cut_off,
-    misplaced,
-    scan_warnings,
-    tree_or_error,
-)
+from anatomy.segmentation.scan_warnings import cut_off, misplaced, scan_warnings, tree_or_error
 
 Images = dict[str, Array]
 Compute = Callable[[], tuple[Images, dict[str, Any]]]
@@ -183,6 +177,7 @@ class Steps:
 
         def compute() -> tuple[Images, dict[str, Any]]:
             from anatomy.segmentation.airway import segment_airway
+            from anatomy.segmentation.scan_warnings import airway_warnings
 
             grid = self._folder.grid
             lumen, wall = self._source_mask("airway"), self._source_mask("airway_wall")
